@@ -1,0 +1,1 @@
+"""Identification of harmonic drives from measured logs."""

@@ -1,0 +1,201 @@
+"""A log made ready for simulation: torque between samples, measured outputs, and the stretches they are cut into."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.logs import Log
+from hdjax import Hold, PiecewisePolynomial, sampled
+from hdjax.effects import Scales
+
+
+class Experiment(eqx.Module):
+    """One log on its sample grid.
+
+    Attributes:
+        name: the log's name.
+        time: sample stamps [s].
+        torque: motor torque [N m] or forcing, as logged, between samples.
+        load_torque: torque on the load [N m], or None.
+        measured: (theta_m/N, dynamic error) [rad] by row, or the dynamic error alone.
+        motor_angle: measured motor angle [rad], or None in a reduced log.
+    """
+
+    name: str = eqx.field(static=True)
+    time: Float[np.ndarray, " n"]
+    torque: PiecewisePolynomial
+    load_torque: PiecewisePolynomial | None
+    measured: Float[np.ndarray, "n outputs"]
+    motor_angle: Float[np.ndarray, " n"] | None
+
+    def __len__(self) -> int:
+        return self.time.size
+
+    @property
+    def time_step(self) -> float:
+        """Median sampling interval [s]."""
+        return float(np.median(np.diff(self.time)))
+
+
+class Stretch(eqx.Module):
+    """Samples `start` to `stop` (exclusive) of one experiment."""
+
+    experiment: Experiment
+    start: int = eqx.field(static=True)
+    stop: int = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def name(self) -> str:
+        """The log's name."""
+        return self.experiment.name
+
+
+class Segments(eqx.Module):
+    """Stretches cut into equally long pieces, the lanes of one program. Missing samples have weight zero.
+
+    Attributes:
+        torque: logged torque of each segment; its first `halo` intervals lie before the segment, so that a delay
+            has something to reach back to.
+        load_torque: coefficients of the load torque, or None.
+        measured: outputs at the samples.
+        weight: 1 for a sample, 0 for padding.
+        halo: intervals before each segment's first sample.
+    """
+
+    torque: PiecewisePolynomial
+    load_torque: PiecewisePolynomial | None
+    measured: Float[Array, "segments samples outputs"]
+    weight: Float[Array, "segments samples"]
+    halo: int = eqx.field(static=True)
+
+    @property
+    def count(self) -> Array:
+        """Number of samples that carry weight."""
+        return jnp.sum(self.weight)
+
+
+def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Experiment:
+    """Turn a log into an experiment.
+
+    Args:
+        log: what was measured.
+        hold: what the torque does between samples.
+        N: reduction ratio of a drive log.
+    """
+    drive_log = log.kind == "drive"
+    input_samples = log.motor_torque if drive_log else log.forcing
+    assert input_samples is not None
+    torque = sampled(log.time, input_samples, hold=hold)
+    load_torque = None
+    if drive_log and log.load_torque is not None:
+        load_torque = sampled(log.time, log.load_torque, hold="linear")
+    columns = [log.dynamic_error]
+    if drive_log:
+        assert log.motor_angle is not None and N is not None
+        columns.insert(0, log.motor_angle / N)
+    return Experiment(
+        name=log.name,
+        time=log.time,
+        torque=torque,
+        load_torque=load_torque,
+        measured=np.stack(columns, axis=1),
+        motor_angle=log.motor_angle if drive_log else None,
+    )
+
+
+def split(
+    experiments: Sequence[Experiment], *, held_out: float = 0.2
+) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]]:
+    """The training part of each log and the stretch at its end that the fit never sees."""
+    training, validation = [], []
+    for experiment in experiments:
+        border = round(len(experiment) * (1.0 - held_out))
+        training.append(Stretch(experiment, 0, border))
+        validation.append(Stretch(experiment, border, len(experiment)))
+    return tuple(training), tuple(validation)
+
+
+def cut(stretches: Sequence[Stretch], length: int, *, halo: int = 0, pad: bool = True) -> Segments:
+    """Cut stretches into segments of `length` samples; the last one of each stretch is padded.
+
+    Args:
+        stretches: the data.
+        length: samples in a segment.
+        halo: intervals of torque before each segment.
+        pad: whether the number of segments is rounded up as well, so that logs of similar length share a program.
+    """
+    torque_knots, torque_coefficients, load_coefficients = [], [], []
+    measured, weight = [], []
+    for stretch in stretches:
+        experiment = stretch.experiment
+        knots = np.asarray(experiment.torque.knots)
+        coefficients = np.asarray(experiment.torque.coefficients)
+        load = experiment.load_torque
+        last = len(experiment) - 1
+        step = experiment.time_step
+        for begin in range(stretch.start, stretch.stop, length):
+            index = np.arange(begin - halo, begin + length)
+            inside = np.clip(index, 0, last)
+            # Before the record the first torque is assumed to have been held; beyond it the last.
+            piece = coefficients[inside].copy()
+            piece[index != inside, 1:] = 0.0
+            outer = np.append(index, index[-1] + 1)
+            known = np.clip(outer, 0, last + 1)
+            torque_knots.append(knots[known] + (outer - known) * step)
+            torque_coefficients.append(piece)
+            own = index[halo:]
+            present = (own < stretch.stop).astype(float)
+            kept = np.clip(own, 0, stretch.stop - 1)
+            measured.append(experiment.measured[kept])
+            weight.append(present)
+            if load is not None:
+                load_coefficients.append(np.asarray(load.coefficients)[np.clip(own, 0, last)])
+    padding = -len(weight) % 16 if pad and len(weight) > 8 else 0
+    for _ in range(padding):
+        torque_knots.append(torque_knots[-1])
+        torque_coefficients.append(torque_coefficients[-1])
+        measured.append(measured[-1])
+        weight.append(np.zeros(length))
+        if load_coefficients:
+            load_coefficients.append(load_coefficients[-1])
+    knots = jnp.asarray(np.stack(torque_knots))
+    load_torque = None
+    if load_coefficients:
+        load_torque = PiecewisePolynomial(knots[:, halo:], jnp.asarray(np.stack(load_coefficients)))
+    return Segments(
+        torque=PiecewisePolynomial(knots, jnp.asarray(np.stack(torque_coefficients))),
+        load_torque=load_torque,
+        measured=jnp.asarray(np.stack(measured)),
+        weight=jnp.asarray(np.stack(weight)),
+        halo=halo,
+    )
+
+
+def scales(stretches: Sequence[Stretch]) -> Scales:
+    """Orders of magnitude of the measured motion."""
+    x = np.concatenate([s.experiment.measured[s.start : s.stop, -1] for s in stretches])
+    x = x - np.median(x)
+    step = stretches[0].experiment.time_step
+
+    def rate(values: np.ndarray) -> float:
+        """Rms slope over a few samples, so that encoder noise does not pass for speed."""
+        span = 8
+        return float(np.sqrt(np.mean(((values[span:] - values[:-span]) / (span * step)) ** 2)))
+
+    angles = [s.experiment.motor_angle[s.start : s.stop] for s in stretches if s.experiment.motor_angle is not None]
+    motor = float(np.sqrt(np.mean([rate(a) ** 2 for a in angles]))) if angles else 1.0
+    output = [rate(s.experiment.measured[s.start : s.stop, 0]) for s in stretches]
+    return Scales(
+        x=float(np.std(x)),
+        x_max=float(np.max(np.abs(x))),
+        v=rate(x),
+        omega_m=motor,
+        omega_l=float(np.sqrt(np.mean(np.square(output)))),
+        time_step=step,
+    )

@@ -1,0 +1,105 @@
+"""What a fit may change: parameters by dotted path, on scales where they are of order one."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdjax import Model, TwoInertiaModel
+from hdjax.effects import Effect
+from hdjax.parameters import own_parameters
+
+
+class FreeParameters(eqx.Module):
+    """The parameters that a fit changes, as a vector of order one.
+
+    A parameter that must be positive moves by its logarithm, any other in units of `scale`.
+
+    Attributes:
+        paths: dotted paths.
+        logarithmic: which move by their logarithm.
+        scale: unit of each of the others.
+    """
+
+    paths: tuple[str, ...] = eqx.field(static=True)
+    logarithmic: tuple[bool, ...] = eqx.field(static=True)
+    scale: Float[Array, " parameters"]
+
+    def pack(self, model: Model) -> Float[Array, " parameters"]:
+        """The vector that stands for the model's values."""
+        values = [model.get(p) for p in self.paths]
+        if not values:
+            return jnp.zeros(0)
+        return jnp.stack(
+            [
+                jnp.log(v) if positive else v / s
+                for v, positive, s in zip(values, self.logarithmic, self.scale, strict=True)
+            ]
+        )
+
+    def unpack(self, model: Model, vector: Float[Array, " parameters"]) -> Model:
+        """The model with the values that the vector stands for."""
+        if not self.paths:
+            return model
+        values = {
+            path: jnp.exp(vector[i]) if positive else vector[i] * self.scale[i]
+            for i, (path, positive) in enumerate(zip(self.paths, self.logarithmic, strict=True))
+        }
+        return model.replace(values)
+
+    def slopes(self, model: Model) -> Float[Array, " parameters"]:
+        """Derivative of each physical value with respect to its entry of the vector."""
+        if not self.paths:
+            return jnp.zeros(0)
+        return jnp.stack(
+            [
+                model.get(p) if positive else s
+                for p, positive, s in zip(self.paths, self.logarithmic, self.scale, strict=True)
+            ]
+        )
+
+
+def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float]) -> FreeParameters:
+    """Free the parameters at `paths`.
+
+    Args:
+        model: holds the current values.
+        paths: dotted paths.
+        scale: a typical magnitude for those that may be zero; the larger of it and the current value is the unit.
+
+    Raises:
+        ValueError: for an unknown path, or a positive parameter whose current value is not.
+    """
+    known = model.parameters()
+    for path in paths:
+        if path not in known:
+            raise ValueError(f"`{path}` must be one of {sorted(known)}")
+    logarithmic = tuple(known[p][1].positive for p in paths)
+    values = [float(known[p][0]) for p in paths]
+    for path, value, positive in zip(paths, values, logarithmic, strict=True):
+        if positive and not value > 0:
+            raise ValueError(f"`{path}` must be positive, but is {value}")
+    units = [
+        max(abs(v), scale.get(p, 0.0)) or 1.0 if math.isfinite(v) else 1.0 for p, v in zip(paths, values, strict=True)
+    ]
+    return FreeParameters(tuple(paths), logarithmic, jnp.asarray(np.array(units, dtype=float)))
+
+
+def base_paths(model: Model) -> tuple[str, ...]:
+    """What is fitted of a drive without effects."""
+    if isinstance(model, TwoInertiaModel):
+        return ("K", "alpha", "B_sp")
+    return ("mu", "omega_0", "alpha", "gain")
+
+
+def effect_paths(effect: Effect) -> tuple[str, ...]:
+    """What is fitted of an effect: its strengths and shapes."""
+    return tuple(f"{effect.name}.{n}" for n, i in own_parameters(effect) if i.role != "base")
+
+
+def strength_paths(effect: Effect) -> tuple[str, ...]:
+    """Those parameters of an effect whose zero removes it."""
+    return tuple(f"{effect.name}.{n}" for n, i in own_parameters(effect) if i.role == "strength")

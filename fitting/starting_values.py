@@ -1,0 +1,138 @@
+"""Starting values without asking the user: the weak form of the equation of motion.
+
+Multiplied by a compact test function phi and integrated by parts, the equation of the dynamic error needs no
+derivative of a measured signal,
+
+    int phi'' x + mu int (-phi') x + omega_0^2 int phi x + omega_0^2 alpha int phi x^3 = gain int phi u,
+
+and is linear in what is sought (Schaeffer and McCalla 2017; Messenger and Bortz 2021).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fitting.errors import DataError
+from fitting.experiment import Stretch
+from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
+
+_WIDTHS = (12, 24, 48, 96, 192, 384)
+
+
+def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Models with starting values of K, alpha, B_sp (or mu, omega_0, alpha, gain), one for each weak form that gives
+    a stable oscillator; near-duplicates are dropped.
+
+    Args:
+        model: supplies everything that is not estimated here.
+        stretches: the data.
+
+    Raises:
+        DataError: where no weak form gives a positive stiffness.
+    """
+    found: list[Model] = []
+    for width in _WIDTHS:
+        for equation in _equations(model):
+            estimate = _weak_form(model, stretches, width, equation)
+            if estimate is None:
+                continue
+            stiffness = float(estimate.drive.stiffness)
+            if all(abs(np.log(stiffness / float(f.drive.stiffness))) > 0.03 for f in found):
+                found.append(estimate)
+    if not found:
+        names = ", ".join(s.name for s in stretches)
+        raise DataError(
+            f"{names}: the dynamic error does not follow from the torque by any positive stiffness; check the signs "
+            "and units of motor_torque, motor_angle and load_angle in the drive file"
+        )
+    return tuple(found)
+
+
+def _equations(model: Model) -> tuple[str, ...]:
+    """The load's own equation does not contain the motor torque, so that an error of the torque can't spoil it."""
+    return ("error", "load") if isinstance(model, TwoInertiaModel) else ("error",)
+
+
+def _weak_form(model: Model, stretches: Sequence[Stretch], width: int, equation: str) -> Model | None:
+    rows, right = [], []
+    for stretch in stretches:
+        if len(stretch) < 3 * width:
+            continue
+        a, b = _rows(model, stretch, width, equation)
+        rows.append(a)
+        right.append(b)
+    if not rows:
+        return None
+    a, b = np.concatenate(rows), np.concatenate(right)
+    norm = np.linalg.norm(a, axis=0)
+    norm[norm == 0] = 1.0
+    solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0] / norm
+    return _model(model, solution, stretches, equation)
+
+
+def _model(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str) -> Model | None:
+    stiffness, cubic, damping = solution[:3]
+    if not np.isfinite(solution).all() or stiffness <= 0:
+        return None
+    x_max = max(float(np.max(np.abs(s.experiment.measured[s.start : s.stop, -1]))) for s in stretches)
+    # Beyond this the restoring force would turn back inside the data.
+    alpha = float(np.clip(cubic / stiffness, -0.2 / x_max**2, 3.0 / x_max**2))
+    if isinstance(model, ReducedModel):
+        omega_0 = np.sqrt(stiffness)
+        mu = max(damping, 1e-3 * omega_0)
+        return model.replace({"omega_0": omega_0, "alpha": alpha, "mu": mu, "gain": solution[3]})
+    drive = model.drive
+    assert isinstance(drive, Drive)
+    inertia = 1.0 if equation == "load" else float(drive.c)
+    K = stiffness / inertia
+    least = 2e-3 * np.sqrt(K / float(drive.c))
+    return model.replace({"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)})
+
+
+def _rows(model: Model, stretch: Stretch, width: int, equation: str) -> tuple[np.ndarray, np.ndarray]:
+    """Weak-form regressors (stiffness, cubic, damping, and gain of a reduced drive) and right-hand side."""
+    experiment = stretch.experiment
+    part = slice(stretch.start, stretch.stop)
+    dt = experiment.time_step
+    x = experiment.measured[part, -1]
+    u = np.asarray(experiment.torque.coefficients)[part, 0]
+    load = experiment.load_torque
+    T_l = np.zeros_like(u) if load is None else np.asarray(load.coefficients)[part, 0]
+    tests, slopes, curvatures = _test_functions(width, dt)
+    hop = max(1, width // 4)
+
+    def against(signal: np.ndarray, functions: np.ndarray) -> np.ndarray:
+        windows = np.lib.stride_tricks.sliding_window_view(signal, width)[::hop]
+        return (windows @ functions.T).ravel() * dt
+
+    spring, cubic, damper = against(x, tests), against(x**3, tests), -against(x, slopes)
+    if equation == "load":
+        drive = model.drive
+        assert isinstance(drive, Drive)
+        theta_l = experiment.measured[part, 0] - x
+        theta_l = theta_l - theta_l[0]
+        right = float(drive.J_l) * against(theta_l, curvatures) - against(T_l, tests)
+        return np.stack([spring, cubic, damper], axis=1), right
+    right = -against(x, curvatures)
+    if isinstance(model.drive, Drive):
+        forcing = u / float(model.drive.N * model.drive.J_m) - T_l / float(model.drive.J_l)
+        return np.stack([spring, cubic, damper], axis=1), right + against(forcing, tests)
+    return np.stack([spring, cubic, damper, -against(u, tests)], axis=1), right
+
+
+def _test_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A bump (1 - s^2)^4 and its modulations, with first and second derivatives, sampled on the window."""
+    t = (np.arange(width) - 0.5 * (width - 1)) * dt
+    half = 0.5 * width * dt
+    s = t / half
+    bump = np.polynomial.Polynomial([1, 0, -1]) ** 4
+    p, dp, ddp = bump(s), bump.deriv(1)(s) / half, bump.deriv(2)(s) / half**2
+    tests, slopes, curvatures = [], [], []
+    for k in range(4):
+        w = np.pi * k / half
+        for phase in (0.0, -0.5 * np.pi) if k else (0.0,):
+            c, dc = np.cos(w * t + phase), -w * np.sin(w * t + phase)
+            tests.append(p * c)
+            slopes.append(dp * c + p * dc)
+            curvatures.append(ddp * c + 2 * dp * dc - w**2 * p * c)
+    return np.stack(tests), np.stack(slopes), np.stack(curvatures)

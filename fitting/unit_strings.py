@@ -1,0 +1,112 @@
+"""Unit strings as people write them, parsed by pint, to SI numbers."""
+
+import re
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pint
+
+# Coherent SI units by which a base unit is shown, where pint would spell kg m^2/(A s^3).
+_SHOWN = ("V", "N", "N m", "Pa", "W", "ohm", "T", "C")
+
+
+class UnitError(ValueError):
+    """A unit string that is not understood or that measures the wrong thing."""
+
+
+@cache
+def _registry() -> Any:
+    registry = pint.UnitRegistry()
+    registry.define("@alias revolution = rev")
+    return registry
+
+
+def _parse(text: str) -> Any:
+    """The pint quantity of one unit, e.g. 1/16777216 revolution."""
+    # pint reads "Nm" as the textile unit number_meter; nobody who logs a torque means that.
+    spelled = re.sub(r"\b([nµumkM]?)Nm\b", r"\1N m", text.strip()) or "1"
+    try:
+        quantity = _registry().Quantity(spelled)
+        finite = bool(np.isfinite(float(quantity.magnitude)))
+    except Exception as error:
+        # pint leaks tokenizer, syntax, arithmetic and attribute errors for malformed strings.
+        raise UnitError(f"unit {text!r} is not understood") from error
+    if not finite or quantity.magnitude == 0:
+        raise UnitError(f"unit {text!r} is not a finite number other than zero")
+    return quantity
+
+
+def _base_powers(quantity: Any) -> dict[str, float]:
+    """Exponents of the base units, radian included, counts left out."""
+    units = _registry().get_base_units(quantity.units)[1]
+    return {str(n): float(p) for n, p in units._units.items() if n != "count"}
+
+
+def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
+    """Values in `target` units.
+
+    Args:
+        values: Numbers in `unit`, any shape.
+        unit: Unit of the numbers, e.g. "rev / 16777216", "mN m", "degC".
+        target: Wanted unit, e.g. "rad".
+
+    Returns:
+        Numbers in `target`, float64, same shape.
+
+    Raises:
+        UnitError: `unit` is not understood, or does not measure what `target` measures. Unlike
+            pint's own conversion, a bare number or a count is not taken for an angle.
+    """
+    quantity, wanted = _parse(unit), _parse(target)
+    if _base_powers(quantity) != _base_powers(wanted):
+        raise UnitError(f"unit {unit!r} does not measure what {target!r} does")
+    try:
+        scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
+        return np.asarray(_registry().Quantity(scaled, quantity.units).m_as(wanted.units))
+    except pint.PintError as error:
+        raise UnitError(f"unit {unit!r} does not convert to {target!r}") from error
+
+
+def to_base(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+    """Values in coherent SI units, whatever they measure, and that unit's name.
+
+    Args:
+        values: Numbers in `unit`, any shape.
+        unit: Unit of the numbers.
+
+    Returns:
+        Numbers in the coherent SI unit, and its name, e.g. "V", "rad/s^2", "1".
+
+    Raises:
+        UnitError: `unit` is not understood.
+    """
+    quantity = _parse(unit)
+    registry = _registry()
+    base = registry.get_base_units(quantity.units)[1]
+    scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
+    try:
+        converted = np.asarray(registry.Quantity(scaled, quantity.units).m_as(base))
+    except pint.PintError as error:
+        raise UnitError(f"unit {unit!r} does not convert to SI base units") from error
+    for shown in _SHOWN:
+        if registry.get_base_units(registry.Unit(shown))[1] == base:
+            return converted, shown
+    name = f"{base:~D}".replace(" ** ", "^").replace(" / ", "/").replace(" * ", " ")
+    return converted, name or "1"
+
+
+def parse_number(text: str, target: str) -> float:
+    """One physical number with its unit, e.g. "5.26 g m^2", in `target` units.
+
+    Args:
+        text: Number and unit.
+        target: Wanted unit, e.g. "kg m^2"; "1" for a pure number.
+
+    Returns:
+        The number in `target`.
+
+    Raises:
+        UnitError: The text is not understood or measures something else.
+    """
+    return float(convert(np.array(1.0), text, target))

@@ -1,0 +1,85 @@
+"""The drive's own parameters: two inertias on a nonlinear, damped mesh, and what follows from them."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.parameters import Scalar, parameter
+
+SEED = "seed document, Table 1"
+
+
+class Drive(eqx.Module):
+    """A harmonic drive between a motor and a load.
+
+    The mesh transmits `tau = K (x + alpha x^3) + B_sp x'` at the dynamic error `x = theta_m / N - theta_l`.
+    """
+
+    N: Scalar = parameter(unit="1", doc="reduction ratio", source=SEED, bounds=(0.0, 1e4))
+    J_m: Scalar = parameter(unit="kg m^2", doc="motor inertia", source=SEED, bounds=(0.0, 1e3))
+    J_l: Scalar = parameter(unit="kg m^2", doc="load inertia", source=SEED, bounds=(0.0, 1e6))
+    K: Scalar = parameter(unit="N m/rad", doc="torsional stiffness", source=SEED, bounds=(0.0, 1e9))
+    alpha: Scalar = parameter(0.0, unit="rad^-2", doc="cubic stiffness coefficient", source=SEED)
+    B_sp: Scalar = parameter(0.0, unit="N m s/rad", doc="mesh damping", source=SEED)
+
+    @property
+    def c(self) -> Scalar:
+        """Inverse of the reduced inertia, `(N^2 J_m + J_l) / (N^2 J_m J_l)` [1/(kg m^2)]."""
+        motor = self.N**2 * self.J_m
+        return (motor + self.J_l) / (motor * self.J_l)
+
+    @property
+    def mu(self) -> Scalar:
+        """Damping of the dynamic error, `c B_sp` [1/s]."""
+        return self.c * self.B_sp
+
+    @property
+    def omega_0(self) -> Scalar:
+        """Natural frequency of the dynamic error for small twist, `sqrt(c K)` [rad/s]."""
+        return jnp.sqrt(self.c * self.K)
+
+    @property
+    def stiffness(self) -> Scalar:
+        """What multiplies `f(x)` in the mesh torque: K [N m/rad]."""
+        return self.K
+
+    def mesh_torque(self, x: Array, v: Array) -> Array:
+        """Torque on the load through the mesh [N m] at twist `x` [rad] and twist rate `v` [rad/s]."""
+        return self.K * restoring(x, self.alpha) + self.B_sp * v
+
+    def error_forcing(self, T_m: Array, T_l: Array) -> Array:
+        """Forcing of the dynamic error, `F = T_m/(N J_m) - T_l/J_l` [rad/s^2].
+
+        The seed prints `(T_m J_l - T_l J_m)/(N J_m J_l)`, which lacks a factor N on the load torque.
+        """
+        return T_m / (self.N * self.J_m) - T_l / self.J_l
+
+    def reduced(self) -> "ReducedDrive":
+        """The single equation of the dynamic error that this drive obeys, forced by the motor torque."""
+        return ReducedDrive(mu=self.mu, omega_0=self.omega_0, alpha=self.alpha, gain=1.0 / (self.N * self.J_m))
+
+
+class ReducedDrive(eqx.Module):
+    """The dynamic error's own equation, `x'' + mu x' + omega_0^2 (x + alpha x^3) = gain u(t)`.
+
+    Stands for a drive (or any Duffing oscillator) known only by a forcing `u` and a response `x`, in any units.
+    """
+
+    mu: Scalar = parameter(unit="1/s", doc="damping of the dynamic error", source="DESIGN eq. 2.1")
+    omega_0: Scalar = parameter(unit="rad/s", doc="natural frequency", source="DESIGN eq. 2.1", bounds=(0.0, 1e9))
+    alpha: Scalar = parameter(0.0, unit="1/[x]^2", doc="cubic stiffness coefficient", source="DESIGN eq. 2.1")
+    gain: Scalar = parameter(1.0, unit="[x]/s^2/[u]", doc="acceleration per unit of forcing", source="DESIGN eq. 2.1")
+
+    @property
+    def stiffness(self) -> Scalar:
+        """What multiplies `f(x)`: omega_0^2 [1/s^2]."""
+        return self.omega_0**2
+
+    def mesh_torque(self, x: Array, v: Array) -> Array:
+        """Restoring and damping acceleration [x/s^2], the reduced equation's stand-in for the mesh torque."""
+        return self.stiffness * restoring(x, self.alpha) + self.mu * v
+
+
+def restoring(x: Float[Array, "..."], alpha: Array) -> Float[Array, "..."]:
+    """The restoring shape `f(x) = x + alpha x^3`."""
+    return x * (1.0 + alpha * x * x)

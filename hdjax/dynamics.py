@@ -1,0 +1,195 @@
+"""The equations of motion: a drive with its effects, as two inertias or as the dynamic error alone."""
+
+import abc
+from typing import ClassVar, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects import (
+    ActuatorEffect,
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+    SensorEffect,
+)
+from hdjax.parameters import ParameterInfo, own_parameters
+from hdjax.signals import PiecewisePolynomial
+
+State = Float[Array, " states"]
+_Kind = TypeVar("_Kind", bound=Effect)
+
+
+class Model(eqx.Module):
+    """A drive and the effects inside its equations. States are a flat array: the motion, then effects' own states."""
+
+    drive: eqx.AbstractVar[Drive | ReducedDrive]
+    effects: eqx.AbstractVar[tuple[Effect, ...]]
+    motion_states: eqx.AbstractClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def motion(self, state: State) -> Motion:
+        """The motion that a state means, as the mesh sees it."""
+
+    @abc.abstractmethod
+    def rates(self, state: State, torque: Array, load_torque: Array) -> State:
+        """Time derivative of the state.
+
+        Args:
+            state: see `state_names`.
+            torque: motor torque [N m] that acts (or the forcing of a reduced drive).
+            load_torque: torque on the load along +theta_l [N m]; ignored by a reduced drive.
+        """
+
+    @abc.abstractmethod
+    def outputs(self, state: State) -> Float[Array, " outputs"]:
+        """What the encoders read: (theta_m/N, dynamic error) [rad], or the dynamic error alone."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state's entries; an effect's own states carry its name."""
+        own = tuple(f"{e.name}.{s}" for e in self.effects for s in e.states)
+        return self.motion_states + own
+
+    def rest(self) -> State:
+        """The state of a drive at rest, unloaded, at angle zero."""
+        parts = [jnp.zeros(len(self.motion_states))]
+        parts += [e.initial_state() for e in self.effects if e.states]
+        return jnp.concatenate(parts)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        """The torque that acts, from the torque that was logged."""
+        for effect in self._of(ActuatorEffect):
+            logged = effect.actuate(logged)
+        return logged
+
+    def with_effects(self, *effects: Effect) -> "Model":
+        """The same model with further effects."""
+        return eqx.tree_at(lambda m: m.effects, self, self.effects + effects)
+
+    def without_effect(self, name: str) -> "Model":
+        """The same model without the effect of that name."""
+        kept = tuple(e for e in self.effects if e.name != name)
+        return eqx.tree_at(lambda m: m.effects, self, kept)
+
+    def effect(self, name: str) -> Effect:
+        """The effect of that name."""
+        return next(e for e in self.effects if e.name == name)
+
+    def parameters(self) -> dict[str, tuple[Array, ParameterInfo]]:
+        """All parameters by dotted path: the drive's by their symbol, an effect's as `name.symbol`."""
+        found = {name: (getattr(self.drive, name), i) for name, i in own_parameters(self.drive)}
+        for e in self.effects:
+            found |= {f"{e.name}.{n}": (getattr(e, n), i) for n, i in own_parameters(e)}
+        return found
+
+    def get(self, path: str) -> Array:
+        """The parameter at a dotted path."""
+        if "." not in path:
+            return getattr(self.drive, path)
+        name, field = path.split(".")
+        return getattr(self.effect(name), field)
+
+    def replace(self, values: dict[str, Array]) -> "Model":
+        """The same model with other values at the given dotted paths."""
+        paths = tuple(values)
+        return eqx.tree_at(lambda m: [m.get(p) for p in paths], self, [jnp.asarray(values[p]) for p in paths])
+
+    def _of(self, kind: type[_Kind]) -> tuple[_Kind, ...]:
+        return tuple(e for e in self.effects if isinstance(e, kind))
+
+    def _own_states(self, state: State) -> dict[str, Array]:
+        """Each effect's own states by its name."""
+        start = len(self.motion_states)
+        found = {}
+        for effect in self.effects:
+            found[effect.name] = state[start : start + len(effect.states)]
+            start += len(effect.states)
+        return found
+
+    def _mesh_torque(self, motion: Motion, own: dict[str, Array]) -> Array:
+        """Torque on the load through the mesh."""
+        tau = self.drive.mesh_torque(motion.x, motion.v)
+        for effect in self._of(MeshTorqueEffect):
+            tau = tau + effect.torque(motion, self.drive, own[effect.name])
+        return tau
+
+    def _with_own_rates(self, motion: Motion, rates: list[Array], own: dict[str, Array]) -> State:
+        """The state's rate: the motion's, then those of the effects' own states."""
+        further = [e.state_rates(motion, own[e.name]) for e in self.effects if e.states]
+        return jnp.concatenate([jnp.stack(rates), *further])
+
+
+class TwoInertiaModel(Model):
+    """Motor and load inertia with the mesh between them.
+
+        J_m theta_m'' = T_m + tau_m - (1/N + e') tau        J_l theta_l'' = tau + T_l + tau_l
+
+    with the mesh torque at `x_s = theta_m/N + e(theta_m) - theta_l`. States: theta_m, theta_l, omega_m, omega_l.
+    """
+
+    drive: Drive
+    effects: tuple[Effect, ...] = ()
+    motion_states: ClassVar[tuple[str, ...]] = ("theta_m", "theta_l", "omega_m", "omega_l")
+
+    def motion(self, state: State) -> Motion:
+        theta_m, theta_l, omega_m, omega_l = state[0], state[1], state[2], state[3]
+        x = theta_m / self.drive.N - theta_l
+        v = omega_m / self.drive.N - omega_l
+        for effect in self._of(MeshGeometryEffect):
+            x = x + effect.error(theta_m)
+            v = v + effect.slope(theta_m) * omega_m
+        return Motion(x=x, v=v, theta_m=theta_m, omega_m=omega_m, theta_l=theta_l, omega_l=omega_l)
+
+    def rates(self, state: State, torque: Array, load_torque: Array) -> State:
+        drive = self.drive
+        motion = self.motion(state)
+        own = self._own_states(state)
+        tau = self._mesh_torque(motion, own)
+        transmission = 1.0 / drive.N
+        for effect in self._of(MeshGeometryEffect):
+            transmission = transmission + effect.slope(state[0])
+        on_motor = torque - transmission * tau
+        for effect in self._of(MotorSideEffect):
+            on_motor = on_motor + effect.torque(motion, drive, own[effect.name])
+        on_load = tau + load_torque
+        for effect in self._of(LoadSideEffect):
+            on_load = on_load + effect.torque(motion, drive, own[effect.name])
+        rates = [state[2], state[3], on_motor / drive.J_m, on_load / drive.J_l]
+        return self._with_own_rates(motion, rates, own)
+
+    def outputs(self, state: State) -> Float[Array, "2"]:
+        theta_m, theta_l = state[0], state[1]
+        for effect in self._of(SensorEffect):
+            theta_m, theta_l = effect.reading(theta_m, theta_l)
+        return jnp.stack([theta_m / self.drive.N, theta_m / self.drive.N - theta_l])
+
+
+class ReducedModel(Model):
+    """The dynamic error alone, `x'' = gain u - torque(x, v, ...)`. States: x, v."""
+
+    drive: ReducedDrive
+    effects: tuple[Effect, ...] = ()
+    motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
+
+    def __check_init__(self):
+        for effect in self.effects:
+            if effect.needs_motor:
+                raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
+
+    def motion(self, state: State) -> Motion:
+        return Motion(x=state[0], v=state[1])
+
+    def rates(self, state: State, torque: Array, load_torque: Array) -> State:
+        motion = self.motion(state)
+        own = self._own_states(state)
+        rates = [state[1], self.drive.gain * torque - self._mesh_torque(motion, own)]
+        return self._with_own_rates(motion, rates, own)
+
+    def outputs(self, state: State) -> Float[Array, "1"]:
+        return state[:1]

@@ -1,0 +1,81 @@
+"""What happens to the logged torque on its way to the drive: sensor gain and bias, delay."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from hdjax.effects.effect import ActuatorEffect, Effect, Scales
+from hdjax.parameters import Scalar, parameter
+from hdjax.signals import PiecewisePolynomial
+
+
+class TorqueBias(ActuatorEffect):
+    """The torque sensor's zero is off: `T = T_logged + bias`."""
+
+    family: ClassVar[str] = "torque_sensor"
+    name: ClassVar[str] = "torque_bias"
+
+    bias: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="torque that acts when the log says zero",
+        source="EFFECTS: percent of rated torque",
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        return logged.affine(jnp.ones_like(self.bias), self.bias)
+
+
+class TorqueGain(ActuatorEffect):
+    """The torque sensor's scale is off: `T = (1 + gain_error) T_logged`.
+
+    A reduced drive's own gain already is this factor, so there it does not apply.
+    """
+
+    family: ClassVar[str] = "torque_sensor"
+    name: ClassVar[str] = "torque_gain"
+    needs_motor: ClassVar[bool] = True
+
+    gain_error: Scalar = parameter(
+        0.0,
+        unit="1",
+        doc="relative error of the torque's scale",
+        source="EFFECTS: within 10 %",
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        return logged.affine(1.0 + self.gain_error, jnp.zeros_like(self.gain_error))
+
+
+class InputDelay(ActuatorEffect):
+    """The torque acts later than logged: `T(t) = T_logged(t - delay)`."""
+
+    family: ClassVar[str] = "input_delay"
+    name: ClassVar[str] = "input_delay"
+
+    delay: Scalar = parameter(
+        0.0,
+        unit="s",
+        doc="from the logged torque to the torque that acts",
+        source="EFFECTS: 0.1 to 3 ms",
+        bounds=(0.0, 0.1),
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        # At exactly zero the delayed sample changes its interval, and the slope is taken on the wrong side.
+        return (cls(delay=1e-9 * scales.time_step),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        return logged.delayed(self.delay)

@@ -1,0 +1,155 @@
+"""What an effect is: extra physics that enters the equations of motion at exactly one place."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.signals import PiecewisePolynomial
+
+
+class Motion(eqx.Module):
+    """The instantaneous motion that an effect may look at.
+
+    A reduced drive has no motor and no load of its own: there the angles and rates are None.
+
+    Attributes:
+        x: twist that the mesh sees [rad], `theta_m/N + e(theta_m) - theta_l`.
+        v: its rate [rad/s].
+        theta_m: motor angle [rad].
+        omega_m: motor rate [rad/s].
+        theta_l: load angle [rad].
+        omega_l: load rate [rad/s].
+    """
+
+    x: Array
+    v: Array
+    theta_m: Array | None = None
+    omega_m: Array | None = None
+    theta_l: Array | None = None
+    omega_l: Array | None = None
+
+
+class Scales(eqx.Module):
+    """Orders of magnitude of a measured motion, from which an effect proposes its shape parameters.
+
+    Attributes:
+        x: rms twist [rad].
+        x_max: largest twist [rad].
+        v: rms twist rate [rad/s].
+        omega_m: rms motor rate [rad/s].
+        omega_l: rms load rate [rad/s].
+        time_step: median sampling interval [s].
+    """
+
+    x: float
+    x_max: float
+    v: float
+    omega_m: float
+    omega_l: float
+    time_step: float
+
+
+class Effect(eqx.Module):
+    """Extra physics with its own parameters and, where it has memory, its own states.
+
+    Attributes:
+        family: the name that reports use, from the catalogue.
+        name: the form's own name, prefix of its parameters' dotted paths.
+        states: names of its internal states.
+        needs_motor: whether it needs the motor's and load's own motion, which a reduced log lacks.
+    """
+
+    family: ClassVar[str]
+    name: ClassVar[str]
+    states: ClassVar[tuple[str, ...]] = ()
+    needs_motor: ClassVar[bool] = False
+
+    @classmethod
+    @abc.abstractmethod
+    def proposals(cls, scales: Scales) -> "tuple[Effect, ...]":
+        """The effect at zero strength, with shape parameters that suit a motion of these scales.
+
+        Several proposals are starting points of the same form.
+        """
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        """Further quantities that a reader expects, as name -> (value, unit)."""
+        return {}
+
+    def initial_state(self) -> Float[Array, " states"]:
+        """Internal states of a drive that has rested unloaded."""
+        raise ValueError(f"`{self.name}` has no internal states")
+
+    def state_rates(self, motion: Motion, state: Array) -> Array:
+        """Rates of the internal states."""
+        raise ValueError(f"`{self.name}` has no internal states")
+
+    def state_scale(self) -> Array:
+        """How far each internal state can be from its value at rest: the prior of an unknown initial state."""
+        raise ValueError(f"`{self.name}` has no internal states")
+
+
+class MotorSideEffect(Effect):
+    """Adds a torque to the motor's equation."""
+
+    needs_motor: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        """Torque on the motor, along +theta_m [N m]."""
+
+
+class LoadSideEffect(Effect):
+    """Adds a torque to the load's equation."""
+
+    needs_motor: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        """Torque on the load, along +theta_l [N m]."""
+
+
+class MeshTorqueEffect(Effect):
+    """Adds to the torque that the mesh transmits.
+
+    On a reduced drive, whose inertia is not known, the torque is an acceleration: stiffness is omega_0^2.
+    """
+
+    @abc.abstractmethod
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        """Torque to add to `K f(x) + B_sp v` [N m]."""
+
+
+class MeshGeometryEffect(Effect):
+    """Makes the mesh see `x_s = x + e(theta_m)` while the encoders see x, and loads the motor through e'."""
+
+    needs_motor: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def error(self, theta_m: Array) -> Array:
+        """The error e [rad, output side]."""
+
+    @abc.abstractmethod
+    def slope(self, theta_m: Array) -> Array:
+        """Its derivative e' with respect to the motor angle [1]."""
+
+
+class SensorEffect(Effect):
+    """Changes what the encoders read, and no force."""
+
+    needs_motor: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def reading(self, theta_m: Array, theta_l: Array) -> tuple[Array, Array]:
+        """What the motor's and the load's encoder read [rad] at the true angles."""
+
+
+class ActuatorEffect(Effect):
+    """Changes the logged torque (or forcing) on its way to the drive."""
+
+    @abc.abstractmethod
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        """The torque that acts, from the torque that was logged."""

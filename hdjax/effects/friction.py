@@ -1,0 +1,108 @@
+"""Friction with a sign: in the mesh and on the motor."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.parameters import Scalar, parameter
+
+
+class CoulombFriction(MeshTorqueEffect):
+    """Torque `T_c sgn(v)` between the mesh's two sides, with the sign smoothed over v_0."""
+
+    family: ClassVar[str] = "coulomb_friction"
+    name: ClassVar[str] = "coulomb_friction"
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="Coulomb torque at the output",
+        source="EFFECTS: 0.1 to 5 N m",
+        bounds=(0.0, 1e3),
+        role="strength",
+    )
+    v_0: Scalar = parameter(unit="rad/s", doc="transition rate", bounds=(0.0, 1e3), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(v_0=0.03 * scales.v),)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return self.T_c * smooth_sign(motion.v, self.v_0)
+
+
+class MotorFriction(MotorSideEffect):
+    """Friction torque `T_c sgn(omega_m) + b omega_m` against the motor, with the sign smoothed over omega_0."""
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "motor_friction"
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="Coulomb torque at the motor",
+        source="EFFECTS",
+        bounds=(0.0, 1e3),
+        role="strength",
+    )
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(transition=0.01 * scales.omega_m),)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        omega = _motor_rate(motion)
+        return -self.T_c * smooth_sign(omega, self.transition) - self.b * omega
+
+
+class StribeckMotorFriction(MotorSideEffect):
+    """Motor friction whose Coulomb part is larger near standstill.
+
+    `(T_c + T_excess exp(-(omega/omega_s)^2)) sgn(omega) + b omega`, with static torque T_s = T_c + T_excess.
+    """
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "stribeck_motor_friction"
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="Coulomb torque at the motor",
+        source="EFFECTS",
+        bounds=(0.0, 1e3),
+        role="strength",
+    )
+    T_excess: Scalar = parameter(0.0, unit="N m", doc="static torque above Coulomb", source="EFFECTS", role="strength")
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
+    omega_s: Scalar = parameter(
+        unit="rad/s",
+        doc="Stribeck rate",
+        source="EFFECTS: 1e-3 to 0.1 rad/s at the output",
+        bounds=(0.0, 1e4),
+        role="shape",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(transition=0.01 * scales.omega_m, omega_s=0.2 * scales.omega_m),)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        omega = _motor_rate(motion)
+        level = self.T_c + self.T_excess * jnp.exp(-((omega / self.omega_s) ** 2))
+        return -level * smooth_sign(omega, self.transition) - self.b * omega
+
+
+def smooth_sign(rate: Array, transition: Array) -> Array:
+    """The sign of a rate, turning over +-transition so that it has a gradient."""
+    return jnp.tanh(rate / transition)
+
+
+def _motor_rate(motion: Motion) -> Array:
+    assert motion.omega_m is not None
+    return motion.omega_m

@@ -1,0 +1,86 @@
+"""Stiffness shapes beyond the cubic: quadratic, quintic, three slopes."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
+from hdjax.parameters import Scalar, parameter
+
+
+class QuadraticStiffness(MeshTorqueEffect):
+    """Torque `K k2 x^2`: the mesh is stiffer one way than the other."""
+
+    family: ClassVar[str] = "stiffness_shape"
+    name: ClassVar[str] = "quadratic_stiffness"
+
+    k2: Scalar = parameter(0.0, unit="1/rad", doc="quadratic stiffness over K", source="EFFECTS", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return drive.stiffness * self.k2 * motion.x**2
+
+
+class QuinticStiffness(MeshTorqueEffect):
+    """Torque `K k5 x^5`: the next odd term after the cubic."""
+
+    family: ClassVar[str] = "stiffness_shape"
+    name: ClassVar[str] = "quintic_stiffness"
+
+    k5: Scalar = parameter(0.0, unit="rad^-4", doc="quintic stiffness over K", source="EFFECTS", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return drive.stiffness * self.k5 * motion.x**5
+
+
+class ThreeSlopeStiffness(MeshTorqueEffect):
+    """The vendors' three straight slopes K1, K2, K3 with knees at the twists x1 and x2.
+
+    K1 is the drive's K; the cubic remains free beside it, and is near zero where three slopes are the truth.
+    """
+
+    family: ClassVar[str] = "stiffness_shape"
+    name: ClassVar[str] = "three_slope_stiffness"
+
+    stiffening_2: Scalar = parameter(
+        0.0, unit="1", doc="(K2 - K1)/K1", source="vendor catalogues: 0.2 to 0.6", role="strength"
+    )
+    stiffening_3: Scalar = parameter(0.0, unit="1", doc="(K3 - K2)/K1", source="vendor catalogues", role="strength")
+    x1: Scalar = parameter(unit="rad", doc="twist at the first knee", bounds=(0.0, 0.1), role="shape")
+    gap: Scalar = parameter(unit="rad", doc="from the first knee to the second", bounds=(0.0, 0.1), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        fractions = ((0.25, 0.35), (0.5, 0.25))
+        return tuple(cls(x1=a * scales.x_max, gap=b * scales.x_max) for a, b in fractions)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        beyond = _beyond(motion.x, self.x1) * self.stiffening_2
+        beyond += _beyond(motion.x, self.x1 + self.gap) * self.stiffening_3
+        return drive.stiffness * beyond
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        K1 = drive.stiffness
+        K2 = K1 * (1 + self.stiffening_2)
+        T1 = K1 * self.x1
+        return {
+            "K1": (K1, "N m/rad"),
+            "K2": (K2, "N m/rad"),
+            "K3": (K2 + K1 * self.stiffening_3, "N m/rad"),
+            "T1": (T1, "N m"),
+            "T2": (T1 + K2 * self.gap, "N m"),
+        }
+
+
+def _beyond(x: Array, knee: Array) -> Array:
+    """How far `x` is beyond the knee, with its sign; zero inside."""
+    return x - jnp.clip(x, -knee, knee)

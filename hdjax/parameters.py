@@ -1,0 +1,88 @@
+"""Physical parameters: fields that carry their unit, bounds and source, and have one dotted path everywhere."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+if TYPE_CHECKING:
+    # Numbers go in and arrays come out (a converter stands between), which a type checker can't follow.
+    Scalar = Any
+else:
+    Scalar = Float[Array, ""]
+Role = Literal["base", "strength", "shape"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterInfo:
+    """What is known of a parameter apart from its value.
+
+    Attributes:
+        unit: SI unit as text, for instance `"N m/rad"`.
+        doc: one line that says what it is.
+        source: paper, table or equation behind its law or magnitude; `"assumed"` where there is none.
+        bounds: open interval of values that make physical sense.
+        role: `"base"` for the drive itself, `"strength"` for a parameter whose zero removes the effect,
+            `"shape"` for one that only shapes an effect that is there.
+    """
+
+    unit: str
+    doc: str
+    source: str
+    bounds: tuple[float, float]
+    role: Role
+
+    @property
+    def positive(self) -> bool:
+        """Whether only values above zero make sense."""
+        return self.bounds[0] == 0.0
+
+
+def as_scalar(value: Any) -> Array:
+    """Turn a number into a floating-point scalar array of JAX's default precision."""
+    return jnp.asarray(value, dtype=float)
+
+
+def parameter(
+    default: float | None = None,
+    *,
+    unit: str,
+    doc: str,
+    source: str = "assumed",
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+    role: Role = "base",
+) -> Any:
+    """Declare a field of an equinox module as a physical parameter.
+
+    Args:
+        default: value where the user gives none.
+        unit: SI unit as text.
+        doc: one line that says what it is.
+        source: where the law or the magnitude comes from.
+        bounds: open interval of sensible values; a lower bound of 0 makes the fitter work on its logarithm.
+        role: see [`ParameterInfo`][].
+
+    Returns:
+        A dataclass field.
+    """
+    info = ParameterInfo(unit=unit, doc=doc, source=source, bounds=bounds, role=role)
+    options: dict[str, Any] = {
+        "converter": as_scalar,
+        "metadata": {"parameter": info},
+        "kw_only": True,
+    }
+    if default is not None:
+        options["default"] = default
+    return eqx.field(**options)
+
+
+def own_parameters(module: eqx.Module) -> Iterator[tuple[str, ParameterInfo]]:
+    """The parameters that a module declares itself, as (field name, info)."""
+    for field in dataclasses.fields(module):
+        info = field.metadata.get("parameter")
+        if info is not None:
+            yield field.name, info

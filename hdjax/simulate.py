@@ -1,0 +1,234 @@
+"""The only place that integrates the equations of motion."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from hdjax.dynamics import Model, State
+from hdjax.results import Ending, SimulationError
+from hdjax.signals import PiecewisePolynomial, polynomial
+
+
+class Trajectory(eqx.Module):
+    """A simulated motion.
+
+    Attributes:
+        time: where the states were saved [s].
+        states: states by row; names in `Model.state_names`.
+        outputs: what the encoders read, see `Model.outputs`.
+        ending: an [`Ending`][] as an integer.
+    """
+
+    time: Float[Array, " n"]
+    states: Float[Array, "n states"]
+    outputs: Float[Array, "n outputs"]
+    ending: Array
+
+    @property
+    def dynamic_error(self) -> Float[Array, " n"]:
+        """The measured dynamic error [rad]."""
+        return self.outputs[:, -1]
+
+
+def _no_torque(t: Array) -> Array:
+    return jnp.zeros_like(t)
+
+
+def simulate(
+    model: Model,
+    forcing: Callable[[Array], Array],
+    times: Float[Array, " n"],
+    initial_state: State | None = None,
+    *,
+    load_torque: Callable[[Array], Array] = _no_torque,
+    solver: dfx.AbstractSolver | None = None,
+    step_size: float | None = None,
+    rtol: float = 1e-8,
+    atol: float = 1e-10,
+    max_steps: int = 1_000_000,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    progress_meter: dfx.AbstractProgressMeter | None = None,
+    throw: bool = True,
+) -> Trajectory:
+    """Simulate a drive under a torque.
+
+    **Main arguments:**
+
+    Args:
+        model: the equations.
+        forcing: motor torque [N m] (or a reduced drive's forcing) as a function of time. Sampled signals come from
+            [`hdjax.sampled`][]; the solver is told where they jump.
+        times: where to save [s], rising; the first is the start.
+        initial_state: state at `times[0]`; at rest where not given.
+
+    **Other arguments:**
+
+    Args:
+        load_torque: torque on the load along +theta_l [N m].
+        solver: any diffrax solver; Tsit5 where not given.
+        step_size: a fixed step [s]; adaptive where not given.
+        rtol: relative tolerance of adaptive steps.
+        atol: absolute tolerance of adaptive steps.
+        max_steps: where to give up.
+        adjoint: how to differentiate: diffrax's default is reverse mode, `diffrax.ForwardMode()` is forward.
+        progress_meter: silent where not given; `diffrax.TqdmProgressMeter()` or `TextProgressMeter()` show progress.
+        throw: whether a simulation that did not reach its end raises. With False each lane of a vmap keeps its own
+            ending, and its states are finite up to where it failed.
+
+    Returns:
+        The trajectory.
+
+    Raises:
+        SimulationError: with the [`Ending`][] that names cause and mend.
+    """
+    if initial_state is None:
+        initial_state = model.rest()
+    trajectory = _simulate(
+        model,
+        forcing,
+        jnp.asarray(times, dtype=float),
+        initial_state,
+        load_torque,
+        dfx.Tsit5() if solver is None else solver,
+        step_size,
+        rtol,
+        atol,
+        max_steps,
+        dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        dfx.NoProgressMeter() if progress_meter is None else progress_meter,
+    )
+    if throw and not isinstance(trajectory.ending, Tracer):
+        worst = int(np.max(trajectory.ending))
+        if worst != Ending.successful:
+            raise SimulationError(Ending(worst))
+    return trajectory
+
+
+@eqx.filter_jit
+def _simulate(
+    model,
+    forcing,
+    times,
+    initial_state,
+    load_torque,
+    solver,
+    step_size,
+    rtol,
+    atol,
+    max_steps,
+    adjoint,
+    progress_meter,
+) -> Trajectory:
+    torque = model.actuate(forcing) if isinstance(forcing, PiecewisePolynomial) else forcing
+
+    def field(t, state, args):
+        model, torque, load_torque = args
+        return model.rates(state, torque(t), load_torque(t))
+
+    if step_size is None:
+        controller: Any = dfx.PIDController(rtol=rtol, atol=atol)
+        if isinstance(torque, PiecewisePolynomial):
+            controller = dfx.ClipStepSizeController(controller, jump_ts=torque.knots)
+    else:
+        controller = dfx.ConstantStepSize()
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(field),
+        solver,
+        times[0],
+        times[-1],
+        step_size,
+        initial_state,
+        args=(model, torque, load_torque),
+        saveat=dfx.SaveAt(ts=times),
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        progress_meter=progress_meter,
+        throw=False,
+    )
+    states = jnp.asarray(solution.ys)
+    finite = jnp.all(jnp.isfinite(states))
+    result = solution.result
+    ending = jnp.where(finite, int(Ending.successful), int(Ending.not_finite))
+    for diffrax_result, ours in (
+        (dfx.RESULTS.max_steps_reached, Ending.step_limit),
+        (dfx.RESULTS.dt_min_reached, Ending.step_too_small),
+    ):
+        ending = jnp.where(result == diffrax_result, int(ours), ending)
+    failed = (result != dfx.RESULTS.successful) & (ending == int(Ending.successful))
+    ending = jnp.where(failed, int(Ending.solver_failed), ending)
+    return Trajectory(times, states, jax.vmap(model.outputs)(states), ending)
+
+
+def march(
+    model: Model,
+    torque: PiecewisePolynomial,
+    load_torque: PiecewisePolynomial | None,
+    initial_state: State,
+    *,
+    solver: dfx.AbstractERK,
+    substeps: int,
+) -> Float[Array, "n states"]:
+    """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
+
+    Agrees with [`simulate`][] to the order of the solver. It unrolls the solver's own tableau inside one scan, so
+    that segments, sensitivities and candidates are lanes of one program; it costs nothing per sample but the
+    arithmetic. A signal's polynomial belongs to one sample interval, so no step crosses a jump.
+
+    Args:
+        model: the equations.
+        torque: the torque that acts (after `Model.actuate`); its knots are the samples.
+        load_torque: likewise on the load; zero where None.
+        initial_state: state at the first knot.
+        solver: an explicit Runge-Kutta solver of diffrax; its tableau is used.
+        substeps: steps in each sample interval.
+
+    Returns:
+        States at each knot but the last, by row.
+    """
+    tableau = solver.tableau
+    if not isinstance(tableau, dfx.ButcherTableau):
+        raise ValueError(f"`solver` must be an explicit Runge-Kutta solver, but is {type(solver).__name__}")
+    lower = [np.asarray(row) for row in tableau.a_lower]
+    nodes = np.concatenate([[0.0], np.asarray(tableau.c)])
+    weights = np.asarray(tableau.b_sol)
+
+    def interval(state, inputs):
+        coefficients, load_coefficients, width = inputs
+        h = width / substeps
+
+        def rates(y, s):
+            load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
+            return model.rates(y, polynomial(coefficients, s), load)
+
+        def step(y, start):
+            slopes = [rates(y, start)]
+            for row, node in zip(lower, nodes[1:], strict=True):
+                stage = y + h * _weighted(row, slopes)
+                slopes.append(rates(stage, start + float(node) * h))
+            return y + h * _weighted(weights, slopes)
+
+        y = state
+        for j in range(substeps):
+            y = step(y, j * h)
+        return y, state
+
+    load_coefficients = None if load_torque is None else load_torque.coefficients
+    inputs = (torque.coefficients, load_coefficients, jnp.diff(torque.knots))
+    _, states = jax.lax.scan(interval, initial_state, inputs)
+    return states
+
+
+def _weighted(weights: np.ndarray, slopes: list[Array]) -> Array:
+    """The weighted sum of stage slopes, skipping zero weights."""
+    return sum(
+        (float(w) * k for w, k in zip(weights, slopes, strict=False) if w != 0.0),
+        start=jnp.zeros_like(slopes[0]),
+    )

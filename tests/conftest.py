@@ -1,0 +1,26 @@
+"""Settings for every test (stricter than a user's), and the data beside the repository."""
+
+from pathlib import Path
+
+import hypothesis
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# The first example of a property compiles, so a time limit per example says nothing. The same
+# examples every time: the gate passes or fails by the code alone.
+hypothesis.settings.register_profile("gate", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("gate")
+
+SHARED = Path(__file__).parents[2] / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Folder with the measured data and the simulated rig's logs; skips where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip("needs the folder `shared` beside the repository, which is absent here")
+    return SHARED
