@@ -1,5 +1,6 @@
 """The only least squares: parameters, initial states and noise covariance from segments of logs."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -16,12 +17,15 @@ from fitting.residual import (
     Problem,
     Unknowns,
     output_error,
+    residual,
     residual_with_blocks,
 )
 from hdjax import Drive, Model, TwoInertiaModel
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 4
+# Longer segments are fitted from states that shorter ones have found already.
+_LONGEST_RETRY = 2048
 # A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: error about 1e-5 of x.
 _STEP_ANGLE = 0.3
 
@@ -73,6 +77,8 @@ def fit(
     max_steps: int = 60,
     covariance: Float[Array, "outputs outputs"] | None = None,
     reweigh: bool = True,
+    hold_parameters: bool = False,
+    count: int | None = None,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
@@ -90,17 +96,21 @@ def fit(
         max_steps: iterations of each pass at most.
         covariance: of the outputs' errors to start the weighing with.
         reweigh: whether to weigh by what is left over; with False the given covariance is kept.
+        hold_parameters: fit the initial states only, by the same program that fits the parameters.
+        count: number of segments, see [`fitting.experiment.cut`][].
 
     Returns:
         The fit.
     """
-    segments = cut(stretches, horizon, halo=halo)
+    segments = cut(stretches, horizon, halo=halo, count=count)
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
     free = free_parameters(model, paths, typical_scales(model, stretches))
     states = initial_states(model, segments)
     unknowns = Unknowns(free.pack(model), states)
-    problem = Problem(model, free, segments, jnp.eye(segments.measured.shape[-1]), substeps=substeps)
+    active = jnp.full(len(paths), 0.0 if hold_parameters else 1.0)
+    outputs = segments.measured.shape[-1]
+    problem = Problem(model, free, segments, jnp.eye(outputs), active, substeps=substeps)
     if covariance is None:
         covariance = _covariance(_error(problem, unknowns), segments)
     objective, converged, steps = np.inf, False, 0
@@ -108,6 +118,10 @@ def fit(
     for _ in range(_REWEIGHTINGS if reweigh else 1):
         problem = eqx.tree_at(lambda p: p.whitening, problem, whitening(covariance))
         unknowns, error, success, count = _solve(problem, unknowns, max_steps)
+        if horizon <= _LONGEST_RETRY:
+            unknowns, changed = _retry_states(problem, unknowns, max_steps)
+            if changed:
+                unknowns, error, success, count = _solve(problem, unknowns, max_steps)
         covariance = _covariance(error, segments)
         before, objective = objective, _half_log_determinant(covariance)
         converged, steps = bool(success), steps + int(count)
@@ -140,6 +154,32 @@ def _solve(problem: Problem, start: Unknowns, max_steps: int):
     error = output_error(problem, solution.value)
     success = solution.result == optx.RESULTS.successful
     return solution.value, error, success, solution.stats["num_steps"]
+
+
+def _retry_states(problem: Problem, unknowns: Unknowns, max_steps: int) -> tuple[Unknowns, bool]:
+    """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one.
+
+    A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
+    segments would dominate the sum of squares. Masking the later samples lets the same compiled program do it.
+    """
+    weight = problem.segments.weight
+    held = eqx.tree_at(lambda p: p.active, problem, jnp.zeros_like(problem.active))
+    model = problem.free.unpack(problem.model, unknowns.parameters)
+    fresh = Unknowns(unknowns.parameters, initial_states(model, problem.segments))
+    length = weight.shape[1]
+    for samples in (max(length // 8, min(length, 16)), length // 2, length):
+        masked = weight * (jnp.arange(length) < samples)[None, :]
+        part = eqx.tree_at(lambda p: p.segments.weight, held, masked)
+        fresh, _, _, _ = _solve(part, fresh, max_steps)
+    old, new = _squares(problem, unknowns), _squares(problem, fresh)
+    better = np.asarray(new < 0.99 * old)
+    states = jnp.where(better[:, None], fresh.states, unknowns.states)
+    return Unknowns(unknowns.parameters, states), bool(np.any(better))
+
+
+@eqx.filter_jit
+def _squares(problem: Problem, unknowns: Unknowns) -> Array:
+    return jnp.sum(residual(problem, unknowns) ** 2, axis=1)
 
 
 @eqx.filter_jit
@@ -227,10 +267,33 @@ def measurement_noise(
 ) -> Float[Array, "outputs outputs"]:
     """Covariance of the outputs' measurement noise: what stays when each short piece of the log may start anew.
 
-    Within a fraction of a period an initial state explains any smooth motion, missing physics included, so that only
+    Within half a period an initial state explains any smooth motion, missing physics included, so that little but
     noise is left. Corrected for the initial states that were fitted.
     """
-    length = 24
+    half_period = np.pi / natural_frequency(model, stretches) / stretches[0].experiment.time_step
+    length = int(np.clip(np.round(half_period), 6, 24))
     found = fit(model, stretches, (), horizon=length, halo=halo, substeps=substeps)
-    outputs, motion = found.covariance.shape[0], len(model.motion_states)
-    return found.covariance * (length * outputs / (length * outputs - motion))
+    rows = length * found.covariance.shape[0]
+    return found.covariance * (rows / (rows - len(model.motion_states)))
+
+
+def needed_substeps(found: Fit, *, tolerance: float = 0.05, most: int = 8) -> int:
+    """Solver steps in a sample interval that keep the step error below a fraction of the residual.
+
+    Args:
+        found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
+        tolerance: largest rms difference in units of the residual's standard deviation.
+        most: where to stop.
+    """
+    problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
+    substeps = problem.substeps
+    error = _error(problem, found.unknowns)
+    while substeps < most:
+        finer = dataclasses.replace(problem, substeps=2 * substeps)
+        better = _error(finer, found.unknowns)
+        white = np.asarray(better - error) @ np.asarray(problem.whitening).T
+        mean_square = (white**2).sum(axis=(0, 1)) / float(problem.segments.count)
+        if np.sqrt(mean_square.max()) < tolerance:
+            break
+        substeps, error = 2 * substeps, better
+    return substeps

@@ -121,14 +121,21 @@ def split(
     return tuple(training), tuple(validation)
 
 
-def cut(stretches: Sequence[Stretch], length: int, *, halo: int = 0, pad: bool = True) -> Segments:
+def segment_count(stretches: Sequence[Stretch], length: int) -> int:
+    """How many segments of `length` samples the stretches need, rounded up so that logs of similar length share a
+    compiled program."""
+    needed = sum(-(-len(s) // length) for s in stretches)
+    return needed if needed <= 8 else needed + -needed % 16
+
+
+def cut(stretches: Sequence[Stretch], length: int, *, halo: int = 0, count: int | None = None) -> Segments:
     """Cut stretches into segments of `length` samples; the last one of each stretch is padded.
 
     Args:
         stretches: the data.
         length: samples in a segment.
         halo: intervals of torque before each segment.
-        pad: whether the number of segments is rounded up as well, so that logs of similar length share a program.
+        count: number of segments, the superfluous ones without weight; [`segment_count`][] where not given.
     """
     torque_knots, torque_coefficients, load_coefficients = [], [], []
     measured, weight = [], []
@@ -156,8 +163,8 @@ def cut(stretches: Sequence[Stretch], length: int, *, halo: int = 0, pad: bool =
             weight.append(present)
             if load is not None:
                 load_coefficients.append(np.asarray(load.coefficients)[np.clip(own, 0, last)])
-    padding = -len(weight) % 16 if pad and len(weight) > 8 else 0
-    for _ in range(padding):
+    wanted = segment_count(stretches, length) if count is None else count
+    for _ in range(wanted - len(weight)):
         torque_knots.append(torque_knots[-1])
         torque_coefficients.append(torque_coefficients[-1])
         measured.append(measured[-1])

@@ -81,15 +81,17 @@ def free_run(
         substeps=substeps,
         covariance=covariance,
         reweigh=False,
+        count=len(stretches),
     )
-    states = _rest_where_at_rest(model, starts.problem, starts.unknowns)[: len(stretches)]
+    states = _rest_where_at_rest(model, starts.problem, starts.unknowns)
     length = max(len(s) for s in stretches)
-    segments = cut(stretches, length, halo=halo, pad=False)
+    segments = cut(stretches, length, halo=halo, count=len(stretches))
     problem = Problem(
         model,
         free_parameters(model, (), {}),
         segments,
         jnp.eye(segments.measured.shape[-1]),
+        jnp.zeros(0),
         substeps=substeps,
     )
     outputs = np.asarray(_simulate(problem, Unknowns(jnp.zeros(0), states)))

@@ -23,6 +23,7 @@ class Problem(eqx.Module):
         free: what is free.
         segments: the data.
         whitening: `whitening @ e` has unit covariance for an output error e.
+        active: 1 for a parameter that may move, 0 for one that is held; one program fits and evaluates.
         solver: explicit Runge-Kutta solver of diffrax.
         substeps: its steps in each sample interval.
     """
@@ -31,6 +32,7 @@ class Problem(eqx.Module):
     free: FreeParameters
     segments: Segments
     whitening: Float[Array, "outputs outputs"]
+    active: Float[Array, " parameters"]
     solver: dfx.AbstractERK = dfx.Tsit5()
     substeps: int = eqx.field(static=True, default=1)
 
@@ -109,7 +111,7 @@ def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
 
     value, columns = jax.vmap(along, out_axes=(None, -1))(seeds)
     columns = jnp.where(jnp.isfinite(columns), columns, 0.0)
-    return Blocks(value, columns[..., :parameters], columns[..., parameters:])
+    return Blocks(value, columns[..., :parameters] * problem.active, columns[..., parameters:])
 
 
 @eqx.filter_custom_jvp

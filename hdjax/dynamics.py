@@ -1,11 +1,13 @@
 """The equations of motion: a drive with its effects, as two inertias or as the dynamic error alone."""
 
 import abc
-from typing import ClassVar, TypeVar
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects import (
@@ -70,7 +72,8 @@ class Model(eqx.Module):
 
     def with_effects(self, *effects: Effect) -> "Model":
         """The same model with further effects."""
-        return eqx.tree_at(lambda m: m.effects, self, self.effects + effects)
+        # Not `eqx.tree_at`, which would skip the check of what a reduced drive can carry.
+        return dataclasses.replace(self, effects=self.effects + effects)
 
     def without_effect(self, name: str) -> "Model":
         """The same model without the effect of that name."""
@@ -90,15 +93,20 @@ class Model(eqx.Module):
 
     def get(self, path: str) -> Array:
         """The parameter at a dotted path."""
+        return self._at(path)
+
+    def _at(self, path: str) -> Any:
+        """What stands at a dotted path, which `eqx.tree_at` fills with placeholders."""
         if "." not in path:
             return getattr(self.drive, path)
         name, field = path.split(".")
         return getattr(self.effect(name), field)
 
-    def replace(self, values: dict[str, Array]) -> "Model":
+    def replace(self, values: Mapping[str, ArrayLike]) -> "Model":
         """The same model with other values at the given dotted paths."""
         paths = tuple(values)
-        return eqx.tree_at(lambda m: [m.get(p) for p in paths], self, [jnp.asarray(values[p]) for p in paths])
+        arrays = [jnp.asarray(values[p], dtype=float) for p in paths]
+        return eqx.tree_at(lambda m: [m._at(p) for p in paths], self, arrays)
 
     def _of(self, kind: type[_Kind]) -> tuple[_Kind, ...]:
         return tuple(e for e in self.effects if isinstance(e, kind))

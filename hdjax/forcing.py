@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from hdjax.parameters import as_scalar
+
 
 class Harmonic(eqx.Module):
     """`amplitude cos(omega t + phase) + offset`.
@@ -16,10 +18,10 @@ class Harmonic(eqx.Module):
         offset: mean value.
     """
 
-    amplitude: Array = eqx.field(converter=jnp.asarray)
-    omega: Array = eqx.field(converter=jnp.asarray)
-    phase: Array = eqx.field(converter=jnp.asarray, default=0.0)
-    offset: Array = eqx.field(converter=jnp.asarray, default=0.0)
+    amplitude: Array = eqx.field(converter=as_scalar)
+    omega: Array = eqx.field(converter=as_scalar)
+    phase: Array = eqx.field(converter=as_scalar, default=0.0)
+    offset: Array = eqx.field(converter=as_scalar, default=0.0)
 
     def __call__(self, t: Array) -> Array:
         return self.offset + self.amplitude * jnp.cos(self.omega * t + self.phase)
@@ -46,10 +48,10 @@ class Chirp(eqx.Module):
         duration: sweep time [s].
     """
 
-    amplitude: Array = eqx.field(converter=jnp.asarray)
-    omega_start: Array = eqx.field(converter=jnp.asarray)
-    omega_end: Array = eqx.field(converter=jnp.asarray)
-    duration: Array = eqx.field(converter=jnp.asarray)
+    amplitude: Array = eqx.field(converter=as_scalar)
+    omega_start: Array = eqx.field(converter=as_scalar)
+    omega_end: Array = eqx.field(converter=as_scalar)
+    duration: Array = eqx.field(converter=as_scalar)
 
     def __call__(self, t: Array) -> Array:
         rate = (self.omega_end - self.omega_start) / self.duration
@@ -77,7 +79,7 @@ def random_phase_multisine(
         raise ValueError(
             f"`period` must be long enough for a line between {omega_min} and {omega_max} rad/s, but is {period} s"
         )
-    n = jnp.arange(max(first, 1), last + 1)
+    n = jnp.arange(max(first, 1), last + 1, dtype=float)
     phases = jax.random.uniform(key, n.shape, minval=0.0, maxval=2 * jnp.pi)
     amplitudes = jnp.full(n.shape, rms * jnp.sqrt(2.0 / n.size))
     return MultiHarmonic(amplitudes, line * n, phases)

@@ -26,8 +26,8 @@ class PiecewisePolynomial(eqx.Module):
         coefficients: `coefficients[k, j]` multiplies `(t - knots[k])**j`.
     """
 
-    knots: Float[Array, " n+1"]
-    coefficients: Float[Array, "n {DEGREE}+1"]
+    knots: Float[Array, "*batch knots"]
+    coefficients: Float[Array, "*batch intervals powers"]
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The signal's value at time `t` [s]; the end polynomials continue beyond the ends."""
@@ -54,8 +54,6 @@ class PiecewisePolynomial(eqx.Module):
         width = jnp.diff(self.knots)
         last = self.coefficients.shape[0] - 1
         source = jnp.clip(jnp.searchsorted(self.knots, start, side="right") - 1, 0, last)
-        following = jnp.minimum(source + 1, last)
-        split = jnp.clip(self.knots[source + 1] - start, 0.0, width)
 
         def moments(coefficients, shift, begin, end):
             """Moments of one source piece over [begin, end] of the target interval, in Legendre polynomials."""
@@ -65,12 +63,16 @@ class PiecewisePolynomial(eqx.Module):
             shape = _legendre(2.0 * at / width[:, None] - 1.0)
             return half[:, None] * jnp.einsum("knd,kn,n->kd", shape, value, jnp.asarray(_WEIGHTS))
 
-        zero = jnp.zeros_like(width)
-        both = moments(self.coefficients[source], start - self.knots[source], zero, split)
-        both = both + moments(self.coefficients[following], start - self.knots[following], split, width)
-        legendre = both * jnp.asarray(_NORMS)[None, :] / width[:, None]
+        total = jnp.zeros((width.size, _NORMS.size), width.dtype)
+        begin = jnp.zeros_like(width)
+        for j in range(_PIECES):
+            piece = jnp.minimum(source + j, last)
+            end = jnp.clip(self.knots[piece + 1] - start, begin, width) if j < _PIECES - 1 else width
+            total = total + moments(self.coefficients[piece], start - self.knots[piece], begin, end)
+            begin = end
+        legendre = total * jnp.asarray(_NORMS)[None, :] / width[:, None]
         powers = jnp.einsum("kd,dj->kj", legendre, jnp.asarray(_LEGENDRE_TO_POWERS))
-        scaled = powers / width[:, None] ** jnp.arange(4)[None, :]
+        scaled = powers / width[:, None] ** jnp.arange(4.0)[None, :]
         return PiecewisePolynomial(self.knots, jnp.pad(scaled, ((0, 0), (0, DEGREE - 3))))
 
 
@@ -85,6 +87,8 @@ def polynomial(coefficients: Float[Array, "*a d"], s: Float[Array, "*b"]) -> Flo
 # Five Gauss-Legendre points integrate a quintic against a cubic exactly.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _NORMS = 2.0 * np.arange(4) + 1.0
+# An interval that a delay has moved can lie on two pieces, or on three where the stamps jitter (by up to a third).
+_PIECES = 3
 # Rows: Legendre polynomials on [0, 1] in powers of the fraction of the interval.
 _LEGENDRE_TO_POWERS = np.array([[1.0, 0, 0, 0], [-1.0, 2.0, 0, 0], [1.0, -6.0, 6.0, 0], [-1.0, 12.0, -30.0, 20.0]])
 
@@ -148,7 +152,7 @@ def _band_limited(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     width = float(np.median(np.diff(knots)))
     reach = 48
     n = np.arange(-reach, reach + 1)
-    window = kaiser(2 * reach + 1, 6.0)
+    window = kaiser(2 * reach + 1, 10.0)
     away = np.where(n == 0, 1, n)
     sign = np.where(n % 2 == 0, 1.0, -1.0)
     slope_filter = np.where(n == 0, 0.0, sign / away) * window
@@ -156,13 +160,14 @@ def _band_limited(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     # A constant has no curvature: the window's truncation must not give it one.
     curvature_filter[reach] -= curvature_filter.sum()
     # Odd reflection keeps value and slope continuous where the record ends.
-    before = 2 * values[0] - values[reach:0:-1]
-    after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
-    extended = np.concatenate([before, values, after])
+    extended = np.pad(values, reach, mode="reflect", reflect_type="odd")
     u0 = values
     d0 = fftconvolve(extended, slope_filter, mode="valid")
     c0 = fftconvolve(extended, curvature_filter, mode="valid")
     u1, d1, c1 = (np.append(a[1:], a[-1]) for a in (u0, d0, c0))
+    # The filters count in median intervals, a piece in its own: with jittered stamps they differ.
+    stretch = np.diff(knots) / width
+    d0, d1, c0, c1 = d0 * stretch, d1 * stretch, c0 * stretch**2, c1 * stretch**2
     jump = u1 - u0
     coefficients = np.stack(
         [
@@ -176,4 +181,4 @@ def _band_limited(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
         axis=1,
     )
     coefficients[-1, 1:] = 0.0
-    return coefficients / width ** np.arange(DEGREE + 1)
+    return coefficients / np.diff(knots)[:, None] ** np.arange(DEGREE + 1)

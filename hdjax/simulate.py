@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from hdjax.dynamics import Model, State
+from hdjax.effects import ActuatorEffect
 from hdjax.results import Ending, SimulationError
 from hdjax.signals import PiecewisePolynomial, polynomial
 
@@ -44,7 +45,7 @@ def _no_torque(t: Array) -> Array:
 def simulate(
     model: Model,
     forcing: Callable[[Array], Array],
-    times: Float[Array, " n"],
+    times: Float[Array | np.ndarray, " n"],
     initial_state: State | None = None,
     *,
     load_torque: Callable[[Array], Array] = _no_torque,
@@ -86,8 +87,14 @@ def simulate(
         The trajectory.
 
     Raises:
+        ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal.
         SimulationError: with the [`Ending`][] that names cause and mend.
     """
+    actuators = [effect.name for effect in model.effects if isinstance(effect, ActuatorEffect)]
+    if actuators and not isinstance(forcing, PiecewisePolynomial):
+        raise ValueError(
+            f"`forcing` must be a sampled signal for {actuators} to act on, but is {type(forcing).__name__}"
+        )
     if initial_state is None:
         initial_state = model.rest()
     trajectory = _simulate(
@@ -134,8 +141,9 @@ def _simulate(
 
     if step_size is None:
         controller: Any = dfx.PIDController(rtol=rtol, atol=atol)
-        if isinstance(torque, PiecewisePolynomial):
-            controller = dfx.ClipStepSizeController(controller, jump_ts=torque.knots)
+        jumps = [signal.knots for signal in (torque, load_torque) if isinstance(signal, PiecewisePolynomial)]
+        if jumps:
+            controller = dfx.ClipStepSizeController(controller, jump_ts=jnp.sort(jnp.concatenate(jumps)))
     else:
         controller = dfx.ConstantStepSize()
     solution = dfx.diffeqsolve(
@@ -193,7 +201,7 @@ def march(
     Returns:
         States at each knot but the last, by row.
     """
-    tableau = solver.tableau
+    tableau = solver.tableau if isinstance(solver, dfx.AbstractERK) else None
     if not isinstance(tableau, dfx.ButcherTableau):
         raise ValueError(f"`solver` must be an explicit Runge-Kutta solver, but is {type(solver).__name__}")
     lower = [np.asarray(row) for row in tableau.a_lower]
@@ -215,10 +223,11 @@ def march(
                 slopes.append(rates(stage, start + float(node) * h))
             return y + h * _weighted(weights, slopes)
 
-        y = state
-        for j in range(substeps):
-            y = step(y, j * h)
-        return y, state
+        if substeps == 1:
+            return step(state, jnp.zeros_like(width)), state
+        # A loop rather than unrolled steps: the program, and its compile time, stay the same size.
+        end, _ = jax.lax.scan(lambda y, j: (step(y, j * h), None), state, jnp.arange(substeps, dtype=h.dtype))
+        return end, state
 
     load_coefficients = None if load_torque is None else load_torque.coefficients
     inputs = (torque.coefficients, load_coefficients, jnp.diff(torque.knots))

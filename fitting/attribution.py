@@ -1,0 +1,277 @@
+"""Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import numpy as np
+
+from fitting.estimate import Fit, fit
+from fitting.experiment import Experiment, Stretch, segment_count
+from fitting.free import base_paths, effect_paths
+from fitting.screening import Lead, Screen, screen
+from hdjax import HOLDS, Hold, Model
+from hdjax.effects import Effect
+from hdjax.parameters import own_parameters
+
+SIGNIFICANCE = 0.01
+"""Largest p-value of an accepted effect: the chance that the best of the catalogue does as well on noise."""
+
+LEAST_GAIN = 1e-3
+"""Smallest accepted gain, a tenth of a percent of the error: below it a solver's imperfection counts too."""
+
+# Forms that are refitted inside the equations in each round.
+_SHORT_LIST = 6
+
+
+class Setting(eqx.Module):
+    """How the data are cut and simulated; the same for all trials, so that they share programs.
+
+    Attributes:
+        horizon: samples in a segment.
+        halo: intervals of torque before a segment.
+        substeps: solver steps in a sample interval.
+        count: segments in each program.
+    """
+
+    horizon: int = eqx.field(static=True)
+    halo: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+
+class Trial(eqx.Module):
+    """A model fitted to the training stretches, and what it does on the held-out ones.
+
+    Attributes:
+        model: with fitted values.
+        training: the fit.
+        held_out: the same parameters on unseen stretches; only initial states are fitted there.
+        hold: what the torque does between samples.
+    """
+
+    model: Model
+    training: Fit
+    held_out: Fit
+    hold: Hold = eqx.field(static=True)
+
+
+class Verdict(eqx.Module):
+    """One competitor of a round.
+
+    Attributes:
+        name: the form.
+        family: its family.
+        trial: the refitted model, or None where it was not worth a refit.
+        gain: decrease of the held-out objective (first-order estimate where there was no refit).
+        p_value: of that gain against the best of the catalogue on noise.
+        separable: whether held-out data tell it from the round's winner.
+    """
+
+    name: str = eqx.field(static=True)
+    family: str = eqx.field(static=True)
+    trial: Trial | None
+    gain: float
+    p_value: float
+    separable: bool
+
+
+class Round(eqx.Module):
+    """One look at the catalogue under one model.
+
+    Attributes:
+        before: the model that was looked at.
+        screen: first-order look and the law of chance.
+        verdicts: all competitors, best first.
+        accepted: whether the best one is supported.
+    """
+
+    before: Trial
+    screen: Screen
+    verdicts: tuple[Verdict, ...]
+    accepted: bool
+
+    @property
+    def winner(self) -> Verdict:
+        """The best competitor."""
+        return self.verdicts[0]
+
+
+Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
+"""Training and held-out stretches for each assumption about the torque between samples."""
+
+
+def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None) -> Trial:
+    """Fit a model and look at it on held-out data.
+
+    Args:
+        model: equations and starting values.
+        data: the stretches.
+        hold: what the torque does between samples.
+        setting: how the data are cut.
+        start: a trial whose error covariance weighs the outputs at the start.
+    """
+    training_stretches, held_out_stretches = data[hold]
+    paths = base_paths(model)
+    for effect in model.effects:
+        paths += effect_paths(effect)
+    training = fit(
+        model,
+        training_stretches,
+        paths,
+        horizon=setting.horizon,
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
+        covariance=None if start is None else start.training.covariance,
+    )
+    held_out = fit(
+        training.model,
+        held_out_stretches,
+        paths,
+        horizon=setting.horizon,
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
+        covariance=training.covariance,
+        hold_parameters=True,
+    )
+    return Trial(training.model, training, held_out, hold)
+
+
+def look(
+    before: Trial,
+    data: Data,
+    setting: Setting,
+    *,
+    catalogue: Sequence[type[Effect]],
+    try_holds: bool,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Round:
+    """Look for the effect that explains most of what a model leaves over.
+
+    Args:
+        before: the current model.
+        data: the stretches.
+        setting: how they are cut.
+        catalogue: forms to consider.
+        try_holds: whether another hold of the torque competes as well.
+        seed: of the surrogates.
+        progress: told what is being done.
+    """
+    progress("looking through the catalogue")
+    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
+    found: list[Verdict] = []
+    chance = float(np.median(screened.null_gains))
+    for rank, lead in enumerate(screened.leads):
+        worth = rank < _SHORT_LIST and lead.gain > max(chance, 0.0)
+        trial = None
+        gain = lead.gain
+        if worth:
+            progress(f"refitting with {lead.effect.name}")
+            trial = _try_lead(before, lead, data, setting)
+            gain = before.held_out.objective - trial.held_out.objective
+            if not np.isfinite(gain):
+                trial, gain = None, -np.inf
+        p_value = screened.p_value(gain)
+        found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
+    if try_holds:
+        for hold in HOLDS:
+            if hold == before.hold:
+                continue
+            progress(f"refitting with a {hold} torque")
+            trial = attempt(before.model, data, hold, setting, start=before)
+            gain = before.held_out.objective - trial.held_out.objective
+            p_value = screened.p_value(gain)
+            found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, p_value, True))
+    found.sort(key=lambda v: (v.trial is None, -v.gain))
+    verdicts = _simplest_first(_with_separability(found))
+    best = verdicts[0]
+    accepted = best.trial is not None and best.gain > LEAST_GAIN and best.p_value <= SIGNIFICANCE
+    return Round(before, screened, tuple(verdicts), accepted)
+
+
+def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
+    """Refit with the effect, from the first-order estimate; for several starting shapes, the best on training data."""
+    model = before.model
+    known = model.parameters()
+    moved = {}
+    for path, change in lead.drive_changes.items():
+        value, info = known[path]
+        new = float(value) + change
+        # First-order changes may overshoot; a positive parameter stays positive.
+        moved[path] = max(new, 0.3 * float(value)) if info.positive else new
+    effect = _with_positive_strengths(lead.effect)
+    return attempt(model.replace(moved).with_effects(effect), data, before.hold, setting, start=before)
+
+
+def _with_positive_strengths(effect: Effect) -> Effect:
+    """The effect with every positive strength off zero, where its logarithm can move."""
+    for name, info in own_parameters(effect):
+        if info.role == "strength" and info.positive:
+            value = float(getattr(effect, name))
+            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, np.maximum(value, 1e-6))
+    return effect
+
+
+def _segment_squares(held_out: Fit, weigh: Fit) -> np.ndarray:
+    """Weighted squared error of each held-out segment."""
+    white = np.asarray(held_out.error) @ np.asarray(weigh.problem.whitening).T
+    weight = np.asarray(held_out.problem.segments.weight).sum(axis=1)
+    return (white**2).sum(axis=(1, 2))[weight > 0]
+
+
+def _with_separability(verdicts: list[Verdict]) -> list[Verdict]:
+    """Mark the competitors whose held-out error can't be told from the best one's (paired over segments, two
+    standard errors)."""
+    best = verdicts[0].trial
+    if best is None:
+        return verdicts
+    reference = _segment_squares(best.held_out, best.held_out)
+    marked = []
+    for verdict in verdicts:
+        separable = True
+        if verdict.trial is not None:
+            difference = _segment_squares(verdict.trial.held_out, best.held_out) - reference
+            spread = np.std(difference, ddof=1) * np.sqrt(difference.size)
+            separable = bool(np.sum(difference) > 2.0 * spread) if spread > 0 else False
+        marked.append(eqx.tree_at(lambda v: v.separable, verdict, separable))
+    return marked
+
+
+def _simplest_first(verdicts: list[Verdict]) -> list[Verdict]:
+    """Among competitors that can't be told apart, the one with the fewest parameters leads."""
+    tied = [v for v in verdicts if v.trial is not None and not v.separable]
+    if len(tied) < 2:
+        return verdicts
+    best_gain = max(v.gain for v in tied)
+    close = [v for v in tied if v.gain > best_gain - max(LEAST_GAIN, 0.02 * best_gain)]
+    leader = min(close, key=lambda v: (_size(v), -v.gain))
+    return [leader] + [v for v in verdicts if v is not leader]
+
+
+def _size(verdict: Verdict) -> int:
+    assert verdict.trial is not None
+    return len(verdict.trial.training.free.paths)
+
+
+def setting_for(training: Sequence[Stretch], *, horizon: int, substeps: int, longest_delay: float = 3e-3) -> Setting:
+    """The setting that all trials share.
+
+    Args:
+        training: training stretches.
+        horizon: samples in a segment.
+        substeps: solver steps in a sample interval.
+        longest_delay: how far back a delayed torque may reach [s].
+    """
+    step = training[0].experiment.time_step
+    halo = int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))
+    return Setting(horizon, halo, substeps, segment_count(training, horizon))
+
+
+def stretches_by_hold(
+    experiments: dict[Hold, tuple[Experiment, ...]],
+    split: Callable[[Sequence[Experiment]], tuple[tuple[Stretch, ...], tuple[Stretch, ...]]],
+) -> Data:
+    """Training and held-out stretches of the same logs under each hold."""
+    return {hold: split(e) for hold, e in experiments.items()}

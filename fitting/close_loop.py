@@ -1,0 +1,319 @@
+"""The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.attribution import (
+    LEAST_GAIN,
+    Data,
+    Round,
+    Setting,
+    Trial,
+    attempt,
+    look,
+    setting_for,
+)
+from fitting.compare import Account, account, excess
+from fitting.diagnostics import ResidualDiagnostics, diagnose
+from fitting.estimate import (
+    Fit,
+    fit,
+    measurement_noise,
+    needed_substeps,
+    short_horizon,
+    suggested_substeps,
+)
+from fitting.experiment import Experiment, Stretch, split
+from fitting.free import base_paths
+from fitting.starting_values import starting_models
+from hdjax import Hold, Model
+from hdjax.effects import CATALOGUE, Effect
+
+Decision = Literal["effect_found", "model_sufficient", "unexplained"]
+
+# Longest segment of the final fit: beyond it a free run forgets nothing that a shorter one would not.
+_LONG_HORIZON = 16384
+# A residual this much larger than the measurement noise is not noise.
+_EXCESS = 1.5
+# Share of the unexplained variance that found effects must remove to be called the explanation.
+_EXPLAINED = 0.75
+
+
+class Finding(eqx.Module):
+    """An effect that the data support.
+
+    Attributes:
+        effect: with fitted values; None where the finding is another hold of the torque.
+        name: its form.
+        family: its family.
+        validation_gain: share of the held-out free-run error that it removes, against the same model without it.
+        p_value: chance that the best of the catalogue would gain as much on noise.
+    """
+
+    effect: Effect | None
+    name: str = eqx.field(static=True)
+    family: str = eqx.field(static=True)
+    validation_gain: float
+    p_value: float
+
+
+class Loop(eqx.Module):
+    """The outcome of closing the loop.
+
+    Attributes:
+        decision: what the data say.
+        before: the base model's account.
+        after: the final model's account; the same where nothing was found.
+        findings: supported effects, largest gain first.
+        rounds: every look at the catalogue.
+        dropped: effects that a later one made superfluous.
+        noise: covariance of the measurement noise of the outputs.
+        residual_before: diagnostics of what the base model leaves over.
+        residual_after: likewise of the final model.
+        hold: what the torque does between samples, as used.
+        setting: how the logs were cut.
+        stretches: training and held-out stretches.
+        seconds: where the time went.
+    """
+
+    decision: Decision = eqx.field(static=True)
+    before: Account
+    after: Account
+    findings: tuple[Finding, ...]
+    rounds: tuple[Round, ...]
+    dropped: tuple[str, ...] = eqx.field(static=True)
+    noise: Float[Array, "outputs outputs"]
+    residual_before: ResidualDiagnostics
+    residual_after: ResidualDiagnostics
+    hold: Hold = eqx.field(static=True)
+    setting: Setting
+    stretches: tuple[tuple[Stretch, ...], tuple[Stretch, ...]]
+    seconds: dict[str, float]
+
+
+def _silent(message: str) -> None:
+    pass
+
+
+def close_loop(
+    model: Model,
+    experiments: dict[Hold, tuple[Experiment, ...]],
+    *,
+    hold: Hold | None = None,
+    max_effects: int = 3,
+    catalogue: Sequence[type[Effect]] = CATALOGUE,
+    seed: int = 0,
+    progress: Callable[[str], None] = _silent,
+) -> Loop:
+    """Close the loop between a model and the logs of one drive.
+
+    Args:
+        model: the base model; its stiffness and damping are only placeholders.
+        experiments: the same logs under each assumption about the torque between samples.
+        hold: the assumption that the user states; where None, the one that suits the base model best.
+        max_effects: effects to add at most.
+        catalogue: forms to look for.
+        seed: of the surrogates behind the p-values.
+        progress: told what is being done.
+
+    Returns:
+        The outcome.
+
+    Raises:
+        DataError: where no oscillator fits the data.
+    """
+    if not jax.config.jax_enable_x64:
+        raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
+    clock = _Clock()
+    data: Data = {h: split(e) for h, e in experiments.items()}
+    progress("finding starting values")
+    base, setting, hold = _base_trial(model, data, hold)
+    clock.lap("base fit")
+    current, rounds, dropped = _add_effects(
+        base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
+    )
+    clock.lap("attribution")
+    progress("final fit over long horizons")
+    training, validation = data[current.hold]
+    noise = measurement_noise(current.model, training, halo=setting.halo, substeps=current.training.problem.substeps)
+    final = _long_fit(current, training)
+    clock.lap("final fit")
+    progress("free runs on held-out data")
+    before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
+    after = before
+    if current is not base:
+        after = account(final, training, validation, noise=noise, halo=setting.halo)
+        short = account(current.training, training, validation, noise=noise, halo=setting.halo)
+        if short.training_rmse < after.training_rmse:
+            after, final = short, current.training
+    findings = _findings(base, current, rounds, data, setting, after, noise)
+    clock.lap("free runs")
+    return Loop(
+        decision=_decide(base, current, findings, noise),
+        before=before,
+        after=after,
+        findings=findings,
+        rounds=rounds,
+        dropped=dropped,
+        noise=noise,
+        residual_before=diagnose(base.training),
+        residual_after=diagnose(current.training),
+        hold=current.hold,
+        setting=setting,
+        stretches=(training, validation),
+        seconds=clock.laps,
+    )
+
+
+class _Clock:
+    """Seconds by stage."""
+
+    def __init__(self):
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = now - self._last
+        self._last = now
+
+
+def base_fit(model: Model, training: Sequence[Stretch]) -> Fit:
+    """Fit a drive without effects, from starting values that the data supply.
+
+    Args:
+        model: the base model; its stiffness and damping are only placeholders.
+        training: the data.
+    """
+    starts = starting_models(model, training)
+    fits = []
+    # Judged on equally short segments, a start with the wrong frequency can't hide.
+    horizon = min(short_horizon(s, training) for s in starts)
+    substeps = max(suggested_substeps(s, training) for s in starts)
+    for start in starts:
+        fits.append(fit(start, training, base_paths(start), horizon=horizon, substeps=substeps))
+    best = min(fits, key=lambda f: f.objective)
+    horizon = short_horizon(best.model, training)
+    substeps = suggested_substeps(best.model, training)
+    return fit(best.model, training, base_paths(best.model), horizon=horizon, substeps=substeps)
+
+
+def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold]:
+    candidates = [hold] if hold is not None else list(data)
+    fits = {h: base_fit(model, data[h][0]) for h in candidates}
+    hold = min(fits, key=lambda h: fits[h].objective)
+    best = fits[hold]
+    training = data[hold][0]
+    setting = setting_for(training, horizon=best.error.shape[1], substeps=best.problem.substeps)
+    return attempt(best.model, data, hold, setting), setting, hold
+
+
+def _add_effects(
+    base: Trial,
+    data: Data,
+    setting: Setting,
+    *,
+    max_effects: int,
+    catalogue: Sequence[type[Effect]],
+    seed: int,
+    progress: Callable[[str], None],
+) -> tuple[Trial, tuple[Round, ...], tuple[str, ...]]:
+    """Add the best effect, refit, look again; then drop what a later effect has made superfluous."""
+    current, rounds = base, []
+    found = 0
+    while found < max_effects:
+        this = look(
+            current,
+            data,
+            setting,
+            catalogue=catalogue,
+            try_holds=len(data) > 1,
+            seed=seed + len(rounds),
+            progress=progress,
+        )
+        rounds.append(this)
+        if not this.accepted:
+            break
+        assert this.winner.trial is not None
+        current = this.winner.trial
+        found += 1
+        progress(f"found {this.winner.name}")
+        substeps = needed_substeps(current.training)
+        if substeps > setting.substeps:
+            # A new effect may turn sharper corners than the steps so far resolve.
+            setting = Setting(setting.horizon, setting.halo, substeps, setting.count)
+            current = attempt(current.model, data, current.hold, setting, start=current)
+    dropped = []
+    for name in [e.name for e in current.model.effects[:-1]]:
+        without = attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
+        if without.held_out.objective - current.held_out.objective < LEAST_GAIN:
+            dropped.append(name)
+            current = without
+    return current, tuple(rounds), tuple(dropped)
+
+
+def _long_fit(current: Trial, training: Sequence[Stretch]) -> Fit:
+    """The last fit, over segments as long as the logs, where small errors of a parameter add up and show."""
+    start = current.training
+    longest = max(len(s) for s in training)
+    return fit(
+        current.model,
+        training,
+        start.free.paths,
+        horizon=min(longest, _LONG_HORIZON),
+        halo=start.problem.segments.halo,
+        substeps=start.problem.substeps,
+        covariance=start.covariance,
+    )
+
+
+def _findings(
+    base: Trial,
+    current: Trial,
+    rounds: Sequence[Round],
+    data: Data,
+    setting: Setting,
+    after: Account,
+    noise: Float[Array, "outputs outputs"],
+) -> tuple[Finding, ...]:
+    """The accepted effects, each with what the held-out error would be without it."""
+    names = [e.name for e in current.model.effects]
+    changed_hold = current.hold != base.hold
+    found = []
+    for this in rounds:
+        winner = this.winner
+        is_hold = winner.name.endswith(" hold")
+        if not this.accepted or not (winner.name in names or (is_hold and changed_hold)):
+            continue
+        if len(names) + changed_hold == 1:
+            without = base
+        elif is_hold:
+            without = attempt(current.model, data, base.hold, setting, start=current)
+        else:
+            reduced = current.model.without_effect(winner.name)
+            without = attempt(reduced, data, current.hold, setting, start=current)
+        poorer = account(without.training, *data[without.hold], noise=noise, halo=setting.halo)
+        gain = 1.0 - after.validation_rmse / poorer.validation_rmse
+        effect = None if is_hold else after.model.effect(winner.name)
+        found.append(Finding(effect, winner.name, winner.family, gain, winner.p_value))
+    return tuple(sorted(found, key=lambda f: -f.validation_gain))
+
+
+def _decide(
+    base: Trial, current: Trial, findings: Sequence[Finding], noise: Float[Array, "outputs outputs"]
+) -> Decision:
+    left = excess(current.held_out, noise)
+    at_first = excess(base.held_out, noise)
+    if not findings:
+        return "model_sufficient" if np.max(left) < _EXCESS else "unexplained"
+    explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
+    misfit = np.argmax(at_first)
+    if left[misfit] < _EXCESS or explained[misfit] >= _EXPLAINED:
+        return "effect_found"
+    return "unexplained"

@@ -1,0 +1,76 @@
+"""Before against after: the same logs, free-running, on what the fits have seen and on what they have not."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimate import Fit
+from fitting.experiment import Stretch
+from fitting.free_run import FreeRun, free_run, rms_error
+from fitting.uncertainty import Uncertainty, uncertainty
+from hdjax import Model
+
+
+class Account(eqx.Module):
+    """What one fitted model is worth.
+
+    Attributes:
+        model: with fitted values.
+        uncertainty: of what was fitted.
+        training: free runs along the training stretches.
+        validation: free runs along the held-out stretches.
+    """
+
+    model: Model
+    uncertainty: Uncertainty
+    training: tuple[FreeRun, ...]
+    validation: tuple[FreeRun, ...]
+
+    @property
+    def training_rmse(self) -> float:
+        """Rms error of the dynamic error on training stretches."""
+        return rms_error(self.training)
+
+    @property
+    def validation_rmse(self) -> float:
+        """Rms error of the dynamic error on held-out stretches."""
+        return rms_error(self.validation)
+
+
+def account(
+    fit: Fit,
+    training: Sequence[Stretch],
+    validation: Sequence[Stretch],
+    *,
+    noise: Float[Array, "outputs outputs"],
+    halo: int,
+) -> Account:
+    """Free runs and standard errors of a fit.
+
+    Args:
+        fit: the fitted model.
+        training: stretches that were fitted.
+        validation: stretches that were not.
+        noise: covariance of the measurement noise.
+        halo: intervals of torque before a stretch.
+    """
+    together = free_run(
+        fit.model,
+        [*training, *validation],
+        covariance=noise,
+        halo=halo,
+        substeps=fit.problem.substeps,
+    )
+    return Account(
+        model=fit.model,
+        uncertainty=uncertainty(fit),
+        training=together[: len(training)],
+        validation=together[len(training) :],
+    )
+
+
+def excess(fit: Fit, noise: Float[Array, "outputs outputs"]) -> Float[np.ndarray, " outputs"]:
+    """What a fit leaves over of each output, in units of the measurement noise; 1 is nothing but noise."""
+    return np.sqrt(np.diag(np.asarray(fit.covariance)) / np.diag(np.asarray(noise)))
