@@ -76,7 +76,7 @@ def normal_equations(blocks: Blocks) -> ArrowSystem:
 def _diagonal(matrix: Array) -> Array:
     """The diagonal part of each matrix; where it is zero (padding), ones."""
     d = jnp.diagonal(matrix, axis1=-2, axis2=-1)
-    return jnp.where(d > 0, d, 1.0)[..., None] * jnp.eye(matrix.shape[-1])
+    return jnp.where(d > 0, d, 1.0)[..., None] * jnp.broadcast_to(jnp.eye(d.shape[-1]), matrix.shape)
 
 
 def _solve_scaled(matrix: Array, right: Array) -> Array:

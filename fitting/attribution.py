@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from fitting.estimate import Fit, fit
-from fitting.experiment import Experiment, Stretch, segment_count
+from fitting.experiment import Stretch
 from fitting.free import base_paths, effect_paths
 from fitting.screening import Lead, Screen, screen
 from hdjax import HOLDS, Hold, Model
@@ -19,6 +19,10 @@ SIGNIFICANCE = 0.01
 LEAST_GAIN = 1e-3
 """Smallest accepted gain, a tenth of a percent of the error: below it a solver's imperfection counts too."""
 
+# A form that to first order does no better than chance does in this share of cases is not refitted.
+_WORTH_A_REFIT = 0.2
+# Iterations of a trial at most: a form that needs more than this has no clear minimum.
+_TRIAL_STEPS = 25
 # Forms that are refitted inside the equations in each round.
 _SHORT_LIST = 6
 
@@ -100,7 +104,9 @@ Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
 """Training and held-out stretches for each assumption about the torque between samples."""
 
 
-def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None) -> Trial:
+def attempt(
+    model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None, contains_start: bool = False
+) -> Trial:
     """Fit a model and look at it on held-out data.
 
     Args:
@@ -109,6 +115,7 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
         hold: what the torque does between samples.
         setting: how the data are cut.
         start: a trial whose error covariance weighs the outputs at the start.
+        contains_start: whether the model can do whatever that of `start` does; a fit that is worse is then given up.
     """
     training_stretches, held_out_stretches = data[hold]
     paths = base_paths(model)
@@ -123,6 +130,8 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
         substeps=setting.substeps,
         count=setting.count,
         covariance=None if start is None else start.training.covariance,
+        max_steps=_TRIAL_STEPS,
+        give_up_above=start.training.objective + LEAST_GAIN if start is not None and contains_start else np.inf,
     )
     held_out = fit(
         training.model,
@@ -133,6 +142,7 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
         substeps=setting.substeps,
         count=setting.count,
         covariance=training.covariance,
+        max_steps=_TRIAL_STEPS,
         hold_parameters=True,
     )
     return Trial(training.model, training, held_out, hold)
@@ -162,9 +172,8 @@ def look(
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     found: list[Verdict] = []
-    chance = float(np.median(screened.null_gains))
     for rank, lead in enumerate(screened.leads):
-        worth = rank < _SHORT_LIST and lead.gain > max(chance, 0.0)
+        worth = rank < _SHORT_LIST and screened.p_value(lead.gain) <= _WORTH_A_REFIT
         trial = None
         gain = lead.gain
         if worth:
@@ -202,7 +211,9 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
         # First-order changes may overshoot; a positive parameter stays positive.
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
     effect = _with_positive_strengths(lead.effect)
-    return attempt(model.replace(moved).with_effects(effect), data, before.hold, setting, start=before)
+    return attempt(
+        model.replace(moved).with_effects(effect), data, before.hold, setting, start=before, contains_start=True
+    )
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:
@@ -255,23 +266,12 @@ def _size(verdict: Verdict) -> int:
     return len(verdict.trial.training.free.paths)
 
 
-def setting_for(training: Sequence[Stretch], *, horizon: int, substeps: int, longest_delay: float = 3e-3) -> Setting:
-    """The setting that all trials share.
+def halo_for(training: Sequence[Stretch], *, longest_delay: float = 3e-3) -> int:
+    """Intervals of torque before each segment.
 
     Args:
         training: training stretches.
-        horizon: samples in a segment.
-        substeps: solver steps in a sample interval.
         longest_delay: how far back a delayed torque may reach [s].
     """
     step = training[0].experiment.time_step
-    halo = int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))
-    return Setting(horizon, halo, substeps, segment_count(training, horizon))
-
-
-def stretches_by_hold(
-    experiments: dict[Hold, tuple[Experiment, ...]],
-    split: Callable[[Sequence[Experiment]], tuple[tuple[Stretch, ...], tuple[Stretch, ...]]],
-) -> Data:
-    """Training and held-out stretches of the same logs under each hold."""
-    return {hold: split(e) for hold, e in experiments.items()}
+    return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))

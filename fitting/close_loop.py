@@ -16,8 +16,8 @@ from fitting.attribution import (
     Setting,
     Trial,
     attempt,
+    halo_for,
     look,
-    setting_for,
 )
 from fitting.compare import Account, account, excess
 from fitting.diagnostics import ResidualDiagnostics, diagnose
@@ -29,7 +29,7 @@ from fitting.estimate import (
     short_horizon,
     suggested_substeps,
 )
-from fitting.experiment import Experiment, Stretch, split
+from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.free import base_paths
 from fitting.starting_values import starting_models
 from hdjax import Hold, Model
@@ -39,6 +39,8 @@ Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
 # Longest segment of the final fit: beyond it a free run forgets nothing that a shorter one would not.
 _LONG_HORIZON = 16384
+# Starts that are fitted in full; more than these are compared as they are first.
+_REFINED_STARTS = 2
 # A residual this much larger than the measurement noise is not noise.
 _EXCESS = 1.5
 # Share of the unexplained variance that found effects must remove to be called the explanation.
@@ -78,6 +80,7 @@ class Loop(eqx.Module):
         residual_after: likewise of the final model.
         hold: what the torque does between samples, as used.
         setting: how the logs were cut.
+        after_substeps: solver steps in a sample interval of the final model.
         stretches: training and held-out stretches.
         seconds: where the time went.
     """
@@ -93,6 +96,7 @@ class Loop(eqx.Module):
     residual_after: ResidualDiagnostics
     hold: Hold = eqx.field(static=True)
     setting: Setting
+    after_substeps: int = eqx.field(static=True)
     stretches: tuple[tuple[Stretch, ...], tuple[Stretch, ...]]
     seconds: dict[str, float]
 
@@ -166,6 +170,7 @@ def close_loop(
         residual_after=diagnose(current.training),
         hold=current.hold,
         setting=setting,
+        after_substeps=current.training.problem.substeps,
         stretches=(training, validation),
         seconds=clock.laps,
     )
@@ -184,34 +189,57 @@ class _Clock:
         self._last = now
 
 
-def base_fit(model: Model, training: Sequence[Stretch]) -> Fit:
+def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
     """Fit a drive without effects, from starting values that the data supply.
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
         training: the data.
+        halo: intervals of torque before a segment.
     """
     starts = starting_models(model, training)
-    fits = []
     # Judged on equally short segments, a start with the wrong frequency can't hide.
     horizon = min(short_horizon(s, training) for s in starts)
     substeps = max(suggested_substeps(s, training) for s in starts)
-    for start in starts:
-        fits.append(fit(start, training, base_paths(start), horizon=horizon, substeps=substeps))
-    best = min(fits, key=lambda f: f.objective)
+
+    def fitted(start: Model, *, hold_parameters: bool) -> Fit:
+        return fit(
+            start,
+            training,
+            base_paths(start),
+            horizon=horizon,
+            halo=halo,
+            substeps=substeps,
+            hold_parameters=hold_parameters,
+            max_steps=20 if hold_parameters else 60,
+        )
+
+    if len(starts) > _REFINED_STARTS:
+        starts = sorted(starts, key=lambda s: fitted(s, hold_parameters=True).objective)[:_REFINED_STARTS]
+    best = min((fitted(s, hold_parameters=False) for s in starts), key=lambda f: f.objective)
     horizon = short_horizon(best.model, training)
-    substeps = suggested_substeps(best.model, training)
-    return fit(best.model, training, base_paths(best.model), horizon=horizon, substeps=substeps)
+    if horizon == best.error.shape[1]:
+        return best
+    return fit(
+        best.model,
+        training,
+        base_paths(best.model),
+        horizon=horizon,
+        halo=halo,
+        substeps=suggested_substeps(best.model, training),
+    )
 
 
 def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold]:
-    candidates = [hold] if hold is not None else list(data)
-    fits = {h: base_fit(model, data[h][0]) for h in candidates}
-    hold = min(fits, key=lambda h: fits[h].objective)
-    best = fits[hold]
-    training = data[hold][0]
-    setting = setting_for(training, horizon=best.error.shape[1], substeps=best.problem.substeps)
-    return attempt(best.model, data, hold, setting), setting, hold
+    """The base model fitted under the stated hold, or under the one that suits it best."""
+    first = hold if hold is not None else next(iter(data))
+    training = data[first][0]
+    halo = halo_for(training)
+    best = base_fit(model, training, halo=halo)
+    setting = Setting(best.error.shape[1], halo, best.problem.substeps, segment_count(training, best.error.shape[1]))
+    trials = [attempt(best.model, data, h, setting) for h in (data if hold is None else [hold])]
+    chosen = min(trials, key=lambda t: t.training.objective)
+    return chosen, setting, chosen.hold
 
 
 def _add_effects(

@@ -23,9 +23,12 @@ from fitting.residual import (
 from hdjax import Drive, Model, TwoInertiaModel
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
-_REWEIGHTINGS = 4
+_REWEIGHTINGS = 3
 # Longer segments are fitted from states that shorter ones have found already.
 _LONGEST_RETRY = 2048
+# A segment with this many times the median sum of squares may have ended in a wrong minimum.
+_OUTLIER = 6.0
+_RETRY_STEPS = 12
 # A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: error about 1e-5 of x.
 _STEP_ANGLE = 0.3
 
@@ -79,6 +82,7 @@ def fit(
     reweigh: bool = True,
     hold_parameters: bool = False,
     count: int | None = None,
+    give_up_above: float = np.inf,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
@@ -98,6 +102,7 @@ def fit(
         reweigh: whether to weigh by what is left over; with False the given covariance is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         count: number of segments, see [`fitting.experiment.cut`][].
+        give_up_above: an objective that the fit must reach in its first pass to be worth another.
 
     Returns:
         The fit.
@@ -115,17 +120,17 @@ def fit(
         covariance = _covariance(_error(problem, unknowns), segments)
     objective, converged, steps = np.inf, False, 0
     error = None
-    for _ in range(_REWEIGHTINGS if reweigh else 1):
+    for turn in range(_REWEIGHTINGS if reweigh else 1):
         problem = eqx.tree_at(lambda p: p.whitening, problem, whitening(covariance))
         unknowns, error, success, count = _solve(problem, unknowns, max_steps)
-        if horizon <= _LONGEST_RETRY:
-            unknowns, changed = _retry_states(problem, unknowns, max_steps)
+        if turn == 0 and horizon <= _LONGEST_RETRY:
+            unknowns, changed = _retry_states(problem, unknowns)
             if changed:
                 unknowns, error, success, count = _solve(problem, unknowns, max_steps)
         covariance = _covariance(error, segments)
         before, objective = objective, _half_log_determinant(covariance)
         converged, steps = bool(success), steps + int(count)
-        if not np.isfinite(objective) or abs(before - objective) < 1e-4:
+        if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
             break
     assert error is not None
     return Fit(
@@ -156,7 +161,7 @@ def _solve(problem: Problem, start: Unknowns, max_steps: int):
     return solution.value, error, success, solution.stats["num_steps"]
 
 
-def _retry_states(problem: Problem, unknowns: Unknowns, max_steps: int) -> tuple[Unknowns, bool]:
+def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]:
     """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one.
 
     A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
@@ -166,13 +171,16 @@ def _retry_states(problem: Problem, unknowns: Unknowns, max_steps: int) -> tuple
     held = eqx.tree_at(lambda p: p.active, problem, jnp.zeros_like(problem.active))
     model = problem.free.unpack(problem.model, unknowns.parameters)
     fresh = Unknowns(unknowns.parameters, initial_states(model, problem.segments))
+    old = _squares(problem, unknowns)
+    squares = np.asarray(old)[np.asarray(weight).any(axis=1)]
+    if squares.max() < _OUTLIER * np.median(squares):
+        return unknowns, False
     length = weight.shape[1]
     for samples in (max(length // 8, min(length, 16)), length // 2, length):
         masked = weight * (jnp.arange(length) < samples)[None, :]
         part = eqx.tree_at(lambda p: p.segments.weight, held, masked)
-        fresh, _, _, _ = _solve(part, fresh, max_steps)
-    old, new = _squares(problem, unknowns), _squares(problem, fresh)
-    better = np.asarray(new < 0.99 * old)
+        fresh, _, _, _ = _solve(part, fresh, _RETRY_STEPS)
+    better = np.asarray(_squares(problem, fresh) < 0.99 * old)
     states = jnp.where(better[:, None], fresh.states, unknowns.states)
     return Unknowns(unknowns.parameters, states), bool(np.any(better))
 

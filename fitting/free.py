@@ -12,6 +12,9 @@ from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
+# A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
+_LARGEST_LOG = 100.0
+
 
 class FreeParameters(eqx.Module):
     """The parameters that a fit changes, as a vector of order one.
@@ -45,7 +48,7 @@ class FreeParameters(eqx.Module):
         if not self.paths:
             return model
         values = {
-            path: jnp.exp(vector[i]) if positive else vector[i] * self.scale[i]
+            path: jnp.exp(jnp.clip(vector[i], -_LARGEST_LOG, _LARGEST_LOG)) if positive else vector[i] * self.scale[i]
             for i, (path, positive) in enumerate(zip(self.paths, self.logarithmic, strict=True))
         }
         return model.replace(values)

@@ -111,7 +111,7 @@ def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
 
     value, columns = jax.vmap(along, out_axes=(None, -1))(seeds)
     columns = jnp.where(jnp.isfinite(columns), columns, 0.0)
-    return Blocks(value, columns[..., :parameters] * problem.active, columns[..., parameters:])
+    return Blocks(value, columns[..., :parameters] * problem.active[None, None, :], columns[..., parameters:])
 
 
 @eqx.filter_custom_jvp

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import irfft, prev_fast_len, rfft
 
-from fitting.estimate import Fit
+from fitting.estimate import Fit, suggested_substeps
 from fitting.experiment import scales
 from fitting.free import FreeParameters, base_paths, effect_paths, strength_paths
 from fitting.residual import Problem, Unknowns, blocks
@@ -139,10 +139,12 @@ def _score(everything: Model, fit: Fit, surrogates: Array) -> tuple[tuple[str, .
         fit.problem.segments,
         fit.problem.whitening,
         jnp.ones(len(paths)),
-        substeps=fit.problem.substeps,
+        # Sensitivities need no more steps than the drive's own oscillation; the residual is the fit's own.
+        substeps=suggested_substeps(everything, fit.stretches),
     )
     unknowns = Unknowns(vector, _states(everything, fit))
-    gram, gradient, against = _inner_products(problem, unknowns, surrogates)
+    residual = jnp.asarray(fit.error) @ fit.problem.whitening.T
+    gram, gradient, against = _inner_products(problem, unknowns, residual, surrogates)
     weight = fit.problem.segments.weight
     rows = float(jnp.sum(weight)) * fit.problem.segments.measured.shape[-1]
     return tuple(paths), _Score(np.asarray(gram), np.asarray(gradient), np.asarray(against), rows)
@@ -158,12 +160,12 @@ def _states(everything: Model, fit: Fit) -> Array:
 
 
 @eqx.filter_jit
-def _inner_products(problem: Problem, unknowns: Unknowns, surrogates: Array):
+def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogates: Array):
     found = blocks(problem, unknowns)
     columns = project(found)
     # Residuals are measured minus simulated: what a strength explains is minus its derivative.
     columns = -columns[:, : surrogates.shape[2]]
-    residual = found.residual[:, : surrogates.shape[2]]
+    residual = error.reshape(error.shape[0], -1)
     gram = jnp.einsum("srp,srq->pq", columns, columns)
     gradient = jnp.einsum("srp,sr->p", columns, residual)
     return gram, gradient, jnp.einsum("srp,dsr->pd", columns, surrogates)

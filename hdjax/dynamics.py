@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -35,10 +35,13 @@ class Model(eqx.Module):
     motion_states: eqx.AbstractClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: State | Sequence[Array]) -> Motion:
         """The motion that a state means, as the mesh sees it."""
 
     @abc.abstractmethod
+    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
+        """[`rates`][] of a state that is kept as separate numbers, which is how a vectorised program is fastest."""
+
     def rates(self, state: State, torque: Array, load_torque: Array) -> State:
         """Time derivative of the state.
 
@@ -47,6 +50,7 @@ class Model(eqx.Module):
             torque: motor torque [N m] that acts (or the forcing of a reduced drive).
             load_torque: torque on the load along +theta_l [N m]; ignored by a reduced drive.
         """
+        return jnp.stack(self.component_rates(tuple(state), torque, load_torque))
 
     @abc.abstractmethod
     def outputs(self, state: State) -> Float[Array, " outputs"]:
@@ -111,12 +115,13 @@ class Model(eqx.Module):
     def _of(self, kind: type[_Kind]) -> tuple[_Kind, ...]:
         return tuple(e for e in self.effects if isinstance(e, kind))
 
-    def _own_states(self, state: State) -> dict[str, Array]:
+    def _own_states(self, state: Sequence[Array]) -> dict[str, Array]:
         """Each effect's own states by its name."""
         start = len(self.motion_states)
         found = {}
         for effect in self.effects:
-            found[effect.name] = state[start : start + len(effect.states)]
+            own = state[start : start + len(effect.states)]
+            found[effect.name] = jnp.stack(own) if own else jnp.zeros(0)
             start += len(effect.states)
         return found
 
@@ -127,10 +132,9 @@ class Model(eqx.Module):
             tau = tau + effect.torque(motion, self.drive, own[effect.name])
         return tau
 
-    def _with_own_rates(self, motion: Motion, rates: list[Array], own: dict[str, Array]) -> State:
+    def _with_own_rates(self, motion: Motion, rates: list[Array], own: dict[str, Array]) -> list[Array]:
         """The state's rate: the motion's, then those of the effects' own states."""
-        further = [e.state_rates(motion, own[e.name]) for e in self.effects if e.states]
-        return jnp.concatenate([jnp.stack(rates), *further])
+        return rates + [r for e in self.effects if e.states for r in e.state_rates(motion, own[e.name])]
 
 
 class TwoInertiaModel(Model):
@@ -145,7 +149,7 @@ class TwoInertiaModel(Model):
     effects: tuple[Effect, ...] = ()
     motion_states: ClassVar[tuple[str, ...]] = ("theta_m", "theta_l", "omega_m", "omega_l")
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: State | Sequence[Array]) -> Motion:
         theta_m, theta_l, omega_m, omega_l = state[0], state[1], state[2], state[3]
         x = theta_m / self.drive.N - theta_l
         v = omega_m / self.drive.N - omega_l
@@ -154,7 +158,7 @@ class TwoInertiaModel(Model):
             v = v + effect.slope(theta_m) * omega_m
         return Motion(x=x, v=v, theta_m=theta_m, omega_m=omega_m, theta_l=theta_l, omega_l=omega_l)
 
-    def rates(self, state: State, torque: Array, load_torque: Array) -> State:
+    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
         drive = self.drive
         motion = self.motion(state)
         own = self._own_states(state)
@@ -190,10 +194,10 @@ class ReducedModel(Model):
             if effect.needs_motor:
                 raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
 
-    def motion(self, state: State) -> Motion:
+    def motion(self, state: State | Sequence[Array]) -> Motion:
         return Motion(x=state[0], v=state[1])
 
-    def rates(self, state: State, torque: Array, load_torque: Array) -> State:
+    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
         motion = self.motion(state)
         own = self._own_states(state)
         rates = [state[1], self.drive.gain * torque - self._mesh_torque(motion, own)]

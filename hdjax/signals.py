@@ -44,8 +44,8 @@ class PiecewisePolynomial(eqx.Module):
         """The signal `self(t - delay)` on the same knots.
 
         A jump that the delay moves into the inside of an interval can't be kept by one polynomial. Each interval
-        gets the cubic with the same moments up to the third (the L2 projection), so that a smooth system sees the
-        same impulse, and the result is differentiable in the delay.
+        gets the quintic with the same moments up to the fifth (the L2 projection), so that a smooth system sees
+        the same impulse, and the result is differentiable in the delay.
 
         Args:
             delay: how much later the signal arrives [s].
@@ -72,8 +72,8 @@ class PiecewisePolynomial(eqx.Module):
             begin = end
         legendre = total * jnp.asarray(_NORMS)[None, :] / width[:, None]
         powers = jnp.einsum("kd,dj->kj", legendre, jnp.asarray(_LEGENDRE_TO_POWERS))
-        scaled = powers / width[:, None] ** jnp.arange(4.0)[None, :]
-        return PiecewisePolynomial(self.knots, jnp.pad(scaled, ((0, 0), (0, DEGREE - 3))))
+        scaled = powers / width[:, None] ** jnp.arange(DEGREE + 1.0)[None, :]
+        return PiecewisePolynomial(self.knots, scaled)
 
 
 def polynomial(coefficients: Float[Array, "*a d"], s: Float[Array, "*b"]) -> Float[Array, "*c"]:
@@ -84,18 +84,29 @@ def polynomial(coefficients: Float[Array, "*a d"], s: Float[Array, "*b"]) -> Flo
     return value
 
 
-# Five Gauss-Legendre points integrate a quintic against a cubic exactly.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
-_NORMS = 2.0 * np.arange(4) + 1.0
+# Six Gauss-Legendre points integrate a quintic against a quintic exactly.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
+_NORMS = 2.0 * np.arange(DEGREE + 1) + 1.0
 # An interval that a delay has moved can lie on two pieces, or on three where the stamps jitter (by up to a third).
 _PIECES = 3
 # Rows: Legendre polynomials on [0, 1] in powers of the fraction of the interval.
-_LEGENDRE_TO_POWERS = np.array([[1.0, 0, 0, 0], [-1.0, 2.0, 0, 0], [1.0, -6.0, 6.0, 0], [-1.0, 12.0, -30.0, 20.0]])
+_LEGENDRE_TO_POWERS = np.array(
+    [
+        np.pad(
+            np.polynomial.Legendre.basis(d, domain=[0, 1]).convert(kind=np.polynomial.Polynomial, domain=[-1, 1]).coef,
+            (0, DEGREE - d),
+        )
+        for d in range(DEGREE + 1)
+    ]
+)
 
 
 def _legendre(z: Array) -> Array:
-    """The first four Legendre polynomials at `z`, stacked last."""
-    return jnp.stack([jnp.ones_like(z), z, 0.5 * (3 * z**2 - 1), 0.5 * (5 * z**3 - 3 * z)], axis=-1)
+    """The Legendre polynomials up to DEGREE at `z`, stacked last."""
+    found = [jnp.ones_like(z), z]
+    for d in range(1, DEGREE):
+        found.append(((2 * d + 1) * z * found[d] - d * found[d - 1]) / (d + 1))
+    return jnp.stack(found, axis=-1)
 
 
 def sampled(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], *, hold: Hold) -> PiecewisePolynomial:

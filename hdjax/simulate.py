@@ -214,14 +214,13 @@ def march(
 
         def rates(y, s):
             load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
-            return model.rates(y, polynomial(coefficients, s), load)
+            return model.component_rates(y, polynomial(coefficients, s), load)
 
         def step(y, start):
             slopes = [rates(y, start)]
             for row, node in zip(lower, nodes[1:], strict=True):
-                stage = y + h * _weighted(row, slopes)
-                slopes.append(rates(stage, start + float(node) * h))
-            return y + h * _weighted(weights, slopes)
+                slopes.append(rates(_advanced(y, h, row, slopes), start + float(node) * h))
+            return _advanced(y, h, weights, slopes)
 
         if substeps == 1:
             return step(state, jnp.zeros_like(width)), state
@@ -231,13 +230,12 @@ def march(
 
     load_coefficients = None if load_torque is None else load_torque.coefficients
     inputs = (torque.coefficients, load_coefficients, jnp.diff(torque.knots))
-    _, states = jax.lax.scan(interval, initial_state, inputs)
-    return states
+    # The state travels as separate numbers: under vmap each is one contiguous row of lanes.
+    _, states = jax.lax.scan(interval, tuple(initial_state), inputs)
+    return jnp.stack(states, axis=-1)
 
 
-def _weighted(weights: np.ndarray, slopes: list[Array]) -> Array:
-    """The weighted sum of stage slopes, skipping zero weights."""
-    return sum(
-        (float(w) * k for w, k in zip(weights, slopes, strict=False) if w != 0.0),
-        start=jnp.zeros_like(slopes[0]),
-    )
+def _advanced(state: tuple[Array, ...], h: Array, weights: np.ndarray, slopes: list[list[Array]]) -> tuple[Array, ...]:
+    """`state + h sum_i weights[i] slopes[i]`, skipping zero weights."""
+    used = [(float(w), k) for w, k in zip(weights, slopes, strict=False) if w != 0.0]
+    return tuple(y + h * sum(w * k[i] for w, k in used) for i, y in enumerate(state))

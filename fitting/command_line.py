@@ -1,0 +1,287 @@
+"""The command line: `hdjax fit | close-loop | predict | simulate | demo`."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cyclopts
+import jax
+import numpy as np
+from cyclopts import Parameter
+from rich.console import Console
+
+from fitting.close_loop import base_fit, close_loop
+from fitting.compare import account
+from fitting.demonstration import write_demo_logs
+from fitting.drive_file import read_drive_file
+from fitting.errors import DataError, InputError
+from fitting.estimate import measurement_noise
+from fitting.experiment import Stretch, split
+from fitting.files import write_whole
+from fitting.free_run import WINDOW, free_run
+from fitting.logs import read_log
+from fitting.model_file import StoredModel, read_model, to_json
+from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
+from fitting.rig import Rig, experiment, read_rig
+from hdjax import (
+    PRESETS,
+    Chirp,
+    Harmonic,
+    SimulationError,
+    TwoInertiaModel,
+    random_phase_multisine,
+    sampled,
+    simulate,
+)
+
+app = cyclopts.App(
+    name="hdjax",
+    help="The dynamic error of harmonic drives: simulate it, fit it to logs, and find what the model lacks.",
+)
+
+Logs = Annotated[list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5 or Parquet.", negative="")]
+DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
+
+
+@app.command
+def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
+    """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
+
+    Parameters
+    ----------
+    out
+        Folder for report.html, report.json and model.json.
+    """
+    rig = read_rig(logs, drive)
+    with _progress() as progress:
+        progress("fitting the base model")
+        by_hold = {h: split(e) for h, e in rig.experiments.items() if rig.hold in (None, h)}
+        fits = {h: base_fit(rig.model, training) for h, (training, _) in by_hold.items()}
+        hold = min(fits, key=lambda h: fits[h].objective)
+        found, (training, validation) = fits[hold], by_hold[hold]
+        progress("free runs on held-out data")
+        noise = measurement_noise(found.model, training)
+        result = account(found, training, validation, noise=noise, halo=0)
+    stored = StoredModel(result.model, hold, found.problem.substeps, 0, noise)
+    paths = write_fit_report(out, result, rig=rig, noise=noise, hold=hold, model_json=to_json(stored))
+    print(fit_text(result, rig=rig, noise=noise))
+    print(f"Report: {paths['report.html']}")
+
+
+@app.command(name="close-loop")
+def close_loop_command(logs: Logs, /, *, drive: DriveOption, out: Path, max_effects: int = 3, seed: int = 0) -> None:
+    """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
+
+    Parameters
+    ----------
+    out
+        Folder for report.html, report.json and model.json.
+    max_effects
+        Effects to add at most.
+    seed
+        Of the surrogates behind the p-values.
+    """
+    if max_effects < 0:
+        raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
+    _close_loop(read_rig(logs, drive), out, max_effects, seed)
+
+
+def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int) -> None:
+    with _progress() as progress:
+        loop = close_loop(
+            rig.model, rig.experiments, hold=rig.hold, max_effects=max_effects, seed=seed, progress=progress
+        )
+    stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
+    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored))
+    print(loop_text(loop, rig=rig))
+    print(f"Report: {paths['report.html']}")
+
+
+@app.command
+def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None:
+    """Run a fitted model freely along a log and write the dynamic error that it predicts.
+
+    The log's outputs are used in the first 50 samples only, for the initial state.
+
+    Parameters
+    ----------
+    model
+        model.json of a report.
+    log
+        The log that supplies torque and time stamps.
+    out
+        CSV file with the columns time, dynamic_error.
+    """
+    stored = read_model(model)
+    drive_file = read_drive_file(drive)
+    read = read_log(log, drive_file, outputs_until=WINDOW)
+    if (read.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
+        raise InputError(
+            f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"
+        )
+    ready = experiment(read, drive_file, stored.hold)
+    (run,) = free_run(
+        stored.model,
+        [Stretch(ready, 0, len(ready))],
+        covariance=stored.noise,
+        halo=stored.halo,
+        substeps=stored.substeps,
+    )
+    if not np.isfinite(run.predicted).all():
+        raise DataError(f"{log}: the model's free run leaves the numbers; check the torque column's unit and sign")
+    _write_table(out, {"time": run.time, "dynamic_error": run.predicted})
+    print(f"Prediction: {out}")
+
+
+@app.command(name="simulate")
+def simulate_command(
+    *,
+    out: Path,
+    model: Path | None = None,
+    preset: str = "HDC-40-050",
+    forcing: Literal["harmonic", "chirp", "multisine"] = "multisine",
+    amplitude: float = 0.5,
+    frequency: float = 10.0,
+    frequency_end: float = 100.0,
+    duration: float = 4.0,
+    rate: float = 2000.0,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> None:
+    """Simulate a drive under a zero-order-held motor torque and write it as a log.
+
+    Parameters
+    ----------
+    out
+        CSV file with the columns time, motor_angle, load_angle, motor_torque (or time, dynamic_error, forcing).
+    model
+        model.json of a report; a preset where not given.
+    preset
+        Name of a drive with published parameters.
+    forcing
+        Shape of the motor torque.
+    amplitude
+        Its peak (multisine: rms) [N m].
+    frequency
+        Its frequency, or where a chirp or multisine begins [Hz].
+    frequency_end
+        Where a chirp or multisine ends [Hz].
+    duration
+        Length of the log [s].
+    rate
+        Sampling rate [Hz].
+    noise
+        Rms noise of each angle [rad at the output].
+    seed
+        Of phases and noise.
+    """
+    for name, value in {"duration": duration, "rate": rate, "frequency": frequency}.items():
+        if not value > 0:
+            raise InputError(f"--{name} must be positive, but is {value}")
+    if preset not in PRESETS:
+        raise InputError(f"--preset must be one of {', '.join(PRESETS)}, but is {preset}")
+    system = TwoInertiaModel(PRESETS[preset]()) if model is None else read_model(model).model
+    time = np.arange(max(2, round(duration * rate))) / rate
+    torque = np.asarray(jax.vmap(_forcing(forcing, amplitude, frequency, frequency_end, duration, seed))(time))
+    motion = simulate(system, sampled(time, torque, hold="zero-order"), time, rtol=1e-9, atol=1e-12)
+    random = np.random.default_rng(seed)
+    if isinstance(system, TwoInertiaModel):
+        outputs = np.asarray(motion.outputs)
+        motor = outputs[:, 0] + noise * random.normal(size=time.size)
+        load = outputs[:, 0] - outputs[:, 1] + noise * random.normal(size=time.size)
+        columns = {"motor_angle": motor * float(system.drive.N), "load_angle": load, "motor_torque": torque}
+    else:
+        x = np.asarray(motion.dynamic_error) + noise * random.normal(size=time.size)
+        columns = {"dynamic_error": x, "forcing": torque}
+    _write_table(out, {"time": time} | columns)
+    print(f"Log: {out}")
+
+
+def _forcing(shape: str, amplitude: float, start: float, end: float, duration: float, seed: int) -> Callable:
+    first, last = 2 * np.pi * start, 2 * np.pi * end
+    if shape == "harmonic":
+        return Harmonic(amplitude, first)
+    if shape == "chirp":
+        return Chirp(amplitude, first, last, duration)
+    try:
+        return random_phase_multisine(
+            rms=amplitude, omega_min=first, omega_max=last, period=duration, key=jax.random.key(seed)
+        )
+    except ValueError as error:
+        raise InputError(f"--frequency, --frequency-end and --duration do not go together: {error}") from error
+
+
+@app.command
+def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
+    """Simulate a drive with an effect that nobody declared, close the loop on its logs, and say where the report is.
+
+    Parameters
+    ----------
+    out
+        Folder for the logs and the report.
+    seed
+        Of torque and noise.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    logs, drive = write_demo_logs(out, seed=seed)
+    print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
+    _close_loop(read_rig(logs, drive), out, max_effects=3, seed=seed)
+
+
+def _write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
+    rows = np.stack(list(columns.values()), axis=1)
+    lines = [",".join(columns)] + [",".join(f"{v:.12g}" for v in row) for row in rows]
+    write_whole({path: "\n".join(lines) + "\n"})
+
+
+class _progress:
+    """A spinner on a terminal, nothing in a pipe."""
+
+    def __init__(self):
+        self._console = Console(stderr=True)
+        self._status = self._console.status("starting") if self._console.is_terminal else None
+
+    def __enter__(self) -> Callable[[str], None]:
+        if self._status is not None:
+            self._status.start()
+        return self._say
+
+    def __exit__(self, *details: object) -> None:
+        if self._status is not None:
+            self._status.stop()
+
+    def _say(self, message: str) -> None:
+        if self._status is not None:
+            self._status.update(message)
+
+
+def _set_up_jax() -> None:
+    """Double precision, and compiled programs kept between runs."""
+    jax.config.update("jax_enable_x64", True)
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdjax"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit: 0 done, 1 the data can't support the request, 2 bad usage or bad input."""
+    _set_up_jax()
+    try:
+        app(arguments, exit_on_error=False, print_error=False)
+    except (cyclopts.CycloptsError, InputError) as error:
+        _fail(error, 2)
+    except (DataError, SimulationError) as error:
+        _fail(error, 1)
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}; check the path and its permissions", 2)
+
+
+def _fail(error: object, code: int) -> None:
+    print(f"hdjax: {error}", file=sys.stderr)
+    sys.exit(code)

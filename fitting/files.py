@@ -1,0 +1,33 @@
+"""Files that are written whole or not at all."""
+
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+
+def write_whole(texts: Mapping[Path, str]) -> None:
+    """Write several text files so that either all of them are whole or none was touched.
+
+    Each is written beside its destination under a temporary name first; only when all are complete are they renamed.
+
+    Args:
+        texts: content by path; missing folders are made.
+    """
+    waiting: list[tuple[str, Path]] = []
+    try:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+            waiting.append((name, path))
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                file.write(text)
+            # mkstemp makes files that only the owner reads; a report is an ordinary file.
+            os.chmod(name, 0o644)
+        while waiting:
+            name, path = waiting[0]
+            os.replace(name, path)
+            waiting.pop(0)
+    finally:
+        for name, _ in waiting:
+            os.unlink(name)

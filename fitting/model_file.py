@@ -1,0 +1,90 @@
+"""A fitted model on disk: `model.json`, what `hdjax predict` reads."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.errors import InputError
+from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
+from hdjax.effects import BY_NAME
+from hdjax.parameters import own_parameters
+
+SCHEMA = "hdjax-model/1"
+
+
+class StoredModel(eqx.Module):
+    """A model and what a free run needs beside it.
+
+    Attributes:
+        model: with fitted values.
+        hold: what the torque does between samples.
+        substeps: solver steps in a sample interval.
+        halo: intervals of torque before the start, for delays.
+        noise: covariance of the measurement noise of the outputs.
+    """
+
+    model: Model
+    hold: Hold = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    halo: int = eqx.field(static=True)
+    noise: Float[Array, "outputs outputs"]
+
+
+def to_json(stored: StoredModel) -> str:
+    """The file's text."""
+    model = stored.model
+    content = {
+        "schema": SCHEMA,
+        "kind": "two-inertia" if isinstance(model, TwoInertiaModel) else "reduced",
+        "drive": _values(model.drive),
+        "effects": [{"name": e.name, "parameters": _values(e)} for e in model.effects],
+        "torque_hold": stored.hold,
+        "substeps": stored.substeps,
+        "halo": stored.halo,
+        "noise_covariance": np.asarray(stored.noise).tolist(),
+    }
+    return json.dumps(content, indent=1, allow_nan=False)
+
+
+def read_model(path: str | Path) -> StoredModel:
+    """Read a model.
+
+    Raises:
+        InputError: where the file is missing or is not a model of this program.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: the model can't be read ({error.strerror}); give the model.json of a report") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not a JSON file ({error}); give the model.json of a report") from error
+    try:
+        return _stored(content)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: not a model of this program ({error}); give the model.json of a report") from error
+
+
+def _values(module: eqx.Module) -> dict[str, float]:
+    return {name: float(getattr(module, name)) for name, _ in own_parameters(module)}
+
+
+def _stored(content: Any) -> StoredModel:
+    if content["schema"] != SCHEMA:
+        raise ValueError(f"schema {content['schema']!r} where {SCHEMA!r} was expected")
+    effects = tuple(BY_NAME[e["name"]](**e["parameters"]) for e in content["effects"])
+    if content["kind"] == "two-inertia":
+        model: Model = TwoInertiaModel(Drive(**content["drive"]), effects)
+    else:
+        model = ReducedModel(ReducedDrive(**content["drive"]), effects)
+    if content["torque_hold"] not in HOLDS:
+        raise ValueError(f"torque_hold {content['torque_hold']!r}")
+    noise = jnp.asarray(content["noise_covariance"], dtype=float)
+    outputs = 2 if isinstance(model, TwoInertiaModel) else 1
+    if noise.shape != (outputs, outputs) or not bool(jnp.all(jnp.isfinite(noise))):
+        raise ValueError("noise_covariance has the wrong shape")
+    return StoredModel(model, content["torque_hold"], int(content["substeps"]), int(content["halo"]), noise)

@@ -1,0 +1,186 @@
+"""The fit finds what an independent simulation was made with, from far away and from several sides."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import (
+    Fit,
+    fit,
+    initial_states,
+    measurement_noise,
+    needed_substeps,
+    short_horizon,
+    suggested_substeps,
+    whitening,
+)
+from fitting.experiment import Stretch, cut
+from fitting.free import base_paths
+from fitting.uncertainty import uncertainty
+from hdjax.effects.friction import CoulombFriction
+
+COUNT, HORIZON = 2000, 256
+REDUCED_COUNT, REDUCED_HORIZON = 1000, 128
+PATHS = ("K", "alpha", "B_sp")
+TRUTH = {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}
+REDUCED_TRUTH = {"mu": rig.MU, "omega_0": rig.OMEGA_0, "alpha": rig.REDUCED_ALPHA, "gain": rig.GAIN}
+X_NOISE = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
+NOISE = jnp.asarray([[(rig.MOTOR_NOISE / rig.N) ** 2, (rig.MOTOR_NOISE / rig.N) ** 2], [0.0, X_NOISE**2]])
+NOISE = NOISE.at[1, 0].set(NOISE[0, 1])
+
+
+def whole(*experiments) -> list[Stretch]:
+    return [Stretch(e, 0, len(e)) for e in experiments]
+
+
+def drive_fit(start, stretches, **options) -> Fit:
+    """All with the same shapes, so that they share one program."""
+    return fit(start, stretches, PATHS, horizon=HORIZON, substeps=1, count=8, **options)
+
+
+def reduced_fit(start, stretches, **options) -> Fit:
+    return fit(start, stretches, base_paths(start), horizon=REDUCED_HORIZON, substeps=2, count=8, **options)
+
+
+def assert_recovered(found: Fit, truth: dict[str, float], *, within: float = 4.0):
+    estimates = uncertainty(found).estimates
+    assert set(estimates) == set(truth)
+    for path, value in truth.items():
+        estimate = estimates[path]
+        assert abs(estimate.value - value) < within * estimate.std, (path, estimate)
+
+
+@pytest.fixture(scope="module")
+def stretches() -> list[Stretch]:
+    return whole(rig.drive_experiment(COUNT))
+
+
+@pytest.fixture(scope="module")
+def found(stretches) -> Fit:
+    return drive_fit(rig.drive_model(K=0.9 * rig.K, alpha=0.0, B_sp=1.0), stretches)
+
+
+def test_a_drive_is_recovered(found: Fit):
+    assert found.converged
+    assert_recovered(found, TRUTH)
+    estimates = uncertainty(found).estimates
+    # The start was far, by hundreds of standard errors, and the log tells all three.
+    assert 0.1 * rig.K > 100 * estimates["K"].std
+    assert rig.ALPHA > 10 * estimates["alpha"].std
+    assert 0.7 > 10 * estimates["B_sp"].std
+    # Nothing but the encoders' noise is left (2000 samples: 1.6 % of a standard deviation).
+    assert found.dynamic_error_std == pytest.approx(X_NOISE, rel=0.06)
+    assert float(np.sqrt(found.covariance[0, 0])) == pytest.approx(rig.MOTOR_NOISE / rig.N, rel=0.06)
+
+
+@pytest.mark.parametrize(("K", "alpha", "B_sp"), [(1.1, 0.0, 0.05), (1.1, 3e4, 2.0), (0.93, -2e4, 0.3)])
+def test_other_starts_reach_the_same_minimum(found: Fit, stretches, K: float, alpha: float, B_sp: float):
+    other = drive_fit(rig.drive_model(K=K * rig.K, alpha=alpha, B_sp=B_sp), stretches)
+    estimates = uncertainty(found).estimates
+    for path in PATHS:
+        # The iteration stops at a change of 1e-4 of an entry; far below what the noise leaves open.
+        assert abs(float(other.model.get(path)) - estimates[path].value) < 0.1 * estimates[path].std, path
+    assert other.objective == pytest.approx(found.objective, abs=1e-4)
+
+
+def test_what_is_not_free_stays(found: Fit):
+    for path, value in {"N": rig.N, "J_m": rig.J_M, "J_l": rig.J_L}.items():
+        assert float(found.model.get(path)) == value
+
+
+def test_error_and_covariance_go_together(found: Fit, stretches):
+    segments = cut(stretches, HORIZON, count=8)
+    error = np.asarray(found.error)[np.asarray(segments.weight) > 0]
+    assert error.shape == (COUNT, 2)
+    np.testing.assert_allclose(found.covariance, error.T @ error / COUNT, rtol=1e-6)
+    assert found.objective == pytest.approx(0.5 * np.log(np.linalg.det(found.covariance)), abs=1e-9)
+
+
+def test_held_parameters_do_not_move(found: Fit, stretches):
+    wrong = rig.drive_model(K=1.02 * rig.K)
+    held = drive_fit(wrong, stretches, hold_parameters=True)
+    for path in PATHS:
+        assert float(held.model.get(path)) == pytest.approx(float(wrong.get(path)), rel=1e-14)
+    assert held.objective > found.objective + 0.5
+    # The states did move: at the truth, they bring the error down to the noise.
+    right = drive_fit(rig.drive_model(), stretches, hold_parameters=True)
+    assert right.dynamic_error_std == pytest.approx(found.dynamic_error_std, rel=0.02)
+
+
+def test_several_logs_jointly(found: Fit):
+    logs = whole(*(rig.drive_experiment(1000, seed=s, name=f"log {s}") for s in (3, 4)))
+    joint = drive_fit(rig.drive_model(K=0.9 * rig.K, alpha=0.0), logs)
+    assert_recovered(joint, TRUTH)
+    alone = drive_fit(joint.model, logs[:1])
+    gain = uncertainty(alone).estimates["K"].std / uncertainty(joint).estimates["K"].std
+    # Twice the data: standard errors shrink by about the square root of two.
+    assert 1.1 < gain < 2.2
+
+
+def test_a_channel_that_the_model_cannot_follow_loses_its_say():
+    # Friction on the motor as large as the slow torque; the twist itself follows from the load's motion.
+    spoiled = whole(rig.drive_experiment(COUNT, motor_friction=(0.1, 0.5)))
+    weighed = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled)
+    assert float(weighed.model.get("K")) == pytest.approx(rig.K, rel=0.01)
+    trusting = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled, covariance=NOISE, reweigh=False)
+    off = [abs(float(m.get("K")) / rig.K - 1.0) for m in (weighed.model, trusting.model)]
+    assert off[0] < off[1]
+
+
+@pytest.mark.parametrize(("omega_0", "mu", "gain"), [(1.04, 10.0, 1.5), (0.96, 0.5, 0.7)])
+def test_a_reduced_drive_is_recovered(omega_0: float, mu: float, gain: float):
+    reduced = whole(rig.reduced_experiment(REDUCED_COUNT, noise=1e-3))
+    start = rig.reduced_model(omega_0=omega_0 * rig.OMEGA_0, mu=mu, alpha=0.0, gain=gain * rig.GAIN)
+    result = reduced_fit(start, reduced)
+    assert_recovered(result, REDUCED_TRUTH)
+    estimates = uncertainty(result).estimates
+    for path, value in REDUCED_TRUTH.items():
+        assert abs(float(start.get(path)) - value) > 10 * estimates[path].std, path
+    assert result.dynamic_error_std == pytest.approx(1e-3, rel=0.1)
+
+
+def test_steps_follow_a_sharp_friction():
+    needed = {}
+    for name, sharpness in (("smooth", 5.0), ("sharp", 0.02)):
+        friction = (150.0, sharpness)
+        experiment = rig.reduced_experiment(400, noise=1e-5, friction=friction, substeps=60)
+        model = rig.reduced_model().with_effects(CoulombFriction(T_c=150.0, v_0=sharpness))
+        result = fit(model, whole(experiment), (), horizon=64, substeps=2, max_steps=15)
+        needed[name] = needed_substeps(result)
+        assert needed_substeps(result, tolerance=1e9) == 2
+    assert needed["sharp"] > needed["smooth"] >= 2
+
+
+def test_measurement_noise_of_a_model_that_is_wrong():
+    # Stiffness 5 % wrong: short pieces that may start anew still show little but noise.
+    stretches = whole(rig.drive_experiment(600))
+    noise = measurement_noise(rig.drive_model(K=1.05 * rig.K), stretches, substeps=1)
+    assert np.sqrt(float(noise[1, 1])) == pytest.approx(X_NOISE, rel=0.35)
+    assert np.sqrt(float(noise[0, 0])) == pytest.approx(rig.MOTOR_NOISE / rig.N, rel=0.35)
+
+
+def test_initial_states_of_a_smooth_motion():
+    torque = rig.drive_torque(200)
+    segments = cut(whole(rig.drive_experiment(200, noise=0.0)), 50)
+    states = initial_states(rig.drive_model(), segments)
+    expected = rig.drive_motion(torque)[::50]
+    # A cubic through eight intervals, a quarter of a period: a few percent of the rates.
+    np.testing.assert_allclose(states, expected, atol=0.1 * np.max(np.abs(expected), axis=0))
+    np.testing.assert_allclose(states[:, :2], expected[:, :2], atol=1e-3)
+
+
+def test_whitening_inverts_the_covariance():
+    W = np.asarray(whitening(NOISE))
+    np.testing.assert_allclose(W @ np.asarray(NOISE) @ W.T, np.eye(2), atol=1e-9)
+
+
+def test_horizon_and_steps_follow_the_frequency():
+    stretches = whole(rig.drive_experiment(400))
+    slow, fast = rig.drive_model(K=rig.K / 100, alpha=0.0), rig.drive_model(K=100 * rig.K, alpha=0.0)
+    assert suggested_substeps(slow, stretches) == 1
+    # omega_0 h = 3855 * 5e-4 = 1.93, at most 0.3 a step.
+    assert suggested_substeps(fast, stretches) == 7
+    # Six periods of 2 pi / (38.55 * 5e-4) = 326 samples, to the next power of two.
+    assert short_horizon(slow, stretches) == 2048
+    assert short_horizon(rig.drive_model(alpha=0.0), stretches) == 256

@@ -1,0 +1,171 @@
+"""Logs are cut into segments without losing, doubling or inventing a sample."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rig
+from fitting.experiment import Experiment, Stretch, cut, experiment_from_log, scales, segment_count, split
+
+COUNT = 47
+LOAD_TORQUE = np.linspace(3.0, -2.0, COUNT)
+
+
+def log(count: int = COUNT):
+    time = np.arange(count)
+    motion = np.stack([50.0 * np.sin(time), np.cos(time)], axis=1)
+    return rig.drive_log(motion, 1.0 + 0.1 * time**2, noise=0.0)
+
+
+def experiment(hold: str = "linear", *, load: bool = False, count: int = COUNT) -> Experiment:
+    logged = replace(log(count), load_torque=LOAD_TORQUE) if load else log(count)
+    return experiment_from_log(logged, hold=hold, N=rig.N)
+
+
+def test_a_drive_log_is_measured_as_motor_angle_at_the_output_and_twist():
+    found = experiment()
+    logged = log()
+    assert len(found) == COUNT
+    np.testing.assert_array_equal(found.measured[:, 0], logged.motor_angle / rig.N)
+    np.testing.assert_array_equal(found.measured[:, 1], logged.dynamic_error)
+    np.testing.assert_array_equal(found.motor_angle, logged.motor_angle)
+    assert found.load_torque is None
+    assert found.time_step == pytest.approx(rig.STEP, rel=1e-12)
+
+
+def test_a_reduced_log_has_one_output_and_no_motor():
+    found = rig.reduced_experiment(40)
+    assert found.measured.shape == (40, 1)
+    assert found.motor_angle is None
+
+
+def test_padding_has_no_weight_and_segments_reassemble_the_record():
+    source = experiment()
+    segments = cut([Stretch(source, 0, COUNT)], 10)
+    weight = np.asarray(segments.weight)
+    assert weight.shape == (5, 10)
+    np.testing.assert_array_equal(weight.sum(axis=1), [10, 10, 10, 10, 7])
+    assert float(segments.count) == COUNT
+    np.testing.assert_array_equal(np.asarray(segments.measured)[weight > 0], source.measured)
+    np.testing.assert_allclose(np.asarray(segments.torque.knots)[:, :-1][weight > 0], source.time, atol=1e-15)
+
+
+@settings(max_examples=30)
+@given(
+    start=st.integers(0, COUNT - 1),
+    extent=st.integers(1, COUNT),
+    length=st.integers(1, COUNT + 5),
+    halo=st.integers(0, 12),
+)
+def test_every_sample_keeps_its_torque_and_outputs(start: int, extent: int, length: int, halo: int):
+    source = experiment(load=True)
+    stop = min(start + extent, COUNT)
+    segments = cut([Stretch(source, start, stop)], length, halo=halo)
+    present = np.asarray(segments.weight) > 0
+    knots = np.asarray(segments.torque.knots)
+    assert knots.shape[1] == length + halo + 1
+    assert (np.diff(knots, axis=1) > 0).all()
+    np.testing.assert_array_equal(np.asarray(segments.measured)[present], source.measured[start:stop])
+    own = np.asarray(segments.torque.coefficients)[:, halo:]
+    expected = np.asarray(source.torque.coefficients)[start:stop]
+    np.testing.assert_array_equal(own[present], expected)
+    load = segments.load_torque
+    np.testing.assert_array_equal(np.asarray(load.coefficients)[present][:, 0], LOAD_TORQUE[start:stop])
+    np.testing.assert_array_equal(np.asarray(load.knots), knots[:, halo:])
+
+
+def test_the_halo_is_the_torque_before_the_segment():
+    source = experiment()
+    halo = 4
+    segments = cut([Stretch(source, 20, 40)], 10, halo=halo)
+    torque = np.asarray(segments.torque.coefficients)[:, :, 0]
+    logged = log().motor_torque
+    np.testing.assert_allclose(torque[0], logged[16:30], rtol=1e-14)
+    np.testing.assert_allclose(torque[1], logged[26:40], rtol=1e-14)
+    np.testing.assert_allclose(segments.torque.knots[0], source.time[16:31], atol=1e-15)
+
+
+def test_before_the_record_the_first_torque_was_held():
+    source = experiment("linear")
+    segments = cut([Stretch(source, 0, 20)], 20, halo=6)
+    knots = np.asarray(segments.torque.knots[0])
+    np.testing.assert_allclose(np.diff(knots), rig.STEP, rtol=1e-9)
+    assert knots[6] == source.time[0]
+    coefficients = np.asarray(segments.torque.coefficients[0])
+    np.testing.assert_array_equal(coefficients[:6, 0], log().motor_torque[0])
+    assert (coefficients[:6, 1:] == 0).all()
+    assert (coefficients[7:, 1] != 0).all()
+
+
+def test_beyond_the_record_the_last_torque_is_held():
+    segments = cut([Stretch(experiment("cubic"), 40, COUNT)], 20)
+    beyond = np.asarray(segments.torque.coefficients)[0, COUNT - 40 :]
+    assert (beyond[:, 1:] == 0).all()
+    np.testing.assert_array_equal(beyond[:, 0], log().motor_torque[-1])
+    np.testing.assert_allclose(np.diff(segments.torque.knots[0]), rig.STEP, rtol=1e-9)
+
+
+def test_stretches_of_several_logs_do_not_mix():
+    first, second = experiment(count=COUNT), experiment(count=31)
+    segments = cut([Stretch(first, 5, COUNT), Stretch(second, 0, 31)], 10)
+    present = np.asarray(segments.weight) > 0
+    np.testing.assert_array_equal(present.sum(axis=1)[:9], [10, 10, 10, 10, 2, 10, 10, 10, 1])
+    np.testing.assert_array_equal(
+        np.asarray(segments.measured)[present], np.concatenate([first.measured[5:], second.measured])
+    )
+
+
+def test_superfluous_segments_have_no_weight():
+    source = experiment()
+    segments = cut([Stretch(source, 0, COUNT)], 10, count=7, halo=2)
+    assert segments.weight.shape == (7, 10)
+    assert float(segments.count) == COUNT
+    assert (np.asarray(segments.weight)[5:] == 0).all()
+    assert np.isfinite(np.asarray(segments.torque.coefficients)).all()
+
+
+@pytest.mark.parametrize(("length", "needed", "expected"), [(47, 1, 1), (6, 8, 8), (5, 10, 16), (2, 24, 32)])
+def test_segment_count_is_exact_up_to_eight_and_then_a_multiple_of_sixteen(length: int, needed: int, expected: int):
+    stretch = Stretch(experiment(), 0, COUNT)
+    assert -(-COUNT // length) == needed
+    assert segment_count([stretch], length) == expected
+    assert cut([stretch], length).weight.shape[0] == expected
+
+
+def test_split_holds_out_the_end_of_each_log():
+    experiments = [experiment(), experiment(count=30)]
+    training, validation = split(experiments, held_out=0.2)
+    assert [(s.start, s.stop) for s in training] == [(0, 38), (0, 24)]
+    assert [(s.start, s.stop) for s in validation] == [(38, 47), (24, 30)]
+    assert [s.name for s in training] == ["log", "log"]
+    assert len(training[0]) + len(validation[0]) == COUNT
+
+
+def test_scales_of_a_sine():
+    time = np.arange(4000) * rig.STEP
+    omega, twist, swing = 40.0, 2e-3, 0.3
+    load = swing * np.sin(3.0 * time)
+    x = twist * np.sin(omega * time) + 5.0
+    motion = np.stack([rig.N * (load + x), load], axis=1)
+    logged = rig.drive_log(motion, np.zeros(time.size), noise=0.0)
+    found = scales([Stretch(experiment_from_log(logged, hold="linear", N=rig.N), 0, 4000)])
+    # The record holds no whole number of periods, and slopes are taken over eight samples.
+    assert found.x == pytest.approx(twist / np.sqrt(2), rel=0.01)
+    assert found.x_max == pytest.approx(twist, rel=0.05)
+    assert found.v == pytest.approx(omega * twist / np.sqrt(2), rel=0.01)
+    rate = np.sqrt((omega * twist) ** 2 + (3.0 * swing) ** 2) / np.sqrt(2)
+    assert found.omega_m == pytest.approx(rig.N * rate, rel=0.05)
+    assert found.omega_l == pytest.approx(rate, rel=0.05)
+    assert found.time_step == pytest.approx(rig.STEP)
+
+
+def test_scales_look_at_their_own_stretch_only():
+    source = experiment(count=200)
+    spoiled = source.measured.copy()
+    spoiled[100:] = np.nan
+    clean = scales([Stretch(source, 0, 100)])
+    blind = scales([Stretch(replace(source, measured=spoiled), 0, 100)])
+    assert blind == clean

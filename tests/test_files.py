@@ -1,0 +1,97 @@
+"""Files are written whole or not at all."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from fitting import files
+from fitting.files import write_whole
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {p.name: p.read_text(encoding="utf-8") for p in folder.iterdir()}
+
+
+def test_several_files_in_folders_that_are_made(tmp_path: Path):
+    first, second = tmp_path / "a" / "b" / "one.txt", tmp_path / "c" / "two.txt"
+    write_whole({first: "eins\n", second: "zwölf"})
+    assert contents(first.parent) == {"one.txt": "eins\n"}
+    assert contents(second.parent) == {"two.txt": "zwölf"}
+    assert stat.S_IMODE(first.stat().st_mode) == 0o644
+
+
+def test_an_old_file_is_replaced(tmp_path: Path):
+    path = tmp_path / "report.json"
+    path.write_text("old and longer", encoding="utf-8")
+    write_whole({path: "new"})
+    assert contents(tmp_path) == {"report.json": "new"}
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+def test_nothing_is_touched_when_writing_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int):
+    (tmp_path / "one.txt").write_text("old", encoding="utf-8")
+    opened = []
+    fdopen = os.fdopen
+
+    class FullDisk:
+        """A file whose disk is full after the first characters."""
+
+        def __init__(self, file):
+            self.file = file
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *details):
+            self.file.close()
+
+        def write(self, text: str):
+            self.file.write(text[:2])
+            raise OSError(28, "No space left on device")
+
+    def open_or_fail(*arguments, **options):
+        opened.append(fdopen(*arguments, **options))
+        return FullDisk(opened[-1]) if len(opened) == failing else opened[-1]
+
+    monkeypatch.setattr(files.os, "fdopen", open_or_fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_whole({tmp_path / "one.txt": "new text", tmp_path / "two.txt": "more text"})
+    assert len(opened) == failing
+    assert contents(tmp_path) == {"one.txt": "old"}
+
+
+def test_nothing_is_touched_when_the_first_renaming_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "one.txt").write_text("old", encoding="utf-8")
+
+    def refuse(source, destination):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(files.os, "replace", refuse)
+    with pytest.raises(PermissionError):
+        write_whole({tmp_path / "one.txt": "new", tmp_path / "two.txt": "more"})
+    assert contents(tmp_path) == {"one.txt": "old"}
+
+
+def test_a_renaming_that_fails_late_leaves_whole_files_and_no_litter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "two.txt").write_text("old", encoding="utf-8")
+    replace = os.replace
+
+    def refuse_two(source, destination):
+        if Path(destination).name == "two.txt":
+            raise PermissionError(13, "Permission denied")
+        replace(source, destination)
+
+    monkeypatch.setattr(files.os, "replace", refuse_two)
+    with pytest.raises(PermissionError):
+        write_whole({tmp_path / "one.txt": "new", tmp_path / "two.txt": "more"})
+    # Whole files only: either the old or the new text, and no temporary ones.
+    assert contents(tmp_path) in ({"one.txt": "new", "two.txt": "old"}, {"two.txt": "old"})
+
+
+def test_a_folder_that_is_a_file(tmp_path: Path):
+    (tmp_path / "taken").write_text("", encoding="utf-8")
+    with pytest.raises(OSError):
+        write_whole({tmp_path / "taken" / "one.txt": "new"})
+    assert contents(tmp_path) == {"taken": ""}

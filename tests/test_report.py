@@ -1,0 +1,315 @@
+"""The report says what the loop found, in numbers that others can read, and is written whole or not at all."""
+
+import json
+import math
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+import rig
+
+from fitting import formatting
+from fitting.attribution import Verdict
+from fitting.close_loop import Loop, close_loop
+from fitting.diagnostics import Dependence
+from fitting.experiment import Experiment
+from fitting.findings import Finding
+from fitting.plots import decimated, plots
+from fitting.report import (
+    FitOnly,
+    explained_share,
+    report_dict,
+    report_text,
+    separating_experiment,
+    write_report,
+)
+from hdjax import Hold
+from hdjax.effects import FAMILIES
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.friction import MotorFriction
+
+HOSTILE = "<script>alert(1)</script>"
+HOLD: Hold = "zero-order"
+T_C = 0.03
+HEALTH = [(HOSTILE, Finding("warning", f"8 rows of {HOSTILE} repeat", "time", "they are left out"))]
+MODEL_JSON = '{"model": 1}\n'
+FILES = {"report.html", "report.json", "model.json"}
+ESTIMATE_KEYS = {"value", "std", "ci95", "unit", "identifiable"}
+
+
+@pytest.fixture(scope="module")
+def loop() -> Loop:
+    """The loop closed on one log of a drive with motor friction, with two forms to choose from."""
+    log = rig.drive_experiment(3000, motor_friction=(T_C, 0.05), name=HOSTILE)
+    data: dict[Hold, tuple[Experiment, ...]] = {HOLD: (log,)}
+    start = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
+    return close_loop(start, data, hold=HOLD, max_effects=1, catalogue=(MotorFriction, TorqueBias))
+
+
+@pytest.fixture(scope="module")
+def fitted(loop: Loop) -> FitOnly:
+    return FitOnly(account=loop.before, noise=loop.noise, hold=HOLD, residual=loop.residual_before)
+
+
+@pytest.fixture
+def page(loop: Loop, tmp_path: Path) -> str:
+    return write_page(tmp_path, loop)
+
+
+def write_page(folder: Path, outcome: Loop | FitOnly) -> str:
+    """The written page without plotly's own code, which mentions addresses that it does not visit."""
+    paths = write_report(folder, outcome, model_json=MODEL_JSON, health=HEALTH, name=HOSTILE)
+    text = paths["report.html"].read_text(encoding="utf-8")
+    start, end = text.index("<script>"), text.index("</script>")
+    assert "plotly.js" in text[start : start + 200]
+    return text[:start] + text[end:]
+
+
+def leaves(value: object) -> Iterator[object]:
+    """All scalars of a nested structure."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from leaves(item)
+    else:
+        yield value
+
+
+def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
+    paths = write_report(tmp_path, loop, model_json=MODEL_JSON, health=HEALTH, name="rig")
+    found = json.loads(paths["report.json"].read_text(encoding="utf-8"))
+    assert found["schema"] == "hdjax-report/1"
+    assert found["decision"] == "effect_found"
+    assert found["noise"]["dynamic_error"] > 0
+    for side in ("before", "after"):
+        assert set(found[side]["rmse"]) == {"training", "validation"}
+        assert set(found[side]["parameters"]) == {"K", "alpha", "B_sp"}
+        assert all(set(e) >= ESTIMATE_KEYS for e in found[side]["parameters"].values())
+    assert found["before"]["effects"] == []
+    (effect,) = found["after"]["effects"]
+    assert effect["family"] in FAMILIES
+    assert 0.5 < effect["validation_gain"] < 1.0 and 0.0 < effect["p_value"] <= 0.01
+    assert all(set(e) >= ESTIMATE_KEYS for e in effect["parameters"].values())
+    T_c = effect["parameters"]["motor_friction.T_c"]
+    # Four standard errors: one in 16000 draws of the noise would be farther off.
+    assert abs(T_c["value"] - T_C) < 4 * T_c["std"] and T_c["unit"] == "N m"
+    assert found["health"] == [
+        {
+            "log": HOSTILE,
+            "severity": "warning",
+            "what": f"8 rows of {HOSTILE} repeat",
+            "where": "time",
+            "consequence": "they are left out",
+        }
+    ]
+    assert found["logs"] == [{"name": HOSTILE, "samples": 3000, "held_out": 600, "seconds": 2999 * rig.STEP}]
+    assert found["hold"] == HOLD and found["dropped"] == [] and found["unexplained"] is None
+
+
+def test_every_number_is_finite(loop: Loop):
+    broken = eqx.tree_at(lambda x: x.before.validation[0].predicted, loop, replace_fn=lambda p: p * np.inf)
+    found = report_dict(broken)
+    assert found["before"]["rmse"]["validation"] is None
+    assert all(math.isfinite(v) for v in leaves(found) if isinstance(v, float))
+    assert "diverged" in report_text(found) or "much of" in report_text(found)
+
+
+def test_effects_are_ordered_by_gain(loop: Loop):
+    (finding,) = loop.findings
+    second = eqx.tree_at(lambda f: f.validation_gain, finding, 0.1)
+    both = eqx.tree_at(lambda x: x.findings, loop, (finding, second))
+    gains = [e["validation_gain"] for e in report_dict(both)["after"]["effects"]]
+    assert gains == sorted(gains, reverse=True) and len(gains) == 2
+
+
+def test_a_tie_is_told_with_the_experiment_that_separates(loop: Loop):
+    """A competitor that does as well as the winner is an alternative; one of the same family that does not is none."""
+    winner = loop.rounds[0].winner
+    tied = Verdict("torque_bias", "torque_sensor", winner.trial, winner.gain, winner.p_value, separable=False)
+    apart = Verdict("other", "motor_friction", winner.trial, winner.gain, winner.p_value, separable=True)
+    told = eqx.tree_at(lambda x: x.rounds[0].verdicts, loop, (winner, tied, apart))
+    found = report_dict(told)
+    (other,) = found["alternatives"]
+    assert (other["family"], other["separable"]) == ("torque_sensor", False)
+    assert "both directions" in other["separating_experiment"]
+    assert other["validation_rmse"] == other["validation_rmse_of_found"] > 0
+    assert any("tie" in note for note in found["cannot_tell"])
+
+
+def test_what_is_unexplained_is_told(loop: Loop):
+    worse = eqx.tree_at(lambda x: x.residual_after, loop, loop.residual_before)
+    found = report_dict(Loop(**{**vars(worse), "decision": "unexplained"}))
+    left = found["unexplained"]
+    assert left["times_noise"] == pytest.approx(loop.residual_before.rms / found["noise"]["dynamic_error"])
+    # Motor friction jumps with the sign of the motor's speed.
+    assert left["depends_on"] in ("motor speed", "dynamic error", "rate of the dynamic error", "motor angle")
+    assert left["explained_share"] == max(left["explained_shares"].values())
+    assert f"depends most on the {left['depends_on']}" in found["summary"]
+
+
+def test_share_that_a_dependence_explains():
+    """A residual that is a function of the quantity is explained whole, noise not at all."""
+    random = np.random.default_rng(0)
+    mean, error = random.normal(size=40), np.full(40, 0.1)
+    exact = Dependence(np.arange(40.0), mean, np.zeros(40))
+    assert explained_share(exact, float(np.sqrt(np.mean(mean**2)))) == pytest.approx(1.0)
+    noise = Dependence(np.arange(40.0), 0.1 * random.normal(size=40), error)
+    # 40 bins of 1/100 of the variance scatter by 0.01 * sqrt(2/40).
+    assert explained_share(noise, 1.0) < 0.01
+
+
+def test_alpha_that_cannot_be_seen_says_from_where_it_could(loop: Loop):
+    def vague(estimate):
+        return eqx.tree_at(
+            lambda e: (e.value, e.std, e.ci95, e.identifiable), estimate, (50.0, 1e3, (-1910.0, 2010.0), False)
+        )
+
+    blind = eqx.tree_at(lambda x: x.after.uncertainty.estimates["alpha"], loop, replace_fn=vague)
+    found = report_dict(blind)
+    (note,) = [n for n in found["cannot_tell"] if n.startswith("alpha")]
+    assert "1960 rad⁻²" not in note and "2000 rad⁻²" in note and "largest measured twist" in note
+    assert "NOT IDENTIFIABLE" in report_text(found)
+
+
+def test_the_page_loads_nothing(page: str):
+    assert not re.search(r"""(src|href|action)\s*=\s*["']?\s*(https?:)?//""", page)
+    assert not re.search(r"@import|url\(", page)
+    assert "default-src 'none'" in page
+
+
+def test_hostile_names_stay_text(page: str):
+    assert HOSTILE not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    # The page's own two blocks, plotly's closing tag left by the cut.
+    assert page.count("<script>") == 1 and page.count("</script>") == 2
+
+
+def test_the_page_tells_the_story_in_order(page: str):
+    heads = re.findall(r"<h2>(.*?)</h2>", page)
+    assert heads == [
+        "What was fitted",
+        "What was left over",
+        "What was found",
+        "What it changed",
+        "What it can&rsquo;t tell",
+        "The data",
+        "How it was done",
+    ]
+    assert "A missing effect was found: motor friction." in page
+    assert not re.search(r"\bNaN\b|\bInfinity\b|\bnan\b|\bNone\b", page)
+
+
+def test_a_fit_alone_has_a_report_too(fitted: FitOnly, tmp_path: Path):
+    page = write_page(tmp_path, fitted)
+    assert "What was found" not in page and "The base model was fitted" in page
+    found = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert found["decision"] == "fit_only"
+    assert found["after"]["parameters"] == {} and found["after"]["rmse"] == {"training": None, "validation": None}
+    assert found["before"]["parameters"]["K"]["value"] == pytest.approx(rig.K, rel=0.05)
+
+
+def test_plotly_knows_every_property_of_every_figure(loop: Loop):
+    pictures = plots(loop, units={"dynamic_error": "rad"})
+    assert len({p.key for p in pictures}) == len(pictures)
+    for picture in pictures:
+        go.Figure(picture.figure)
+        points = [len(t["x"]) for t in picture.figure["data"]]
+        assert 0 < max(points) <= 4000
+
+
+@pytest.mark.parametrize("failing", ["os.replace", "os.fdopen"])
+def test_nothing_is_left_when_writing_fails(loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str):
+    def full(*args, **kwargs):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(failing, full)
+    with pytest.raises(OSError, match="no space"):
+        write_report(tmp_path, loop, model_json=MODEL_JSON)
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == []
+    write_report(tmp_path, loop, model_json=MODEL_JSON)
+    assert set(os.listdir(tmp_path)) == FILES
+    assert (tmp_path / "model.json").read_text(encoding="utf-8") == MODEL_JSON
+
+
+def test_text_lists_parameters_and_decision(loop: Loop):
+    text = report_text(report_dict(loop))
+    (K,) = re.findall(r"^    K +(\S+) \+/- (\S+) \((\S+) %\) N m/rad +\[(\S+), (\S+)\]$", text, re.MULTILINE)
+    value, std, share, low, high = map(float, K)
+    # The numbers are shown to 6, 2 and 2 digits.
+    assert value == pytest.approx(float(loop.after.model.drive.K), rel=1e-5)
+    assert share == pytest.approx(100 * std / value, rel=0.1)
+    assert low < value < high
+    assert "A missing effect was found: motor friction." in text
+    assert "motor_friction.T_c" in text
+
+
+def test_decimation_keeps_every_peak():
+    values = np.zeros(100_001)
+    values[[777, 50_000, 99_998]] = 3.0, -2.0, 1.0
+    time, kept = decimated(np.arange(values.size) * 0.5, values, 400)
+    assert time.size <= 400 and np.all(np.diff(time) >= 0)
+    assert {*kept[kept != 0]} == {3.0, -2.0, 1.0}
+    assert {*time[kept != 0]} == {388.5, 25_000.0, 49_999.0}
+
+
+def test_experiments_are_symmetric_and_always_there():
+    for one in FAMILIES:
+        for other in FAMILIES:
+            assert separating_experiment(one, other) == separating_experiment(other, one) or one != other
+            assert len(separating_experiment(one, other)) > 20
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (1.05e-6, "rad", "1.05 µrad"),
+        (-0.0123, "N m", "−12.3 mN m"),
+        (2.0, "rad", "2.00 rad"),
+        (1.2e5, "rad^-2", "120 000 rad⁻²"),
+        (3.4e-7, "N m s/rad", "3.40 × 10⁻⁷ N m s/rad"),
+        (0.0, "1", "0"),
+        (None, "rad", "—"),
+        (math.nan, "rad", "—"),
+    ],
+)
+def test_quantities(value: float | None, unit: str, shown: str):
+    assert formatting.quantity(value, unit).replace("\N{NARROW NO-BREAK SPACE}", " ") == shown
+
+
+def test_values_have_the_digits_that_their_errors_leave():
+    def shown(*args) -> str:
+        return formatting.measured(*args).replace("\N{NARROW NO-BREAK SPACE}", " ")
+
+    assert shown(17432.123, 12.3, "N m/rad") == "17 432 ± 12 N m/rad"
+    assert shown(1.2345e7, 3.4e4, "rad^-2") == "(1.2345 ± 0.0034) × 10⁷ rad⁻²"
+    assert shown(4.05e-5, 1.2e-8, "rad") == "40.500 ± 0.012 µrad"
+    assert shown(0.3, None, "rad") == "300.0 mrad"
+
+
+@pytest.mark.parametrize(
+    ("unit", "actuator", "shown"),
+    [
+        ("N m", False, "V/s^2"),
+        ("N m", True, "A"),
+        ("N m s^2/rad^2", False, "1/V"),
+        ("rad^-4", False, "1/V^4"),
+        ("[x]/s^2/[u]", False, "V/(s^2 A)"),
+        ("1/[x]^2", False, "1/V^2"),
+        ("1", False, "1"),
+    ],
+)
+def test_units_of_a_reduced_log(unit: str, actuator: bool, shown: str):
+    """The mesh torque stands for an acceleration of the response, the actuator's for the forcing."""
+    assert formatting.in_log_units(unit, response="V", forcing="A", actuator=actuator) == shown
+
+
+@pytest.mark.parametrize(("share", "shown"), [(0.98, "98 %"), (0.9996, "99.96 %"), (-0.013, "−1.3 %"), (1.0, "100 %")])
+def test_shares_do_not_round_up_to_everything(share: float, shown: str):
+    assert formatting.percent(share) == shown

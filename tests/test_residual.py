@@ -1,0 +1,198 @@
+"""The residual is zero at the truth, and its Jacobian is the derivative of it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting.experiment import Stretch, cut
+from fitting.free import base_paths, effect_paths, free_parameters
+from fitting.residual import Problem, Unknowns, blocks, output_error, residual, residual_with_blocks
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.hysteresis import BoucWen
+from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.load import GravityLoad
+
+COUNT, LENGTH = 100, 40  # three segments, the last one half padding
+WHITENING = jnp.asarray([[1e5, 0.0], [-3e4, 1e6]])
+
+
+def problem_of(experiment, model, paths, *, length=LENGTH, substeps=1, halo=0) -> Problem:
+    segments = cut([Stretch(experiment, 0, len(experiment))], length, halo=halo)
+    outputs = segments.measured.shape[-1]
+    whitening = WHITENING if outputs == 2 else jnp.asarray([[1e4]])
+    free = free_parameters(model, paths, {"alpha": 2e4})
+    return Problem(model, free, segments, whitening, jnp.ones(len(paths)), substeps=substeps)
+
+
+def first_states(motion: np.ndarray, length: int = LENGTH) -> jnp.ndarray:
+    return jnp.asarray(motion[::length])
+
+
+def test_zero_at_the_truth_of_a_reduced_drive():
+    forcing = rig.reduced_forcing(COUNT)
+    experiment = rig.reduced_experiment(COUNT)
+    model = rig.reduced_model()
+    problem = problem_of(experiment, model, base_paths(model), substeps=8)
+    truth = Unknowns(problem.free.pack(model), first_states(rig.reduced_motion(forcing)))
+    error = np.asarray(output_error(problem, truth))
+    # Both solvers turn omega_0 h = 0.045 a step: the rig's errs by some 1e-7 of the twist over the record.
+    assert np.max(np.abs(error)) < 1e-6 * np.max(np.abs(experiment.measured))
+
+
+PHYSICS = {
+    "base": ({}, ()),
+    "effects on every side": (
+        {
+            "mesh_friction": (0.8, 0.05),
+            "torque_bias": 0.03,
+            "kinematic": (1.5e-4, -1e-4),
+            "gravity": 2.0,
+        },
+        (
+            CoulombFriction(T_c=0.8, v_0=0.05),
+            TorqueBias(bias=0.03),
+            KinematicError(cos_2=1.5e-4, sin_2=-1e-4),
+            GravityLoad(sine=2.0),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize(("physics", "effects"), PHYSICS.values(), ids=PHYSICS.keys())
+def test_zero_at_the_truth_of_a_drive(physics: dict, effects: tuple):
+    start = (0.5, 0.009, 10.0, 0.3)
+    torque = rig.drive_torque(COUNT)
+    motion = rig.drive_motion(torque, state=start, substeps=12, **physics)
+    experiment = rig.drive_experiment(COUNT, noise=0.0, state=start, substeps=12, **physics)
+    model = rig.drive_model().with_effects(*effects)
+    problem = problem_of(experiment, model, ("K",), substeps=4)
+    truth = Unknowns(problem.free.pack(model), first_states(motion))
+    error = np.asarray(output_error(problem, truth))
+    assert error.shape == (3, LENGTH, 2)
+    twist = np.max(np.abs(experiment.measured[:, 1]))
+    assert np.max(np.abs(error)) < 1e-6 * twist
+    # The padding is simulated, but has no error.
+    assert (error[2, 20:] == 0).all()
+    wrong = eqx.tree_at(lambda u: u.parameters, truth, truth.parameters + 0.01)
+    assert np.max(np.abs(output_error(problem, wrong))) > 1e-4 * twist
+
+
+@pytest.fixture(scope="module")
+def hidden() -> tuple[Problem, Unknowns]:
+    """A drive with two effects, one of which has a state of its own, away from any optimum."""
+    experiment = rig.drive_experiment(COUNT)
+    effects = (CoulombFriction(T_c=0.5, v_0=0.1), BoucWen(k=900.0, yield_twist=4e-4, n=1.5))
+    model = rig.drive_model(K=6500.0, alpha=1e4).with_effects(*effects)
+    paths = base_paths(model) + effect_paths(effects[0]) + effect_paths(effects[1])
+    problem = problem_of(experiment, model, paths, halo=2)
+    motion = rig.drive_motion(rig.drive_torque(COUNT))[::LENGTH]
+    z = np.array([[1e-4], [-2e-4], [0.5e-4]])
+    states = motion + np.array([1e-3, -3e-5, 0.1, 1e-3])
+    return problem, Unknowns(problem.free.pack(model), jnp.asarray(np.hstack([states, z])))
+
+
+@pytest.fixture(scope="module")
+def hidden_blocks(hidden):
+    return eqx.filter_jit(blocks)(*hidden)
+
+
+_residual = eqx.filter_jit(residual)
+
+
+def difference(problem: Problem, unknowns: Unknowns, change: Unknowns, step: float = 1e-6) -> np.ndarray:
+    """Central difference. The step is small because the derivative of |v| in the hysteresis jumps."""
+    up, down = (_residual(problem, jax.tree.map(lambda u, c, s=s: u + s * step * c, unknowns, change)) for s in (1, -1))
+    return (np.asarray(up) - np.asarray(down)) / (2 * step)
+
+
+def assert_column(found, expected):
+    """Without the prior's row, whose scale is taken as fixed."""
+    found, expected = np.asarray(found)[:, :-1], expected[:, :-1]
+    # Residuals of some 1e3 are rounded to 1e-13, over the step 1e-6 that is 1e-7; the jump adds as much.
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.max(np.abs(expected)))
+    assert np.max(np.abs(expected)) > 0
+
+
+def test_blocks_by_parameter_are_differences(hidden, hidden_blocks):
+    problem, unknowns = hidden
+    count = unknowns.parameters.size
+    assert count == 8
+    for i in range(count):
+        change = Unknowns(jnp.eye(count)[i], jnp.zeros_like(unknowns.states))
+        expected = difference(problem, unknowns, change)
+        assert_column(hidden_blocks.by_parameter[:, :, i], expected)
+
+
+def test_blocks_by_state_are_differences(hidden, hidden_blocks):
+    problem, unknowns = hidden
+    scale = np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])
+    for i in range(5):
+        own = np.zeros(unknowns.states.shape)
+        own[:, i] = scale[i]
+        expected = difference(problem, unknowns, Unknowns(jnp.zeros(8), jnp.asarray(own)))
+        assert_column(hidden_blocks.by_state[:, :, i] * scale[i], expected)
+
+
+def test_a_segment_depends_on_its_own_state_only(hidden):
+    problem, unknowns = hidden
+    moved = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[1].add(jnp.asarray([0, 1e-4, 0, 0, 0.0])))
+    changed = np.any(np.asarray(_residual(problem, moved)) != np.asarray(_residual(problem, unknowns)), axis=1)
+    np.testing.assert_array_equal(changed, [False, True, False])
+
+
+def test_hidden_states_have_a_prior(hidden, hidden_blocks):
+    _, unknowns = hidden
+    rows = np.asarray(hidden_blocks.residual)
+    assert rows.shape == (3, 2 * LENGTH + 1)
+    np.testing.assert_allclose(rows[:, -1], unknowns.states[:, 4] / 4e-4, rtol=1e-12)
+    np.testing.assert_allclose(hidden_blocks.by_state[:, -1, 4], 1 / 4e-4, rtol=1e-12)
+    assert (np.asarray(hidden_blocks.by_parameter)[:, -1] == 0).all()
+
+
+def test_the_derivative_is_a_product_with_the_blocks(hidden, hidden_blocks):
+    problem, unknowns = hidden
+    random = np.random.default_rng(3)
+    change = Unknowns(
+        jnp.asarray(random.normal(size=8)),
+        jnp.asarray(random.normal(size=(3, 5)) * np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])),
+    )
+    value, slope = eqx.filter_jit(lambda p, u, c: jax.jvp(lambda w: residual_with_blocks(w, p), (u,), (c,)))(
+        problem, unknowns, change
+    )
+    np.testing.assert_allclose(value, _residual(problem, unknowns), rtol=1e-12)
+    expected = np.einsum("srp,p->sr", hidden_blocks.by_parameter, change.parameters)
+    expected += np.einsum("srq,sq->sr", hidden_blocks.by_state, change.states)
+    np.testing.assert_allclose(slope, expected, atol=1e-9 * np.max(np.abs(expected)))
+    assert_column(slope, difference(problem, unknowns, change))
+
+
+def test_padding_does_not_matter(hidden, hidden_blocks):
+    problem, unknowns = hidden
+    measured = problem.segments.measured.at[2, 20:].add(7.0)
+    spoiled = eqx.tree_at(lambda p: p.segments.measured, problem, measured)
+    found = eqx.filter_jit(blocks)(spoiled, unknowns)
+    np.testing.assert_array_equal(found.residual, hidden_blocks.residual)
+    assert (np.asarray(hidden_blocks.by_parameter)[2, 40:80] == 0).all()
+    assert (np.asarray(hidden_blocks.residual)[2, 40:80] == 0).all()
+
+
+def test_a_held_parameter_has_no_column(hidden, hidden_blocks):
+    problem, unknowns = hidden
+    held = eqx.tree_at(lambda p: p.active, problem, problem.active.at[1].set(0.0))
+    found = eqx.filter_jit(blocks)(held, unknowns)
+    assert (np.asarray(found.by_parameter)[:, :, 1] == 0).all()
+    np.testing.assert_array_equal(found.by_parameter[:, :, 2], hidden_blocks.by_parameter[:, :, 2])
+
+
+def test_a_simulation_that_leaves_the_numbers_is_a_large_residual(hidden):
+    problem, unknowns = hidden
+    lost = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[0].set(jnp.inf))
+    found = eqx.filter_jit(blocks)(problem, lost)
+    for leaf in jax.tree.leaves((found.residual[:, :-1], found.by_parameter, found.by_state)):
+        assert np.isfinite(leaf).all()
+    assert np.max(np.abs(found.residual[0, :-1])) >= 1e8
+    np.testing.assert_allclose(found.residual[1], _residual(problem, unknowns)[1], rtol=1e-9)
