@@ -7,11 +7,12 @@ import numpy as np
 
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
-from fitting.free import base_paths, effect_paths
+from fitting.free import base_paths, effect_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
-from hdjax import HOLDS, Hold, Model
+from fitting.uncertainty import uncertainty
+from hdjax import Hold, Model
 from hdjax.effects import Effect
-from hdjax.parameters import own_parameters
+from hdjax.parameters import as_scalar, own_parameters
 
 SIGNIFICANCE = 0.01
 """Largest p-value of an accepted effect: the chance that the best of the catalogue does as well on noise."""
@@ -23,6 +24,8 @@ LEAST_GAIN = 1e-3
 _WORTH_A_REFIT = 0.2
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
+# Nor is one that explains less than this share of what the best one does.
+_SHARE_OF_BEST = 0.03
 # Forms that are refitted inside the equations in each round.
 _SHORT_LIST = 6
 
@@ -154,7 +157,6 @@ def look(
     setting: Setting,
     *,
     catalogue: Sequence[type[Effect]],
-    try_holds: bool,
     seed: int,
     progress: Callable[[str], None],
 ) -> Round:
@@ -162,18 +164,18 @@ def look(
 
     Args:
         before: the current model.
-        data: the stretches.
+        data: the stretches; every hold that is here competes with the present one.
         setting: how they are cut.
         catalogue: forms to consider.
-        try_holds: whether another hold of the torque competes as well.
         seed: of the surrogates.
         progress: told what is being done.
     """
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     found: list[Verdict] = []
+    least = max(0.25 * LEAST_GAIN, _SHARE_OF_BEST * screened.leads[0].gain) if screened.leads else 0.0
     for rank, lead in enumerate(screened.leads):
-        worth = rank < _SHORT_LIST and screened.p_value(lead.gain) <= _WORTH_A_REFIT
+        worth = rank < _SHORT_LIST and lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT
         trial = None
         gain = lead.gain
         if worth:
@@ -184,20 +186,46 @@ def look(
                 trial, gain = None, -np.inf
         p_value = screened.p_value(gain)
         found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
-    if try_holds:
-        for hold in HOLDS:
-            if hold == before.hold:
-                continue
-            progress(f"refitting with a {hold} torque")
-            trial = attempt(before.model, data, hold, setting, start=before)
-            gain = before.held_out.objective - trial.held_out.objective
-            p_value = screened.p_value(gain)
-            found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, p_value, True))
+    for hold in data:
+        if hold == before.hold:
+            continue
+        progress(f"refitting with a {hold} torque")
+        trial = attempt(before.model, data, hold, setting, start=before)
+        gain = before.held_out.objective - trial.held_out.objective
+        p_value = screened.p_value(gain)
+        found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, p_value, True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    verdicts = _simplest_first(_with_separability(found))
-    best = verdicts[0]
-    accepted = best.trial is not None and best.gain > LEAST_GAIN and best.p_value <= SIGNIFICANCE
-    return Round(before, screened, tuple(verdicts), accepted)
+    verdicts = _determined_first(_simplest_first(_with_separability(found)))
+    return Round(before, screened, tuple(verdicts), bool(verdicts) and _supported(verdicts[0]))
+
+
+def _supported(verdict: Verdict) -> bool:
+    """Whether a competitor is more than chance, more than an imperfection, and has a strength that is not zero."""
+    return (
+        verdict.trial is not None
+        and verdict.gain > LEAST_GAIN
+        and verdict.p_value <= SIGNIFICANCE
+        and _strength_is_determined(verdict)
+    )
+
+
+def _strength_is_determined(verdict: Verdict) -> bool:
+    """Whether the fit tells at least one of the effect's strengths from zero; another hold has none to tell."""
+    assert verdict.trial is not None
+    if verdict.name not in {e.name for e in verdict.trial.model.effects}:
+        return True
+    estimates = uncertainty(verdict.trial.training).estimates
+    return any(estimates[p].identifiable for p in strength_paths(verdict.trial.model.effect(verdict.name)))
+
+
+def _determined_first(verdicts: list[Verdict]) -> list[Verdict]:
+    """The list from its first supported competitor on, the unsupported ones behind it; unchanged where none is."""
+    for i, verdict in enumerate(verdicts):
+        if verdict.trial is None or verdict.gain <= LEAST_GAIN:
+            break
+        if _supported(verdict):
+            return [verdict, *verdicts[:i], *verdicts[i + 1 :]]
+    return verdicts
 
 
 def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
@@ -221,7 +249,7 @@ def _with_positive_strengths(effect: Effect) -> Effect:
     for name, info in own_parameters(effect):
         if info.role == "strength" and info.positive:
             value = float(getattr(effect, name))
-            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, np.maximum(value, 1e-6))
+            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(max(value, 1e-6)))
     return effect
 
 

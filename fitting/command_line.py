@@ -29,6 +29,7 @@ from hdjax import (
     PRESETS,
     Chirp,
     Harmonic,
+    Hold,
     SimulationError,
     TwoInertiaModel,
     random_phase_multisine,
@@ -57,10 +58,10 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     rig = read_rig(logs, drive)
     with _progress() as progress:
         progress("fitting the base model")
-        by_hold = {h: split(e) for h, e in rig.experiments.items() if rig.hold in (None, h)}
-        fits = {h: base_fit(rig.model, training) for h, (training, _) in by_hold.items()}
-        hold = min(fits, key=lambda h: fits[h].objective)
-        found, (training, validation) = fits[hold], by_hold[hold]
+        holds: list[Hold] = list(rig.experiments) if rig.hold is None else [rig.hold]
+        fits = {h: base_fit(rig.model, split(rig.experiments[h])[0]) for h in holds}
+        hold = min(holds, key=lambda h: fits[h].objective)
+        found, (training, validation) = fits[hold], split(rig.experiments[hold])
         progress("free runs on held-out data")
         noise = measurement_noise(found.model, training)
         result = account(found, training, validation, noise=noise, halo=0)

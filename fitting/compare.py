@@ -56,19 +56,28 @@ def account(
         noise: covariance of the measurement noise.
         halo: intervals of torque before a stretch.
     """
-    together = free_run(
-        fit.model,
-        [*training, *validation],
-        covariance=noise,
-        halo=halo,
-        substeps=fit.problem.substeps,
-    )
-    return Account(
-        model=fit.model,
-        uncertainty=uncertainty(fit),
-        training=together[: len(training)],
-        validation=together[len(training) :],
-    )
+    seen, unseen = _runs(fit, training, validation, noise, halo)
+    return Account(model=fit.model, uncertainty=uncertainty(fit), training=seen, validation=unseen)
+
+
+def validation_rmse(
+    fit: Fit,
+    training: Sequence[Stretch],
+    validation: Sequence[Stretch],
+    *,
+    noise: Float[Array, "outputs outputs"],
+    halo: int,
+) -> float:
+    """Rms error of a fit's free runs on held-out stretches; arguments as in [`account`][]."""
+    return rms_error(_runs(fit, training, validation, noise, halo)[1])
+
+
+def _runs(
+    fit: Fit, training: Sequence[Stretch], validation: Sequence[Stretch], noise: Array, halo: int
+) -> tuple[tuple[FreeRun, ...], tuple[FreeRun, ...]]:
+    """Free runs on training and held-out stretches, in one program."""
+    together = free_run(fit.model, [*training, *validation], covariance=noise, halo=halo, substeps=fit.problem.substeps)
+    return together[: len(training)], together[len(training) :]
 
 
 def excess(fit: Fit, noise: Float[Array, "outputs outputs"]) -> Float[np.ndarray, " outputs"]:

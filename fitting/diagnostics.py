@@ -6,6 +6,7 @@ from jaxtyping import Float
 from scipy.signal import welch
 
 from fitting.estimate import Fit
+from hdjax import TwoInertiaModel
 
 _BINS = 40
 _ORDERS = np.arange(0.25, 10.01, 0.05)
@@ -60,7 +61,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     x = simulated[:, -1]
     quantities = {"x": x, "v": np.gradient(x, step)}
     order = amplitude = np.zeros(0)
-    if simulated.shape[1] > 1:
+    if isinstance(fit.model, TwoInertiaModel):
         theta_m = simulated[:, 0] * float(fit.model.drive.N)
         speed = np.gradient(theta_m, step)
         # Segment borders are jumps of the simulated motion, not motion.

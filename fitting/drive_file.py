@@ -11,6 +11,7 @@ from typing import Any
 
 from fitting.errors import InputError
 from fitting.unit_strings import UnitError, parse_number
+from hdjax import HOLDS, Hold
 
 SIGNALS = (
     "time",
@@ -23,8 +24,6 @@ SIGNALS = (
     "forcing",
     "motor_velocity",
 )
-HOLDS = ("zero-order", "linear", "cubic", "band-limited")
-
 _DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2"}
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
@@ -68,7 +67,7 @@ class DriveFile:
     reduction_ratio: float | None
     motor_inertia: float | None
     load_inertia: float | None
-    torque_hold: str | None
+    torque_hold: Hold | None
     sample_rate: float | None
     columns: dict[str, ColumnMap]
 
@@ -173,9 +172,12 @@ def _positive(path: Path, table: str, key: str, value: object, unit: str) -> flo
     return number
 
 
-def _hold(path: Path, value: object) -> str | None:
-    if value is None or (isinstance(value, str) and value in HOLDS):
-        return value
+def _hold(path: Path, value: object) -> Hold | None:
+    if value is None:
+        return None
+    for hold in HOLDS:
+        if value == hold:
+            return hold
     hint = did_you_mean(value, HOLDS) if isinstance(value, str) else ""
     raise InputError(f"{path}: [signals] torque_hold must be one of {', '.join(HOLDS)}, but is {value!r}{hint}")
 

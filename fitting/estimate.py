@@ -122,14 +122,14 @@ def fit(
     error = None
     for turn in range(_REWEIGHTINGS if reweigh else 1):
         problem = eqx.tree_at(lambda p: p.whitening, problem, whitening(covariance))
-        unknowns, error, success, count = _solve(problem, unknowns, max_steps)
+        unknowns, error, success, taken = _solve(problem, unknowns, max_steps)
         if turn == 0 and horizon <= _LONGEST_RETRY:
             unknowns, changed = _retry_states(problem, unknowns)
             if changed:
-                unknowns, error, success, count = _solve(problem, unknowns, max_steps)
+                unknowns, error, success, taken = _solve(problem, unknowns, max_steps)
         covariance = _covariance(error, segments)
         before, objective = objective, _half_log_determinant(covariance)
-        converged, steps = bool(success), steps + int(count)
+        converged, steps = bool(success), steps + int(taken)
         if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
             break
     assert error is not None
@@ -158,7 +158,7 @@ def _solve(problem: Problem, start: Unknowns, max_steps: int):
     )
     error = output_error(problem, solution.value)
     success = solution.result == optx.RESULTS.successful
-    return solution.value, error, success, solution.stats["num_steps"]
+    return solution.value, error, success, jnp.asarray(solution.stats["num_steps"])
 
 
 def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]:
@@ -177,7 +177,7 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
         return unknowns, False
     length = weight.shape[1]
     for samples in (max(length // 8, min(length, 16)), length // 2, length):
-        masked = weight * (jnp.arange(length) < samples)[None, :]
+        masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
         part = eqx.tree_at(lambda p: p.segments.weight, held, masked)
         fresh, _, _, _ = _solve(part, fresh, _RETRY_STEPS)
     better = np.asarray(_squares(problem, fresh) < 0.99 * old)
@@ -246,7 +246,7 @@ def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, floa
     drive = model.drive
     stiffness = float(drive.stiffness)
     damping = stiffness * motion.x / motion.v if motion.v > 0 else 1.0
-    typical = {"alpha": 0.1 / motion.x_max**2}
+    typical = {"alpha": 0.1 / motion.x_max**2} if motion.x_max > 0 else {}
     typical |= {"B_sp": 0.01 * damping} if isinstance(drive, Drive) else {"mu": 0.01 * damping}
     return typical
 

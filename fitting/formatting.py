@@ -2,6 +2,12 @@
 
 import math
 import re
+from collections.abc import Sequence
+from typing import Literal
+
+Place = Literal["drive", "mesh", "actuator"]
+Ends = Sequence[float | None]
+"""Lower and upper end of an interval; None where there is none."""
 
 _MINUS, _NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
 _SUPERSCRIPT = str.maketrans("0123456789-n", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ⁿ")
@@ -72,11 +78,11 @@ def measured(value: float | None, std: float | None, unit: str) -> str:
     return _together((value,), std, unit, "{0} ± {1}")
 
 
-def interval(low: float | None, high: float | None, std: float | None, unit: str) -> str:
+def interval(ends: Ends, std: float | None, unit: str) -> str:
     """An interval, to the digits that the standard error leaves."""
     if std is None or not math.isfinite(std) or std <= 0:
-        return f"{quantity(low, unit)} to {quantity(high, unit)}"
-    return _together((low, high), std, unit, "{0} to {1}")
+        return f"{quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
+    return _together(ends, std, unit, "{0} to {1}")
 
 
 def in_factor(value: float | None, std: float | None, factor: float) -> str:
@@ -88,11 +94,11 @@ def in_factor(value: float | None, std: float | None, factor: float) -> str:
     return _together((value,), std, "1", "{0} ± {1}", factor)
 
 
-def interval_in_factor(low: float | None, high: float | None, std: float | None, factor: float) -> str:
+def interval_in_factor(ends: Ends, std: float | None, factor: float) -> str:
     """[`interval`][] for a column whose head states the unit."""
-    if low is None or high is None or std is None or not math.isfinite(std) or std <= 0:
+    if std is None or not math.isfinite(std) or std <= 0:
         return "—"
-    return _together((low, high), std, "1", "{0} to {1}", factor)
+    return _together(ends, std, "1", "{0} to {1}", factor)
 
 
 def percent(share: float | None) -> str:
@@ -113,14 +119,15 @@ def words(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def in_log_units(unit: str, *, response: str, forcing: str, actuator: bool = False) -> str:
+def in_log_units(unit: str, *, response: str, forcing: str, place: Place = "mesh") -> str:
     """The unit of a parameter of a reduced drive, whose response and forcing have units of their own.
 
     Args:
         unit: as the parameter states it, for a drive in SI or with `[x]` and `[u]`.
         response: unit of the dynamic error.
         forcing: unit of the forcing.
-        actuator: whether a torque stands for the forcing rather than for the mesh's acceleration.
+        place: where it acts. In the mesh a twist stands for the response and a torque for its acceleration; at the
+            actuator a torque stands for the forcing; the drive's own radian is an angle.
     """
     if "^-n" in unit:
         return unit.replace("rad", response)
@@ -129,13 +136,14 @@ def in_log_units(unit: str, *, response: str, forcing: str, actuator: bool = Fal
     for name in ("N", "m"):
         if torque:
             powers[name] = powers.get(name, 0) - torque
+    twist = "rad" if place == "drive" else response
     replaced: dict[str, int] = {}
     for name, power in powers.items():
-        inner = _powers({"rad": response, "[x]": response, "[u]": forcing}.get(name, name))
+        inner = _powers({"rad": twist, "[x]": response, "[u]": forcing}.get(name, name))
         _multiply(replaced, inner, power)
     mesh = {"s": -2}
     _multiply(mesh, _powers(response), 1)
-    _multiply(replaced, _powers(forcing) if actuator else mesh, torque)
+    _multiply(replaced, _powers(forcing) if place == "actuator" else mesh, torque)
     return _spell(replaced)
 
 
@@ -177,9 +185,7 @@ def _superscript(power: int) -> str:
     return str(power).translate(_SUPERSCRIPT)
 
 
-def _together(
-    values: tuple[float | None, ...], std: float, unit: str, pattern: str, factor: float | None = None
-) -> str:
+def _together(values: Sequence[float | None], std: float, unit: str, pattern: str, factor: float | None = None) -> str:
     """Values and their standard error with one power of ten and one unit."""
     known = [abs(v) for v in values if v is not None and math.isfinite(v)]
     largest = max([*known, std])

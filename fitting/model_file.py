@@ -60,7 +60,8 @@ def read_model(path: str | Path) -> StoredModel:
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{path}: the model can't be read ({error.strerror}); give the model.json of a report") from error
+        reason = f"the model can't be read ({error.strerror})"
+        raise InputError(f"{path}: {reason}; give the model.json of a report") from error
     except ValueError as error:
         raise InputError(f"{path}: not a JSON file ({error}); give the model.json of a report") from error
     try:

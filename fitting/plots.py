@@ -1,6 +1,7 @@
 """Pictures of a closed loop, as plotly figures in plain dictionaries. Statistics are computed elsewhere."""
 
 import html
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -143,7 +144,8 @@ def predictions(runs: tuple[FreeRun, FreeRun | None], *, omega_0: float, unit: s
         "fit",
         f"Held-out data of {first.name}: measured and predicted",
         "Free run from the first samples on; the model sees the torque only. Below: measured minus predicted. "
-        "The view starts where the base model errs most; double-click for the whole stretch, drag to zoom.",
+        f"The view starts where the {'base ' if runs[1] else ''}model errs most; "
+        "double-click for the whole stretch, drag to zoom.",
         _figure(traces, 460, **layout),
     )
 
@@ -153,7 +155,7 @@ def rmse_bars(before: Account, after: Account | None, *, noise: float, unit: str
     accounts = [before] if after is None else [before, after]
     values = [[a.training_rmse, a.validation_rmse] for a in accounts]
     finite = [v for pair in values for v in pair if np.isfinite(v)]
-    factor, label = scaled_unit(min([noise, *finite]), unit)
+    factor, label = scaled_unit(max([noise, *finite]), unit)
     wide = max([noise, *finite]) > 20 * min([noise, *finite])
     bars = [
         {
@@ -172,14 +174,14 @@ def rmse_bars(before: Account, after: Account | None, *, noise: float, unit: str
     layout: dict[str, Any] = {
         "barmode": "group",
         "bargap": 0.35,
-        "xaxis": _axis(axis_label("rms error of the dynamic error", label), rangemode="tozero"),
+        "xaxis": _axis(axis_label("rms error of the dynamic error", label), rangemode="tozero", exponentformat="power"),
         "yaxis": _axis("", autorange="reversed", showgrid=False),
         "shapes": [_line(x=factor * noise)],
         "annotations": [_note("noise", x=float(np.log10(factor * noise)) if wide else factor * noise)],
     }
     if wide:
         low, high = min([noise, *finite]), max([noise, *finite])
-        layout["xaxis"] |= _scale(wide, low, high)
+        layout["xaxis"] |= _scale(wide, factor * low, factor * high)
         layout["xaxis"]["range"] = [float(np.log10(factor * low / 2)), float(np.log10(factor * high * 2))]
     return Plot(
         "rmse",
@@ -207,7 +209,7 @@ def spectrum(
     layout: dict[str, Any] = {
         "xaxis": _axis("frequency [Hz]", **_scale(True, float(before.frequency[1]), nyquist)),
         "yaxis": _axis(
-            f"residual [{label or '1'}/√Hz]", exponentformat="power", **_scale(True, _low(density), _high(density))
+            f"residual [{label or '1'}/√Hz]", exponentformat="power", **_density_scale([factor * d for d in density])
         ),
     }
     if before.frequency[1] < resonance < nyquist:
@@ -554,7 +556,11 @@ def _scale(logarithmic: bool, low: float, high: float) -> Figure:
     """A linear axis, or a logarithmic one with a label at each decade (more where there are few)."""
     if not logarithmic:
         return {"type": "linear"}
-    return {"type": "log", "dtick": 1 if high > 30 * low else "D2"}
+    if high > 100 * low or not 0 < low < high:
+        return {"type": "log", "dtick": 1}
+    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 2)
+    ticks = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 5)]
+    return {"type": "log", "tickvals": ticks, "ticktext": [number(t, 1) for t in ticks]}
 
 
 def _density_scale(densities: Sequence[np.ndarray]) -> Figure:

@@ -40,6 +40,7 @@ _LIBRARIES = ("hdjax", "jax", "diffrax", "optimistix", "equinox", "numpy", "scip
 # Beyond it two parameters are told as one combination.
 _CORRELATED = 0.9
 _MOST_CORRELATIONS = 8
+_COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
 _PLAIN_FAMILY = {"torque_sensor": "torque sensor error", "unknown": "unknown term"}
 
 # Which experiment separates two families; symmetric. Restates the look-alike column of EFFECTS.md.
@@ -232,7 +233,11 @@ def summary(report: Mapping[str, Any]) -> str:
             f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
         )
     if decision == "effect_found":
-        opening = "A missing effect was found" if len(families) == 1 else f"{len(families)} missing effects were found"
+        opening = (
+            "A missing effect was found"
+            if len(families) == 1
+            else f"{_count(len(families))} missing effects were found"
+        )
         return (
             f"{opening}: {found}. {'It removes' if len(families) == 1 else 'Together they remove'} "
             f"{_removed(before, after)} of the held-out error, which falls from {_rmse(before, unit)} to "
@@ -302,8 +307,8 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         "unit": formatting.pretty_unit,
         "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
         "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
-        "interval_in_factor": lambda p, factor: formatting.interval_in_factor(*p["ci95"], p["std"], factor),
-        "interval": lambda p: formatting.interval(*p["ci95"], p["std"], p["unit"]),
+        "interval_in_factor": lambda p, factor: formatting.interval_in_factor(p["ci95"], p["std"], factor),
+        "interval": lambda p: formatting.interval(p["ci95"], p["std"], p["unit"]),
         "family": plain_family,
         "code": _code,
         "symbol": _symbol,
@@ -441,6 +446,10 @@ def _of_rig(rig: Rig) -> dict[str, Any]:
     }
 
 
+def _count(number: int) -> str:
+    return _COUNTS[number] if number < len(_COUNTS) else str(number)
+
+
 def _pictures(outcome: Outcome, report: Mapping[str, Any]) -> list[Plot]:
     if isinstance(outcome, Loop):
         return plots(outcome, units=report["units"])
@@ -478,8 +487,11 @@ def _unit_in_log(unit: str, path: str, model: Model, units: Mapping[str, str]) -
     """The unit of what stands at a path; a reduced drive's come from the log."""
     if not isinstance(model, ReducedModel):
         return unit
-    actuator = "." in path and isinstance(model.effect(path.split(".")[0]), ActuatorEffect)
-    return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"], actuator=actuator)
+    place: formatting.Place = "drive"
+    if "." in path:
+        effect = model.effect(path.split(".")[0])
+        place = "actuator" if isinstance(effect, ActuatorEffect) else "mesh"
+    return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"], place=place)
 
 
 def _effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any]:

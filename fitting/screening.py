@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.fft import irfft, prev_fast_len, rfft
+from scipy.fft import prev_fast_len
 
 from fitting.estimate import Fit, suggested_substeps
 from fitting.experiment import scales
@@ -179,12 +179,12 @@ def _surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]
     series = error[weight].T
     samples = series.shape[1]
     length = prev_fast_len(samples, real=True)
-    spectrum = rfft(series[:, :length])
+    spectrum = np.fft.rfft(series[:, :length])
     found = np.zeros((DRAWS, *error.shape))
     for draw in range(DRAWS):
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
         turn[0] = random.choice((-1.0, 1.0))
-        surrogate = irfft(spectrum * turn[None, :], n=length)
+        surrogate = np.fft.irfft(spectrum * turn[None, :], n=length)
         found[draw][weight] = np.resize(surrogate.T, (samples, series.shape[0]))
     return found.reshape(DRAWS, error.shape[0], -1)
 

@@ -16,6 +16,8 @@ from fitting.errors import DataError
 from fitting.experiment import Stretch
 from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 
+# Starts whose stiffness differs by less than this (in its logarithm) end in the same minimum.
+_DISTINCT = 0.1
 _WIDTHS = (12, 24, 48, 96, 192, 384)
 
 
@@ -37,7 +39,7 @@ def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, 
             if estimate is None:
                 continue
             stiffness = float(estimate.drive.stiffness)
-            if all(abs(np.log(stiffness / float(f.drive.stiffness))) > 0.03 for f in found):
+            if all(abs(np.log(stiffness / float(f.drive.stiffness))) > _DISTINCT for f in found):
                 found.append(estimate)
     if not found:
         names = ", ".join(s.name for s in stretches)

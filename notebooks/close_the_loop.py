@@ -8,8 +8,8 @@
 # %% [markdown]
 # # Close the loop with a log
 #
-# A drive hides an effect that its drive file does not mention. We fit what is declared, look at what is left over, let the
-# loop name the effect, and compare both models on the part of the logs that no fit has seen.
+# A drive hides an effect that its drive file does not mention. We fit what is declared, look at what is left over, let
+# the loop name the effect, and compare both models on the part of the logs that no fit has seen.
 
 # %%
 from pathlib import Path
@@ -42,8 +42,7 @@ axes[1].plot(log.time, log.motor_angle)
 axes[1].set_ylabel("motor angle [rad]")
 axes[2].plot(log.time, 1e3 * log.dynamic_error, lw=0.5)
 axes[2].set_ylabel("dynamic error [mrad]")
-axes[2].set_xlabel("time [s]");
-
+axes[2].set_xlabel("time [s]")
 # %% [markdown]
 # ## The loop
 # No starting values: they come from the weak form of the equation of motion. The last 20 % of each log is held out.
@@ -66,11 +65,11 @@ axes[0].plot(after.time, 1e6 * after.predicted, color="#0072B2", lw=0.8, label="
 axes[0].set_ylabel("dynamic error [µrad]")
 axes[0].legend(loc="upper right", ncols=2)
 for run, colour, name in ((before, "#D55E00", "before"), (after, "#0072B2", "after")):
-    axes[1].plot(run.time, 1e6 * (run.measured - run.predicted), color=colour, lw=0.8, label=f"{name}: {1e6 * run.rmse:.2f} µrad rms")
+    label = f"{name}: {1e6 * run.rmse:.2f} µrad rms"
+    axes[1].plot(run.time, 1e6 * (run.measured - run.predicted), color=colour, lw=0.8, label=label)
 axes[1].set_ylabel("left over [µrad]")
 axes[1].set_xlabel("time [s]")
-axes[1].legend(loc="upper right", ncols=2);
-
+axes[1].legend(loc="upper right", ncols=2)
 # %% [markdown]
 # ## Was it right?
 # Only here do we look at the truth. Leaving the effect out had biased the drive's own parameters as well.

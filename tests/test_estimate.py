@@ -119,13 +119,14 @@ def test_several_logs_jointly(found: Fit):
 
 
 def test_a_channel_that_the_model_cannot_follow_loses_its_say():
-    # Friction on the motor as large as the slow torque; the twist itself follows from the load's motion.
-    spoiled = whole(rig.drive_experiment(COUNT, motor_friction=(0.1, 0.5)))
+    # Unmodelled friction takes the motor a thousand times further off than its encoder's noise.
+    spoiled = whole(rig.drive_experiment(COUNT, motor_friction=(0.05, 0.5)))
     weighed = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled)
     assert float(weighed.model.get("K")) == pytest.approx(rig.K, rel=0.01)
+    assert float(np.sqrt(weighed.covariance[0, 0])) > 1e3 * rig.MOTOR_NOISE / rig.N
     trusting = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled, covariance=NOISE, reweigh=False)
     off = [abs(float(m.get("K")) / rig.K - 1.0) for m in (weighed.model, trusting.model)]
-    assert off[0] < off[1]
+    assert off[0] < 0.5 * off[1]
 
 
 @pytest.mark.parametrize(("omega_0", "mu", "gain"), [(1.04, 10.0, 1.5), (0.96, 0.5, 0.7)])
@@ -152,12 +153,16 @@ def test_steps_follow_a_sharp_friction():
     assert needed["sharp"] > needed["smooth"] >= 2
 
 
-def test_measurement_noise_of_a_model_that_is_wrong():
-    # Stiffness 5 % wrong: short pieces that may start anew still show little but noise.
-    stretches = whole(rig.drive_experiment(600))
-    noise = measurement_noise(rig.drive_model(K=1.05 * rig.K), stretches, substeps=1)
-    assert np.sqrt(float(noise[1, 1])) == pytest.approx(X_NOISE, rel=0.35)
-    assert np.sqrt(float(noise[0, 0])) == pytest.approx(rig.MOTOR_NOISE / rig.N, rel=0.35)
+def test_measurement_noise_needs_no_good_model():
+    stretches = whole(rig.reduced_experiment(REDUCED_COUNT, noise=1e-3))
+    found = {k: measurement_noise(rig.reduced_model(omega_0=k * rig.OMEGA_0), stretches) for k in (1.0, 1.02)}
+    noise = {k: float(np.sqrt(v[0, 0])) for k, v in found.items()}
+    # 1000 samples less two states in nine: 2.6 % of a standard deviation.
+    assert noise[1.0] == pytest.approx(1e-3, rel=0.08)
+    # A frequency 2 % off leaves much more over many periods than over half of one.
+    many = reduced_fit(rig.reduced_model(omega_0=1.02 * rig.OMEGA_0), stretches, hold_parameters=True)
+    assert many.dynamic_error_std > 1e-2
+    assert noise[1.02] < 0.2 * many.dynamic_error_std
 
 
 def test_initial_states_of_a_smooth_motion():
@@ -166,8 +171,8 @@ def test_initial_states_of_a_smooth_motion():
     states = initial_states(rig.drive_model(), segments)
     expected = rig.drive_motion(torque)[::50]
     # A cubic through eight intervals, a quarter of a period: a few percent of the rates.
-    np.testing.assert_allclose(states, expected, atol=0.1 * np.max(np.abs(expected), axis=0))
-    np.testing.assert_allclose(states[:, :2], expected[:, :2], atol=1e-3)
+    off = np.max(np.abs(np.asarray(states) - expected), axis=0) / np.max(np.abs(expected), axis=0)
+    np.testing.assert_array_less(off, [0.01, 0.01, 0.15, 0.15])
 
 
 def test_whitening_inverts_the_covariance():

@@ -6,13 +6,14 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
 import plotly.graph_objects as go
 import pytest
-import rig
 
+import rig
 from fitting import formatting
 from fitting.attribution import Verdict
 from fitting.close_loop import Loop, close_loop
@@ -97,8 +98,8 @@ def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
     assert 0.5 < effect["validation_gain"] < 1.0 and 0.0 < effect["p_value"] <= 0.01
     assert all(set(e) >= ESTIMATE_KEYS for e in effect["parameters"].values())
     T_c = effect["parameters"]["motor_friction.T_c"]
-    # Four standard errors: one in 16000 draws of the noise would be farther off.
-    assert abs(T_c["value"] - T_C) < 4 * T_c["std"] and T_c["unit"] == "N m"
+    # The report's own number, not the loop's precision: that is tested with the loop.
+    assert T_c["value"] == pytest.approx(T_C, rel=1e-2) and T_c["unit"] == "N m"
     assert found["health"] == [
         {
             "log": HOSTILE,
@@ -294,20 +295,22 @@ def test_values_have_the_digits_that_their_errors_leave():
 
 
 @pytest.mark.parametrize(
-    ("unit", "actuator", "shown"),
+    ("unit", "place", "shown"),
     [
-        ("N m", False, "V/s^2"),
-        ("N m", True, "A"),
-        ("N m s^2/rad^2", False, "1/V"),
-        ("rad^-4", False, "1/V^4"),
-        ("[x]/s^2/[u]", False, "V/(s^2 A)"),
-        ("1/[x]^2", False, "1/V^2"),
-        ("1", False, "1"),
+        ("N m", "mesh", "V/s^2"),
+        ("N m", "actuator", "A"),
+        ("N m s^2/rad^2", "mesh", "1/V"),
+        ("rad^-4", "mesh", "1/V^4"),
+        ("rad/s", "mesh", "V/s"),
+        ("rad/s", "drive", "rad/s"),
+        ("[x]/s^2/[u]", "drive", "V/(s^2 A)"),
+        ("1/[x]^2", "drive", "1/V^2"),
+        ("1", "mesh", "1"),
     ],
 )
-def test_units_of_a_reduced_log(unit: str, actuator: bool, shown: str):
+def test_units_of_a_reduced_log(unit: str, place: Literal["drive", "mesh", "actuator"], shown: str):
     """The mesh torque stands for an acceleration of the response, the actuator's for the forcing."""
-    assert formatting.in_log_units(unit, response="V", forcing="A", actuator=actuator) == shown
+    assert formatting.in_log_units(unit, response="V", forcing="A", place=place) == shown
 
 
 @pytest.mark.parametrize(("share", "shown"), [(0.98, "98 %"), (0.9996, "99.96 %"), (-0.013, "−1.3 %"), (1.0, "100 %")])

@@ -84,12 +84,10 @@ def test_several_logs_serve_together():
 
 
 def test_a_log_without_a_spring_is_refused():
-    # A twist that runs away from its middle: negative stiffness in every weak form.
-    time = np.arange(COUNT) * rig.STEP
-    x = 1e-3 * np.cosh(8.0 * (time - time.mean()))
-    load = -300.0 * x
-    motion = np.stack([rig.N * (load + x), load], axis=1)
-    log = rig.drive_log(motion, np.zeros(COUNT), noise=0.0, name="runaway")
+    # A mesh that pushes instead of pulling: every weak form sees a negative stiffness.
+    torque = rig.drive_torque(COUNT)
+    motion = rig.drive_motion(torque, stiffness=-1.0, alpha=0.0, damping=0.0)
+    log = rig.drive_log(motion, torque, noise=0.0, name="runaway")
     with pytest.raises(DataError, match="runaway.*check the signs and units of motor_torque"):
         starting_models(PLACEHOLDER, whole(experiment_from_log(log, hold="zero-order", N=rig.N)))
 

@@ -1,0 +1,125 @@
+"""The whole loop on a small scale: it names the effect that was hidden, and nothing where nothing was."""
+
+import jax
+import numpy as np
+import pytest
+
+import rig
+from fitting.close_loop import Loop, close_loop
+from fitting.experiment import Experiment
+from hdjax.effects import Effect
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.load import GravityLoad
+from hdjax.effects.stiffness import QuadraticStiffness
+
+COUNT, REDUCED_COUNT = 2000, 1200
+BIAS = 0.02
+FRICTION = (10.0, 0.3)
+CATALOGUE: tuple[type[Effect], ...] = (TorqueBias, GravityLoad, QuadraticStiffness)
+REDUCED_CATALOGUE: tuple[type[Effect], ...] = (CoulombFriction, QuadraticStiffness)
+X_NOISE = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
+REDUCED_NOISE = 1e-3
+
+
+def reduced_loop(experiment: Experiment, **options) -> Loop:
+    """With placeholders that are wrong by a factor of about a hundred, and one effect at most: further rounds compile
+    as much again."""
+    placeholder = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
+    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=REDUCED_CATALOGUE, max_effects=1, **options)
+
+
+def drive_loop(experiment: Experiment, **options) -> Loop:
+    placeholder = rig.drive_model(K=1.0, alpha=0.0, B_sp=0.0)
+    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=CATALOGUE, max_effects=1, **options)
+
+
+@pytest.fixture(scope="module")
+def rubbing() -> tuple[Loop, list[str]]:
+    told: list[str] = []
+    experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)
+    return reduced_loop(experiment, progress=told.append), told
+
+
+def test_friction_is_found(rubbing):
+    found, told = rubbing
+    assert found.decision == "effect_found"
+    (finding,) = found.findings
+    assert (finding.family, finding.name) == ("coulomb_friction", "coulomb_friction")
+    assert finding.p_value <= 0.01
+    assert finding.validation_gain > 0.2
+    assert found.dropped == ()
+    assert found.hold == "zero-order"
+    assert any("found coulomb_friction" in message for message in told)
+
+
+def test_the_drive_is_right_once_the_effect_is_inside(rubbing):
+    after = rubbing[0].after
+    truth = {
+        "omega_0": rig.OMEGA_0,
+        "alpha": rig.REDUCED_ALPHA,
+        "mu": rig.MU,
+        "gain": rig.GAIN,
+        "coulomb_friction.T_c": FRICTION[0],
+    }
+    assert set(truth) < set(after.uncertainty.estimates)
+    for path, value in truth.items():
+        estimate = after.uncertainty.estimates[path]
+        assert abs(estimate.value - value) < 4 * estimate.std, (path, estimate)
+    # Without friction its dissipation had passed for damping, by many standard errors.
+    before = rubbing[0].before.uncertainty.estimates["mu"]
+    assert before.value - rig.MU > 5 * before.std
+
+
+def test_held_out_data_say_so(rubbing):
+    found, _ = rubbing
+    assert found.after.validation_rmse < found.before.validation_rmse
+    assert found.after.validation_rmse < 1.3 * REDUCED_NOISE
+    assert np.sqrt(float(found.noise[0, 0])) == pytest.approx(REDUCED_NOISE, rel=0.1)
+    training, validation = found.stretches
+    assert [len(s) for s in training + validation] == [960, 240]
+    assert found.after.validation[0].time.size == 240
+    assert not np.any(np.isin(found.after.validation[0].time, found.after.training[0].time))
+
+
+def test_nothing_is_found_where_nothing_is():
+    clean = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE))
+    assert clean.decision == "model_sufficient"
+    assert clean.findings == ()
+    assert clean.after is clean.before
+    assert not clean.rounds[0].accepted
+    assert float(clean.before.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=1e-3)
+    assert clean.before.validation_rmse < 1.3 * REDUCED_NOISE
+
+
+@pytest.mark.slow
+def test_a_torque_bias_of_a_drive_is_found():
+    found = drive_loop(rig.drive_experiment(COUNT, torque_bias=BIAS))
+    assert found.decision == "effect_found"
+    (finding,) = found.findings
+    assert (finding.family, finding.name) == ("torque_sensor", "torque_bias")
+    assert finding.p_value <= 0.01
+    assert finding.validation_gain > 0.3
+    assert float(finding.effect.bias) == pytest.approx(BIAS, rel=0.05)
+    # The placeholder was wrong by a factor of thousands.
+    assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=2e-3)
+    assert float(found.after.model.get("alpha")) == pytest.approx(rig.ALPHA, rel=0.1)
+    assert found.after.validation_rmse < 2 * X_NOISE
+
+
+@pytest.mark.slow
+def test_a_drive_without_effects_suffices():
+    clean = drive_loop(rig.drive_experiment(COUNT))
+    assert clean.decision == "model_sufficient"
+    assert clean.findings == ()
+    assert float(clean.before.model.get("K")) == pytest.approx(rig.K, rel=2e-3)
+
+
+def test_single_precision_is_refused():
+    experiment = rig.reduced_experiment(200)
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match=r'call jax\.config\.update\("jax_enable_x64", True\) first'):
+            reduced_loop(experiment)
+    finally:
+        jax.config.update("jax_enable_x64", True)

@@ -1,0 +1,278 @@
+"""What a user types: one sentence and an exit code where it can't be done, and a file where it can."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting.command_line import main
+from fitting.free_run import WINDOW
+from fitting.model_file import StoredModel, to_json
+from hdjax import Model, TwoInertiaModel
+from hdjax.effects.actuation import TorqueBias
+
+COUNT = 600
+DRIVE = """\
+[drive]
+name = "rig"
+reduction_ratio = 50
+motor_inertia = 5.26e-4
+load_inertia = 5.0e-2
+[signals]
+torque_hold = "zero-order"
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Compiled programs go to the test's folder, and JAX's settings are put back."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def run(*arguments: object) -> int:
+    """The exit code of a command."""
+    try:
+        main([str(a) for a in arguments])
+    except SystemExit as end:
+        return 0 if end.code is None else int(end.code)
+    return 0
+
+
+def table() -> dict[str, np.ndarray]:
+    """Columns of a healthy drive log."""
+    torque = rig.drive_torque(COUNT)
+    log = rig.drive_log(rig.drive_motion(torque), torque)
+    return {
+        "time": log.time.copy(),
+        "motor_angle": log.motor_angle,
+        "load_angle": log.load_angle,
+        "motor_torque": torque,
+    }
+
+
+def reduced_table() -> dict[str, np.ndarray]:
+    forcing = rig.reduced_forcing(COUNT)
+    log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0], forcing, noise=1e-3)
+    return {"time": log.time, "dynamic_error": log.dynamic_error, "forcing": forcing}
+
+
+def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    rows = np.stack(list(columns.values()), axis=1)
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.12g")
+    return path
+
+
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    names = path.read_text(encoding="utf-8").splitlines()[0].split(",")
+    return dict(zip(names, np.loadtxt(path, delimiter=",", skiprows=1, unpack=True), strict=True))
+
+
+def write_drive(folder: Path, text: str = DRIVE) -> Path:
+    path = folder / "drive.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_model(folder: Path, model: Model, **options) -> Path:
+    noise = jnp.diag(jnp.asarray([4e-14, 1e-12])) if isinstance(model, TwoInertiaModel) else 1e-6 * jnp.eye(1)
+    content = {"hold": "zero-order", "substeps": 2, "halo": 4, "noise": noise} | options
+    path = folder / "model.json"
+    path.write_text(to_json(StoredModel(model=model, **content)), encoding="utf-8")
+    return path
+
+
+def spoiled(**changes: Callable[[np.ndarray], np.ndarray]) -> dict[str, np.ndarray]:
+    columns = table()
+    return columns | {name: change(columns[name]) for name, change in changes.items()}
+
+
+def at(index: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda column: np.where(np.arange(column.size) == index, value, column)
+
+
+def renamed(old: str, new: str) -> dict[str, np.ndarray]:
+    return {new if name == old else name: column for name, column in table().items()}
+
+
+def swapped() -> dict[str, np.ndarray]:
+    columns = table()
+    return columns | {"motor_angle": columns["load_angle"], "load_angle": columns["motor_angle"]}
+
+
+BAD_LOGS: dict[str, tuple[Callable[[], dict[str, np.ndarray]], int, Sequence[str]]] = {
+    "missing column": (lambda: renamed("motor_torque", "current"), 2, ("motor_torque", "current")),
+    "not a number": (lambda: spoiled(load_angle=at(300, np.nan)), 2, ("load_angle", "data row 301")),
+    "time stands": (lambda: spoiled(time=at(100, 99 * rig.STEP)), 2, ("time", "data row 101")),
+    "time goes back": (lambda: spoiled(time=at(100, 0.0)), 2, ("time", "data row 101")),
+    "other ratio": (lambda: spoiled(motor_angle=lambda m: 2.0 * m), 1, ("reduction_ratio", "correct the ratio")),
+    "swapped sides": (swapped, 1, ("swapped",)),
+    "no torque": (lambda: spoiled(motor_torque=np.zeros_like), 1, ("motor_torque",)),
+    "no response": (lambda: spoiled(motor_angle=np.zeros_like, load_angle=np.zeros_like), 1, ("motor_angle",)),
+    "too short": (lambda: {n: c[:150] for n, c in table().items()}, 1, ("150 rows", "200")),
+    "mirrored": (lambda: spoiled(load_angle=np.negative), 1, ("sign = -1",)),
+}
+
+
+def assert_one_line(capsys: pytest.CaptureFixture[str], *words: str):
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("hdjax: ")
+    assert shown.err.count("\n") == 1, shown.err
+    assert shown.err.endswith("\n")
+    assert "Traceback" not in shown.err
+    for word in words:
+        assert word in shown.err
+
+
+@pytest.mark.parametrize("command", ["fit", "close-loop"])
+@pytest.mark.parametrize(("columns", "code", "words"), BAD_LOGS.values(), ids=BAD_LOGS.keys())
+def test_bad_logs(command: str, columns, code: int, words, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    log = write_table(tmp_path / "log.csv", columns())
+    out = tmp_path / "out"
+    assert run(command, log, "--drive", write_drive(tmp_path), "--out", out) == code
+    assert_one_line(capsys, str(log), *words)
+    assert not out.exists()
+
+
+BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
+    "missing log": (("fit", "absent.csv", "--drive", "drive.toml", "--out", "out"), ("absent.csv",)),
+    "missing drive file": (("fit", "log.csv", "--drive", "absent.toml", "--out", "out"), ("absent.toml",)),
+    "no log": (("fit", "--drive", "drive.toml", "--out", "out"), ()),
+    "no drive file": (("fit", "log.csv", "--out", "out"), ("--drive",)),
+    "no out": (("fit", "log.csv", "--drive", "drive.toml"), ("--out",)),
+    "unknown option": (("fit", "log.csv", "--drive", "drive.toml", "--out", "out", "--fast"), ("--fast",)),
+    "unknown subcommand": (("calibrate", "log.csv"), ("calibrate",)),
+    "broken drive file": (("fit", "log.csv", "--drive", "broken.toml", "--out", "out"), ("broken.toml", "TOML")),
+    "unknown key": (("fit", "log.csv", "--drive", "typo.toml", "--out", "out"), ("reduction_ratoi", "did you mean")),
+    "unknown format": (("fit", "log.xyz", "--drive", "drive.toml", "--out", "out"), ("log.xyz",)),
+    "negative number of effects": (
+        ("close-loop", "log.csv", "--drive", "drive.toml", "--out", "out", "--max-effects", "-1"),
+        ("--max-effects",),
+    ),
+    "number that is none": (
+        ("close-loop", "log.csv", "--drive", "drive.toml", "--out", "out", "--max-effects", "many"),
+        ("many",),
+    ),
+    "logs of different kinds": (
+        ("fit", "log.csv", "reduced.csv", "--drive", "drive.toml", "--out", "out"),
+        ("log.csv",),
+    ),
+    "broken model": (("predict", "broken.json", "log.csv", "--drive", "drive.toml", "--out", "out"), ("broken.json",)),
+    "missing model": (("predict", "absent.json", "log.csv", "--drive", "drive.toml", "--out", "out"), ("absent.json",)),
+    "reduced log, drive model": (
+        ("predict", "model.json", "reduced.csv", "--drive", "drive.toml", "--out", "out"),
+        ("reduced.csv", "model.json"),
+    ),
+    "unknown preset": (("simulate", "--out", "out", "--preset", "HFUC"), ("HFUC", "HDC-40-050")),
+    "no rate": (("simulate", "--out", "out", "--rate", "0"), ("--rate",)),
+    "no line in the band": (
+        ("simulate", "--out", "out", "--frequency", "10", "--frequency-end", "10.01", "--duration", "0.55"),
+        ("--frequency",),
+    ),
+    "folder that is a file": (
+        ("simulate", "--out", "log.csv/out.csv", "--duration", "0.05", "--forcing", "harmonic"),
+        ("log.csv",),
+    ),
+}
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD_USE.values(), ids=BAD_USE.keys())
+def test_bad_use(arguments, words, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.chdir(tmp_path)
+    write_table(tmp_path / "log.csv", table())
+    write_table(tmp_path / "log.xyz", table())
+    write_table(tmp_path / "reduced.csv", reduced_table())
+    write_drive(tmp_path)
+    (tmp_path / "broken.toml").write_text("[drive\nname = 3", encoding="utf-8")
+    (tmp_path / "typo.toml").write_text("[drive]\nreduction_ratoi = 50\n", encoding="utf-8")
+    (tmp_path / "broken.json").write_text('{"schema": "hdjax-model/1"', encoding="utf-8")
+    write_model(tmp_path, rig.drive_model())
+    before = sorted(p.name for p in tmp_path.iterdir() if p.name != "cache")
+    assert run(*arguments) == 2
+    assert_one_line(capsys, *words)
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name != "cache") == before
+
+
+def test_predict_needs_outputs_in_the_window_and_torque_throughout(tmp_path: Path):
+    columns = table()
+    columns["motor_angle"][WINDOW:] = np.nan
+    columns["load_angle"][WINDOW:] = np.nan
+    log = write_table(tmp_path / "log.csv", columns)
+    out = tmp_path / "predicted.csv"
+    model = write_model(tmp_path, rig.drive_model())
+    assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 0
+    found = read_table(out)
+    assert list(found) == ["time", "dynamic_error"]
+    whole = table()
+    x = whole["motor_angle"] / rig.N - whole["load_angle"]
+    noise = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
+    np.testing.assert_allclose(found["time"], whole["time"], atol=1e-12)
+    assert np.sqrt(np.mean((found["dynamic_error"] - x) ** 2)) < 2 * noise
+    columns["motor_torque"][WINDOW + 5] = np.nan
+    broken = write_table(tmp_path / "broken.csv", columns)
+    other = tmp_path / "other.csv"
+    assert run("predict", model, broken, "--drive", write_drive(tmp_path), "--out", other) == 2
+    assert not other.exists()
+
+
+def test_simulate_and_predict_a_model_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    bias = 0.05
+    model = write_model(tmp_path, rig.drive_model().with_effects(TorqueBias(bias=bias)))
+    log, out = tmp_path / "new" / "log.csv", tmp_path / "new" / "predicted.csv"
+    duration = COUNT * rig.STEP
+    simulation = ("simulate", "--model", model, "--out", log, "--duration", duration, "--frequency-end", "110")
+    assert run(*simulation) == 0
+    assert str(log) in capsys.readouterr().out
+    columns = read_table(log)
+    assert list(columns) == ["time", "motor_angle", "load_angle", "motor_torque"]
+    assert columns["time"].size == COUNT
+    # What was simulated is what the rig's own equations say of the same torque.
+    motion = rig.drive_motion(columns["motor_torque"], torque_bias=bias)
+    np.testing.assert_allclose(columns["motor_angle"], motion[:, 0], atol=1e-6 * np.max(np.abs(motion[:, 0])))
+    np.testing.assert_allclose(columns["load_angle"], motion[:, 1], atol=1e-6 * np.max(np.abs(motion[:, 1])))
+    assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 0
+    assert str(out) in capsys.readouterr().out
+    x = motion[:, 0] / rig.N - motion[:, 1]
+    predicted = read_table(out)["dynamic_error"]
+    # The start is known from fifty samples without noise.
+    np.testing.assert_allclose(predicted, x, atol=2e-3 * np.max(np.abs(x)))
+    # Without the bias it would not be so.
+    blunt = write_model(tmp_path, rig.drive_model())
+    assert run("predict", blunt, log, "--drive", write_drive(tmp_path), "--out", out) == 0
+    assert np.max(np.abs(read_table(out)["dynamic_error"] - x)) > 0.02 * np.max(np.abs(x))
+
+
+def test_a_prediction_that_leaves_the_numbers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    model = write_model(tmp_path, rig.drive_model(alpha=-1e9))
+    log = write_table(tmp_path / "log.csv", table())
+    out = tmp_path / "predicted.csv"
+    assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 1
+    assert_one_line(capsys, str(log), "leaves the numbers")
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_fit_then_predict(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    log = write_table(tmp_path / "log.csv", reduced_table())
+    drive = write_drive(tmp_path, '[signals]\ntorque_hold = "zero-order"\n')
+    out = tmp_path / "out"
+    assert run("fit", log, "--drive", drive, "--out", out) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert sorted(p.name for p in out.iterdir()) == ["model.json", "report.html", "report.json"]
+    parameters = json.loads((out / "report.json").read_text(encoding="utf-8"))["before"]["parameters"]
+    assert parameters["omega_0"]["value"] == pytest.approx(rig.OMEGA_0, rel=0.01)
+    predicted = tmp_path / "predicted.csv"
+    assert run("predict", out / "model.json", log, "--drive", drive, "--out", predicted) == 0
+    error = read_table(predicted)["dynamic_error"] - reduced_table()["dynamic_error"]
+    assert np.sqrt(np.mean(error**2)) < 2e-3

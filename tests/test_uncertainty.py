@@ -1,0 +1,151 @@
+"""Standard errors by repetition: what they promise is how the estimates scatter."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import Experiment, Stretch
+from fitting.free import base_paths, free_parameters
+from fitting.uncertainty import Uncertainty, uncertainty
+
+COUNT, HORIZON, NOISE = 1000, 128, 2e-3
+TRUTH = {"mu": rig.MU, "omega_0": rig.OMEGA_0, "alpha": rig.REDUCED_ALPHA, "gain": rig.GAIN}
+PATHS = tuple(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Experiment:
+    return rig.reduced_experiment(COUNT)
+
+
+def noisy(clean: Experiment, noise: np.ndarray) -> list[Stretch]:
+    measured = clean.measured + noise[:, None]
+    return [Stretch(eqx.tree_at(lambda e: e.measured, clean, measured), 0, COUNT)]
+
+
+def reduced_fit(stretches: list[Stretch], **start) -> Fit:
+    model = rig.reduced_model(**start)
+    return fit(model, stretches, base_paths(model), horizon=HORIZON, substeps=2, count=8)
+
+
+def white(seed: int) -> np.ndarray:
+    return NOISE * np.random.default_rng(seed).normal(size=COUNT)
+
+
+def coloured(seed: int) -> np.ndarray:
+    """First-order noise with the same rms, correlated over some six samples."""
+    pole = 0.85
+    draws = np.random.default_rng(seed).normal(size=COUNT) * NOISE * np.sqrt(1 - pole**2)
+    noise = np.empty(COUNT)
+    level = draws[0] / np.sqrt(1 - pole**2)
+    for i, d in enumerate(draws):
+        noise[i] = level = pole * level + d
+    return noise
+
+
+def repeated(clean: Experiment, noise, draws: int) -> list[Uncertainty]:
+    return [uncertainty(reduced_fit(noisy(clean, noise(seed)))) for seed in range(draws)]
+
+
+def z_scores(found: list[Uncertainty], error: str) -> np.ndarray:
+    """(draws, parameters) deviations from the truth in standard errors."""
+    return np.array(
+        [[(u.estimates[p].value - TRUTH[p]) / getattr(u.estimates[p], error) for p in PATHS] for u in found]
+    )
+
+
+def assert_chi_squared(z: np.ndarray):
+    """Second moments about the truth, in the 99.9 % band that all parameters together hold (Bonferroni)."""
+    draws = z.shape[0]
+    low, high = chi2.ppf([0.0005 / len(PATHS), 1 - 0.0005 / len(PATHS)], draws) / draws
+    moment = np.mean(z**2, axis=0)
+    assert (moment > low).all() and (moment < high).all(), (low, moment, high)
+
+
+def coverage(found: list[Uncertainty]) -> np.ndarray:
+    return np.array(
+        [np.sum([u.estimates[p].ci95[0] < TRUTH[p] < u.estimates[p].ci95[1] for u in found]) for p in PATHS]
+    )
+
+
+DRAWS = 60
+
+
+@pytest.fixture(scope="module")
+def white_draws(clean: Experiment) -> list[Uncertainty]:
+    return repeated(clean, white, DRAWS)
+
+
+def test_white_noise(white_draws: list[Uncertainty]):
+    z = z_scores(white_draws, "std_classical")
+    assert_chi_squared(z)
+    # No bias: the mean of so many is a standard normal over their root.
+    assert np.max(np.abs(z.mean(axis=0))) * np.sqrt(DRAWS) < 4.0
+    covered = coverage(white_draws)
+    # Robust errors are the larger of the two, so that they may cover more than 95 %.
+    assert (covered >= binom.ppf(0.0005, DRAWS, 0.95)).all(), covered
+    assert np.mean([u.estimates["omega_0"].std / u.estimates["omega_0"].std_classical for u in white_draws]) < 1.3
+
+
+def test_the_check_itself_sees_a_wrong_factor(white_draws: list[Uncertainty]):
+    z = z_scores(white_draws, "std_classical")
+    for factor in (0.5, 2.0):
+        with pytest.raises(AssertionError):
+            assert_chi_squared(factor * z)
+
+
+def test_coloured_noise(clean: Experiment):
+    draws = 40
+    found = repeated(clean, coloured, draws)
+    classical, robust = (np.mean(z_scores(found, e) ** 2, axis=0) for e in ("std_classical", "std"))
+    # Noise with more power below the resonance than white: classical errors promise too much, of every parameter.
+    high = chi2.ppf(0.9995, draws) / draws
+    assert (classical > high).all(), (classical, high)
+    # Eight clusters of a natural period's memory only, so that the robust ones are still too small, but less.
+    assert (robust <= classical).all()
+    assert robust.mean() < 0.8 * classical.mean(), (robust, classical)
+    assert coverage(found).sum() > binom.ppf(0.5, draws * len(PATHS), 0.7)
+
+
+def test_correlations(white_draws: list[Uncertainty]):
+    correlation = white_draws[0].correlation
+    np.testing.assert_allclose(np.diag(correlation), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(correlation, correlation.T, atol=1e-12)
+    assert (np.linalg.eigvalsh(correlation) > 0).all()
+    # They are those of the scatter: 60 draws know a correlation to 0.13 or better.
+    values = np.array([[u.estimates[p].value for p in PATHS] for u in white_draws])
+    np.testing.assert_allclose(np.corrcoef(values.T), correlation, atol=0.5)
+    assert tuple(white_draws[0].estimates) == PATHS
+
+
+def test_intervals_and_units(white_draws: list[Uncertainty]):
+    estimates = white_draws[0].estimates
+    for path, estimate in estimates.items():
+        assert estimate.path == path
+        assert estimate.identifiable
+        assert estimate.std >= estimate.std_classical > 0
+        assert estimate.ci95[0] < estimate.value < estimate.ci95[1]
+        width = estimate.ci95[1] - estimate.ci95[0]
+        # A positive parameter's interval is one of its logarithm: a little longer above.
+        assert width == pytest.approx(2 * 1.959964 * estimate.std, rel=0.01)
+    assert estimates["mu"].unit == "1/s"
+    assert estimates["omega_0"].ci95[0] > 0
+
+
+def test_alpha_of_a_nearly_linear_log_is_not_identifiable():
+    small = [Stretch(rig.reduced_experiment(COUNT, noise=NOISE, rms=0.5), 0, COUNT)]
+    found = uncertainty(reduced_fit(small, alpha=0.0)).estimates
+    assert not found["alpha"].identifiable
+    assert found["alpha"].ci95[0] < 0.0 < found["alpha"].ci95[1]
+    for path in ("mu", "omega_0", "gain"):
+        assert found[path].identifiable, path
+
+
+def test_nothing_free_is_nothing_estimated(clean: Experiment):
+    result = reduced_fit(noisy(clean, white(0)))
+    found = uncertainty(eqx.tree_at(lambda f: f.problem.free, result, free_parameters(result.model, (), {})))
+    assert found.estimates == {}
+    assert found.correlation.shape == (0, 0)
