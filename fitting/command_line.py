@@ -15,6 +15,7 @@ from rich.console import Console
 from fitting.close_loop import base_fit, close_loop
 from fitting.compare import account
 from fitting.demonstration import write_demo_logs
+from fitting.diagnostics import diagnose
 from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.estimate import measurement_noise
@@ -66,7 +67,9 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
         noise = measurement_noise(found.model, training)
         result = account(found, training, validation, noise=noise, halo=0)
     stored = StoredModel(result.model, hold, found.problem.substeps, 0, noise)
-    paths = write_fit_report(out, result, rig=rig, noise=noise, hold=hold, model_json=to_json(stored))
+    paths = write_fit_report(
+        out, result, rig=rig, noise=noise, hold=hold, model_json=to_json(stored), residual=diagnose(found)
+    )
     print(fit_text(result, rig=rig, noise=noise))
     print(f"Report: {paths['report.html']}")
 

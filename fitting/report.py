@@ -263,8 +263,9 @@ def report_text(report: Mapping[str, Any]) -> str:
     unit = report["units"]["dynamic_error"]
     final = report["after"] if report["after"]["parameters"] else report["before"]
     lines = ["[Decision]", f"    {report['summary']}", "[Rms error of the free runs]"]
-    shown = [("before", report["before"]), ("after", report["after"])]
-    shown = [(n, a) for n, a in shown if a["parameters"]]
+    shown = [("model", report["before"])]
+    if report["after"]["effects"]:
+        shown = [("before", report["before"]), ("after", report["after"])]
     lines.append("    " + " " * 12 + "".join(f"{n:>14}" for n, _ in shown))
     for key, label in (("training", "training"), ("validation", "held out")):
         values = "".join(f"{_plain_number(a['rmse'][key]):>14}" for _, a in shown)

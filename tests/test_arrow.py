@@ -39,6 +39,11 @@ def dense(found: Blocks) -> tuple[np.ndarray, np.ndarray]:
     return jacobian, np.asarray(found.residual).ravel()
 
 
+@eqx.filter_jit
+def take_step(found: Blocks, damping) -> Unknowns:
+    return normal_equations(found).step(damping)
+
+
 def flat(step: Unknowns) -> np.ndarray:
     return np.concatenate([np.asarray(step.parameters), np.asarray(step.states).ravel()])
 
@@ -52,7 +57,7 @@ def test_the_step_is_that_of_dense_least_squares(damping: float):
     rows = np.vstack([jacobian / length, np.sqrt(damping) * np.eye(length.size)])
     right = np.concatenate([-r, np.zeros(length.size)])
     expected = np.linalg.lstsq(rows, right, rcond=None)[0] / length
-    step = flat(normal_equations(found).step(jnp.asarray(damping)))
+    step = flat(take_step(found, jnp.asarray(damping)))
     # Normal equations square the condition of the scaled columns (about 10), and _solve_scaled adds 1e-13.
     np.testing.assert_allclose(step * length, expected * length, atol=1e-10)
     assert np.max(np.abs(step * length)) > (1e-3 if damping < 10 else 1e-5)
@@ -62,7 +67,7 @@ def test_a_direction_without_information_does_not_move():
     found = random_blocks()
     blind = Blocks(found.residual, found.by_parameter.at[:, :, 1].set(0.0), found.by_state.at[2, :, 0].set(0.0))
     for damping in (0.0, 1e-3):
-        step = normal_equations(blind).step(jnp.asarray(damping))
+        step = take_step(blind, jnp.asarray(damping))
         assert float(step.parameters[1]) == 0.0
         assert float(step.states[2, 0]) == 0.0
         others = np.delete(flat(step), [1, PARAMETERS + 2 * STATES])
@@ -73,7 +78,7 @@ def test_a_direction_without_information_does_not_move():
 def test_a_segment_without_weight_does_not_matter():
     found = random_blocks()
     padded = Blocks(*(jnp.concatenate([leaf, jnp.zeros((1, *leaf.shape[1:]))]) for leaf in leaves(found)))
-    step, wanted = (normal_equations(b).step(jnp.asarray(1e-3)) for b in (padded, found))
+    step, wanted = (take_step(b, jnp.asarray(1e-3)) for b in (padded, found))
     np.testing.assert_allclose(step.parameters, wanted.parameters, rtol=1e-10)
     np.testing.assert_array_equal(step.states[-1], 0.0)
 

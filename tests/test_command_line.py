@@ -14,7 +14,6 @@ from fitting.command_line import main
 from fitting.free_run import WINDOW
 from fitting.model_file import StoredModel, to_json
 from hdjax import Model, TwoInertiaModel
-from hdjax.effects.actuation import TorqueBias
 
 COUNT = 600
 DRIVE = """\
@@ -226,8 +225,8 @@ def test_predict_needs_outputs_in_the_window_and_torque_throughout(tmp_path: Pat
 
 
 def test_simulate_and_predict_a_model_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    bias = 0.05
-    model = write_model(tmp_path, rig.drive_model().with_effects(TorqueBias(bias=bias)))
+    stiffness = 6000.0
+    model = write_model(tmp_path, rig.drive_model(K=stiffness))
     log, out = tmp_path / "new" / "log.csv", tmp_path / "new" / "predicted.csv"
     duration = COUNT * rig.STEP
     simulation = ("simulate", "--model", model, "--out", log, "--duration", duration, "--frequency-end", "110")
@@ -237,7 +236,7 @@ def test_simulate_and_predict_a_model_of_ones_own(tmp_path: Path, capsys: pytest
     assert list(columns) == ["time", "motor_angle", "load_angle", "motor_torque"]
     assert columns["time"].size == COUNT
     # What was simulated is what the rig's own equations say of the same torque.
-    motion = rig.drive_motion(columns["motor_torque"], torque_bias=bias)
+    motion = rig.drive_motion(columns["motor_torque"], stiffness=stiffness)
     np.testing.assert_allclose(columns["motor_angle"], motion[:, 0], atol=1e-6 * np.max(np.abs(motion[:, 0])))
     np.testing.assert_allclose(columns["load_angle"], motion[:, 1], atol=1e-6 * np.max(np.abs(motion[:, 1])))
     assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 0
@@ -246,10 +245,10 @@ def test_simulate_and_predict_a_model_of_ones_own(tmp_path: Path, capsys: pytest
     predicted = read_table(out)["dynamic_error"]
     # The start is known from fifty samples without noise.
     np.testing.assert_allclose(predicted, x, atol=2e-3 * np.max(np.abs(x)))
-    # Without the bias it would not be so.
+    # Another drive would not do.
     blunt = write_model(tmp_path, rig.drive_model())
     assert run("predict", blunt, log, "--drive", write_drive(tmp_path), "--out", out) == 0
-    assert np.max(np.abs(read_table(out)["dynamic_error"] - x)) > 0.02 * np.max(np.abs(x))
+    assert np.max(np.abs(read_table(out)["dynamic_error"] - x)) > 0.1 * np.max(np.abs(x))
 
 
 def test_a_prediction_that_leaves_the_numbers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -141,6 +141,19 @@ def test_a_reduced_drive_is_recovered(omega_0: float, mu: float, gain: float):
     assert result.dynamic_error_std == pytest.approx(1e-3, rel=0.1)
 
 
+def test_steps_follow_the_accuracy_of_the_log():
+    needed = {}
+    for noise in (1e-3, 1e-8):
+        stretches = whole(rig.reduced_experiment(REDUCED_COUNT, noise=noise, substeps=30))
+        result = reduced_fit(rig.reduced_model(), stretches)
+        needed[noise] = needed_substeps(result)
+        assert needed_substeps(result, tolerance=1e9) == 2
+    # Two steps to a sample turn 0.18 each and err by some 1e-6 of the twist: below a noise of 1e-3, not one of 1e-8.
+    assert needed[1e-3] == 2
+    assert needed[1e-8] > 2
+
+
+@pytest.mark.slow
 def test_steps_follow_a_sharp_friction():
     needed = {}
     for name, sharpness in (("smooth", 5.0), ("sharp", 0.02)):

@@ -108,9 +108,6 @@ def test_rates_are_exactly_zero_at_rest_and_not_in_motion(moving: Experiment, mo
     np.testing.assert_allclose(starts[1][:, 2:], [[30.0, 0.7]] * 2, rtol=0.01)
 
 
-@pytest.mark.xfail(
-    reason="typical_scales divides by a twist that is exactly zero", raises=ZeroDivisionError, strict=True
-)
 def test_an_encoder_that_stands_still_to_the_last_bit():
     found = run(at_rest(0.0))
     np.testing.assert_array_equal(found.motor_angle, found.motor_angle[0])

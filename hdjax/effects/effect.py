@@ -75,6 +75,14 @@ class Effect(eqx.Module):
         Several proposals are starting points of the same form.
         """
 
+    @classmethod
+    def typical(cls, scales: Scales) -> tuple["Effect", ...]:
+        """The effect as catalogues describe it, at strengths off zero: further starting points of a fit.
+
+        For forms whose shape decides so much that the first-order view from zero strength can mislead.
+        """
+        return ()
+
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         """Further quantities that a reader expects, as name -> (value, unit)."""
         return {}

@@ -35,7 +35,7 @@ class CoulombFriction(MeshTorqueEffect):
 
 
 class MotorFriction(MotorSideEffect):
-    """Friction torque `T_c sgn(omega_m) + b omega_m` against the motor, with the sign smoothed over omega_0."""
+    """Friction torque `T_c sgn(omega_m) + b omega_m` against the motor, its sign smoothed over `transition`."""
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "motor_friction"

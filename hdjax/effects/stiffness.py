@@ -63,6 +63,14 @@ class ThreeSlopeStiffness(MeshTorqueEffect):
         fractions = ((0.25, 0.35), (0.5, 0.25))
         return tuple(cls(x1=a * scales.x_max, gap=b * scales.x_max) for a, b in fractions)
 
+    @classmethod
+    def typical(cls, scales: Scales) -> tuple[Effect, ...]:
+        # Vendors: K2/K1 near 1.4, K3/K1 near 1.8, and T2 about 3.5 times T1.
+        fractions = ((0.25, 0.35), (0.15, 0.3), (0.4, 0.3))
+        return tuple(
+            cls(stiffening_2=0.4, stiffening_3=0.4, x1=a * scales.x_max, gap=b * scales.x_max) for a, b in fractions
+        )
+
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         beyond = _beyond(motion.x, self.x1) * self.stiffening_2
         beyond += _beyond(motion.x, self.x1 + self.gap) * self.stiffening_3
