@@ -19,9 +19,7 @@ STEP = 5e-4
 
 
 def drive_file(ratio: float | None = N, columns: dict[str, ColumnMap] | None = None) -> DriveFile:
-    return DriveFile(
-        Path("drive.toml"), "rig", ratio, 5e-4, 5e-2, "zero-order", None, columns or {}
-    )
+    return DriveFile(Path("drive.toml"), "rig", ratio, 5e-4, 5e-2, "zero-order", None, columns or {})
 
 
 def drive_log(swing: float = 0.3) -> Log:
@@ -269,9 +267,7 @@ def test_jitter_is_noted() -> None:
     assert examine(slight, drive_file()) == ()
 
 
-@pytest.mark.parametrize(
-    ("factor", "severity"), [(1.0, None), (1.05, "warning"), (1e-3, "refusal"), (50, "refusal")]
-)
+@pytest.mark.parametrize(("factor", "severity"), [(1.0, None), (1.05, "warning"), (1e-3, "refusal"), (50, "refusal")])
 def test_velocity_against_time_base(factor: float, severity: str | None) -> None:
     log = drive_log()
     motor, _ = angles(log)
@@ -292,9 +288,7 @@ SPOILERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @pytest.mark.parametrize("spoil", SPOILERS.values(), ids=SPOILERS)
 @pytest.mark.parametrize("until", [1, 50, 1000])
-def test_unknown_outputs_are_not_looked_at(
-    spoil: Callable[[np.ndarray], np.ndarray], until: int
-) -> None:
+def test_unknown_outputs_are_not_looked_at(spoil: Callable[[np.ndarray], np.ndarray], until: int) -> None:
     log = replace(drive_log(), outputs_until=until)
     spoilt = {}
     for name in ("motor_angle", "load_angle", "dynamic_error"):

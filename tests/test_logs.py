@@ -433,9 +433,7 @@ def test_a_bare_dataset_name_must_be_unique(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.load_angle, 2 * rig()["load_angle"])
 
 
-@pytest.mark.parametrize(
-    "value", [{"a": 1.0}, np.ones((ROWS, 2)), np.ones(ROWS) * 1j, "text"], ids=repr
-)
+@pytest.mark.parametrize("value", [{"a": 1.0}, np.ones((ROWS, 2)), np.ones(ROWS) * 1j, "text"], ids=repr)
 def test_what_is_no_vector_is_refused(tmp_path: Path, value: object) -> None:
     path = tmp_path / "log.mat"
     scipy.io.savemat(path, rig() | {"motor_torque": value})
@@ -497,12 +495,8 @@ anywhere = hypothesis.settings(
 
 
 @anywhere
-@hypothesis.given(
-    suffix=st.sampled_from(SUFFIXES), begun=st.booleans(), raw=st.binary(max_size=300)
-)
-def test_any_bytes_are_refused_politely(
-    tmp_path: Path, suffix: str, begun: bool, raw: bytes
-) -> None:
+@hypothesis.given(suffix=st.sampled_from(SUFFIXES), begun=st.booleans(), raw=st.binary(max_size=300))
+def test_any_bytes_are_refused_politely(tmp_path: Path, suffix: str, begun: bool, raw: bytes) -> None:
     path = tmp_path / f"log{suffix}"
     path.write_bytes(FIRST_BYTES.get(suffix, b"") * begun + raw)
     with pytest.raises((InputError, DataError)) as error:
