@@ -1,6 +1,7 @@
 """A fitted model on disk: `model.json`, what `hdjax predict` reads."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -82,10 +83,18 @@ def _stored(content: Any) -> StoredModel:
         model: Model = TwoInertiaModel(Drive(**content["drive"]), effects)
     else:
         model = ReducedModel(ReducedDrive(**content["drive"]), effects)
+    for path, (value, info) in model.parameters().items():
+        if not math.isfinite(value) or (info.role == "base" and info.positive and value <= 0):
+            raise ValueError(f"{path} is {float(value)}")
     if content["torque_hold"] not in HOLDS:
         raise ValueError(f"torque_hold {content['torque_hold']!r}")
     noise = jnp.asarray(content["noise_covariance"], dtype=float)
     outputs = 2 if isinstance(model, TwoInertiaModel) else 1
     if noise.shape != (outputs, outputs) or not bool(jnp.all(jnp.isfinite(noise))):
         raise ValueError("noise_covariance has the wrong shape")
-    return StoredModel(model, content["torque_hold"], int(content["substeps"]), int(content["halo"]), noise)
+    if np.min(np.linalg.eigvalsh(np.asarray(noise))) <= 0:
+        raise ValueError("noise_covariance is not positive definite")
+    substeps, halo = int(content["substeps"]), int(content["halo"])
+    if substeps < 1 or halo < 0:
+        raise ValueError(f"substeps is {substeps} and halo is {halo}")
+    return StoredModel(model, content["torque_hold"], substeps, halo, noise)

@@ -183,7 +183,8 @@ def _surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]
     found = np.zeros((DRAWS, *error.shape))
     for draw in range(DRAWS):
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
-        turn[0] = random.choice((-1.0, 1.0))
+        # Noise has no mean; what mean there is may be the very thing that is looked for.
+        turn[0] = 0.0
         surrogate = np.fft.irfft(spectrum * turn[None, :], n=length)
         found[draw][weight] = np.resize(surrogate.T, (samples, series.shape[0]))
     return found.reshape(DRAWS, error.shape[0], -1)

@@ -1,7 +1,6 @@
 """Elimination by segments takes the same steps as dense least squares, to the same minimum."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -9,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import rig
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, normal_equations
+from fitting.arrow import ArrowLevenbergMarquardt, normal_equations
 from fitting.estimate import initial_states
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths, free_parameters
@@ -96,29 +95,6 @@ def small() -> tuple[Problem, Unknowns]:
     free = free_parameters(model, base_paths(model), {"alpha": 1.0})
     problem = Problem(model, free, segments, jnp.asarray([[1 / 2e-3]]), jnp.ones(4), substeps=2)
     return problem, Unknowns(free.pack(model), initial_states(model, segments))
-
-
-def test_query_assembles_the_normal_equations(small):
-    problem, start = small
-
-    @eqx.filter_jit
-    def query(problem, start):
-        value, mv = jax.linearize(lambda u: residual_with_blocks(u, problem), start)
-        operator = _Operator(mv)
-        info = optx.FunctionInfo.ResidualJac(value, operator)
-        descent = ArrowDescent()
-        return descent.query(start, info, descent.init(start, None)), normal_equations(blocks(problem, start))
-
-    found, wanted = query(problem, start)
-    for name in ("shared", "own", "coupling", "shared_gradient", "own_gradient"):
-        expected = np.asarray(getattr(wanted, name))
-        np.testing.assert_allclose(getattr(found, name), expected, atol=1e-10 * np.max(np.abs(expected)))
-
-
-class _Operator(eqx.Module):
-    """All that the descent asks of a Jacobian."""
-
-    mv: object
 
 
 def test_the_minimum_is_that_of_scipy(small):

@@ -166,6 +166,7 @@ def test_steps_follow_a_sharp_friction():
     assert needed["sharp"] > needed["smooth"] >= 2
 
 
+@pytest.mark.slow
 def test_measurement_noise_needs_no_good_model():
     stretches = whole(rig.reduced_experiment(REDUCED_COUNT, noise=1e-3))
     found = {k: measurement_noise(rig.reduced_model(omega_0=k * rig.OMEGA_0), stretches) for k in (1.0, 1.02)}

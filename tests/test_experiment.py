@@ -53,7 +53,7 @@ def test_padding_has_no_weight_and_segments_reassemble_the_record():
     np.testing.assert_allclose(np.asarray(segments.torque.knots)[:, :-1][weight > 0], source.time, atol=1e-15)
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(
     start=st.integers(0, COUNT - 1),
     extent=st.integers(1, COUNT),

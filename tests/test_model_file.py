@@ -110,7 +110,6 @@ OUT_OF_RANGE = {
 }
 
 
-@pytest.mark.xfail(reason="read_model takes numbers as they are", strict=True)
 @pytest.mark.parametrize("change", OUT_OF_RANGE.values(), ids=OUT_OF_RANGE.keys())
 def test_numbers_out_of_range(change, tmp_path: Path):
     path = tmp_path / "model.json"

@@ -65,7 +65,6 @@ def test_a_torque_bias_leads(biased: Screen):
     assert float(lead.effect.bias) == pytest.approx(0.3, rel=0.05)
 
 
-@pytest.mark.xfail(reason="surrogates keep the residual's mean: half of them have the same bias", strict=True)
 def test_a_torque_bias_is_not_chance(biased: Screen):
     assert biased.p_value(biased.leads[0].gain) == 1 / (DRAWS + 1)
 

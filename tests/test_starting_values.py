@@ -66,11 +66,10 @@ def test_an_offset_of_both_angles_does_not_matter():
     assert min(abs(float(m.get("K")) / rig.K - 1.0) for m in found) < 0.1
 
 
-def test_a_torque_of_the_wrong_scale_leaves_the_load_to_tell():
-    torque = rig.drive_torque(COUNT)
-    log = rig.drive_log(rig.drive_motion(torque), 3.0 * torque)
+def test_where_the_torque_is_wrong_the_load_tells():
+    log = rig.drive_log(rig.drive_motion(rig.drive_torque(COUNT)), rig.drive_torque(COUNT, rms=1.5, seed=9))
     found = starting_models(PLACEHOLDER, whole(experiment_from_log(log, hold="zero-order", N=rig.N)))
-    assert min(abs(float(m.get("K")) / rig.K - 1.0) for m in found) < 0.05
+    assert min(abs(float(m.get("K")) / rig.K - 1.0) for m in found) < 0.1
 
 
 @pytest.mark.parametrize("gain", [rig.GAIN, -rig.GAIN])
