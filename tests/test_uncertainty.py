@@ -104,7 +104,7 @@ def test_coloured_noise(clean: Experiment):
     # Noise with more power below the resonance than white: classical errors promise too much, of every parameter.
     high = chi2.ppf(0.9995, draws) / draws
     assert (classical > high).all(), (classical, high)
-    # Eight clusters of a natural period's memory only, so that the robust ones are still too small, but less.
+    # Eight clusters for four parameters are few, so that the robust errors are still too small, but less so.
     assert (robust <= classical).all()
     assert robust.mean() < 0.8 * classical.mean(), (robust, classical)
     assert coverage(found).sum() > binom.ppf(0.5, draws * len(PATHS), 0.7)
