@@ -1,6 +1,7 @@
 """Periodic functions of time as Fourier series: forcings and steady responses."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -42,14 +43,34 @@ class FourierSeries(eqx.Module):
         return jnp.arctan2(-self.sine, self.cosine)
 
     def __call__(self, t: Array) -> Array:
-        angles = self.omega * jnp.asarray(t)[..., None] * jnp.arange(1.0, self.harmonics + 1.0)
-        waves = self.cosine * jnp.cos(angles) + self.sine * jnp.sin(angles)
-        return self.mean + jnp.sum(waves, axis=-1)
+        """The function at times of any shape; coordinates come last."""
+        angles = jnp.tensordot(self.omega * t, jnp.arange(1.0, self.harmonics + 1.0), axes=0)
+        waves = jnp.tensordot(jnp.cos(angles), self.cosine, axes=(-1, -1))
+        waves += jnp.tensordot(jnp.sin(angles), self.sine, axes=(-1, -1))
+        return waves + jnp.broadcast_to(self.mean, waves.shape)
 
     def derivative(self) -> "FourierSeries":
         """The series of the time derivative."""
         rates = self.omega * jnp.arange(1.0, self.harmonics + 1.0)
         return FourierSeries(self.omega, jnp.zeros_like(self.mean), rates * self.sine, -rates * self.cosine)
+
+    def largest(self) -> Float[Array, "*coordinates"]:
+        """Largest magnitude over a period, between samples too."""
+
+        def of_one(mean: Array, cosine: Array, sine: Array) -> Array:
+            wave = FourierSeries(1.0, mean, cosine, sine)
+            samples = wave.values(8 * (self.harmonics + 1))
+            t = jnp.argmax(jnp.abs(samples)) * (2 * jnp.pi / samples.size)
+            slope = wave.derivative()
+            curvature = slope.derivative()
+            for _ in range(3):
+                bend = curvature(t)
+                t = t - jnp.where(bend == 0.0, 0.0, slope(t) / jnp.where(bend == 0.0, 1.0, bend))
+            # The slope is zero there: how the instant moves does not matter.
+            return jnp.abs(wave(jax.lax.stop_gradient(t)))
+
+        flat = self.mean.reshape(-1), *(c.reshape(-1, self.harmonics) for c in (self.cosine, self.sine))
+        return jax.vmap(of_one)(*flat).reshape(self.mean.shape)
 
     def padded(self, harmonics: int) -> "FourierSeries":
         """The same function with zeros for the harmonics above, or cut after `harmonics`."""

@@ -1,0 +1,354 @@
+"""Branches of steady motions through folds: pseudo-arclength continuation of harmonic balance.
+
+The predictor-corrector is JaxCont's (Keller 1977); it follows the branch in a few steps. What it found is then
+interpolated and every point asked for is corrected at once, as lanes of one program.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.scipy.linalg import lu_factor, lu_solve
+from jaxcont.core.scan_continuation import ScanResult, pseudo_arclength_scan
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from hdjax.dynamics import Model
+from hdjax.fourier import FourierSeries
+from hdjax.parameters import as_scalar
+from hdjax.response.floquet import is_stable, multipliers
+from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance
+
+_TOLERANCE = 1e-9
+_SOLVED = 1e-8
+_CORRECTIONS = 2
+_FOLD_TOLERANCE = 1e-11
+
+
+class Branch(eqx.Module):
+    """Steady motions along a branch, by rows; where it turns back in the parameter there is a fold.
+
+    Attributes:
+        system: what was solved.
+        parameter: `"omega"`, `"amplitude"` or a parameter's dotted path.
+        scale: of the parameter in the scaled problem that is followed.
+        value: the parameter's value.
+        omega: the forcing frequency [rad/s].
+        unknowns: the system's unknowns.
+        tangents: unit direction of the branch in (unknowns, scaled parameter); the last entry changes sign at a fold.
+        valid: which rows are motions; the others lie behind the end of the branch, or were not solved.
+        complete: whether the branch reached the end of the parameter's range or closed upon itself.
+    """
+
+    system: BalancedMotion
+    parameter: str = eqx.field(static=True)
+    scale: Float[Array, ""]
+    value: Float[Array, " points"]
+    omega: Float[Array, " points"]
+    unknowns: Float[Array, "points unknowns"]
+    tangents: Float[Array, "points directions"]
+    valid: Bool[Array, " points"]
+    complete: Bool[Array, ""]
+
+    @property
+    def steady_states(self) -> SteadyState:
+        """The motions, by row."""
+        return jax.vmap(self._steady_state)(self.value, self.omega, self.unknowns, self.valid)
+
+    @property
+    def amplitude(self) -> Float[Array, " points"]:
+        """Largest |x| over a period [rad]."""
+        return self.steady_states.x.largest()
+
+    @property
+    def multipliers(self) -> Array:
+        """Floquet multipliers by row."""
+        return _branch_multipliers(self)
+
+    @property
+    def stable(self) -> Bool[Array, " points"]:
+        """Whether no Floquet multiplier lies outside the unit circle."""
+        return is_stable(self.multipliers)
+
+    def at(self, value: Array) -> BalancedMotion:
+        """The system at a value of the parameter."""
+        return self.system if self.parameter == "omega" else self.system.with_parameter(self.parameter, value)
+
+    def residual(self, unknowns: Array, scaled: Array, omega: Array) -> Array:
+        """The system's residual at a scaled value of the parameter; `omega` holds where it is not the parameter."""
+        value = scaled * self.scale
+        return self.at(value).residual(unknowns, value if self.parameter == "omega" else omega)
+
+    def _steady_state(self, value: Array, omega: Array, unknowns: Array, valid: Array) -> SteadyState:
+        return self.at(value).steady_state(unknowns, omega, valid)
+
+
+class Folds(eqx.Module):
+    """Folds of a branch, where two motions meet and the response jumps.
+
+    Attributes:
+        value: the branch's parameter at each fold.
+        unknowns: the system's unknowns there.
+        null_vector: the direction in which the motion can change while the parameter stands still.
+        exists: which entries are folds.
+    """
+
+    value: Float[Array, " folds"]
+    unknowns: Float[Array, "folds unknowns"]
+    null_vector: Float[Array, "folds unknowns"]
+    exists: Bool[Array, " folds"]
+
+
+def frequency_response(
+    model: Model,
+    forcing: FourierSeries | None,
+    omega_start: ArrayLike,
+    omega_end: ArrayLike,
+    *,
+    load_torque: FourierSeries | None = None,
+    points: int = 1000,
+    harmonics: int = 9,
+    samples: int | None = None,
+    subharmonic: int = 1,
+    rotating: bool = False,
+    guess: FourierSeries | None = None,
+    steps: int = 200,
+) -> Branch:
+    """All steady motions on the branch that starts at `omega_start`, through its folds to `omega_end`.
+
+    Args:
+        model: see [`hdjax.response.balance`][], as for the other arguments of that name.
+        forcing: its omega is not used.
+        omega_start: forcing frequency to start from [rad/s]; away from a resonance the start needs no guess.
+        omega_end: where to stop [rad/s].
+        load_torque: torque on the load.
+        points: motions to return, even along the branch's length, so that a peak gets its share.
+        harmonics: highest multiple of the fundamental to keep.
+        samples: points of one period.
+        subharmonic: look for motions of this many forcing periods; needs a guess.
+        rotating: the motor turns at the forcing frequency.
+        guess: dynamic error to start from (reduced drives); the linearised response where not given.
+        steps: of the continuation, at most.
+    """
+    system = balance(
+        model,
+        forcing,
+        load_torque=load_torque,
+        harmonics=harmonics,
+        samples=samples,
+        subharmonic=subharmonic,
+        rotating=rotating,
+    )
+    return follow(system, "omega", omega_start, omega_end, guess=guess, points=points, steps=steps)
+
+
+def follow(
+    system: BalancedMotion,
+    parameter: str,
+    start: ArrayLike,
+    end: ArrayLike,
+    *,
+    omega: ArrayLike = 1.0,
+    guess: FourierSeries | None = None,
+    points: int = 1000,
+    steps: int = 200,
+) -> Branch:
+    """Follow steady motions in any parameter.
+
+    Args:
+        system: from [`hdjax.response.balance`][].
+        parameter: `"omega"`, `"amplitude"` (a factor on the forcing) or a parameter's dotted path such as `"K"`.
+        start: its first value.
+        end: its last value.
+        omega: forcing frequency [rad/s] where another parameter is followed.
+        guess: dynamic error to start from (reduced drives); the linearised response where not given.
+        points: motions to return.
+        steps: of the continuation, at most.
+    """
+    start, end, omega = as_scalar(start), as_scalar(end), as_scalar(omega)
+    return _follow(system, parameter, start, end, omega, guess, points, steps)
+
+
+@eqx.filter_jit
+def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branch:
+    scale = system.model.drive.omega_0 if parameter == "omega" else jnp.maximum(jnp.abs(start), jnp.abs(end))
+    nothing = jnp.zeros(0)
+    branch = Branch(system, parameter, scale, nothing, nothing, nothing, nothing, nothing, nothing)
+
+    def residual(u: Array, p: Array) -> Array:
+        return branch.residual(u, p, omega)
+
+    # The search itself is not differentiated; the correction of what it found is.
+    still, still_omega = jax.lax.stop_gradient((branch, omega))
+
+    first = start if parameter == "omega" else omega
+    u_0 = branch.at(start).linear(first) if guess is None else branch.at(start).unknowns(guess)
+    p_0, p_1 = start / scale, end / scale
+    start_and_end = jax.lax.stop_gradient((u_0, p_0, p_1))
+    found = _continued(lambda u, p: still.residual(u, p, still_omega), *start_and_end, steps)
+    count, complete = _end(found, p_0, p_1, _longest_step(p_0, p_1, steps))
+    path = jnp.concatenate([found.states, found.params[:, None]], axis=1)
+    predicted, tangents = _interpolated(path, found.tangents, count, p_1, points)
+    corrected, tangents, left = jax.vmap(_correct, in_axes=(None, 0, 0))(residual, predicted, tangents)
+    value = corrected[:, -1] * scale
+    return Branch(
+        system,
+        parameter,
+        scale,
+        value,
+        value if parameter == "omega" else jnp.full(points, 1.0) * omega,
+        corrected[:, :-1],
+        tangents,
+        found.converged[0] & (left < _SOLVED),
+        found.converged[0] & complete,
+    )
+
+
+def _end(found, p_0: Array, p_1: Array, step: Array) -> tuple[Array, Array]:
+    """How many points of a continuation are the branch, and whether it came to its end or back to its start."""
+    index = jnp.arange(found.params.size)
+    used = index < found.n_valid
+    distance = jnp.linalg.norm(found.states - found.states[0], axis=1) + jnp.abs(found.params - found.params[0])
+    back = used & (index > 8) & (distance < 0.75 * step) & (found.tangents @ found.tangents[0] > 0.5)
+    closed = jnp.any(back)
+    last = found.params[found.n_valid - 1]
+    reached = (last - p_1) * jnp.sign(p_1 - p_0) >= 0.0
+    return jnp.where(closed, jnp.argmax(back) + 1, found.n_valid), reached | closed
+
+
+def _interpolated(path: Array, tangents: Array, count: Array, p_1: Array, points: int) -> tuple[Array, Array]:
+    """Points evenly along a branch, by cubic Hermite interpolation over its chord length, and their tangents."""
+    used = jnp.arange(path.shape[0]) < count
+    chords = jnp.where(used[1:], jnp.linalg.norm(jnp.diff(path, axis=0), axis=1), 0.0)
+    length = jnp.concatenate([jnp.zeros(1), jnp.cumsum(chords)])
+    # The last step runs past the end of the range: stop at the end itself.
+    before, after = path[count - 2, -1], path[count - 1, -1]
+    fraction = jnp.where(after == before, 1.0, jnp.clip((p_1 - before) / (after - before), 0.0, 1.0))
+    overshoot = (after - p_1) * jnp.sign(after - before) > 0.0
+    end = length[-1] - jnp.where(overshoot, (1.0 - fraction) * chords[count - 2], 0.0)
+    at = jnp.linspace(0.0, 1.0, points) * end
+    left = jnp.clip(jnp.searchsorted(length, at, side="right") - 1, 0, count - 2)
+    h = chords[left][:, None]
+    s = ((at - length[left]) / chords[left])[:, None]
+    y_0, y_1, d_0, d_1 = path[left], path[left + 1], h * tangents[left], h * tangents[left + 1]
+    value = (1 + 2 * s) * (1 - s) ** 2 * y_0 + s**2 * (3 - 2 * s) * y_1 + s * (1 - s) ** 2 * d_0 - s**2 * (1 - s) * d_1
+    slope = 6 * s * (1 - s) * (y_1 - y_0) + (1 - s) * (1 - 3 * s) * d_0 - s * (2 - 3 * s) * d_1
+    return value, slope / jnp.linalg.norm(slope, axis=1, keepdims=True)
+
+
+def _correct(residual, point: Array, tangent: Array) -> tuple[Array, Array, Array]:
+    """Newton steps at right angles to the branch: the point, the branch's direction there, what is left over."""
+    nothing = jnp.zeros(1)
+    for _ in range(_CORRECTIONS):
+        u, p = point[:-1], point[-1]
+        by_unknowns, by_parameter = jax.jacfwd(residual, (0, 1))(u, p)
+        bordered = jnp.concatenate([jnp.column_stack([by_unknowns, by_parameter]), tangent[None]])
+        factors = lu_factor(bordered)
+        for _ in range(_CORRECTIONS):
+            left = residual(point[:-1], point[-1])
+            point = point - lu_solve(factors, jnp.concatenate([left, nothing]))
+        direction = lu_solve(factors, jnp.zeros_like(point).at[-1].set(1.0))
+        tangent = direction / jnp.linalg.norm(direction)
+    left = jnp.max(jnp.abs(residual(point[:-1], point[-1])))
+    finite = jnp.isfinite(left) & jnp.all(jnp.isfinite(point))
+    return jnp.where(finite, point, 0.0), jnp.where(finite, tangent, 0.0), jnp.where(finite, left, jnp.inf)
+
+
+@eqx.filter_jit
+def _branch_multipliers(branch: Branch) -> Array:
+    return jax.vmap(lambda v, w, u: multipliers(branch.at(v), u, w))(branch.value, branch.omega, branch.unknowns)
+
+
+@eqx.filter_jit
+def folds(branch: Branch, *, at_most: int = 4) -> Folds:
+    """Locate the folds of a branch; their values have gradients with respect to everything in `branch.system`.
+
+    Args:
+        branch: from [`frequency_response`][] or [`follow`][].
+        at_most: folds to look for, the first along the branch.
+    """
+    slope = branch.tangents[:, -1]
+    turns = (slope[1:] * slope[:-1] <= 0.0) & branch.valid[1:] & branch.valid[:-1]
+    (index,) = jnp.nonzero(turns, size=at_most, fill_value=0)
+    exists = jnp.arange(at_most) < jnp.sum(turns)
+    n = branch.unknowns.shape[1]
+
+    def locate(i: Array) -> tuple[Array, Array]:
+        # Where the branch turns back, its direction is the null vector.
+        guess = jnp.concatenate([branch.unknowns[i], branch.value[i, None] / branch.scale, branch.tangents[i, :-1]])
+
+        def residual(y: Array, given: tuple[BalancedMotion, Array]) -> Array:
+            return _fold_residual(eqx.tree_at(lambda b: b.system, branch, given[0]), y, given[1])
+
+        solver = optx.Newton(_FOLD_TOLERANCE, _FOLD_TOLERANCE)
+        given = (branch.system, branch.omega[i])
+        y = optx.root_find(residual, solver, jax.lax.stop_gradient(guess), given, max_steps=30, throw=False).value
+        left = jnp.max(jnp.abs(residual(y, given)))
+        return y, jnp.isfinite(left) & (left < _SOLVED)
+
+    y, converged = jax.vmap(locate)(index)
+    y = jnp.where((exists & converged)[:, None], y, 0.0)
+    return Folds(y[:, n] * branch.scale, y[:, :n], y[:, n + 1 :], exists & converged)
+
+
+def _fold_residual(branch: Branch, y: Array, omega: Array) -> Array:
+    """Zero where (unknowns, scaled parameter, null vector) are a fold (Seydel 2010, eq. 5.19)."""
+    n = branch.unknowns.shape[1]
+    u, p, v = y[:n], y[n], y[n + 1 :]
+    left, along = jax.jvp(lambda u: branch.residual(u, p, omega), (u,), (v,))
+    return jnp.concatenate([left, along, jnp.sum(v * v, keepdims=True) - 1.0])
+
+
+class FoldTrack(eqx.Module):
+    """A fold in the plane of two parameters: the edge of the region where several motions coexist.
+
+    Attributes:
+        second: the second parameter.
+        value: the branch's own parameter at the fold.
+        valid: which entries are folds.
+    """
+
+    second: Float[Array, " steps"]
+    value: Float[Array, " steps"]
+    valid: Bool[Array, " steps"]
+
+
+@eqx.filter_jit
+def follow_fold(
+    branch: Branch, fold: int, parameter: str, start: ArrayLike, end: ArrayLike, *, steps: int = 200
+) -> FoldTrack:
+    """Track a fold of a branch in a second parameter, through cusps.
+
+    Args:
+        branch: whose fold to track.
+        fold: its index in `folds(branch)`.
+        parameter: the second parameter, named as in [`follow`][].
+        start: its value in the branch.
+        end: where to stop.
+        steps: of the continuation, at most.
+    """
+    found = folds(branch)
+    start, end = as_scalar(start), as_scalar(end)
+    second = jnp.maximum(jnp.abs(start), jnp.abs(end))
+
+    def residual(y: Array, q: Array) -> Array:
+        moved = eqx.tree_at(lambda b: b.system, branch, branch.system.with_parameter(parameter, q * second))
+        return _fold_residual(moved, y, branch.omega[0])
+
+    y_0 = jnp.concatenate([found.unknowns[fold], found.value[fold, None] / branch.scale, found.null_vector[fold]])
+    track = _continued(residual, y_0, start / second, end / second, steps)
+    valid = (jnp.arange(steps + 1) < track.n_valid) & found.exists[fold]
+    return FoldTrack(track.params * second, track.states[:, branch.unknowns.shape[1]] * branch.scale, valid)
+
+
+def _continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int) -> ScanResult:
+    """JaxCont's pseudo-arclength continuation, with steps that suit unknowns and a parameter of order one."""
+    largest = _longest_step(p_0, p_1, steps)
+    # JaxCont mixes integer and floating types.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        return pseudo_arclength_scan(
+            residual, u_0, p_0, p_1, 0.1 * largest, 1e-6 * largest, largest, jnp.asarray(_TOLERANCE), steps, 8
+        )
+
+
+def _longest_step(p_0: Array, p_1: Array, steps: int) -> Array:
+    return 3.0 * (jnp.abs(p_1 - p_0) + 2.0) / steps
