@@ -38,7 +38,8 @@ class Trajectory(eqx.Module):
         return self.outputs[:, -1]
 
 
-def _no_torque(t: Array) -> Array:
+def no_torque(t: Array) -> Array:
+    """No torque at any time."""
     return jnp.zeros_like(t)
 
 
@@ -48,7 +49,7 @@ def simulate(
     times: Float[Array | np.ndarray, " n"],
     initial_state: State | None = None,
     *,
-    load_torque: Callable[[Array], Array] = _no_torque,
+    load_torque: Callable[[Array], Array] = no_torque,
     solver: dfx.AbstractSolver | None = None,
     step_size: float | None = None,
     rtol: float = 1e-8,
@@ -90,11 +91,7 @@ def simulate(
         ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal.
         SimulationError: with the [`Ending`][] that names cause and mend.
     """
-    actuators = [effect.name for effect in model.effects if isinstance(effect, ActuatorEffect)]
-    if actuators and not isinstance(forcing, PiecewisePolynomial):
-        raise ValueError(
-            f"`forcing` must be a sampled signal for {actuators} to act on, but is {type(forcing).__name__}"
-        )
+    require_sampled(model, forcing)
     if initial_state is None:
         initial_state = model.rest()
     trajectory = _simulate(
@@ -111,7 +108,21 @@ def simulate(
         dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         dfx.NoProgressMeter() if progress_meter is None else progress_meter,
     )
-    if throw and not isinstance(trajectory.ending, Tracer):
+    return raise_failure(trajectory) if throw else trajectory
+
+
+def require_sampled(model: Model, forcing: Callable[[Array], Array]) -> None:
+    """Refuse a forcing that the model's effects on the logged torque can't act on."""
+    actuators = [effect.name for effect in model.effects if isinstance(effect, ActuatorEffect)]
+    if actuators and not isinstance(forcing, PiecewisePolynomial):
+        raise ValueError(
+            f"`forcing` must be a sampled signal for {actuators} to act on, but is {type(forcing).__name__}"
+        )
+
+
+def raise_failure(trajectory: Trajectory) -> Trajectory:
+    """The trajectory, if it reached its end; inside a transformation nothing is known yet."""
+    if not isinstance(trajectory.ending, Tracer):
         worst = int(np.max(trajectory.ending))
         if worst != Ending.successful:
             raise SimulationError(Ending(worst))

@@ -1,0 +1,220 @@
+"""Feedforward compensation of the dynamic error: the torque and the motor angle that a periodic error asks for.
+
+The equations are solved backwards along one motor revolution: the motion that is wanted is prescribed, what the other
+coordinate must then do follows from the load's equation by harmonic balance, and the motor's equation gives the torque.
+"""
+
+from typing import Any, ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from hdjax.drive import Drive
+from hdjax.dynamics import TwoInertiaModel
+from hdjax.effects import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
+from hdjax.fourier import FourierSeries, fourier_series, harmonic_series
+from hdjax.parameters import Scalar, as_scalar, parameter
+from hdjax.simulate import Trajectory, simulate
+
+Target = Literal["dynamic_error", "output"]
+_TOLERANCE = 1e-12
+_SOLVED = 1e-9
+
+
+class Feedforward(eqx.Module):
+    """What the motor must do so that an error vanishes at constant speed.
+
+    Attributes:
+        speed: mean motor rate [rad/s].
+        correction: of the motor angle, around `speed * t` [rad, motor side].
+        torque: motor torque along that motion [N m].
+        dynamic_error: what is left of x = theta_m/N - theta_l [rad].
+        output_error: what is left of the load's distance from its mean rotation [rad].
+        converged: whether the equations were solved.
+    """
+
+    speed: Float[Array, ""]
+    correction: FourierSeries
+    torque: FourierSeries
+    dynamic_error: FourierSeries
+    output_error: FourierSeries
+    converged: Bool[Array, ""]
+
+    def motor_angle(self, t: Array) -> Array:
+        """The motor angle to command at time t [rad]."""
+        return self.speed * t + self.correction(t)
+
+
+@eqx.filter_jit
+def feedforward(
+    model: TwoInertiaModel,
+    speed: ArrayLike,
+    *,
+    target: Target = "dynamic_error",
+    load_torque: ArrayLike = 0.0,
+    harmonics: int = 12,
+    samples: int = 64,
+) -> Feedforward:
+    """The motor torque and angle under which an error vanishes at a constant mean speed.
+
+    Args:
+        model: the drive with its kinematic error and other effects without memory.
+        speed: mean motor rate [rad/s].
+        target: `"dynamic_error"`: x stands still, motor and load swing together. `"output"`: the load turns
+            uniformly, and the motor moves against the kinematic error.
+        load_torque: constant torque on the load along +theta_l [N m].
+        harmonics: of the motor revolution to keep.
+        samples: of a revolution at which forces are evaluated; above twice the harmonics.
+
+    Raises:
+        ValueError: where an effect has memory or turns with the output.
+    """
+    for effect in model.effects:
+        if effect.states or isinstance(effect, LoadSideEffect):
+            raise ValueError(f"`{effect.name}` has memory or turns with the output: no period of a motor revolution")
+    if samples <= 2 * harmonics:
+        raise ValueError(f"`samples` must be above {2 * harmonics}, but is {samples}")
+    speed, load_torque = as_scalar(speed), as_scalar(load_torque)
+    drive = model.drive
+
+    def motion(unknowns: Array, speed: Array) -> tuple[FourierSeries, FourierSeries]:
+        """x and the load's swing: the mean of x, then the cosines and sines of the coordinate that is not held."""
+        free = FourierSeries(speed, jnp.zeros(()), unknowns[1 : harmonics + 1], unknowns[harmonics + 1 :])
+        held = FourierSeries(speed, jnp.zeros(()), jnp.zeros(harmonics), jnp.zeros(harmonics))
+        x, swing = (held, free) if target == "dynamic_error" else (free, held)
+        return FourierSeries(speed, unknowns[0], x.cosine, x.sine), swing
+
+    def torques(model: TwoInertiaModel, x: FourierSeries, swing: FourierSeries, load_torque: Array) -> Array:
+        """By sample: what the load lacks, and what the motor must give [N m]."""
+        drive = model.drive
+        t = jnp.arange(samples) * (2 * np.pi / samples) / x.omega
+        rates = [(s, s.derivative(), s.derivative().derivative()) for s in (x, swing)]
+        (x_0, x_1, x_2), (y_0, y_1, y_2) = ([s(t) for s in series] for series in rates)
+        states = jnp.stack(
+            [
+                drive.N * (x_0 + y_0) + x.omega * t,
+                y_0 + x.omega * t / drive.N,
+                drive.N * (x_1 + y_1) + x.omega,
+                y_1 + x.omega / drive.N,
+            ],
+            axis=1,
+        )
+        no_torque = jnp.zeros_like(t)
+        free = jax.vmap(model.rates)(states, no_torque, jnp.full(samples, 1.0) * load_torque)
+        return jnp.stack([drive.J_l * (y_2 - free[:, 3]), drive.J_m * (drive.N * (x_2 + y_2) - free[:, 2])])
+
+    length = jnp.maximum(jnp.max(jnp.abs(_geometry(model))), jnp.abs(load_torque) / drive.K)
+    length = jnp.where(length > 0.0, length, 1.0)
+
+    def residual(unknowns: Array, given: Any) -> Array:
+        model, speed, load_torque, length = given
+        lacking = torques(model, *motion(length * unknowns, speed), load_torque)[0]
+        series = fourier_series(speed, lacking / (model.drive.K * length), harmonics)
+        return jnp.concatenate([series.mean[None], series.cosine, series.sine])
+
+    given = (model, speed, load_torque, length)
+    start = jnp.zeros(2 * harmonics + 1)
+    solver = optx.Newton(_TOLERANCE, _TOLERANCE)
+    unknowns = optx.root_find(residual, solver, start, given, max_steps=50, throw=False).value
+    left = jnp.max(jnp.abs(residual(unknowns, given)))
+    converged = jnp.isfinite(left) & (left < _SOLVED)
+    x, swing = motion(jnp.where(converged, length * unknowns, 0.0), speed)
+    torque = fourier_series(speed, torques(model, x, swing, load_torque)[1], harmonics)
+    correction = FourierSeries(
+        speed, drive.N * x.mean, drive.N * (x.cosine + swing.cosine), drive.N * (x.sine + swing.sine)
+    )
+    return Feedforward(speed, correction, torque, x, swing, converged)
+
+
+def _geometry(model: TwoInertiaModel) -> Array:
+    """The mesh's kinematic error over a motor revolution [rad]."""
+    angles = jnp.arange(64) * (2 * np.pi / 64)
+    at = jax.vmap(lambda a: model.motion(jnp.zeros(4).at[0].set(a)).x - a / model.drive.N)
+    return at(angles)
+
+
+class MotorServo(MotorSideEffect):
+    """A position servo on the motor: torque `stiffness (theta_command - theta_m) + damping (its rate)`.
+
+    The command is a function of time and enters with the motor torque, see [`ServoTorque`][].
+    """
+
+    family: ClassVar[str] = "servo"
+    name: ClassVar[str] = "motor_servo"
+
+    stiffness: Scalar = parameter(unit="N m/rad", doc="position gain, motor side", bounds=(0.0, 1e9))
+    damping: Scalar = parameter(unit="N m s/rad", doc="rate gain, motor side", bounds=(0.0, 1e9))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        """None: a servo is known to whoever closed the loop."""
+        return ()
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.stiffness * motion.theta_m - self.damping * motion.omega_m
+
+
+class ServoTorque(eqx.Module):
+    """The part of a servo's motor torque that is a function of time: what the command asks for, and the feedforward.
+
+    Attributes:
+        servo: its gains.
+        speed: mean motor rate that is commanded [rad/s].
+        correction: of the commanded motor angle, around `speed * t` [rad].
+        feedforward: torque added to the servo's [N m].
+    """
+
+    servo: MotorServo
+    speed: Array = eqx.field(converter=as_scalar)
+    correction: FourierSeries
+    feedforward: FourierSeries
+
+    def __call__(self, t: Array) -> Array:
+        angle = self.speed * t + self.correction(t)
+        rate = self.speed + self.correction.derivative()(t)
+        return self.servo.stiffness * angle + self.servo.damping * rate + self.feedforward(t)
+
+
+def run_at_speed(
+    plant: TwoInertiaModel,
+    speed: ArrayLike,
+    times: Float[Array | np.ndarray, " n"],
+    servo: MotorServo,
+    *,
+    correction: Feedforward | None = None,
+    use: tuple[Literal["torque", "motor_angle"], ...] = ("torque", "motor_angle"),
+    load_torque: ArrayLike = 0.0,
+) -> Trajectory:
+    """Simulate a drive whose motor a servo turns at constant speed, with or without feedforward.
+
+    The drive starts as if it had rotated rigidly; drop the transient before you compare.
+
+    Args:
+        plant: the true drive.
+        speed: motor rate that is commanded [rad/s].
+        times: where to save [s].
+        servo: the motor's position servo.
+        correction: from [`feedforward`][], of a model that may differ from the plant; none where not given.
+        use: whether the servo is given the corrected motor angle, the torque, or both. The torque alone helps where
+            the servo is soft (it holds against the motion that is wanted), the angle alone where it is stiff.
+        load_torque: constant torque on the load along +theta_l [N m].
+    """
+    speed = as_scalar(speed)
+    nothing = harmonic_series(speed, jnp.zeros(1 if correction is None else correction.torque.harmonics))
+    angle = torque = nothing
+    if correction is not None:
+        angle = correction.correction if "motor_angle" in use else nothing
+        torque = correction.torque if "torque" in use else nothing
+    return simulate(
+        plant.with_effects(servo),
+        ServoTorque(servo, speed, angle, torque),
+        times,
+        jnp.stack([jnp.zeros(()), jnp.zeros(()), speed, speed / plant.drive.N]),
+        load_torque=harmonic_series(speed, 0.0, mean=load_torque),
+        rtol=1e-9,
+        atol=1e-12,
+    )
