@@ -1,0 +1,275 @@
+"""The check of the analytic amplitudes: multiple scales against harmonic balance against time integration."""
+
+import dataclasses
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.dynamics import ReducedModel
+from hdjax.fourier import FourierSeries, harmonic_series
+from hdjax.parameters import as_scalar
+from hdjax.response.floquet import is_stable, multipliers
+from hdjax.response.harmonic_balance import balance, solve
+from hdjax.response.multiple_scales import (
+    PrimaryResonance,
+    Resonance,
+    SubharmonicResonance,
+    SuperharmonicResonance,
+    first_order,
+    second_order,
+)
+from hdjax.response.shooting import shoot, steady_series
+
+Kind = Literal["off-resonance", "primary", "super-harmonic", "sub-harmonic"]
+KINDS: dict[Kind, type[Resonance]] = {
+    "primary": PrimaryResonance,
+    "super-harmonic": SuperharmonicResonance,
+    "sub-harmonic": SubharmonicResonance,
+}
+GOOD = (0.01, 0.05, 0.10)
+"""Relative errors that a verdict tells apart."""
+
+_NEAR = 0.3
+_AGREEMENT = 1e-6
+_HARMONICS = 15
+_SLOTS = ("lower", "middle", "upper")
+
+
+@dataclasses.dataclass(frozen=True)
+class AmplitudeRow:
+    """One steady motion, by four routes; amplitudes are the largest |x| over a period [rad].
+
+    Attributes:
+        branch: which of the coexisting motions; for the sub-harmonic resonance the lower is the motion without it.
+        stable: whether its Floquet multipliers lie inside the unit circle.
+        first_order: multiple scales, first order.
+        second_order: multiple scales, second order; None where it has no such motion.
+        balance: harmonic balance; None where it has no such motion.
+        time: time integration over one period from a closed orbit (shooting); None where there is none.
+    """
+
+    branch: str
+    stable: bool
+    first_order: float
+    second_order: float | None
+    balance: float | None
+    time: float | None
+
+    @property
+    def error(self) -> float | None:
+        """Relative error of first-order multiple scales."""
+        return _relative(self.first_order, self.time)
+
+    @property
+    def second_order_error(self) -> float | None:
+        """Relative error of second-order multiple scales."""
+        return _relative(self.second_order, self.time)
+
+    @property
+    def agreement(self) -> float | None:
+        """Relative difference of harmonic balance and time integration."""
+        return _relative(self.balance, self.time)
+
+    @property
+    def verdict(self) -> str:
+        """What the check says of the analytic amplitude."""
+        if self.error is None or self.agreement is None:
+            return "fails: no motion near it"
+        if self.agreement > _AGREEMENT:
+            return "undecided: the two numerical routes differ"
+        for level in GOOD:
+            if self.error <= level:
+                return f"holds to {level:.0%}"
+        return f"fails by {self.error:.0%}"
+
+
+def _relative(value: float | None, truth: float | None) -> float | None:
+    return None if value is None or truth is None or truth == 0.0 else abs(value / truth - 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class AmplitudeCheck:
+    """All steady motions at one forcing frequency, analytic against numeric.
+
+    Attributes:
+        omega: forcing frequency [rad/s].
+        A: forcing amplitude [rad/s^2].
+        kind: which expansion applies.
+        rows: the motions.
+    """
+
+    omega: float
+    A: float
+    kind: Kind
+    rows: tuple[AmplitudeRow, ...]
+
+
+def resonance_kind(omega_0: float, omega: float) -> Kind:
+    """Which expansion applies: a resonance within 30 % of its centre, else off resonance."""
+    if abs(omega / omega_0 - 1.0) <= _NEAR:
+        return "primary"
+    if abs(3.0 * omega / omega_0 - 1.0) <= _NEAR:
+        return "super-harmonic"
+    if abs(omega / (3.0 * omega_0) - 1.0) <= _NEAR:
+        return "sub-harmonic"
+    return "off-resonance"
+
+
+def check_amplitudes(
+    drive: Drive | ReducedDrive, A: float, omega: float, *, harmonics: int = _HARMONICS
+) -> AmplitudeCheck:
+    """Compare the analytic amplitudes with two independent numerical routes at one frequency.
+
+    Args:
+        drive: gives mu, omega_0 and alpha.
+        A: amplitude of the forcing `A cos(omega t)` as an acceleration [rad/s^2], see [`hdjax.Drive.error_forcing`][].
+        omega: forcing frequency [rad/s].
+        harmonics: of the forcing frequency in harmonic balance.
+    """
+    kind = resonance_kind(float(drive.omega_0), omega)
+    # Off resonance the super-harmonic's expansion holds too: its third harmonic is then merely not resonant.
+    resonance = KINDS.get(kind, SuperharmonicResonance)
+    reduced = ReducedDrive(mu=drive.mu, omega_0=drive.omega_0, alpha=drive.alpha)
+    found = _check(resonance(reduced, A), as_scalar(omega), harmonics)
+    existing = np.flatnonzero(np.asarray(found.exists))
+    rows = []
+    for slot in existing:
+        first = float(found.first_order[slot])
+        if kind == "off-resonance":
+            first = abs(A / (float(drive.omega_0) ** 2 - omega**2))
+        rows.append(
+            AmplitudeRow(
+                branch=_SLOTS[slot] if existing.size > 1 else "only",
+                stable=bool(found.stable[slot]),
+                first_order=first,
+                second_order=float(found.second_order[slot]) if found.second_exists[slot] else None,
+                balance=float(found.balance[slot]) if found.balanced[slot] else None,
+                time=float(found.time[slot]) if found.closed[slot] else None,
+            )
+        )
+    return AmplitudeCheck(float(omega), float(A), kind, tuple(rows))
+
+
+class _Found(eqx.Module):
+    exists: Bool[Array, "3"]
+    first_order: Float[Array, "3"]
+    second_exists: Bool[Array, "3"]
+    second_order: Float[Array, "3"]
+    balanced: Bool[Array, "3"]
+    balance: Float[Array, "3"]
+    closed: Bool[Array, "3"]
+    time: Float[Array, "3"]
+    stable: Bool[Array, "3"]
+
+
+@eqx.filter_jit
+def _check(resonance: Resonance, omega: Array, harmonics: int) -> _Found:
+    model = ReducedModel(resonance.drive)
+    forcing = harmonic_series(omega, resonance.A)
+    periods = resonance.forcing
+    system = balance(model, forcing, harmonics=harmonics * periods, subharmonic=periods)
+    first, second = first_order(resonance, omega), second_order(resonance, omega)
+
+    def numeric(slot: Array) -> tuple[Array, ...]:
+        guess = _where(second.branches.exists[slot], second.series(slot), first.series(slot))
+        steady = solve(system, omega, guess)
+        x = steady.x
+        start = jnp.stack([x(jnp.zeros(())), x.derivative()(jnp.zeros(()))])
+        orbit = shoot(model, forcing, start, periods=periods)
+        series = steady_series(model, forcing, orbit, harmonics=harmonics * periods)
+        stable = is_stable(multipliers(system, system.unknowns(x), omega))
+        return steady.converged, x.largest(), orbit.converged & steady.converged, series.largest(), stable
+
+    balanced, size, closed, time, stable = jax.vmap(numeric)(jnp.arange(3))
+    return _Found(
+        first.branches.exists,
+        first.harmonics.largest(),
+        second.branches.exists,
+        second.harmonics.largest(),
+        balanced,
+        size,
+        closed,
+        time,
+        stable & balanced,
+    )
+
+
+def _where(condition: Array, a: FourierSeries, b: FourierSeries) -> FourierSeries:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+class ErrorMap(eqx.Module):
+    """Where multiple scales holds: its relative error in the largest |x|, against harmonic balance.
+
+    Attributes:
+        sigma: detuning over omega_0.
+        strength: `alpha a^2` at the primary resonance (a: the analytic amplitude), `alpha C^2` at the others.
+        mu: damping over omega_0.
+        first_order: relative error of first order, infinite where there is no such motion.
+        second_order: likewise of second order.
+    """
+
+    sigma: Float[Array, " sigmas"]
+    strength: Float[Array, " strengths"]
+    mu: Float[Array, " mus"]
+    first_order: Float[Array, "mus strengths sigmas"]
+    second_order: Float[Array, "mus strengths sigmas"]
+
+
+def error_map(
+    kind: Literal["primary", "super-harmonic"],
+    sigma: ArrayLike,
+    strength: ArrayLike,
+    mu: ArrayLike,
+    *,
+    harmonics: int = _HARMONICS,
+) -> ErrorMap:
+    """The error of multiple scales over detuning, nonlinearity and damping, for any drive: all in units of omega_0.
+
+    Args:
+        kind: the resonance. At the primary one each point is the motion of the given amplitude at the given
+            detuning (the forcing follows from them); at the super-harmonic the largest stable one.
+        sigma: detunings over omega_0.
+        strength: `alpha a^2` or `alpha C^2`; may be negative for a softening drive.
+        mu: dampings over omega_0.
+        harmonics: of the forcing frequency in harmonic balance.
+    """
+    sigma, strength, mu = (jnp.atleast_1d(jnp.asarray(v, dtype=float)) for v in (sigma, strength, mu))
+    grid = jnp.meshgrid(mu, strength, sigma, indexing="ij")
+    flat = [g.reshape(-1) for g in grid]
+    first, second = _errors(KINDS[kind], harmonics, *flat)
+    return ErrorMap(sigma, strength, mu, first.reshape(grid[0].shape), second.reshape(grid[0].shape))
+
+
+@eqx.filter_jit
+def _errors(resonance_class: type[Resonance], harmonics: int, mu: Array, strength: Array, sigma: Array):
+    def at(mu: Array, strength: Array, sigma: Array) -> tuple[Array, Array]:
+        drive = ReducedDrive(mu=mu, omega_0=1.0, alpha=strength)
+        if resonance_class is PrimaryResonance:
+            # The amplitude is one: the frequency response gives the forcing that makes it so.
+            A = 2.0 * jnp.hypot(0.5 * mu, sigma - 0.375 * strength)
+        else:
+            A = 1.0 - resonance_class(drive, 1.0).omega(0.0) ** 2
+        resonance = resonance_class(drive, A)
+        omega = resonance.omega(sigma)
+        first, second = first_order(resonance, omega), second_order(resonance, omega)
+        sizes = first.harmonics.largest()
+        if resonance_class is PrimaryResonance:
+            slot = jnp.argmin(jnp.where(first.branches.exists, jnp.abs(first.branches.amplitude - 1.0), jnp.inf))
+        else:
+            slot = jnp.argmax(jnp.where(first.branches.stable, first.branches.amplitude, -1.0))
+        refined = second.branches.exists[slot]
+        guess = _where(refined, second.series(slot), first.series(slot))
+        system = balance(ReducedModel(drive), harmonic_series(1.0, A), harmonics=harmonics)
+        steady = solve(system, omega, guess)
+        truth = jnp.where(steady.converged, steady.x.largest(), 1.0)
+        errors = [jnp.abs(s / truth - 1.0) for s in (sizes[slot], second.harmonics.largest()[slot])]
+        first_error = jnp.where(steady.converged, errors[0], jnp.inf)
+        return first_error, jnp.where(steady.converged & refined, errors[1], jnp.inf)
+
+    return jax.lax.map(lambda v: at(*v), (mu, strength, sigma), batch_size=256)
