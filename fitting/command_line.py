@@ -1,4 +1,4 @@
-"""The command line: `hdjax fit | close-loop | predict | simulate | demo`."""
+"""The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds`."""
 
 import os
 import sys
@@ -25,6 +25,7 @@ from fitting.free_run import WINDOW, free_run
 from fitting.logs import read_log
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
+from fitting.response_commands import amplitudes, seed_tables, speeds
 from fitting.rig import Rig, experiment, read_rig
 from hdjax import (
     PRESETS,
@@ -42,6 +43,9 @@ app = cyclopts.App(
     name="hdjax",
     help="The dynamic error of harmonic drives: simulate it, fit it to logs, and find what the model lacks.",
 )
+app.command(amplitudes)
+app.command(seed_tables)
+app.command(speeds)
 
 Logs = Annotated[list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5 or Parquet.", negative="")]
 DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]

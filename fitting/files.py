@@ -6,22 +6,22 @@ from collections.abc import Mapping
 from pathlib import Path
 
 
-def write_whole(texts: Mapping[Path, str]) -> None:
-    """Write several text files so that either all of them are whole or none was touched.
+def write_whole(contents: Mapping[Path, str | bytes]) -> None:
+    """Write several files so that either all of them are whole or none was touched.
 
     Each is written beside its destination under a temporary name first; only when all are complete are they renamed.
 
     Args:
-        texts: content by path; missing folders are made.
+        contents: text or bytes by path; missing folders are made.
     """
     waiting: list[tuple[str, Path]] = []
     try:
-        for path, text in texts.items():
+        for path, content in contents.items():
             path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
             waiting.append((name, path))
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
+            with os.fdopen(handle, "wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
             # mkstemp makes files that only the owner reads; a report is an ordinary file.
             os.chmod(name, 0o644)
         while waiting:

@@ -51,7 +51,7 @@ class FourierSeries(eqx.Module):
 
     def derivative(self) -> "FourierSeries":
         """The series of the time derivative."""
-        rates = self.omega * jnp.arange(1.0, self.harmonics + 1.0)
+        rates = jnp.broadcast_to(self.omega * jnp.arange(1.0, self.harmonics + 1.0), self.sine.shape)
         return FourierSeries(self.omega, jnp.zeros_like(self.mean), rates * self.sine, -rates * self.cosine)
 
     def largest(self) -> Float[Array, "*coordinates"]:
@@ -60,14 +60,16 @@ class FourierSeries(eqx.Module):
         def of_one(mean: Array, cosine: Array, sine: Array) -> Array:
             wave = FourierSeries(1.0, mean, cosine, sine)
             samples = wave.values(8 * (self.harmonics + 1))
-            t = jnp.argmax(jnp.abs(samples)) * (2 * jnp.pi / samples.size)
+            # From every sample: of two tops alike, the higher may lie further from its nearest sample.
+            t = jnp.arange(float(samples.size)) * (2 * jnp.pi / samples.size)
             slope = wave.derivative()
             curvature = slope.derivative()
             for _ in range(3):
                 bend = curvature(t)
                 t = t - jnp.where(bend == 0.0, 0.0, slope(t) / jnp.where(bend == 0.0, 1.0, bend))
-            # The slope is zero there: how the instant moves does not matter.
-            return jnp.abs(wave(jax.lax.stop_gradient(t)))
+            # The slope is zero there: how the instant moves does not matter. Newton may leave a flat top for a dip.
+            tops = jnp.concatenate([wave(jax.lax.stop_gradient(t)), samples])
+            return jnp.max(jnp.abs(tops))
 
         flat = self.mean.reshape(-1), *(c.reshape(-1, self.harmonics) for c in (self.cosine, self.sine))
         return jax.vmap(of_one)(*flat).reshape(self.mean.shape)
@@ -83,9 +85,10 @@ class FourierSeries(eqx.Module):
         """The function at `samples` equal steps of one period; the first is t = 0."""
         if samples <= 2 * self.harmonics:
             raise ValueError(f"`samples` must be above {2 * self.harmonics}, but is {samples}")
-        first = self.mean[..., None].astype(complex)
-        spectrum = jnp.concatenate([first, 0.5 * (self.cosine - 1j * self.sine)], axis=-1)
-        return jnp.fft.irfft(spectrum * samples, n=samples, axis=-1)
+        first = self.mean[..., None]
+        real = jnp.concatenate([first, 0.5 * self.cosine], axis=-1)
+        imaginary = jnp.concatenate([jnp.zeros_like(first), -0.5 * self.sine], axis=-1)
+        return jnp.fft.irfft(jax.lax.complex(real, imaginary) * samples, n=samples, axis=-1)
 
 
 def harmonic_series(

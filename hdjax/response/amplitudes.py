@@ -1,6 +1,7 @@
 """The check of the analytic amplitudes: multiple scales against harmonic balance against time integration."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
@@ -26,7 +27,7 @@ from hdjax.response.multiple_scales import (
 from hdjax.response.shooting import shoot, steady_series
 
 Kind = Literal["off-resonance", "primary", "super-harmonic", "sub-harmonic"]
-KINDS: dict[Kind, type[Resonance]] = {
+KINDS: dict[Kind, Callable[[Drive | ReducedDrive, ArrayLike], Resonance]] = {
     "primary": PrimaryResonance,
     "super-harmonic": SuperharmonicResonance,
     "sub-harmonic": SubharmonicResonance,
@@ -134,8 +135,7 @@ def check_amplitudes(
     kind = resonance_kind(float(drive.omega_0), omega)
     # Off resonance the super-harmonic's expansion holds too: its third harmonic is then merely not resonant.
     resonance = KINDS.get(kind, SuperharmonicResonance)
-    reduced = ReducedDrive(mu=drive.mu, omega_0=drive.omega_0, alpha=drive.alpha)
-    found = _check(resonance(reduced, A), as_scalar(omega), harmonics)
+    found = _check(resonance(drive, A), as_scalar(omega), harmonics)
     existing = np.flatnonzero(np.asarray(found.exists))
     rows = []
     for slot in existing:
@@ -169,7 +169,8 @@ class _Found(eqx.Module):
 
 @eqx.filter_jit
 def _check(resonance: Resonance, omega: Array, harmonics: int) -> _Found:
-    model = ReducedModel(resonance.drive)
+    drive = resonance.drive
+    model = ReducedModel(ReducedDrive(mu=drive.mu, omega_0=drive.omega_0, alpha=drive.alpha))
     forcing = harmonic_series(omega, resonance.A)
     periods = resonance.forcing
     system = balance(model, forcing, harmonics=harmonics * periods, subharmonic=periods)
@@ -247,19 +248,19 @@ def error_map(
 
 
 @eqx.filter_jit
-def _errors(resonance_class: type[Resonance], harmonics: int, mu: Array, strength: Array, sigma: Array):
+def _errors(expansion: Callable[..., Resonance], harmonics: int, mu: Array, strength: Array, sigma: Array):
     def at(mu: Array, strength: Array, sigma: Array) -> tuple[Array, Array]:
         drive = ReducedDrive(mu=mu, omega_0=1.0, alpha=strength)
-        if resonance_class is PrimaryResonance:
+        if expansion is PrimaryResonance:
             # The amplitude is one: the frequency response gives the forcing that makes it so.
             A = 2.0 * jnp.hypot(0.5 * mu, sigma - 0.375 * strength)
         else:
-            A = 1.0 - resonance_class(drive, 1.0).omega(0.0) ** 2
-        resonance = resonance_class(drive, A)
+            A = 1.0 - expansion(drive, 1.0).omega(0.0) ** 2
+        resonance = expansion(drive, A)
         omega = resonance.omega(sigma)
         first, second = first_order(resonance, omega), second_order(resonance, omega)
         sizes = first.harmonics.largest()
-        if resonance_class is PrimaryResonance:
+        if expansion is PrimaryResonance:
             slot = jnp.argmin(jnp.where(first.branches.exists, jnp.abs(first.branches.amplitude - 1.0), jnp.inf))
         else:
             slot = jnp.argmax(jnp.where(first.branches.stable, first.branches.amplitude, -1.0))

@@ -16,11 +16,12 @@ from hdjax.dynamics import Model
 from hdjax.fourier import FourierSeries
 from hdjax.parameters import as_scalar
 from hdjax.response.floquet import is_stable, multipliers
-from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance
+from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance, find_root
 
 _TOLERANCE = 1e-9
 _SOLVED = 1e-8
 _CORRECTIONS = 2
+_ITERATIONS = 8
 _FOLD_TOLERANCE = 1e-11
 
 
@@ -165,6 +166,9 @@ def follow(
         steps: of the continuation, at most.
     """
     start, end, omega = as_scalar(start), as_scalar(end), as_scalar(omega)
+    if guess is not None and system.subharmonic > 1:
+        # The linear resonance's amplitude can be far from that of a sub-harmonic motion.
+        system = eqx.tree_at(lambda s: s.length, system, guess.largest())
     return _follow(system, parameter, start, end, omega, guess, points, steps)
 
 
@@ -181,7 +185,7 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
     still, still_omega = jax.lax.stop_gradient((branch, omega))
 
     first = start if parameter == "omega" else omega
-    u_0 = branch.at(start).linear(first) if guess is None else branch.at(start).unknowns(guess)
+    u_0, _ = find_root(branch.at(start), first, guess)
     p_0, p_1 = start / scale, end / scale
     start_and_end = jax.lax.stop_gradient((u_0, p_0, p_1))
     found = _continued(lambda u, p: still.residual(u, p, still_omega), *start_and_end, steps)
@@ -207,8 +211,9 @@ def _end(found, p_0: Array, p_1: Array, step: Array) -> tuple[Array, Array]:
     """How many points of a continuation are the branch, and whether it came to its end or back to its start."""
     index = jnp.arange(found.params.size)
     used = index < found.n_valid
-    distance = jnp.linalg.norm(found.states - found.states[0], axis=1) + jnp.abs(found.params - found.params[0])
-    back = used & (index > 8) & (distance < 0.75 * step) & (found.tangents @ found.tangents[0] > 0.5)
+    distance = jnp.linalg.norm(found.states - found.states[:1], axis=1) + jnp.abs(found.params - found.params[0])
+    away = jnp.cumsum(jnp.where(distance > step, 1, 0)) > 0
+    back = used & away & (distance < 0.75 * step) & (found.tangents @ found.tangents[0] > 0.5)
     closed = jnp.any(back)
     last = found.params[found.n_valid - 1]
     reached = (last - p_1) * jnp.sign(p_1 - p_0) >= 0.0
@@ -226,7 +231,7 @@ def _interpolated(path: Array, tangents: Array, count: Array, p_1: Array, points
     overshoot = (after - p_1) * jnp.sign(after - before) > 0.0
     end = length[-1] - jnp.where(overshoot, (1.0 - fraction) * chords[count - 2], 0.0)
     at = jnp.linspace(0.0, 1.0, points) * end
-    left = jnp.clip(jnp.searchsorted(length, at, side="right") - 1, 0, count - 2)
+    left = jnp.clip(jnp.astype(jnp.searchsorted(length, at, side="right"), int) - 1, 0, count - 2)
     h = chords[left][:, None]
     s = ((at - length[left]) / chords[left])[:, None]
     y_0, y_1, d_0, d_1 = path[left], path[left + 1], h * tangents[left], h * tangents[left + 1]
@@ -345,9 +350,10 @@ def _continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int) -> Scan
     largest = _longest_step(p_0, p_1, steps)
     # JaxCont mixes integer and floating types.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        return pseudo_arclength_scan(
-            residual, u_0, p_0, p_1, 0.1 * largest, 1e-6 * largest, largest, jnp.asarray(_TOLERANCE), steps, 8
+        found = pseudo_arclength_scan(
+            residual, u_0, p_0, p_1, 0.1 * largest, 1e-6 * largest, largest, jnp.asarray(_TOLERANCE), steps, _ITERATIONS
         )
+    return found._replace(n_valid=jnp.astype(found.n_valid, int))
 
 
 def _longest_step(p_0: Array, p_1: Array, steps: int) -> Array:

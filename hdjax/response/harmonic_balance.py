@@ -106,7 +106,7 @@ class BalancedMotion(eqx.Module):
         position, velocity = coefficients @ basis, fundamental * (coefficients @ slope)
         acceleration = self._accelerations(position, velocity, omega, mean_torque)
         inertial = jnp.zeros((self.coordinates, projection.shape[1]))
-        inertial = inertial.at[:, : orders.size].set(-((orders * fundamental) ** 2) * coefficients)
+        inertial = inertial.at[:, : orders.size].set(-((orders[None] * fundamental) ** 2) * coefficients)
         return (inertial - acceleration @ projection) / (self.length * self.model.drive.omega_0**2)
 
     def _coefficients(self, unknowns: Array) -> tuple[Array, Array]:
@@ -119,7 +119,7 @@ class BalancedMotion(eqx.Module):
 
     def _accelerations(self, position: Array, velocity: Array, omega: Array, mean_torque: Array) -> Array:
         """Each coordinate's acceleration at the samples, from the model's own rates."""
-        angles = jnp.arange(self.samples) * (2 * np.pi / self.samples)
+        angles = jnp.arange(float(self.samples)) * (2 * np.pi / self.samples)
         # In time units in which the forcing's frequency is one.
         torque, load_torque = (
             FourierSeries(1.0, s.mean, s.cosine, s.sine)(self.subharmonic * angles)
@@ -142,7 +142,7 @@ class BalancedMotion(eqx.Module):
         if self.coordinates == 1:
             return jnp.concatenate([q, q_rate])
         N = self._ratio
-        turned, speed = (angle, omega) if self.rotating else (0.0, 0.0)
+        turned, speed = (self.subharmonic * angle, omega) if self.rotating else (0.0, 0.0)
         return jnp.stack(
             [N * (q[0] + q[1]) + turned, q[1] + turned / N, N * (q_rate[0] + q_rate[1]) + speed, q_rate[1] + speed / N]
         )
@@ -235,7 +235,7 @@ def balance(
     drive = model.drive
     still = jnp.zeros(system.coordinates * (2 * harmonics + 1))
     push = jnp.max(jnp.abs(system.residual(still, drive.omega_0)))
-    length = push * drive.omega_0 / jnp.maximum(drive.mu, 1e-3 * drive.omega_0)
+    length = push * drive.omega_0 / jnp.maximum(drive.mu, 1e-6 * drive.omega_0)
     return eqx.tree_at(lambda s: s.length, system, jnp.where(length > 0, length, 1.0))
 
 
@@ -254,6 +254,14 @@ def solve(
         max_steps: where to give up.
     """
     omega = as_scalar(omega)
+    unknowns, solved = find_root(system, omega, guess, max_steps)
+    return system.steady_state(unknowns, omega, solved)
+
+
+def find_root(
+    system: BalancedMotion, omega: Array, guess: FourierSeries | None, max_steps: int = 64
+) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
+    """[`solve`][] in the system's own unknowns, and whether they solve it."""
     start = system.linear(omega) if guess is None else system.unknowns(guess)
 
     def residual(unknowns: Array, args: Any) -> Array:
@@ -273,7 +281,7 @@ def solve(
     best = jax.lax.stop_gradient(jnp.where(jnp.any(solved), roots[jnp.argmax(solved)], jnp.zeros_like(start)))
     unknowns, _ = root(best)
     unknowns = jnp.where(jnp.any(solved), unknowns, best)
-    return system.steady_state(unknowns, omega, jnp.any(solved))
+    return unknowns, jnp.any(solved)
 
 
 def _waves(harmonics: int, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -285,5 +293,5 @@ def _waves(harmonics: int, samples: int) -> tuple[np.ndarray, np.ndarray, np.nda
     slope = np.concatenate([np.zeros((1, samples)), -k * sine, k * cosine])
     above = np.arange(harmonics + 1, (samples + 1) // 2)[:, None]
     weights = np.concatenate([np.full((1, samples), 0.5), cosine, sine, np.cos(above * angles), np.sin(above * angles)])
-    orders = np.concatenate([[0], k[:, 0], k[:, 0]])
+    orders = np.concatenate([[0.0], k[:, 0], k[:, 0]])
     return basis, slope, weights.T * (2.0 / samples), orders
