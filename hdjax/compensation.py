@@ -91,7 +91,7 @@ def feedforward(
     def torques(model: TwoInertiaModel, x: FourierSeries, swing: FourierSeries, load_torque: Array) -> Array:
         """By sample: what the load lacks, and what the motor must give [N m]."""
         drive = model.drive
-        t = jnp.arange(samples) * (2 * np.pi / samples) / x.omega
+        t = jnp.arange(float(samples)) * (2 * np.pi / samples) / x.omega
         rates = [(s, s.derivative(), s.derivative().derivative()) for s in (x, swing)]
         (x_0, x_1, x_2), (y_0, y_1, y_2) = ([s(t) for s in series] for series in rates)
         states = jnp.stack(
@@ -132,7 +132,7 @@ def feedforward(
 
 def _geometry(model: TwoInertiaModel) -> Array:
     """The mesh's kinematic error over a motor revolution [rad]."""
-    angles = jnp.arange(64) * (2 * np.pi / 64)
+    angles = jnp.arange(64.0) * (2 * np.pi / 64)
     at = jax.vmap(lambda a: model.motion(jnp.zeros(4).at[0].set(a)).x - a / model.drive.N)
     return at(angles)
 

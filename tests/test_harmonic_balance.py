@@ -90,12 +90,10 @@ def test_drawn_cases_are_what_time_integration_gives(found):
     assert np.median(strength[usable]) > 0.03 and strength[usable].max() > 0.5
     for i in np.flatnonzero(usable):
         mu, omega_0, alpha, w, mean = (float(v[i]) for v in cases[:5])
-        (a1, a2, a3), (b1, b2, b3) = cases[5][i], cases[6][i]
 
-        def rates(t, y):
+        def rates(t, y, w=w, mean=mean, mu=mu, omega_0=omega_0, alpha=alpha, a=cases[5][i], b=cases[6][i]):
             p = w * t
-            push = mean + a1 * cos(p) + a2 * cos(2 * p) + a3 * cos(3 * p)
-            push += b1 * sin(p) + b2 * sin(2 * p) + b3 * sin(3 * p)
+            push = mean + sum(a[k] * cos((k + 1) * p) + b[k] * sin((k + 1) * p) for k in range(3))
             return y[1], push - mu * y[1] - omega_0**2 * y[0] * (1 + alpha * y[0] * y[0])
 
         x = jax.tree.map(lambda leaf, i=i: leaf[i], found).x

@@ -21,6 +21,7 @@ from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance
 _TOLERANCE = 1e-9
 _SOLVED = 1e-8
 _CORRECTIONS = 2
+_CHORDS = 3
 _ITERATIONS = 8
 _FOLD_TOLERANCE = 1e-11
 
@@ -112,7 +113,7 @@ def frequency_response(
     subharmonic: int = 1,
     rotating: bool = False,
     guess: FourierSeries | None = None,
-    steps: int = 200,
+    steps: int = 1000,
 ) -> Branch:
     """All steady motions on the branch that starts at `omega_start`, through its folds to `omega_end`.
 
@@ -151,7 +152,7 @@ def follow(
     omega: ArrayLike = 1.0,
     guess: FourierSeries | None = None,
     points: int = 1000,
-    steps: int = 200,
+    steps: int = 1000,
 ) -> Branch:
     """Follow steady motions in any parameter.
 
@@ -175,8 +176,8 @@ def follow(
 @eqx.filter_jit
 def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branch:
     scale = system.model.drive.omega_0 if parameter == "omega" else jnp.maximum(jnp.abs(start), jnp.abs(end))
-    nothing = jnp.zeros(0)
-    branch = Branch(system, parameter, scale, nothing, nothing, nothing, nothing, nothing, nothing)
+    row, rows, no = jnp.zeros(0), jnp.zeros((0, 0)), jnp.zeros(0, dtype=bool)
+    branch = Branch(system, parameter, scale, row, row, rows, rows, no, jnp.asarray(False))
 
     def residual(u: Array, p: Array) -> Array:
         return branch.residual(u, p, omega)
@@ -248,7 +249,7 @@ def _correct(residual, point: Array, tangent: Array) -> tuple[Array, Array, Arra
         by_unknowns, by_parameter = jax.jacfwd(residual, (0, 1))(u, p)
         bordered = jnp.concatenate([jnp.column_stack([by_unknowns, by_parameter]), tangent[None]])
         factors = lu_factor(bordered)
-        for _ in range(_CORRECTIONS):
+        for _ in range(_CHORDS):
             left = residual(point[:-1], point[-1])
             point = point - lu_solve(factors, jnp.concatenate([left, nothing]))
         direction = lu_solve(factors, jnp.zeros_like(point).at[-1].set(1.0))

@@ -66,6 +66,7 @@ def multipliers(
         # In closed form: a general eigenvalue solver costs more than all the rest.
         half, determinant = 0.5 * jnp.trace(matrix), jnp.linalg.det(matrix)
         root = jnp.sqrt(jnp.astype(half**2 - determinant, complex))
+        half = jnp.astype(half, complex)
         return jnp.stack([half + root, half - root])
     return jnp.linalg.eigvals(matrix)
 

@@ -21,3 +21,46 @@ TABLE_2 = (
     PrintedCase("sub-harmonic", 367.5, 8.50e-3, 8.70e-3, 2.30),
 )
 """Frequencies [rad/s], amplitudes [rad], relative error [%]."""
+
+OMEGA_0 = 122.5
+"""Natural frequency stated for Table 1, used in Tables 2 and 3 and in the figure [rad/s]."""
+
+FIGURE_1 = (0.05, 122.5, 0.1, 0.01)
+"""mu [1/s], omega_0 [rad/s], alpha [rad^-2] and x(0) [rad] of the phase portrait."""
+
+
+class PrintedDamping(NamedTuple):
+    """A row of the seed's Table 3."""
+
+    mu: float
+    peak: float
+    bandwidth: float
+    shift: float
+
+
+TABLE_3 = (
+    PrintedDamping(0.01, 2.10e-2, 0.015, 0.12),
+    PrintedDamping(0.05, 1.20e-2, 0.075, 0.10),
+    PrintedDamping(0.10, 8.50e-3, 0.150, 0.08),
+)
+"""Damping [1/s], peak amplitude [rad], half-power bandwidth and nonlinear shift [rad/s]."""
+
+
+class PrintedSource(NamedTuple):
+    """A row of the seed's Table 4, with what is known of the source from elsewhere."""
+
+    source: str
+    low: float
+    high: float
+    known_low: float | None
+    known_high: float | None
+    known: str
+
+
+TABLE_4 = (
+    PrintedSource("tooth meshing friction", 1e-3, 1e-2, 0.1 / 7160, 5.0 / 7160, "friction of 0.1 to 5 N m over K"),
+    PrintedSource("flexspline deformation", 1e-4, 1e-3, None, None, "the cubic's own part of the twist"),
+    PrintedSource("assembly imperfections", 1e-5, 1e-4, None, None, "no published range"),
+    PrintedSource("wave generator eccentricity", 1e-4, 1e-3, 0.75e-4, 2.9e-4, "vendors: 1.5e-4 to 5.8e-4 peak to peak"),
+)
+"""Magnitudes [rad]."""

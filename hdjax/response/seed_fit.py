@@ -30,8 +30,12 @@ ORDERS = np.arange(1, 16, 2)
 SAMPLES = 96
 HARMONICS = 21
 """Of a third of the forcing frequency when the optimum is confirmed."""
-WEIGHTS = (10.0, 1000.0)
-"""Of the equation of motion against the log amplitudes, one pass after the other."""
+NEWTON_STEPS = 10
+REFINED = 3
+"""Rough motions at a frequency that are corrected: the nearest ones."""
+ROUNDS, CHILDREN, STEP = 3, 20, 0.4
+"""Of the random local search around each start: rounds, tries in each, and how far they reach at first (logarithms)."""
+_FAR = 5.0
 LOWEST = np.array([1e-3, 20.0, 1e-4, 1e-4])
 HIGHEST = np.array([1e3, 1500.0, 1.0, 1e2])
 """Range of the starts: A/(omega_0^2 a), omega_0 [rad/s], mu/omega_0, |alpha| a^2, where a is the mean amplitude."""
@@ -88,8 +92,9 @@ def fit_amplitudes(
 ) -> AmplitudeFit:
     """The (A, omega_0, mu, alpha) whose stable steady motions come nearest to the amplitudes, and how near.
 
-    Random parameters are screened with two-term approximations of all their motions; the best are refined with the
-    motions' own Fourier coefficients as further unknowns (Levenberg-Marquardt); the stable results are confirmed.
+    Random parameters are screened with two-term approximations of all their motions. The best are searched around and
+    polished (Levenberg-Marquardt on the log amplitudes) with motions that obey the equation in harmonic balance. Of
+    the results, those whose Floquet multipliers show all motions stable are confirmed, and the best is returned.
 
     Args:
         omega: forcing frequencies [rad/s].
@@ -132,10 +137,10 @@ def best_fit_of_table_2(*, screened: int = 20_000, starts: int = 48, seed: int =
 
 
 class _Balanced(eqx.Module):
-    size: Float[Array, "*lanes cases"]
-    start: Float[Array, "*lanes cases 2"]
-    usable: Bool[Array, "*lanes cases"]
-    subharmonic: Bool[Array, "*lanes cases"]
+    size: Float[Array, "*cases"]
+    start: Float[Array, "*cases 2"]
+    usable: Bool[Array, "*cases"]
+    subharmonic: Bool[Array, "*cases"]
 
 
 def _nearest(found: Array, balanced: _Balanced, sizes: Array) -> tuple[float, int]:
@@ -148,38 +153,101 @@ def _nearest(found: Array, balanced: _Balanced, sizes: Array) -> tuple[float, in
 
 @eqx.filter_jit
 def _search(omega: Array, sizes: Array, key: Array, screened: int, starts: int) -> tuple[Array, _Balanced]:
-    """Refined parameters (A, omega_0, mu, alpha) in units of the mean amplitude, and their motions."""
+    """The best parameters (A, omega_0, mu, alpha) in units of the mean amplitude, and their motions."""
     low, high = jnp.log(LOWEST), jnp.log(HIGHEST)
-    logs = jax.random.uniform(key, (screened, 4), minval=low[None], maxval=high[None])
+    keys = jax.random.split(key, ROUNDS + 1)
+    logs = jax.random.uniform(keys[0], (screened, 4), minval=low[None], maxval=high[None])
     signs = jnp.where(jnp.arange(screened) % 2 == 0, 1.0, -1.0)
 
-    def screen(lane: tuple[Array, Array]) -> tuple[Array, Array]:
+    def rough(lane: tuple[Array, Array]) -> Array:
+        return _nearest_motions(_parameters(*lane), omega, sizes, refined=False)[0]
+
+    def exact(lane: tuple[Array, Array]) -> Array:
+        return _nearest_motions(_parameters(*lane), omega, sizes, refined=True)[0]
+
+    def best(cost: Array, signs: Array, count: int) -> Array:
+        """As many hardening as softening ones: next to a softening drive's saddles rough motions look too good."""
+        return jnp.concatenate(
+            [jax.lax.top_k(jnp.where(signs == s, -cost, -jnp.inf), count // 2)[1] for s in (1.0, -1.0)]
+        )
+
+    kept = best(jax.lax.map(rough, (logs, signs), batch_size=1000), signs, CHILDREN * starts)
+    logs, signs = logs[kept], signs[kept]
+    cost = jax.lax.map(exact, (logs, signs), batch_size=200)
+    kept = best(cost, signs, starts)
+    logs, signs, cost = logs[kept], signs[kept], cost[kept]
+    # A random local search first: the nearest motions often lie at the end of their branch, where no slope leads.
+    for r in range(ROUNDS):
+        step = STEP * 0.5**r * jax.random.normal(keys[r + 1], (starts, CHILDREN, 4))
+        tried = (logs[:, None] + step).reshape(-1, 4)
+        found = jax.lax.map(exact, (tried, jnp.repeat(signs, CHILDREN)), batch_size=200).reshape(starts, CHILDREN)
+        child = jnp.argmin(found, axis=1)
+        better = jnp.min(found, axis=1) < cost
+        logs = jnp.where(better[:, None], tried.reshape(starts, CHILDREN, 4)[jnp.arange(starts), child], logs)
+        cost = jnp.minimum(cost, jnp.min(found, axis=1))
+
+    def polish(log: Array, sign: Array) -> Array:
+        _, motions = _nearest_motions(_parameters(log, sign), omega, sizes, refined=True)
+
+        def miss(log: Array, motions: Array) -> Array:
+            p = _parameters(log, sign)
+            found, usable = jax.vmap(lambda c, w: _corrected(p, c, w))(motions, omega)
+            size = jnp.max(jnp.abs(found @ jnp.asarray(_BASIS)), axis=1)
+            return jnp.where(usable, jnp.log(jnp.where(usable, size, 1.0) / sizes), _FAR)
+
+        solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+        return optx.least_squares(miss, solver, log, motions, max_steps=60, throw=False).value
+
+    def confirm(lane: tuple[Array, Array]) -> tuple[Array, _Balanced]:
         p = _parameters(*lane)
-        motions, size, exists = jax.vmap(lambda w: _two_term_motions(p, w))(omega)
-        miss = jnp.where(exists & (size > 0), jnp.log(jnp.where(exists & (size > 0), size, 1.0) / sizes[:, None]), 30.0)
-        slot = jnp.argmin(jnp.abs(miss), axis=1)
-        rows = jnp.arange(omega.size)
-        return jnp.sum(miss[rows, slot] ** 2), motions[rows, slot]
+        _, motions = _nearest_motions(p, omega, sizes, refined=True)
+        return p, jax.vmap(lambda c, w: _balanced(p, c, w))(motions, omega)
 
-    cost, motions = jax.lax.map(screen, (logs, signs), batch_size=1000)
-    _, kept = jax.lax.top_k(-jnp.where(jnp.isfinite(cost), cost, jnp.inf), starts)
+    logs = jnp.concatenate([logs, jax.vmap(polish)(logs, signs)])
+    return jax.lax.map(confirm, (logs, jnp.concatenate([signs, signs])), batch_size=starts)
 
-    def refine(log: Array, sign: Array, motion: Array) -> tuple[Array, _Balanced]:
-        y = (log, motion)
-        for weight in WEIGHTS:
-            solver = optx.LevenbergMarquardt(rtol=1e-7, atol=1e-7)
 
-            def residuals(y: tuple[Array, Array], weight: float) -> tuple[Array, Array]:
-                p, c = _parameters(y[0], sign), y[1]
-                off = jax.vmap(lambda c, w: _left_over(p, c, w))(c, omega)
-                size = jnp.max(jnp.abs(c @ jnp.asarray(_BASIS)), axis=1)
-                return jnp.log(size / sizes), weight * off
+def _nearest_motions(p: Array, omega: Array, sizes: Array, *, refined: bool) -> tuple[Array, Array]:
+    """Sum of squared log ratios over the nearest motion at each frequency, and those motions' coefficients."""
 
-            y = optx.least_squares(residuals, solver, y, weight, max_steps=100, throw=False).value
-        p = _parameters(y[0], sign)
-        return p, jax.vmap(lambda c, w: _balanced(p, c, w))(y[1], omega)
+    def at(w: Array, target: Array) -> tuple[Array, Array]:
+        motions, size, exists = _two_term_motions(p, w)
+        if refined:
+            order = jnp.argsort(_miss(size, exists, target))[:REFINED]
+            motions, usable = jax.vmap(lambda c: _corrected(p, c, w))(motions[order])
+            exists = exists[order] & usable
+            size = jnp.max(jnp.abs(motions @ jnp.asarray(_BASIS)), axis=1)
+        miss = _miss(size, exists, target)
+        slot = jnp.argmin(miss)
+        return miss[slot] ** 2, motions[slot]
 
-    return jax.vmap(refine)(logs[kept], signs[kept], motions[kept])
+    squares, motions = jax.vmap(at)(omega, sizes)
+    return jnp.sum(squares), motions
+
+
+def _miss(size: Array, exists: Array, target: Array) -> Array:
+    there = exists & (size > 0.0) & jnp.isfinite(size)
+    return jnp.where(there, jnp.abs(jnp.log(jnp.where(there, size, 1.0) / target)), _FAR)
+
+
+def _corrected(
+    p: Array, c: Float[Array, " unknowns"], omega: Array
+) -> tuple[Float[Array, " unknowns"], Bool[Array, ""]]:
+    """Newton steps to the motion near `c`, and whether they settled on one that is no saddle; differentiable in `p`."""
+
+    def step(p: Array, c: Array) -> tuple[Array, Array]:
+        slope = jax.jacfwd(_left_over, 1)(p, c, omega)
+        return jnp.linalg.solve(slope, _left_over(p, c, omega)), jnp.linalg.det(slope)
+
+    fixed = jax.lax.stop_gradient((p, c))
+    near = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, c: c - step(fixed[0], c)[0], fixed[1])
+    near = jax.lax.stop_gradient(near)
+    settled = jnp.all(jnp.isfinite(near))
+    near = jnp.where(settled, near, fixed[1])
+    change, determinant = step(p, near)
+    # The slope of the balance changes sign where a branch turns back: below zero the motion is not stable.
+    usable = settled & (jnp.max(jnp.abs(change)) < 1e-6 * jnp.max(jnp.abs(near))) & (determinant > 0.0)
+    return near - jnp.where(usable, change, 0.0), usable
 
 
 def _parameters(log: Array, sign: Array) -> Float[Array, "4"]:
@@ -189,7 +257,7 @@ def _parameters(log: Array, sign: Array) -> Float[Array, "4"]:
 
 
 def _left_over(p: Array, c: Float[Array, " unknowns"], omega: Array) -> Float[Array, " unknowns"]:
-    """Harmonic balance at the multiples `ORDERS` of omega/3, in units of its largest coefficient's inertia or spring."""
+    """Harmonic balance at the multiples `ORDERS` of omega/3, over inertia and spring."""
     A, omega_0, mu, alpha = p
     rates = jnp.asarray(ORDERS / 3.0) * omega
     cosine, sine = jnp.split(c, 2)

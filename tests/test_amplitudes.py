@@ -1,0 +1,199 @@
+"""Analytic amplitudes against the numerical routes, the verdicts on them, and the pictures."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hdjax import ReducedDrive
+from hdjax.dynamics import ReducedModel
+from hdjax.fourier import harmonic_series
+from hdjax.response.amplitudes import (
+    AmplitudeCheck,
+    AmplitudeRow,
+    ErrorMap,
+    check_amplitudes,
+    error_map,
+    resonance_kind,
+)
+from hdjax.response.attractors import Attractor, Basins, PoincareSection, SweptSine
+from hdjax.response.continuation import Branch, folds, frequency_response
+from hdjax.response.lyapunov import phase_portrait
+from hdjax.response.multiple_scales import PrimaryResonance
+from hdjax.response.plots import (
+    basins_plot,
+    error_map_plot,
+    frequency_response_plot,
+    phase_portrait_plot,
+    poincare_plot,
+)
+from hdjax.response.resonance import backbone, peak
+
+MU, ALPHA = 0.02, 0.05
+DRIVE = ReducedDrive(mu=MU, omega_0=1.0, alpha=ALPHA)
+
+
+@pytest.mark.parametrize("omega", (0.34, 0.5, 1.02, 3.05))
+def test_all_routes_agree_on_a_linear_drive(omega):
+    A = 0.05
+    (row,) = check_amplitudes(ReducedDrive(mu=MU, omega_0=1.0), A, omega).rows
+    truth = A / abs(1.0 - omega**2 + 1j * MU * omega)
+    assert row.stable and row.branch == "only"
+    assert (row.balance, row.time) == pytest.approx((truth, truth), rel=1e-8)
+    # Near the resonance first order lacks terms of sigma; elsewhere it leaves out the damping.
+    assert row.error < 0.015
+    assert row.second_order_error is None or row.second_order_error < 1e-3
+    assert row.verdict in ("holds to 1%", "holds to 5%")
+
+
+def by_branch(check: AmplitudeCheck) -> dict[str, AmplitudeRow]:
+    return {row.branch: row for row in check.rows}
+
+
+def test_three_motions_coexist_near_the_primary_resonance():
+    check = check_amplitudes(DRIVE, 0.05, 1.08)
+    assert check.kind == "primary"
+    rows = by_branch(check)
+    assert list(rows) == ["lower", "middle", "upper"]
+    assert [r.stable for r in rows.values()] == [True, False, True]
+    for row in rows.values():
+        assert row.agreement < 1e-6
+        assert row.error < 0.05
+        assert row.second_order_error < row.error
+        assert row.verdict.startswith("holds to")
+    assert rows["lower"].time < rows["middle"].time < rows["upper"].time
+
+
+def test_a_sub_harmonic_lives_beside_the_motion_without_it():
+    check = check_amplitudes(DRIVE, 20.0, 3.2)
+    assert check.kind == "sub-harmonic"
+    assert check.rows
+    for row in check.rows:
+        assert row.agreement < 1e-6, check
+    print([(r.branch, r.stable, r.time) for r in check.rows])
+
+
+def row(first: float, balance: float | None = 1.0, time: float | None = 1.0) -> AmplitudeRow:
+    return AmplitudeRow("only", True, first, None, balance, time)
+
+
+@pytest.mark.parametrize(
+    ("made", "verdict"),
+    (
+        (row(1.0), "holds to 1%"),
+        (row(1.03), "holds to 5%"),
+        (row(0.93), "holds to 10%"),
+        (row(1.25), "fails by 25%"),
+        (row(1.0, balance=None), "fails: no motion near it"),
+        (row(1.0, time=None), "fails: no motion near it"),
+        (row(1.0, balance=1.001), "undecided: the two numerical routes differ"),
+    ),
+)
+def test_verdicts(made, verdict):
+    assert made.verdict == verdict
+    assert made.second_order_error is None
+
+
+@pytest.mark.parametrize(
+    ("omega", "kind"),
+    (
+        (2.0, "primary"),
+        (2.5, "primary"),
+        (2 / 3, "super-harmonic"),
+        (0.8, "super-harmonic"),
+        (6.0, "sub-harmonic"),
+        (7.5, "sub-harmonic"),
+        (0.1, "off-resonance"),
+        (1.2, "off-resonance"),
+        (3.5, "off-resonance"),
+        (9.0, "off-resonance"),
+    ),
+)
+def test_kinds(omega, kind):
+    assert resonance_kind(2.0, omega) == kind
+
+
+@cache
+def errors() -> ErrorMap:
+    return error_map("primary", np.asarray([-0.02, 0.0, 0.02]), np.asarray([1e-3, 1e-2, 1e-1, 0.5]), 0.02, harmonics=5)
+
+
+def test_errors_are_small_where_the_drive_is_nearly_linear():
+    found = errors()
+    first, second = np.asarray(found.first_order[0]), np.asarray(found.second_order[0])
+    assert first.shape == (4, 3)
+    assert first[0].max() < 0.02 and second[0].max() < 2e-3
+    # At resonance only the nonlinearity is left to be wrong about.
+    assert (np.diff(first[:, 1]) > 0.0).all()
+    assert (second[:3] < first[:3]).all()
+
+
+# -- pictures --
+
+
+@cache
+def branch() -> Branch:
+    return frequency_response(ReducedModel(DRIVE), harmonic_series(1.0, 0.05), 0.8, 1.3, points=150, harmonics=5)
+
+
+def saved(figure, path) -> int:
+    figure.savefig(path)
+    return path.stat().st_size
+
+
+def test_the_frequency_response_is_drawn_with_its_unstable_part(tmp_path):
+    omegas = jnp.linspace(0.9, 1.2, 31)
+    analytic = jax.vmap(PrimaryResonance(DRIVE, 0.05).branches)(omegas)
+    size = jnp.linspace(0.2, 0.4, 5)
+    sweep = SweptSine(jnp.linspace(0.9, 1.0, 5), size, size, jnp.zeros((5, 2)), jnp.zeros(5, dtype=bool))
+    figure = frequency_response_plot(
+        branch(),
+        folds=folds(branch()),
+        peak=peak(branch()),
+        backbone=backbone(ReducedModel(DRIVE), jnp.linspace(0.1, 3.0, 10), harmonics=5),
+        sweeps=(sweep, sweep),
+        analytic=(np.asarray(omegas), analytic),
+    )
+    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    unstable = np.asarray(lines["harmonic balance, unstable"].get_ydata())
+    assert np.isfinite(unstable).sum() > 5 and np.isnan(unstable).any()
+    x = np.asarray(lines["harmonic balance, unstable"].get_xdata())[np.isfinite(unstable)]
+    crosses = np.asarray(lines["folds (jumps)"].get_xdata())
+    assert crosses.size == 2
+    assert (x.min(), x.max()) == pytest.approx((crosses.min(), crosses.max()), abs=0.02)
+    assert {"harmonic balance, stable", "peak", "backbone", "time integration, sweep down"} <= set(lines)
+    assert saved(figure, tmp_path / "response.png") > 1000
+
+
+def test_the_phase_portrait_is_drawn(tmp_path):
+    starts = jnp.asarray([[0.3, 0.0], [0.0, 0.5], [1.5, 1.5]])
+    softening = ReducedDrive(mu=0.3, omega_0=1.5, alpha=-1.0)
+    for name, drive in (("softening", softening), ("hardening", ReducedDrive(mu=0.3, omega_0=1.5, alpha=1.0))):
+        figure = phase_portrait_plot(phase_portrait(drive, starts, jnp.linspace(0.0, 10.0, 101)))
+        assert len(figure.axes[0].get_lines()) == 7
+        assert saved(figure, tmp_path / f"{name}.png") > 1000
+
+
+def test_sections_and_basins_are_drawn(tmp_path):
+    states = jnp.arange(24.0).reshape(2, 6, 2)
+    section = PoincareSection(jnp.ones(2), states, jnp.ones(2), jnp.ones(2), jnp.asarray([False, True]))
+    figure = poincare_plot(section)
+    assert len(figure.axes[0].get_lines()) == 1  # what escaped is not drawn
+    assert saved(figure, tmp_path / "section.png") > 1000
+    grid = np.linspace(-1.0, 1.0, 3)
+    found = (Attractor(1, np.asarray([[0.1, 0.2]]), 0.2, 0.5), Attractor(3, np.ones((3, 2)), 1.0, 0.3))
+    figure = basins_plot(Basins(grid, grid, np.asarray([[0, 1, 0], [1, -1, 0], [-2, 0, 1]]), found))
+    picture = np.asarray(figure.axes[0].get_images()[0].get_array())
+    # x runs along the columns, v along the rows.
+    np.testing.assert_array_equal(picture[0, 2], 0.25)
+    np.testing.assert_array_equal(picture[1, 1], 0.25)
+    assert (picture[2, 0] == picture[0, 0]).all() and (picture[1, 0] != picture[0, 0]).any()
+    assert saved(figure, tmp_path / "basins.png") > 1000
+
+
+def test_the_error_map_is_drawn(tmp_path):
+    figure = error_map_plot(errors(), title="primary resonance", strength="$\\alpha a^2$")
+    assert len(figure.axes) == 2
+    assert saved(figure, tmp_path / "errors.png") > 1000

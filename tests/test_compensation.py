@@ -1,0 +1,98 @@
+"""Feedforward of the kinematic error, on simulated drives that a servo turns."""
+
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hdjax import Drive
+from hdjax.compensation import Feedforward, MotorServo, feedforward, run_at_speed
+from hdjax.dynamics import TwoInertiaModel
+from hdjax.effects.hysteresis import BoucWen
+from hdjax.effects.kinematic import KinematicError
+from hdjax.simulate import Trajectory
+
+DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5e-2, K=7160.0, alpha=1e5, B_sp=0.5)
+PLANT = TwoInertiaModel(DRIVE, (KinematicError(cos_2=1.5e-4, sin_1=3e-5, cos_4=2e-5),))
+SOFT, STIFF = MotorServo(stiffness=20.0, damping=0.2), MotorServo(stiffness=2000.0, damping=2.0)
+TIMES = np.linspace(0.0, 1.5, 3001)
+SETTLED = TIMES >= 1.0
+OFF = {"K": 1.02, "J_l": 0.98, "alpha": 1.02, "B_sp": 1.02, "kinematic_error.cos_2": 0.98, "J_m": 1.02}
+
+
+def two_percent_off() -> TwoInertiaModel:
+    return PLANT.replace({path: factor * float(PLANT.get(path)) for path, factor in OFF.items()})
+
+
+def swings(found: Trajectory, speed: float) -> dict[str, float]:
+    """Standard deviations of the two errors once the transient has died out."""
+    load = np.asarray(found.states[:, 1]) - speed * TIMES / float(DRIVE.N)
+    errors = {"dynamic_error": np.asarray(found.dynamic_error), "output": load}
+    return {name: float(e[SETTLED].std()) for name, e in errors.items()}
+
+
+@cache
+def without(speed: float, stiff: bool = False) -> dict[str, float]:
+    return swings(run_at_speed(PLANT, speed, TIMES, STIFF if stiff else SOFT), speed)
+
+
+def reduction(correction: Feedforward, target: str, **options) -> float:
+    speed = float(correction.speed)
+    servo = options.pop("servo", SOFT)
+    found = swings(run_at_speed(PLANT, speed, TIMES, servo, correction=correction, **options), speed)
+    return without(speed, servo is STIFF)[target] / found[target]
+
+
+@pytest.mark.parametrize("speed", (60.0, 180.0))
+@pytest.mark.parametrize("target", ("dynamic_error", "output"))
+def test_the_error_vanishes_under_feedforward(target, speed):
+    exact = feedforward(PLANT, speed, target=target)
+    assert bool(exact.converged)
+    assert reduction(exact, target) > 1e3
+    near = feedforward(two_percent_off(), speed, target=target)
+    assert bool(near.converged)
+    assert reduction(near, target) > 5.0
+
+
+def test_a_stiff_servo_needs_the_angle_alone():
+    correction = feedforward(PLANT, 60.0)
+    assert reduction(correction, "dynamic_error", servo=STIFF, use=("motor_angle",)) > 10.0
+
+
+def test_what_is_held_stands_still():
+    still = feedforward(PLANT, 60.0)
+    assert float(jnp.max(still.dynamic_error.amplitudes)) == 0.0
+    assert float(jnp.max(still.output_error.amplitudes)) > 0.0
+    uniform = feedforward(PLANT, 60.0, target="output")
+    assert float(jnp.max(uniform.output_error.amplitudes)) == 0.0
+    # The load turns uniformly without a torque on it: the mesh is not twisted, x = -e(theta_m).
+    t = jnp.linspace(0.0, 0.1, 50)
+    error = PLANT.effects[0].error(uniform.motor_angle(t))
+    np.testing.assert_allclose(uniform.dynamic_error(t), -error, atol=1e-9)
+    np.testing.assert_allclose(uniform.correction(t), -float(DRIVE.N) * error, atol=1e-7)
+
+
+def test_without_kinematic_error_there_is_nothing_to_correct():
+    for target in ("dynamic_error", "output"):
+        found = feedforward(TwoInertiaModel(DRIVE), 60.0, target=target)
+        assert bool(found.converged)
+        for series in (found.correction, found.torque):
+            np.testing.assert_allclose(series.values(64), 0.0, atol=1e-12)
+
+
+def test_a_load_is_carried():
+    """The mesh is twisted against it, `K (x + alpha x^3) = -T_l`, and the motor gives `-T_l / N`."""
+    found = feedforward(TwoInertiaModel(DRIVE), 60.0, load_torque=8.0)
+    assert bool(found.converged)
+    x = found.dynamic_error.mean
+    assert float(DRIVE.mesh_torque(x, jnp.zeros(()))) == pytest.approx(-8.0, rel=1e-9)
+    assert float(found.torque.mean) == pytest.approx(-8.0 / 50.0, rel=1e-9)
+    np.testing.assert_allclose(found.correction.mean, 50.0 * x, rtol=1e-12)
+
+
+def test_effects_with_memory_and_few_samples_are_refused():
+    with pytest.raises(ValueError, match="bouc_wen"):
+        feedforward(PLANT.with_effects(BoucWen(k=500.0, yield_twist=1e-4)), 60.0)
+    with pytest.raises(ValueError, match="samples"):
+        feedforward(PLANT, 60.0, harmonics=12, samples=24)

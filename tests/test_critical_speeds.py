@@ -1,0 +1,79 @@
+"""Speeds to avoid, against the closed form of a linear drive."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hdjax import Drive
+from hdjax.dynamics import TwoInertiaModel
+from hdjax.effects.kinematic import KinematicError
+from hdjax.response.continuation import Branch, frequency_response
+from hdjax.response.critical_speeds import critical_speeds, speeds_to_avoid, swing
+from hdjax.response.plots import speed_plot
+
+DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5e-2, K=7160.0, B_sp=2.0)
+ERROR = 1.5e-4
+OMEGA_0 = float(DRIVE.omega_0)
+
+
+@cache
+def branch() -> Branch:
+    model = TwoInertiaModel(DRIVE, (KinematicError(cos_2=ERROR),))
+    return frequency_response(model, None, 0.3 * OMEGA_0, 0.8 * OMEGA_0, rotating=True, harmonics=6, points=300)
+
+
+def closed_form(speed: np.ndarray) -> np.ndarray:
+    """Amplitude of `x'' + mu (x' + e') + omega_0^2 (x + e) = 0` with `e = ERROR cos(2 speed t)`."""
+    w, mu = 2.0 * speed, float(DRIVE.mu)
+    return ERROR * np.abs((OMEGA_0**2 + 1j * mu * w) / (OMEGA_0**2 - w**2 + 1j * mu * w))
+
+
+def test_two_cycles_a_revolution_meet_the_natural_frequency_at_half_of_it():
+    found = critical_speeds(DRIVE)
+    speeds = [c.speed for c in found]
+    assert speeds == sorted(speeds) and len(found) == 9
+    primary = {c.order: c.speed for c in found if c.kind == "primary"}
+    assert primary == pytest.approx({1: OMEGA_0, 2: OMEGA_0 / 2, 4: OMEGA_0 / 4})
+    (two,) = (c for c in critical_speeds(DRIVE, (2,)) if c.kind == "super-harmonic")
+    assert two.speed == pytest.approx(OMEGA_0 / 6)
+    assert len(critical_speeds(DRIVE, (2,))) == 3
+
+
+def test_the_swing_is_the_closed_form_of_a_linear_drive():
+    found = branch()
+    assert bool(found.complete)
+    valid = np.asarray(found.valid)
+    np.testing.assert_allclose(np.asarray(swing(found))[valid], closed_form(np.asarray(found.omega)[valid]), rtol=0.02)
+
+
+def test_one_band_lies_around_half_the_natural_frequency():
+    limit = 6e-4
+    (band,) = speeds_to_avoid(branch(), limit)
+    assert band.order == 2
+    assert band.start < OMEGA_0 / 2 < band.end
+    assert band.start <= band.speed_at_peak <= band.end
+    speeds = np.linspace(0.3, 0.8, 5001) * OMEGA_0
+    size = closed_form(speeds)
+    assert band.amplitude == pytest.approx(size.max(), rel=0.02)
+    assert band.speed_at_peak == pytest.approx(speeds[size.argmax()], rel=0.01)
+    assert band.start == pytest.approx(speeds[size > limit][0], rel=0.02)
+
+
+@pytest.mark.xfail(strict=True, reason="rows above the resonance count as unstable (free motor), so the band is cut")
+def test_the_band_ends_where_the_closed_form_does():
+    (band,) = speeds_to_avoid(branch(), 6e-4)
+    speeds = np.linspace(0.3, 0.8, 5001) * OMEGA_0
+    assert band.end == pytest.approx(speeds[closed_form(speeds) > 6e-4][-1], rel=0.02)
+
+
+def test_no_band_above_the_peak():
+    assert speeds_to_avoid(branch(), 0.1) == []
+
+
+def test_the_bands_are_drawn(tmp_path):
+    figure = speed_plot(branch(), speeds_to_avoid(branch(), 6e-4), 6e-4)
+    labels = figure.axes[0].get_legend_handles_labels()[1]
+    assert {"stable", "limit", "avoid"} <= set(labels)
+    figure.savefig(tmp_path / "speeds.png")
+    assert (tmp_path / "speeds.png").stat().st_size > 1000

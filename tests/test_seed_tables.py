@@ -1,0 +1,89 @@
+"""The seed's tables recomputed: what is wrong in them, and that nothing fits the second."""
+
+import numpy as np
+import pytest
+
+from hdjax import hdc_40_050
+from hdjax.response.seed_fit import best_fit_of_table_2, fit_amplitudes
+from hdjax.response.seed_tables import Cell, as_text, seed_tables
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return {table.title.split(":")[0]: table.cells for table in seed_tables()}
+
+
+def cells(tables, title: str, column: str) -> list[Cell]:
+    return [c for c in tables[title] if c.column == column]
+
+
+@pytest.mark.parametrize(
+    ("printed", "recomputed", "verdict"),
+    [
+        (1.0, 1.004, "agrees"),
+        (1.0, 1.2, "differs by 17%"),
+        (3.0, 1.0, "differs by a factor 3"),
+        (1.0, 4.0, "differs by a factor 4"),
+        (1.0, None, "does not follow from the stated model"),
+        (0.0, 0.0, "agrees"),
+    ],
+)
+def test_verdicts(printed, recomputed, verdict):
+    assert Cell("row", "column", printed, recomputed, "rad").verdict == verdict
+
+
+def test_the_natural_frequency_is_not_what_is_printed(tables):
+    (cell,) = cells(tables, "Table 1", "omega_0")
+    assert cell.recomputed == pytest.approx(385.545, abs=1e-3)
+    assert cell.verdict.startswith("differs by a factor")
+
+
+def test_table_2_by_the_linear_closed_form(tables):
+    """With alpha = 0.1 nothing nonlinear is visible, so that the closed form is the whole truth."""
+    drive = hdc_40_050()
+    A = 10.0 / (50 * 5.26e-4)
+    rows = cells(tables, "Table 2", "analytical amplitude")[::2]
+    for cell, omega in zip(rows, (100.0, 300.0, 122.5, 40.83, 367.5), strict=True):
+        linear = A / abs(complex(float(drive.omega_0) ** 2 - omega**2, float(drive.mu) * omega))
+        assert cell.recomputed == pytest.approx(linear, rel=1e-3)
+        assert cell.verdict != "agrees"
+    implied = [float(c.note.split("A = ")[1].split()[0]) for c in rows]
+    assert (min(implied), max(implied)) == pytest.approx((116.0, 2005.0), rel=0.01)
+    assert all(c.verdict == "agrees" for c in cells(tables, "Table 2", "relative error"))
+
+
+def test_table_3_has_no_model_behind_it(tables):
+    assert [c.recomputed for c in cells(tables, "Table 3", "first peak over this")] == pytest.approx([5.0, 10.0])
+    for cell in cells(tables, "Table 3", "half-power bandwidth"):
+        assert cell.printed / cell.recomputed == pytest.approx(1.5, rel=2e-3)
+    assert cells(tables, "Table 3", "nonlinear shift")[0].printed == pytest.approx(
+        60 * cells(tables, "Table 3", "nonlinear shift")[0].recomputed, rel=0.05
+    )
+
+
+def test_the_figure_is_right_for_the_parameters_beside_it(tables):
+    verdicts = [c.verdict for c in tables["Figure 1"]]
+    assert verdicts[1] == "agrees"
+    # The largest of the last swings, and the mean rate, lie within a swing of the envelope's.
+    assert tables["Figure 1"][2].recomputed == pytest.approx(0.05, rel=0.02)
+
+
+def test_nothing_fits_table_2(tables):
+    fit = best_fit_of_table_2()
+    assert fit.worst > 1.5 and fit.rms > 0.3
+    confirmed = [t for t in fit.time if t is not None]
+    assert len(confirmed) >= 3
+    for size, time in zip(fit.fitted, fit.time, strict=True):
+        assert time is None or time == pytest.approx(size, rel=1e-4)
+    text = as_text((), fit)
+    assert "no parameters of the stated model" in text
+
+
+def test_a_consistent_table_is_fitted():
+    """Amplitudes of a linear response, far from its resonance: the same search finds parameters that give them."""
+    omega = (100.0, 300.0, 122.5, 40.83, 367.5)
+    amplitude = tuple(500.0 / abs(complex(200.0**2 - w**2, 5.0 * w)) for w in omega)
+    fit = fit_amplitudes(omega, amplitude)
+    assert fit.worst < 1.01
+    assert fit.omega_0 == pytest.approx(200.0, rel=0.02)
+    assert np.isfinite(fit.rms)
