@@ -60,7 +60,6 @@ def test_one_band_lies_around_half_the_natural_frequency():
     assert band.start == pytest.approx(speeds[size > limit][0], rel=0.02)
 
 
-@pytest.mark.xfail(strict=True, reason="rows above the resonance count as unstable (free motor), so the band is cut")
 def test_the_band_ends_where_the_closed_form_does():
     (band,) = speeds_to_avoid(branch(), 6e-4)
     speeds = np.linspace(0.3, 0.8, 5001) * OMEGA_0

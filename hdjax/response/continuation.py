@@ -204,7 +204,8 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
         corrected[:, :-1],
         tangents,
         found.converged[0] & (left < _SOLVED),
-        found.converged[0] & complete,
+        # A step that jumped to another branch leaves points between that no correction solves.
+        found.converged[0] & complete & jnp.all(left < _SOLVED),
     )
 
 
@@ -318,7 +319,6 @@ class FoldTrack(eqx.Module):
     valid: Bool[Array, " steps"]
 
 
-@eqx.filter_jit
 def follow_fold(
     branch: Branch, fold: int, parameter: str, start: ArrayLike, end: ArrayLike, *, steps: int = 200
 ) -> FoldTrack:
@@ -332,8 +332,12 @@ def follow_fold(
         end: where to stop.
         steps: of the continuation, at most.
     """
+    return _follow_fold(branch, fold, parameter, as_scalar(start), as_scalar(end), steps)
+
+
+@eqx.filter_jit
+def _follow_fold(branch, fold, parameter, start, end, steps) -> FoldTrack:
     found = folds(branch)
-    start, end = as_scalar(start), as_scalar(end)
     second = jnp.maximum(jnp.abs(start), jnp.abs(end))
 
     def residual(y: Array, q: Array) -> Array:

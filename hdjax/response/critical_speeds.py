@@ -76,14 +76,18 @@ def swing(branch: Branch) -> Float[Array, " points"]:
 
 
 def speeds_to_avoid(branch: Branch, limit: float) -> list[SpeedBand]:
-    """Bands of speed in which a steady motion that can persist swings further than a limit.
+    """Bands of speed in which a steady motion swings further than a limit.
+
+    Of a motor under a periodic forcing only stable motions count. Where the motor rotates every motion does: past the
+    resonance a free motor at constant torque can't hold its speed (Sommerfeld), but a servo can.
 
     Args:
         branch: `frequency_response(model, None, slow, fast, rotating=True)` of a drive with kinematic error; or of any
             periodic forcing, where speed stands for its frequency.
         limit: of the dynamic error's swing about its mean [rad].
     """
-    keep = np.asarray(branch.valid & branch.stable)
+    rotating = branch.system.rotating
+    keep = np.asarray(branch.valid if rotating else branch.valid & branch.stable)
     order = np.argsort(np.asarray(branch.omega)[keep], kind="stable")
     speed, size, amplitudes = (
         np.asarray(a)[keep][order] for a in (branch.omega, swing(branch), branch.steady_states.x.amplitudes)

@@ -231,15 +231,15 @@ def balance(
     )
     if system.samples <= 2 * harmonics:
         raise ValueError(f"`samples` must be above {2 * harmonics}, but is {system.samples}")
-    # The linear resonance's amplitude is the scale of the motion.
+    # The resonance's amplitude is the scale of the motion: A/(mu omega), where hardening raises omega.
     drive = model.drive
     still = jnp.zeros(system.coordinates * (2 * harmonics + 1))
     push = jnp.max(jnp.abs(system.residual(still, drive.omega_0)))
     length = push * drive.omega_0 / jnp.maximum(drive.mu, 1e-6 * drive.omega_0)
+    length = length / (1.0 + 0.75 * jnp.maximum(drive.alpha, 0.0) * length**2) ** 0.25
     return eqx.tree_at(lambda s: s.length, system, jnp.where(length > 0, length, 1.0))
 
 
-@eqx.filter_jit
 def solve(
     system: BalancedMotion, omega: ArrayLike, guess: FourierSeries | None = None, *, max_steps: int = 64
 ) -> SteadyState:
@@ -253,7 +253,11 @@ def solve(
         guess: a dynamic error to start from (reduced drives); the linearised response where not given.
         max_steps: where to give up.
     """
-    omega = as_scalar(omega)
+    return _solve(system, as_scalar(omega), guess, max_steps)
+
+
+@eqx.filter_jit
+def _solve(system, omega, guess, max_steps) -> SteadyState:
     unknowns, solved = find_root(system, omega, guess, max_steps)
     return system.steady_state(unknowns, omega, solved)
 
