@@ -1,8 +1,11 @@
 """Levenberg-Marquardt for arrow-shaped least squares: shared parameters, and states that belong to one segment each.
 
-The dense Jacobian of a log has thousands of columns, nearly all of them zero. Eliminating each segment's state first
-leaves a system as small as the number of shared parameters (the Schur complement), so that a step costs little more
-than the simulation behind it. optimistix does the iteration; this file tells it how to solve for a step.
+The dense Jacobian of a log has thousands of columns, nearly all of them zero. Where segments are joined, closing the
+gaps between them makes each initial state an affine function of the shared parameters and of the state that its
+chain starts from (multiple shooting with condensing: Bock and Plitt 1984). Eliminating the chains' first states leaves
+a system as small as the number of shared parameters (the Schur complement), so that a step costs little more than the
+simulation behind it, and a chain of many segments no more than as many segments that start anew. optimistix does the
+iteration; this file tells it how to solve for a step.
 """
 
 from collections.abc import Callable
@@ -12,65 +15,142 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from fitting.residual import Blocks, Unknowns
+from fitting.residual import Blocks, LinearisedResidual, Unknowns
 
-# optimistix starts with damping 1; relative to the diagonal of J^T J a thousandth of it suits a good start.
-_INITIAL_DAMPING = 1e-3
+# Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
+# across it, so it must go quickly where the model predicts well.
+_REGION = optx.ClassicalTrustRegion(high_cutoff=0.75, high_constant=30.0, low_constant=0.1)
+
+
+class Chains(eqx.Module):
+    """What closing the gaps makes of each segment's initial state: `by_parameter dp + by_first dc + closing`, where
+    dc is the change of the state that its chain starts from.
+
+    Attributes:
+        by_parameter: response to the shared parameters.
+        by_first: response to the chain's first state.
+        closing: what closes the gaps where nothing else moves.
+        index: the chain of each segment.
+    """
+
+    by_parameter: Float[Array, "segments states parameters"]
+    by_first: Float[Array, "segments states states"]
+    closing: Float[Array, "segments states"]
+    index: Int[Array, " segments"]
+
+    def collect(self, each: Array) -> Array:
+        """Sum over the segments of each chain; there are as many places as segments."""
+        return jax.ops.segment_sum(each, self.index, num_segments=each.shape[0])
+
+
+def chains(found: Blocks, joined: Bool[Array, " segments"]) -> Chains:
+    """Follow the linearised motion from segment to segment."""
+    parameters, states = found.by_parameter.shape[2], found.by_state.shape[2]
+    first = jnp.concatenate([jnp.zeros((states, parameters)), jnp.eye(states), jnp.zeros((states, 1))], axis=1)
+    added = jnp.concatenate(
+        [found.before_by_parameter, jnp.zeros_like(found.before_by_state), -found.gap[:, :, None]], axis=2
+    )
+
+    def follow(before, inputs):
+        continues, by_state, own = inputs
+        here = jnp.where(continues, by_state @ before + own, first)
+        return here, here
+
+    _, path = jax.lax.scan(follow, first, (joined, found.before_by_state, added))
+    index = jnp.cumsum(jnp.where(joined, 0, 1)) - 1
+    return Chains(path[..., :parameters], path[..., parameters:-1], path[..., -1], jnp.maximum(index, 0))
 
 
 class ArrowSystem(eqx.Module):
-    """The normal equations of [`Blocks`][], in blocks.
+    """The normal equations of [`Blocks`][], in blocks. The gradients have two columns: of the residual as it is, and
+    what closing the gaps adds to it.
 
     Attributes:
         shared: sum over segments of J_p^T J_p.
-        own: J_s^T J_s of each segment.
-        coupling: J_s^T J_p of each segment.
+        own: J_c^T J_c of each chain.
+        coupling: J_c^T J_p of each chain.
         shared_gradient: sum of J_p^T r.
-        own_gradient: J_s^T r of each segment.
+        own_gradient: J_c^T r of each chain.
+        chains: how segments' states follow from shared parameters and chains' first states.
     """
 
     shared: Float[Array, "parameters parameters"]
     own: Float[Array, "segments states states"]
     coupling: Float[Array, "segments states parameters"]
-    shared_gradient: Float[Array, " parameters"]
-    own_gradient: Float[Array, "segments states"]
+    shared_gradient: Float[Array, "parameters 2"]
+    own_gradient: Float[Array, "segments states 2"]
+    chains: Chains
 
-    def eliminate(self, damping: Array) -> tuple[Array, Array, Array, Array]:
-        """Solve each segment for its own state.
+    def eliminate(self, damping: Array, closing: Array) -> tuple[Array, Array, Array, Array]:
+        """Solve each chain for its own first state.
+
+        Args:
+            damping: relative to the diagonals.
+            closing: share of the gaps that the step closes.
 
         Returns:
-            The reduced matrix and gradient of the shared parameters, and each segment's response `own^-1 coupling`
+            The reduced matrix and gradient of the shared parameters, and each chain's response `own^-1 coupling`
             and `own^-1 own_gradient`.
         """
+        share = jnp.stack([jnp.ones_like(closing), closing])
         own = self.own + damping * _diagonal(self.own)
-        right = jnp.concatenate([self.coupling, self.own_gradient[:, :, None]], axis=2)
+        right = jnp.concatenate([self.coupling, (self.own_gradient @ share)[:, :, None]], axis=2)
         solved = jax.vmap(_solve_scaled)(own, right)
         response, own_step = solved[:, :, :-1], solved[:, :, -1]
         shared = self.shared + damping * _diagonal(self.shared)
         matrix = shared - jnp.einsum("sqp,sqr->pr", self.coupling, response)
-        gradient = self.shared_gradient - jnp.einsum("sqp,sq->p", self.coupling, own_step)
+        gradient = self.shared_gradient @ share - jnp.einsum("sqp,sq->p", self.coupling, own_step)
         return matrix, gradient, response, own_step
 
     def step(self, damping: Array) -> Unknowns:
-        """The damped Gauss-Newton step."""
-        matrix, gradient, response, own_step = self.eliminate(damping)
-        shared = _solve_scaled(matrix, gradient[:, None])[:, 0]
-        own = own_step - jnp.einsum("sqp,p->sq", response, shared)
-        return Unknowns(-shared, -own)
+        """The damped Gauss-Newton step; damping holds back the closing of the gaps as well."""
+        closing = 1.0 / (1.0 + damping)
+        matrix, gradient, response, own_step = self.eliminate(damping, closing)
+        shared = -_solve_scaled(matrix, gradient[:, None])[:, 0]
+        first = -own_step - jnp.einsum("sqp,p->sq", response, shared)
+        path = self.chains
+        states = jnp.einsum("sqp,p->sq", path.by_parameter, shared)
+        states = states + jnp.einsum("sqk,sk->sq", path.by_first, first[path.index]) + closing * path.closing
+        return Unknowns(shared, states)
 
 
-def normal_equations(blocks: Blocks) -> ArrowSystem:
-    """The normal equations of a linearised residual."""
-    p, s, r = blocks.by_parameter, blocks.by_state, blocks.residual
-    return ArrowSystem(
-        shared=jnp.einsum("srp,srq->pq", p, p),
-        own=jnp.einsum("srp,srq->spq", s, s),
-        coupling=jnp.einsum("srq,srp->sqp", s, p),
-        shared_gradient=jnp.einsum("srp,sr->p", p, r),
-        own_gradient=jnp.einsum("srq,sr->sq", s, r),
+def normal_equations(found: Blocks, joined: Bool[Array, " segments"]) -> ArrowSystem:
+    """The normal equations of a linearised residual, with the gaps closed."""
+    p, s, r = found.by_parameter, found.by_state, found.residual
+    path = chains(found, joined)
+    parameters, states = p.shape[2], s.shape[2]
+    columns = jnp.concatenate([p, s, r[:, :, None]], axis=2)
+    products = jnp.einsum("sri,srj->sij", columns, columns)
+    # From (parameters, first state, residual, closing) to (parameters, own state, residual), segment by segment.
+    through = jnp.concatenate(
+        [path.by_parameter, path.by_first, jnp.zeros_like(path.closing)[..., None], path.closing[..., None]], axis=2
     )
+    above = jnp.broadcast_to(jnp.eye(parameters, through.shape[2]), (through.shape[0], parameters, through.shape[2]))
+    below = jnp.broadcast_to(
+        jnp.eye(1, through.shape[2], parameters + states), (through.shape[0], 1, through.shape[2])
+    )
+    change = jnp.concatenate([above, through, below], axis=1)
+    total = jnp.einsum("sia,sij,sjb->sab", change, products, change)
+    mine = slice(parameters, parameters + states)
+    return ArrowSystem(
+        shared=jnp.sum(total[:, :parameters, :parameters], axis=0),
+        own=path.collect(total[:, mine, mine]),
+        coupling=path.collect(total[:, mine, :parameters]),
+        shared_gradient=jnp.sum(total[:, :parameters, parameters + states :], axis=0),
+        own_gradient=path.collect(total[:, mine, parameters + states :]),
+        chains=path,
+    )
+
+
+def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "segments rows parameters"]:
+    """The parameters' columns without what each chain's own first state could do as well."""
+    system = normal_equations(found, joined)
+    _, _, response, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
+    path = system.chains
+    moved = path.by_parameter - jnp.einsum("sqk,skp->sqp", path.by_first, response[path.index])
+    return found.by_parameter + jnp.einsum("srq,sqp->srp", found.by_state, moved)
 
 
 def _diagonal(matrix: Array) -> Array:
@@ -89,17 +169,34 @@ def _solve_scaled(matrix: Array, right: Array) -> Array:
 
 
 class ArrowDescent(optx.AbstractDescent):
-    """Damped Gauss-Newton steps by elimination of the segments' states; damping is relative to diag(J^T J)."""
+    """Damped Gauss-Newton steps by elimination of the segments' states; damping is relative to diag(J^T J).
+
+    Attributes:
+        joined: whether a segment starts where the one before it ends.
+        gap_weight: of each state, as in the problem.
+        damping: at the start.
+    """
+
+    joined: Bool[Array, " segments"]
+    gap_weight: Float[Array, " states"]
+    damping: Float[Array, ""]
 
     def init(self, y: Unknowns, f_info_struct) -> ArrowSystem:
         parameters = y.parameters.shape[0]
         segments, states = y.states.shape
+        zeros = jnp.zeros((segments, states, states))
         return ArrowSystem(
             shared=jnp.eye(parameters),
-            own=jnp.broadcast_to(jnp.eye(states)[None], (segments, states, states)),
-            coupling=jnp.zeros((segments, states, parameters)),
-            shared_gradient=jnp.zeros(parameters),
-            own_gradient=jnp.zeros((segments, states)),
+            own=zeros,
+            coupling=zeros[:, :, :1] * jnp.zeros(parameters)[None, None, :],
+            shared_gradient=jnp.zeros((parameters, 2)),
+            own_gradient=jnp.zeros((segments, states, 2)),
+            chains=Chains(
+                by_parameter=zeros[:, :, :1] * jnp.zeros(parameters)[None, None, :],
+                by_first=zeros,
+                closing=zeros[:, :, 0],
+                index=jnp.zeros(segments, dtype=int),
+            ),
         )
 
     def query(self, y: Unknowns, f_info, state: ArrowSystem) -> ArrowSystem:
@@ -110,21 +207,67 @@ class ArrowDescent(optx.AbstractDescent):
             own = jnp.broadcast_to(seed[None, parameters:], (segments, states))
             return f_info.jac.mv(Unknowns(seed[:parameters], own))
 
-        # One seed moves the same state of every segment: no row depends on two of them.
-        columns = jax.vmap(column, out_axes=-1)(jnp.eye(parameters + states))
-        return normal_equations(Blocks(f_info.residual, columns[..., :parameters], columns[..., parameters:]))
+        # One seed moves the same state of every segment: no row depends on two of them, and a gap on two that the
+        # difference of the identity tells apart.
+        moved: LinearisedResidual = jax.vmap(column, out_axes=-1)(jnp.eye(parameters + states))
+        slopes = moved.gap / self.gap_weight[None, :, None]
+        own = jnp.where(self.joined[:, None, None], jnp.eye(states), 0.0)
+        found = Blocks(
+            residual=f_info.residual.rows,
+            by_parameter=moved.rows[..., :parameters],
+            by_state=moved.rows[..., parameters:],
+            gap=f_info.residual.gap / self.gap_weight[None],
+            before_by_parameter=-slopes[..., :parameters],
+            before_by_state=own - slopes[..., parameters:],
+        )
+        return normal_equations(found, self.joined)
 
     def step(self, step_size: Array, state: ArrowSystem) -> tuple[Unknowns, optx.RESULTS]:
-        damping = _INITIAL_DAMPING / jnp.maximum(step_size, 1e-30)
+        damping = self.damping / jnp.maximum(step_size, 1e-30)
         return state.step(damping), optx.RESULTS.successful
 
 
-class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):
-    """optimistix' Levenberg-Marquardt with [`ArrowDescent`][] for its linear algebra."""
+class GapTrustRegion(optx.AbstractSearch):
+    """optimistix' trust region, but a step that hardly changes the sum of squares is taken in any case: to close the
+    last of the gaps costs a little residual, which no finite weight of the gaps repays."""
 
-    rtol: float
-    atol: float
-    norm: Callable[[Any], Array] = optx.rms_norm
-    descent: ArrowDescent = ArrowDescent()
-    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion()
+    region: optx.ClassicalTrustRegion = _REGION
+    slack: float = 1e-4
+
+    def init(self, y, f_info_struct):
+        return self.region.init(y, f_info_struct)
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        size, accept, result, after = self.region.step(first_step, y, y_eval, f_info, f_eval_info, state)
+        before = f_info.as_min()
+        slight = ~accept & (jnp.abs(f_eval_info.as_min() - before) < self.slack * before)
+        after = jax.tree.map(lambda old, new: jnp.where(slight, old, new), state, after)
+        return jnp.where(slight, state.step_size, size), accept | slight, result, after
+
+
+class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):
+    """optimistix' Levenberg-Marquardt with [`ArrowDescent`][] for its linear algebra.
+
+    It ends where a step promises next to nothing: less than `rtol` of what one more degree of freedom explains of
+    noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) How many
+    steps it may take is data, so that one compiled program serves hasty fits and patient ones.
+    """
+
+    descent: ArrowDescent
+    most_steps: Int[Array, ""]
+    rtol: float = 1e-3
+    atol: float = 0.0
+    norm: Callable[[Any], Array] = optx.max_norm
+    search: GapTrustRegion = GapTrustRegion()
     verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
+
+    def terminate(self, fn, y, args, options, state, tags):
+        """Whether to stop: by the decrease that the next step promises."""
+        step = jax.tree.map(jnp.subtract, state.y_eval, y)
+        promised = self.search.region.predict_reduction(step, state.f_info)
+        residual = state.f_info.residual
+        cost = 0.5 * (jnp.sum(residual.rows**2) + jnp.sum(residual.gap**2))
+        small = jnp.abs(promised) < self.rtol * cost / residual.rows.size
+        done = small & ~state.first_step
+        late = ~done & (state.num_steps >= self.most_steps)
+        return done | late, optx.RESULTS.where(late, optx.RESULTS.nonlinear_max_steps_reached, state.result)

@@ -26,6 +26,7 @@ from fitting.estimate import (
     fit,
     measurement_noise,
     needed_substeps,
+    segment_length,
     short_horizon,
     suggested_substeps,
 )
@@ -37,9 +38,7 @@ from hdjax.effects import CATALOGUE, Effect
 
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
-# Longest segment of the final fit: beyond it a free run forgets nothing that a shorter one would not.
-_LONG_HORIZON = 16384
-_LONG_STEPS = 8
+_LONG_STEPS = 20
 # What the long fit may cost on short segments, in the objective: 2 % of the error.
 _LONG_LOSS = 0.02
 # Starts that are fitted in full; more than these are compared as they are first.
@@ -148,7 +147,7 @@ def close_loop(
     clock.lap("attribution")
     progress("final fit over long horizons")
     training, validation = data[current.hold]
-    noise = measurement_noise(current.model, training, halo=setting.halo, substeps=current.training.problem.substeps)
+    noise = measurement_noise(current.training)
     final = _long_fit(current, training, setting)
     clock.lap("final fit")
     progress("free runs on held-out data")
@@ -218,7 +217,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         starts = sorted(starts, key=lambda s: fitted(s, hold_parameters=True).objective)[:_REFINED_STARTS]
     best = min((fitted(s, hold_parameters=False) for s in starts), key=lambda f: f.objective)
     horizon = short_horizon(best.model, training)
-    if horizon == best.error.shape[1]:
+    if best.horizon <= 2 * horizon <= 4 * best.horizon:
         return best
     return fit(
         best.model,
@@ -236,7 +235,8 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     training = data[first][0]
     halo = halo_for(training)
     best = base_fit(model, training, halo=halo)
-    setting = Setting(best.error.shape[1], halo, best.problem.substeps, segment_count(training, best.error.shape[1]))
+    count = segment_count(training, segment_length(best.horizon))
+    setting = Setting(best.horizon, halo, best.problem.substeps, count)
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
@@ -287,7 +287,7 @@ def _add_effects(
 
 
 def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> Fit:
-    """The last fit, over segments as long as the logs, where small errors of a parameter add up and show.
+    """The last fit, over simulations as long as the logs, where small errors of a parameter add up and show.
 
     Where a long simulation has lost its way, short segments say so, and their own fit stays.
     """
@@ -297,10 +297,13 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         current.model,
         training,
         start.free.paths,
-        horizon=min(longest, _LONG_HORIZON),
+        horizon=longest,
+        length=segment_length(setting.horizon),
         halo=setting.halo,
         substeps=start.problem.substeps,
         covariance=start.covariance,
+        count=setting.count,
+        states=start.unknowns.states,
         max_steps=_LONG_STEPS,
     )
     check = fit(

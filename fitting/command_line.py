@@ -1,6 +1,13 @@
 """The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds`."""
 
+# ruff: noqa: E402
+
 import os
+
+# XLA reads this once, when jax loads. With a warm cache it would warn at length that the processor lacks
+# "+prefer-no-gather", a tuning flag that it set itself.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -68,7 +75,7 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
         hold = min(holds, key=lambda h: fits[h].objective)
         found, (training, validation) = fits[hold], split(rig.experiments[hold])
         progress("free runs on held-out data")
-        noise = measurement_noise(found.model, training)
+        noise = measurement_noise(found)
         result = account(found, training, validation, noise=noise, halo=0)
     stored = StoredModel(result.model, hold, found.problem.substeps, 0, noise)
     paths = write_fit_report(

@@ -76,7 +76,14 @@ def _runs(
     fit: Fit, training: Sequence[Stretch], validation: Sequence[Stretch], noise: Array, halo: int
 ) -> tuple[tuple[FreeRun, ...], tuple[FreeRun, ...]]:
     """Free runs on training and held-out stretches, in one program."""
-    together = free_run(fit.model, [*training, *validation], covariance=noise, halo=halo, substeps=fit.problem.substeps)
+    together = free_run(
+        fit.model,
+        [*training, *validation],
+        covariance=noise,
+        halo=halo,
+        substeps=fit.problem.substeps,
+        like=fit,
+    )
     return together[: len(training)], together[len(training) :]
 
 

@@ -10,13 +10,12 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fitting.arrow import ArrowLevenbergMarquardt
+from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import FreeParameters, free_parameters
 from fitting.residual import (
     Problem,
     Unknowns,
-    output_error,
     residual,
     residual_with_blocks,
 )
@@ -24,11 +23,20 @@ from hdjax import Drive, Model, TwoInertiaModel
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
-# Longer segments are fitted from states that shorter ones have found already.
-_LONGEST_RETRY = 2048
+# Simulations longer than this many segments start from states that shorter ones have found already.
+_LONGEST_RETRY = 16
+# Segments are no longer than this; longer simulations join several, which are then lanes of one program.
+_LONGEST_SEGMENT = 256
+# A gap between joined segments counts this many times what it would in the residual of the next sample.
+_GAP_WEIGHT = 3.0
+# Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other weights.
+_DAMPING = (np.asarray(1e-3), np.asarray(1e-9))
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
 _RETRY_STEPS = 12
+# So many samples tell the noise to 1 %.
+_NOISE_SAMPLES = 5000
+_NOISE_STEPS = 30
 # A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: error about 1e-5 of x.
 _STEP_ANGLE = 0.3
 
@@ -44,6 +52,7 @@ class Fit(eqx.Module):
         covariance: of the output error, from the error itself.
         objective: half the log-determinant of that covariance; a decrease of 0.01 is 1 % less error.
         stretches: the data.
+        horizon: samples until a simulation starts anew.
         converged: whether the iteration met its tolerance.
         steps: iterations spent.
     """
@@ -55,6 +64,7 @@ class Fit(eqx.Module):
     covariance: Float[Array, "outputs outputs"]
     objective: float = eqx.field(static=True)
     stretches: tuple[Stretch, ...]
+    horizon: int = eqx.field(static=True)
     converged: bool = eqx.field(static=True)
     steps: int = eqx.field(static=True)
 
@@ -75,6 +85,7 @@ def fit(
     paths: Sequence[str],
     *,
     horizon: int,
+    length: int | None = None,
     halo: int = 0,
     substeps: int | None = None,
     max_steps: int = 60,
@@ -82,19 +93,23 @@ def fit(
     reweigh: bool = True,
     hold_parameters: bool = False,
     count: int | None = None,
+    states: Float[Array, "segments states"] | None = None,
     give_up_above: float = np.inf,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
-    The stretches are cut into segments of `horizon` samples. Each segment's initial state is fitted with the shared
-    parameters. The outputs are weighed by the covariance of what is left over, which maximises the likelihood
+    Simulations start anew every `horizon` samples, and their initial states are fitted with the shared parameters.
+    Longer horizons are cut into joined segments that run side by side; their gaps close as the fit converges, so that
+    the result is that of one simulation (multiple shooting). The outputs are weighed by the covariance of what is left over, which maximises the likelihood
     of Gaussian errors of unknown covariance: an output that the model cannot follow loses its say.
 
     Args:
         model: equations and starting values.
         stretches: the data.
         paths: dotted paths of what is free; may be empty.
-        horizon: samples in a segment. Short ones converge from far away, long ones use the data fully.
+        horizon: samples until a simulation starts anew. Short ones converge from far away, long ones use the data
+            fully.
+        length: samples in a segment; see [`segment_length`][] where not given.
         halo: intervals of torque before each segment, for delays.
         substeps: solver steps in a sample interval; from the natural frequency where not given.
         max_steps: iterations of each pass at most.
@@ -102,32 +117,38 @@ def fit(
         reweigh: whether to weigh by what is left over; with False the given covariance is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         count: number of segments, see [`fitting.experiment.cut`][].
+        states: initial states of the segments to start from; from their first samples where not given.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
 
     Returns:
         The fit.
     """
-    segments = cut(stretches, horizon, halo=halo, count=count)
+    if length is None:
+        length = segment_length(horizon)
+    segments = cut(stretches, length, horizon=horizon, halo=halo, count=count)
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
     free = free_parameters(model, paths, typical_scales(model, stretches))
-    states = initial_states(model, segments)
+    if states is None:
+        states = initial_states(model, segments)
     unknowns = Unknowns(free.pack(model), states)
-    active = jnp.full(len(paths), 0.0 if hold_parameters else 1.0)
+    active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
+    motion = scales(stretches)
     outputs = segments.measured.shape[-1]
-    problem = Problem(model, free, segments, jnp.eye(outputs), active, substeps=substeps)
+    problem = Problem(model, free, segments, jnp.eye(outputs), active, jnp.ones(states.shape[1]), substeps=substeps)
     if covariance is None:
-        covariance = _covariance(_error(problem, unknowns), segments)
+        _, covariance, _ = _evaluate(problem, unknowns)
+    # The scale of a single output changes nothing but the say of the hidden states' prior.
+    scale_matters = outputs > 1 or states.shape[1] > len(model.motion_states)
     objective, converged, steps = np.inf, False, 0
     error = None
-    for turn in range(_REWEIGHTINGS if reweigh else 1):
-        problem = eqx.tree_at(lambda p: p.whitening, problem, whitening(covariance))
-        unknowns, error, success, taken = _solve(problem, unknowns, max_steps)
-        if turn == 0 and horizon <= _LONGEST_RETRY:
+    for turn in range(_REWEIGHTINGS if reweigh and scale_matters else 1):
+        problem = _weighed(problem, covariance, motion.x)
+        unknowns, error, covariance, success, taken = _solve(problem, unknowns, jnp.asarray(max_steps), _DAMPING[min(turn, 1)])
+        if turn == 0 and horizon <= _LONGEST_RETRY * length:
             unknowns, changed = _retry_states(problem, unknowns)
             if changed:
-                unknowns, error, success, taken = _solve(problem, unknowns, max_steps)
-        covariance = _covariance(error, segments)
+                unknowns, error, covariance, success, taken = _solve(problem, unknowns, jnp.asarray(max_steps), _DAMPING[1])
         before, objective = objective, _half_log_determinant(covariance)
         converged, steps = bool(success), steps + int(taken)
         if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
@@ -135,30 +156,56 @@ def fit(
     assert error is not None
     return Fit(
         model=free.unpack(model, unknowns.parameters),
-        problem=problem,
+        problem=_weighed(problem, covariance, motion.x) if reweigh else problem,
         unknowns=unknowns,
         error=error,
         covariance=covariance,
         objective=objective,
         stretches=tuple(stretches),
+        horizon=horizon,
         converged=converged,
         steps=steps,
     )
 
 
 @eqx.filter_jit
-def _solve(problem: Problem, start: Unknowns, max_steps: int):
+def _weighed(problem: Problem, covariance: Array, swing: float | Array) -> Problem:
+    """The problem, weighed by the covariance of the outputs' errors."""
+    white = whitening(covariance)
+    return eqx.tree_at(
+        lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem.model, white, jnp.asarray(swing)))
+    )
+
+
+@eqx.filter_jit
+def _solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
+    descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
     solution = optx.least_squares(
         residual_with_blocks,
-        ArrowLevenbergMarquardt(rtol=1e-4, atol=1e-4),
+        ArrowLevenbergMarquardt(descent, max_steps),
         start,
         args=problem,
-        max_steps=max_steps,
+        max_steps=None,
         throw=False,
     )
-    error = output_error(problem, solution.value)
     success = solution.result == optx.RESULTS.successful
-    return solution.value, error, success, jnp.asarray(solution.stats["num_steps"])
+    error = _error_of_rows(problem, solution.state.f_info.residual.rows)
+    return solution.value, error, _covariance(error, problem.segments), success, solution.stats["num_steps"]
+
+
+def _error_of_rows(problem: Problem, rows: Array) -> Array:
+    """The output error behind the rows of a residual."""
+    shape = problem.segments.measured.shape
+    white = rows[:, : shape[1] * shape[2]].reshape(shape)
+    return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
+
+
+@eqx.filter_jit
+def _evaluate(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array, Array]:
+    """The output error, its covariance, and each segment's sum of squares."""
+    rows, _ = residual(problem, unknowns)
+    error = _error_of_rows(problem, rows)
+    return error, _covariance(error, problem.segments), jnp.sum(rows**2, axis=1)
 
 
 def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]:
@@ -171,46 +218,54 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
     held = eqx.tree_at(lambda p: p.active, problem, jnp.zeros_like(problem.active))
     model = problem.free.unpack(problem.model, unknowns.parameters)
     fresh = Unknowns(unknowns.parameters, initial_states(model, problem.segments))
-    old = _squares(problem, unknowns)
-    squares = np.asarray(old)[np.asarray(weight).any(axis=1)]
-    if squares.max() < _OUTLIER * np.median(squares):
+    _, _, old = _evaluate(problem, unknowns)
+    suspect = np.asarray(old > _OUTLIER * jnp.median(old[np.asarray(weight).any(axis=1)]))
+    if not suspect.any():
         return unknowns, False
     length = weight.shape[1]
     for samples in (max(length // 8, min(length, 16)), length // 2, length):
         masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
-        part = eqx.tree_at(lambda p: p.segments.weight, held, masked)
-        fresh, _, _, _ = _solve(part, fresh, _RETRY_STEPS)
-    better = np.asarray(_squares(problem, fresh) < 0.99 * old)
+        part = eqx.tree_at(
+            lambda p: (p.segments.weight, p.segments.joined), held, (masked, jnp.zeros_like(held.segments.joined))
+        )
+        fresh, *_ = _solve(part, fresh, jnp.asarray(_RETRY_STEPS), _DAMPING[0])
+    _, _, new = _evaluate(problem, fresh)
+    better = np.asarray(new < 0.99 * old) & suspect
     states = jnp.where(better[:, None], fresh.states, unknowns.states)
     return Unknowns(unknowns.parameters, states), bool(np.any(better))
 
 
-@eqx.filter_jit
-def _squares(problem: Problem, unknowns: Unknowns) -> Array:
-    return jnp.sum(residual(problem, unknowns) ** 2, axis=1)
-
-
-@eqx.filter_jit
-def _error(problem: Problem, unknowns: Unknowns):
-    return output_error(problem, unknowns)
-
-
-@jax.jit
 def whitening(covariance: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
     """W with `W covariance W^T = 1`."""
     return jnp.linalg.inv(jnp.linalg.cholesky(covariance))
 
 
+def segment_length(horizon: int) -> int:
+    """Samples in a segment of simulations that start anew every `horizon` samples."""
+    return min(horizon, _LONGEST_SEGMENT)
+
+
+def _gap_weight(model: Model, white: Array, swing: Array) -> Float[Array, " states"]:
+    """What the states count in a gap: an angle as much as in the residual, a rate as the angle that it becomes within
+    a radian of the oscillation, a hidden state by what the error does while it runs through its range."""
+    motion = len(model.motion_states)
+    angles = jnp.linalg.norm(white @ jax.jacfwd(model.outputs)(model.rest()), axis=0)[: motion // 2]
+    rates = angles / model.drive.omega_0
+    visible = 0.1 * swing * jnp.linalg.norm(white[:, -1])
+    hidden = [visible / e.state_scale() for e in model.effects if e.states]
+    return _GAP_WEIGHT * jnp.concatenate([angles, rates, *hidden])
+
+
 def _covariance(error: Array, segments: Segments) -> Array:
     """Covariance of the output error. Runaway simulations count as large, not as unknown."""
-    measured = np.asarray(segments.measured)
-    weight = np.asarray(segments.weight)
-    span = np.std(measured[weight > 0], axis=0)
-    bounded = np.clip(np.nan_to_num(np.asarray(error), nan=np.inf), -10 * span, 10 * span)
-    rows = bounded[weight > 0]
+    weight = segments.weight[:, :, None]
+    samples = jnp.sum(weight)
+    mean = jnp.sum(segments.measured * weight, axis=(0, 1), keepdims=True) / samples
+    variance = jnp.sum((segments.measured - mean) ** 2 * weight, axis=(0, 1), keepdims=True) / samples
+    span = jnp.sqrt(variance)
+    rows = jnp.clip(jnp.nan_to_num(error, nan=jnp.inf), -10 * span, 10 * span) * weight
     # The floor keeps an output that the model follows to the last bit from becoming infinitely certain.
-    floor = np.diag((1e-9 * span + 1e-300) ** 2)
-    return jnp.asarray(rows.T @ rows / rows.shape[0] + floor)
+    return jnp.einsum("sni,snj->ij", rows, rows) / samples + jnp.diag((1e-9 * span[0, 0] + 1e-300) ** 2)
 
 
 def _half_log_determinant(covariance: Array) -> float:
@@ -270,19 +325,37 @@ def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float 
     return int(2 ** np.clip(np.round(np.log2(periods * period)), 5, 11))
 
 
-def measurement_noise(
-    model: Model, stretches: Sequence[Stretch], *, halo: int = 0, substeps: int | None = None
-) -> Float[Array, "outputs outputs"]:
+def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
     """Covariance of the outputs' measurement noise: what stays when each short piece of the log may start anew.
 
     Within half a period an initial state explains any smooth motion, missing physics included, so that little but
     noise is left. Corrected for the initial states that were fitted.
+
+    Args:
+        found: a fit; its parameters are held, and its compiled program does the work.
     """
-    half_period = np.pi / natural_frequency(model, stretches) / stretches[0].experiment.time_step
-    length = int(np.clip(np.round(half_period), 6, 24))
-    found = fit(model, stretches, (), horizon=length, halo=halo, substeps=substeps)
-    rows = length * found.covariance.shape[0]
-    return found.covariance * (rows / (rows - len(model.motion_states)))
+    count, length = found.problem.segments.weight.shape
+    half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
+    piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
+    held = eqx.tree_at(lambda p: p.active, found.problem, jnp.zeros_like(found.problem.active))
+    total, samples = jnp.zeros_like(found.covariance), 0.0
+    # A piece is the head of a segment; segments that begin later have other heads.
+    for offset in range(0, length - piece + 1, piece):
+        shifted = [Stretch(s.experiment, s.start + offset, s.stop) for s in found.stretches if len(s) >= offset + piece]
+        if not shifted or samples >= _NOISE_SAMPLES:
+            break
+        segments = cut(shifted, length, halo=held.segments.halo, count=count)
+        whole = segments.weight[:, piece - 1 : piece]
+        head = segments.weight * whole * (jnp.arange(length) < piece)[None].astype(whole.dtype)
+        part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, head))
+        unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
+        covariance = found.covariance
+        for turn in range(_REWEIGHTINGS):
+            part = _weighed(part, covariance, scales(found.stretches).x)
+            unknowns, _, covariance, _, _ = _solve(part, unknowns, jnp.asarray(_NOISE_STEPS), _DAMPING[min(turn, 1)])
+        total, samples = total + covariance * jnp.sum(head), samples + float(jnp.sum(head))
+    rows = piece * total.shape[0]
+    return total / samples * (rows / (rows - len(found.model.motion_states)))
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, most: int = 8) -> int:
@@ -295,10 +368,10 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, most: int = 8) -> in
     """
     problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
     substeps = problem.substeps
-    error = _error(problem, found.unknowns)
+    error, _, _ = _evaluate(problem, found.unknowns)
     while substeps < most:
         finer = dataclasses.replace(problem, substeps=2 * substeps)
-        better = _error(finer, found.unknowns)
+        better, _, _ = _evaluate(finer, found.unknowns)
         white = np.asarray(better - error) @ np.asarray(problem.whitening).T
         mean_square = (white**2).sum(axis=(0, 1)) / float(problem.segments.count)
         if np.sqrt(mean_square.max()) < tolerance:

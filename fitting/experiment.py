@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.logs import Log
 from hdjax import Hold, PiecewisePolynomial, sampled
@@ -59,12 +59,16 @@ class Stretch(eqx.Module):
 class Segments(eqx.Module):
     """Stretches cut into equally long pieces, the lanes of one program. Missing samples have weight zero.
 
+    A segment either starts anew, or it is joined to the one before and must start where that one ends. Which it is
+    are data, so that one compiled program fits short horizons and whole logs.
+
     Attributes:
         torque: logged torque of each segment; its first `halo` intervals lie before the segment, so that a delay
             has something to reach back to.
         load_torque: coefficients of the load torque, or None.
         measured: outputs at the samples.
         weight: 1 for a sample, 0 for padding.
+        joined: whether a segment starts where the one before it ends.
         halo: intervals before each segment's first sample.
     """
 
@@ -72,6 +76,7 @@ class Segments(eqx.Module):
     load_torque: PiecewisePolynomial | None
     measured: Float[Array, "segments samples outputs"]
     weight: Float[Array, "segments samples"]
+    joined: Bool[Array, " segments"]
     halo: int = eqx.field(static=True)
 
     @property
@@ -128,59 +133,61 @@ def segment_count(stretches: Sequence[Stretch], length: int) -> int:
     return needed if needed <= 8 else needed + -needed % 16
 
 
-def cut(stretches: Sequence[Stretch], length: int, *, halo: int = 0, count: int | None = None) -> Segments:
+def cut(
+    stretches: Sequence[Stretch], length: int, *, horizon: int | None = None, halo: int = 0, count: int | None = None
+) -> Segments:
     """Cut stretches into segments of `length` samples; the last one of each stretch is padded.
 
     Args:
         stretches: the data.
         length: samples in a segment.
+        horizon: samples until a simulation starts anew; the length where not given.
         halo: intervals of torque before each segment.
         count: number of segments, the superfluous ones without weight; [`segment_count`][] where not given.
     """
-    torque_knots, torque_coefficients, load_coefficients = [], [], []
-    measured, weight = [], []
-    for stretch in stretches:
-        experiment = stretch.experiment
-        knots = np.asarray(experiment.torque.knots)
-        coefficients = np.asarray(experiment.torque.coefficients)
-        load = experiment.load_torque
-        last = len(experiment) - 1
-        step = experiment.time_step
-        for begin in range(stretch.start, stretch.stop, length):
-            index = np.arange(begin - halo, begin + length)
-            inside = np.clip(index, 0, last)
-            # Before the record the first torque is assumed to have been held; beyond it the last.
-            piece = coefficients[inside].copy()
-            piece[index != inside, 1:] = 0.0
-            outer = np.append(index, index[-1] + 1)
-            known = np.clip(outer, 0, last + 1)
-            torque_knots.append(knots[known] + (outer - known) * step)
-            torque_coefficients.append(piece)
-            own = index[halo:]
-            present = (own < stretch.stop).astype(float)
-            kept = np.clip(own, 0, stretch.stop - 1)
-            measured.append(experiment.measured[kept])
-            weight.append(present)
-            if load is not None:
-                load_coefficients.append(np.asarray(load.coefficients)[np.clip(own, 0, last)])
-    wanted = segment_count(stretches, length) if count is None else count
-    for _ in range(wanted - len(weight)):
-        torque_knots.append(torque_knots[-1])
-        torque_coefficients.append(torque_coefficients[-1])
-        measured.append(measured[-1])
-        weight.append(np.zeros(length))
-        if load_coefficients:
-            load_coefficients.append(load_coefficients[-1])
-    knots = jnp.asarray(np.stack(torque_knots))
-    load_torque = None
-    if load_coefficients:
-        load_torque = PiecewisePolynomial(knots[:, halo:], jnp.asarray(np.stack(load_coefficients)))
+    pieces = 1 if horizon is None else max(1, -(-horizon // length))
+    parts = [_cut_one(s, length, pieces, halo) for s in stretches]
+    found = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    missing = max(0, (segment_count(stretches, length) if count is None else count) - found[0].shape[0])
+    filled = [np.concatenate([column, np.repeat(column[-1:], missing, axis=0)]) for column in found]
+    knots, torque, load, measured, weight, joined = filled
+    weight[weight.shape[0] - missing :] = 0.0
+    joined[joined.shape[0] - missing :] = False
+    own_knots = jnp.asarray(knots)
+    loaded = any(s.experiment.load_torque is not None for s in stretches)
     return Segments(
-        torque=PiecewisePolynomial(knots, jnp.asarray(np.stack(torque_coefficients))),
-        load_torque=load_torque,
-        measured=jnp.asarray(np.stack(measured)),
-        weight=jnp.asarray(np.stack(weight)),
+        torque=PiecewisePolynomial(own_knots, jnp.asarray(torque)),
+        load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if loaded else None,
+        measured=jnp.asarray(measured),
+        weight=jnp.asarray(weight),
+        joined=jnp.asarray(joined),
         halo=halo,
+    )
+
+
+def _cut_one(stretch: Stretch, length: int, pieces: int, halo: int) -> tuple[np.ndarray, ...]:
+    """Knots, torque, load torque, measured outputs, weight, and whether joined, of one stretch's segments by row."""
+    experiment = stretch.experiment
+    last = len(experiment) - 1
+    begin = np.arange(stretch.start, stretch.stop, length)
+    index = begin[:, None] + np.arange(-halo, length)
+    inside = np.clip(index, 0, last)
+    # Before the record the first torque is assumed to have been held; beyond it the last.
+    torque = np.asarray(experiment.torque.coefficients)[inside]
+    torque[index != inside, 1:] = 0.0
+    outer = begin[:, None] + np.arange(-halo, length + 1)
+    known = np.clip(outer, 0, last + 1)
+    knots = np.asarray(experiment.torque.knots)[known] + (outer - known) * experiment.time_step
+    own = index[:, halo:]
+    load = experiment.load_torque
+    coefficients = np.zeros((last + 1, 0)) if load is None else np.asarray(load.coefficients)
+    return (
+        knots,
+        torque,
+        coefficients[np.clip(own, 0, last)],
+        experiment.measured[np.clip(own, 0, stretch.stop - 1)],
+        (own < stretch.stop).astype(float),
+        np.arange(begin.size) % pieces != 0,
     )
 
 

@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.arrow import normal_equations
-from fitting.estimate import fit, suggested_substeps
+from fitting.estimate import Fit, fit, suggested_substeps
 from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
-from fitting.residual import Problem, Unknowns, blocks, simulate_segments
+from fitting.residual import Problem, Unknowns, linearise, simulate_segments
 from hdjax import Model, TwoInertiaModel
 
 WINDOW = 50
@@ -58,6 +57,7 @@ def free_run(
     halo: int = 0,
     substeps: int | None = None,
     window: int = WINDOW,
+    like: Fit | None = None,
 ) -> tuple[FreeRun, ...]:
     """Simulate each stretch from its first `window` samples on.
 
@@ -68,22 +68,28 @@ def free_run(
         halo: intervals of torque before the start, for delays.
         substeps: solver steps in a sample interval.
         window: samples for the initial state.
+        like: a fit of the same model, whose compiled program then finds the initial states as well.
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
     windows = [Stretch(s.experiment, s.start, min(s.start + window, s.stop)) for s in stretches]
+    paths, length, count = (), window, len(stretches)
+    if like is not None and _holds(like, count, window):
+        paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
     starts = fit(
         model,
         windows,
-        (),
-        horizon=window,
+        paths,
+        horizon=length,
+        length=length,
         halo=halo,
         substeps=substeps,
         covariance=covariance,
         reweigh=False,
-        count=len(stretches),
+        hold_parameters=True,
+        count=count,
     )
-    states = _rest_where_at_rest(model, starts.problem, starts.unknowns)
+    states = _rest_where_at_rest(model, starts, len(stretches))
     length = max(len(s) for s in stretches)
     segments = cut(stretches, length, halo=halo, count=len(stretches))
     problem = Problem(
@@ -92,6 +98,7 @@ def free_run(
         segments,
         jnp.eye(segments.measured.shape[-1]),
         jnp.zeros(0),
+        jnp.ones(states.shape[1]),
         substeps=substeps,
     )
     outputs = np.asarray(_simulate(problem, Unknowns(jnp.zeros(0), states)))
@@ -114,28 +121,29 @@ def free_run(
 
 @eqx.filter_jit
 def _simulate(problem: Problem, unknowns: Unknowns) -> Array:
-    return simulate_segments(problem, unknowns)
+    return simulate_segments(problem, unknowns)[0]
 
 
-@eqx.filter_jit
-def _window_system(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array]:
-    found = blocks(problem, unknowns)
-    rows = found.residual.shape[1] - found.by_state.shape[2]
-    excess = jnp.sum(found.residual**2, axis=1) / rows
-    return normal_equations(found).own, jnp.maximum(excess, 1.0)
+def _holds(like: Fit, count: int, window: int) -> bool:
+    segments, samples = like.problem.segments.weight.shape
+    return segments >= count and samples >= window
 
 
-def _rest_where_at_rest(model: Model, problem: Problem, unknowns: Unknowns) -> Array:
+def _rest_where_at_rest(model: Model, starts: Fit, lanes: int) -> Array:
     """Initial states, with rates set to zero where the window can't tell them from zero.
 
     A short window knows a rate poorly, and the error grows with time. A log that begins at rest is common; where
     that is compatible with the window (1 % level), rest is taken.
     """
-    information, excess = _window_system(problem, unknowns)
+    found = linearise(starts.problem, starts.unknowns)
+    slopes = np.asarray(found.by_state)
+    information = np.einsum("srp,srq->spq", slopes, slopes)
+    rows = np.maximum(np.asarray(starts.problem.segments.weight).sum(1) * starts.covariance.shape[0], 1.0)
+    excess = np.maximum(np.sum(np.asarray(found.residual) ** 2, axis=1) / rows, 1.0)
     rates = np.array([i for i, n in enumerate(model.motion_states) if n in ("omega_m", "omega_l", "v")])
-    states = np.array(unknowns.states)
-    for lane in range(states.shape[0]):
-        matrix = np.asarray(information[lane])
+    states = np.array(starts.unknowns.states[:lanes])
+    for lane in range(lanes):
+        matrix = information[lane]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         scaled = matrix * scale[:, None] * scale[None, :]
         covariance = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale[None, :]

@@ -24,8 +24,11 @@ class Problem(eqx.Module):
         segments: the data.
         whitening: `whitening @ e` has unit covariance for an output error e.
         active: 1 for a parameter that may move, 0 for one that is held; one program fits and evaluates.
+        gap_weight: what a unit of each state counts where a joined segment does not yet start where the one before
+            it ends.
         solver: explicit Runge-Kutta solver of diffrax.
         substeps: its steps in each sample interval.
+        unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
     """
 
     model: Model
@@ -33,8 +36,10 @@ class Problem(eqx.Module):
     segments: Segments
     whitening: Float[Array, "outputs outputs"]
     active: Float[Array, " parameters"]
+    gap_weight: Float[Array, " states"]
     solver: dfx.AbstractERK = dfx.Tsit5()
     substeps: int = eqx.field(static=True, default=1)
+    unroll: bool = eqx.field(static=True, default=True)
 
 
 class Unknowns(eqx.Module):
@@ -45,16 +50,30 @@ class Unknowns(eqx.Module):
 
 
 class Blocks(eqx.Module):
-    """Residual and its Jacobian, which is arrow-shaped: a segment's rows depend on the shared parameters and on its
-    own initial state only."""
+    """Residual and Jacobian: a segment's rows and its end depend on the shared parameters and on its own initial
+    state only.
+
+    Attributes:
+        residual: see [`residual`][].
+        by_parameter: derivative of the residual.
+        by_state: likewise.
+        gap: how far each joined segment starts from where the one before it ends; zero where a segment starts anew.
+        before_by_parameter: derivative of the end of the segment before; zero where a segment starts anew.
+        before_by_state: likewise, with respect to the initial state of the segment before.
+    """
 
     residual: Float[Array, "segments rows"]
     by_parameter: Float[Array, "segments rows parameters"]
     by_state: Float[Array, "segments rows states"]
+    gap: Float[Array, "segments states"]
+    before_by_parameter: Float[Array, "segments states parameters"]
+    before_by_state: Float[Array, "segments states states"]
 
 
-def simulate_segments(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments samples outputs"]:
-    """The outputs that the model gives on each segment."""
+def simulate_segments(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
+    """The outputs that the model gives on each segment, and the state it ends in."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
     segments = problem.segments
 
@@ -66,26 +85,41 @@ def simulate_segments(problem: Problem, unknowns: Unknowns) -> Float[Array, "seg
             acting,
             (acting.knots[halo:], acting.coefficients[halo:]),
         )
-        states = march(model, own, load_torque, state, solver=problem.solver, substeps=problem.substeps)
-        return jax.vmap(model.outputs)(states)
+        states, end = march(
+            model,
+            own,
+            load_torque,
+            state,
+            solver=problem.solver,
+            substeps=problem.substeps,
+            unroll=problem.unroll,
+        )
+        return jax.vmap(model.outputs)(states), end
 
     return jax.vmap(one)(segments.torque, segments.load_torque, unknowns.states)
 
 
 def output_error(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments samples outputs"]:
     """Measured minus simulated outputs, zero on padding."""
-    error = problem.segments.measured - simulate_segments(problem, unknowns)
-    return error * problem.segments.weight[:, :, None]
+    outputs, _ = simulate_segments(problem, unknowns)
+    return (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
 
 
-def residual(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments rows"]:
-    """Whitened output error of each segment by row, then its hidden initial states in units of their prior."""
-    error = output_error(problem, unknowns)
+def residual(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
+    """Whitened output error of each segment by row, then its hidden initial states in units of their prior; and the
+    gap before each joined segment."""
+    outputs, end = simulate_segments(problem, unknowns)
+    error = (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
     rows = white.reshape(white.shape[0], -1)
     rows = jnp.where(jnp.isfinite(rows), rows, _LOST)
-    prior = _state_prior(problem, unknowns)
-    return jnp.concatenate([rows, prior], axis=1)
+    joined = problem.segments.joined[:, None]
+    rows = jnp.concatenate([rows, jnp.where(joined, 0.0, _state_prior(problem, unknowns))], axis=1)
+    gap = unknowns.states - jnp.roll(end, 1, axis=0)
+    gap = jnp.where(jnp.isfinite(gap), gap, _LOST)
+    return rows, jnp.where(joined, gap, 0.0)
 
 
 def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments hidden"]:
@@ -109,15 +143,40 @@ def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
         tangent = Unknowns(seed[:parameters], jnp.broadcast_to(seed[None, parameters:], (segments, states)))
         return jax.jvp(lambda u: residual(problem, u), (unknowns,), (tangent,))
 
-    value, columns = jax.vmap(along, out_axes=(None, -1))(seeds)
+    (value, gap), (columns, slopes) = jax.vmap(along, out_axes=(None, -1))(seeds)
     columns = jnp.where(jnp.isfinite(columns), columns, 0.0)
-    return Blocks(value, columns[..., :parameters] * problem.active[None, None, :], columns[..., parameters:])
+    slopes = jnp.where(jnp.isfinite(slopes), slopes, 0.0)
+    active = problem.active[None, None, :]
+    # A gap is a segment's own initial state minus the end of the one before.
+    own = jnp.where(problem.segments.joined[:, None, None], jnp.eye(states), 0.0)
+    return Blocks(
+        residual=value,
+        by_parameter=columns[..., :parameters] * active,
+        by_state=columns[..., parameters:],
+        gap=gap,
+        before_by_parameter=-slopes[..., :parameters] * active,
+        before_by_state=own - slopes[..., parameters:],
+    )
+
+
+linearise = eqx.filter_jit(blocks)
+"""[`blocks`][], compiled once for all who look at a solution."""
+
+
+class LinearisedResidual(eqx.Module):
+    """What the least squares solver of optimistix minimises the squares of: residual and weighted gaps. (Their
+    derivatives are carried along by [`residual_with_blocks`][].)"""
+
+    rows: Float[Array, "segments rows"]
+    gap: Float[Array, "segments states"]
 
 
 @eqx.filter_custom_jvp
-def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> Float[Array, "segments rows"]:
-    """[`residual`][], whose derivative is a product with [`blocks`][] rather than a second simulation."""
-    return residual(problem, unknowns)
+def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> LinearisedResidual:
+    """[`residual`][] with weighted gaps, whose derivative is a product with [`blocks`][] rather than a second
+    simulation."""
+    rows, gap = residual(problem, unknowns)
+    return LinearisedResidual(rows, gap * problem.gap_weight[None])
 
 
 @residual_with_blocks.def_jvp
@@ -125,9 +184,16 @@ def _residual_jvp(primals, tangents):
     unknowns, problem = primals
     tangent, _ = tangents
     found = blocks(problem, unknowns)
-    change = jnp.zeros_like(found.residual)
+    rows, gap = jnp.zeros_like(found.residual), jnp.zeros_like(found.gap)
     if tangent.parameters is not None:
-        change = change + jnp.einsum("srp,p->sr", found.by_parameter, tangent.parameters)
+        rows = rows + jnp.einsum("srp,p->sr", found.by_parameter, tangent.parameters)
+        gap = gap - jnp.einsum("sqp,p->sq", found.before_by_parameter, tangent.parameters)
     if tangent.states is not None:
-        change = change + jnp.einsum("srq,sq->sr", found.by_state, tangent.states)
-    return found.residual, change
+        before = jnp.roll(tangent.states, 1, axis=0)
+        own = jnp.where(problem.segments.joined[:, None], tangent.states, 0.0)
+        rows = rows + jnp.einsum("srq,sq->sr", found.by_state, tangent.states)
+        gap = gap + own - jnp.einsum("sqk,sk->sq", found.before_by_state, before)
+    return (
+        LinearisedResidual(found.residual, found.gap * problem.gap_weight[None]),
+        LinearisedResidual(rows, gap * problem.gap_weight[None]),
+    )

@@ -18,7 +18,7 @@ from fitting.estimate import Fit, suggested_substeps
 from fitting.experiment import scales
 from fitting.free import FreeParameters, base_paths, effect_paths, strength_paths
 from fitting.residual import Problem, Unknowns, blocks
-from fitting.uncertainty import project
+from fitting.arrow import project
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
 
@@ -139,8 +139,10 @@ def _score(everything: Model, fit: Fit, surrogates: Array) -> tuple[tuple[str, .
         fit.problem.segments,
         fit.problem.whitening,
         jnp.ones(len(paths)),
+        jnp.ones(len(everything.state_names)),
         # Sensitivities need no more steps than the drive's own oscillation; the residual is the fit's own.
         substeps=suggested_substeps(everything, fit.stretches),
+        unroll=False,
     )
     unknowns = Unknowns(vector, _states(everything, fit))
     residual = jnp.asarray(fit.error) @ fit.problem.whitening.T
@@ -162,7 +164,7 @@ def _states(everything: Model, fit: Fit) -> Array:
 @eqx.filter_jit
 def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogates: Array):
     found = blocks(problem, unknowns)
-    columns = project(found)
+    columns = project(found, problem.segments.joined)
     # Residuals are measured minus simulated: what a strength explains is minus its derivative.
     columns = -columns[:, : surrogates.shape[2]]
     residual = error.reshape(error.shape[0], -1)

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.arrow import normal_equations
+from fitting.arrow import project
 from fitting.estimate import Fit, short_horizon
-from fitting.residual import Blocks, Problem, Unknowns, blocks
+from fitting.residual import Blocks, Problem, linearise
 from hdjax.parameters import ParameterInfo
 
 _NORMAL_95 = 1.959963984540054
@@ -62,7 +62,7 @@ def uncertainty(fit: Fit) -> Uncertainty:
         return Uncertainty({}, np.zeros((0, 0)))
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
     chunk = min(short_horizon(fit.model, fit.stretches), fit.error.shape[1])
-    information, meat = (np.asarray(a) for a in _information(problem, fit.unknowns, chunk))
+    information, meat = (np.asarray(a) for a in _information(problem, linearise(problem, fit.unknowns), chunk))
     classical = _inverse(information)
     robust = classical @ meat @ classical
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
@@ -113,9 +113,8 @@ def _estimate(
 
 
 @eqx.filter_jit
-def _information(problem: Problem, unknowns: Unknowns, chunk: int) -> tuple[Array, Array]:
-    found = blocks(problem, unknowns)
-    projected = project(found)
+def _information(problem: Problem, found: Blocks, chunk: int) -> tuple[Array, Array]:
+    projected = project(found, problem.segments.joined)
     information = jnp.einsum("srp,srq->pq", projected, projected)
     outputs = problem.segments.measured.shape[-1]
     samples = problem.segments.measured.shape[1]
@@ -127,13 +126,6 @@ def _information(problem: Problem, unknowns: Unknowns, chunk: int) -> tuple[Arra
     clusters = scores.reshape(segments, -1, chunk, parameters).sum(2)
     meat = jnp.einsum("scp,scq->pq", clusters, clusters)
     return information, meat
-
-
-def project(found: Blocks) -> Float[Array, "segments rows parameters"]:
-    """The parameters' columns without what each segment's own initial state could do as well."""
-    system = normal_equations(found)
-    _, _, response, _ = system.eliminate(jnp.zeros(()))
-    return found.by_parameter - jnp.einsum("srq,sqp->srp", found.by_state, response)
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:

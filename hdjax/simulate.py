@@ -194,7 +194,8 @@ def march(
     *,
     solver: dfx.AbstractERK,
     substeps: int,
-) -> Float[Array, "n states"]:
+    unroll: bool = True,
+) -> tuple[Float[Array, "n states"], State]:
     """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
 
     Agrees with [`simulate`][] to the order of the solver. It unrolls the solver's own tableau inside one scan, so
@@ -208,9 +209,11 @@ def march(
         initial_state: state at the first knot.
         solver: an explicit Runge-Kutta solver of diffrax; its tableau is used.
         substeps: steps in each sample interval.
+        unroll: whether a step's stages are written out. A loop over them compiles several times faster for a large
+            model, and runs slower for a small one.
 
     Returns:
-        States at each knot but the last, by row.
+        States at each knot but the last, by row, and the state at the last.
     """
     tableau = solver.tableau if isinstance(solver, dfx.AbstractERK) else None
     if not isinstance(tableau, dfx.ButcherTableau):
@@ -218,6 +221,7 @@ def march(
     lower = [np.asarray(row) for row in tableau.a_lower]
     nodes = np.concatenate([[0.0], np.asarray(tableau.c)])
     weights = np.asarray(tableau.b_sol)
+    table = np.stack([np.pad(row, (0, len(nodes) - len(row))) for row in [np.zeros(0), *lower]])
 
     def interval(state, inputs):
         coefficients, load_coefficients, width = inputs
@@ -227,7 +231,21 @@ def march(
             load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
             return model.component_rates(y, polynomial(coefficients, s), load)
 
+        def step_in_a_loop(y, start):
+            def stage(slopes, inputs):
+                i, row, node = inputs
+                now = tuple(c + h * jnp.dot(row, k) for c, k in zip(y, slopes, strict=True))
+                found = rates(now, start + node * h)
+                return tuple(k.at[i].set(r) for k, r in zip(slopes, found, strict=True)), None
+
+            none = tuple(jnp.zeros(len(nodes)) for _ in y)
+            stages = (jnp.arange(len(nodes)), jnp.asarray(table), jnp.asarray(nodes))
+            slopes, _ = jax.lax.scan(stage, none, stages)
+            return tuple(c + h * jnp.dot(jnp.asarray(weights), k) for c, k in zip(y, slopes, strict=True))
+
         def step(y, start):
+            if not unroll:
+                return step_in_a_loop(y, start)
             slopes = [rates(y, start)]
             for row, node in zip(lower, nodes[1:], strict=True):
                 slopes.append(rates(_advanced(y, h, row, slopes), start + float(node) * h))
@@ -242,8 +260,8 @@ def march(
     load_coefficients = None if load_torque is None else load_torque.coefficients
     inputs = (torque.coefficients, load_coefficients, jnp.diff(torque.knots))
     # The state travels as separate numbers: under vmap each is one contiguous row of lanes.
-    _, states = jax.lax.scan(interval, tuple(initial_state), inputs)
-    return jnp.stack(states, axis=-1)
+    end, states = jax.lax.scan(interval, tuple(initial_state), inputs)
+    return jnp.stack(states, axis=-1), jnp.stack(end)
 
 
 def _advanced(state: tuple[Array, ...], h: Array, weights: np.ndarray, slopes: list[list[Array]]) -> tuple[Array, ...]:

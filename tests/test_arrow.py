@@ -1,6 +1,7 @@
 """Elimination by segments takes the same steps as dense least squares, to the same minimum."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -8,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import rig
-from fitting.arrow import ArrowLevenbergMarquardt, normal_equations
+from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, normal_equations, project
 from fitting.estimate import initial_states
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths, free_parameters
@@ -23,7 +24,11 @@ def random_blocks(seed: int = 0) -> Blocks:
     by_parameter = random.normal(size=(SEGMENTS, ROWS, PARAMETERS)) * np.array([1e3, 1.0, 1e-4])
     by_state = random.normal(size=(SEGMENTS, ROWS, STATES)) * np.array([1e5, 1e-2])
     r = random.normal(size=(SEGMENTS, ROWS))
-    return Blocks(jnp.asarray(r), jnp.asarray(by_parameter), jnp.asarray(by_state))
+    gap = random.normal(size=(SEGMENTS, STATES)) * np.array([1e-5, 1e2])
+    before_by_parameter = random.normal(size=(SEGMENTS, STATES, PARAMETERS)) * np.array([1e-2, 1e-5, 1e-9])
+    before_by_state = 0.7 * np.array([[1.0, 1e-7], [1e7, 1.0]]) * random.normal(size=(SEGMENTS, STATES, STATES))
+    leaves = (r, by_parameter, by_state, gap, before_by_parameter, before_by_state)
+    return Blocks(*(jnp.asarray(leaf) for leaf in leaves))
 
 
 def dense(found: Blocks) -> tuple[np.ndarray, np.ndarray]:
@@ -38,9 +43,13 @@ def dense(found: Blocks) -> tuple[np.ndarray, np.ndarray]:
     return jacobian, np.asarray(found.residual).ravel()
 
 
+APART = jnp.zeros(SEGMENTS, dtype=bool)
+JOINED = jnp.asarray([False, True, True, False])
+
+
 @eqx.filter_jit
-def take_step(found: Blocks, damping) -> Unknowns:
-    return normal_equations(found).step(damping)
+def take_step(found: Blocks, damping, joined=APART) -> Unknowns:
+    return normal_equations(found, joined).step(damping)
 
 
 def flat(step: Unknowns) -> np.ndarray:
@@ -62,9 +71,59 @@ def test_the_step_is_that_of_dense_least_squares(damping: float):
     assert np.max(np.abs(step * length)) > (1e-3 if damping < 10 else 1e-5)
 
 
+def closed(found: Blocks) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and right-hand side of the conditions that the gaps of joined segments close."""
+    rows, right = [], []
+    for s in np.flatnonzero(JOINED):
+        row = np.zeros((STATES, PARAMETERS + SEGMENTS * STATES))
+        row[:, :PARAMETERS] = -found.before_by_parameter[s]
+        row[:, PARAMETERS + (s - 1) * STATES :][:, :STATES] = -found.before_by_state[s]
+        row[:, PARAMETERS + s * STATES :][:, :STATES] = np.eye(STATES)
+        rows.append(row)
+        right.append(-np.asarray(found.gap)[s])
+    return np.concatenate(rows), np.concatenate(right)
+
+
+def test_the_step_of_joined_segments_closes_their_gaps_at_least_residual():
+    found = random_blocks()
+    jacobian, r = dense(found)
+    length = np.linalg.norm(jacobian, axis=0)
+    condition, right = closed(found)
+    condition = condition * (1 / length)
+    # Another route: any solution of the conditions, and the best change along their null space.
+    particular = np.linalg.lstsq(condition, right, rcond=None)[0]
+    free = np.linalg.svd(condition)[2][len(right) :].T
+    scaled = jacobian / length
+    expected = particular + free @ np.linalg.lstsq(scaled @ free, -r - scaled @ particular, rcond=None)[0]
+    step = flat(take_step(found, jnp.zeros(()), JOINED)) * length
+    np.testing.assert_allclose(step, expected, atol=1e-8 * np.max(np.abs(expected)))
+
+
+def test_heavy_damping_holds_joined_segments_back():
+    step = take_step(random_blocks(), jnp.asarray(1e12), JOINED)
+    assert np.max(np.abs(step.parameters)) < 1e-6
+    assert np.max(np.abs(np.asarray(step.states) / np.array([1e-5, 1e2]))) < 1e-4
+
+
+def test_projected_columns_are_orthogonal_to_what_the_first_states_can_do():
+    found = random_blocks()
+    jacobian, _ = dense(found)
+    condition, _ = closed(found)
+    # Changes of the states alone that keep the gaps as they are.
+    states = np.linalg.svd(condition[:, PARAMETERS:])[2][condition.shape[0] :].T
+    columns = np.asarray(project(found, JOINED)).reshape(-1, PARAMETERS)
+    against = (jacobian[:, PARAMETERS:] @ states).T @ columns
+    scale = np.linalg.norm(jacobian[:, PARAMETERS:] @ states, axis=0)[:, None] * np.linalg.norm(columns, axis=0)
+    assert np.max(np.abs(against / scale)) < 1e-6
+
+
 def test_a_direction_without_information_does_not_move():
     found = random_blocks()
-    blind = Blocks(found.residual, found.by_parameter.at[:, :, 1].set(0.0), found.by_state.at[2, :, 0].set(0.0))
+    blind = eqx.tree_at(
+        lambda b: (b.by_parameter, b.by_state),
+        found,
+        (found.by_parameter.at[:, :, 1].set(0.0), found.by_state.at[2, :, 0].set(0.0)),
+    )
     for damping in (0.0, 1e-3):
         step = take_step(blind, jnp.asarray(damping))
         assert float(step.parameters[1]) == 0.0
@@ -76,14 +135,11 @@ def test_a_direction_without_information_does_not_move():
 
 def test_a_segment_without_weight_does_not_matter():
     found = random_blocks()
-    padded = Blocks(*(jnp.concatenate([leaf, jnp.zeros((1, *leaf.shape[1:]))]) for leaf in leaves(found)))
-    step, wanted = (take_step(b, jnp.asarray(1e-3)) for b in (padded, found))
+    padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.zeros((1, *leaf.shape[1:]))]), found)
+    wanted = take_step(found, jnp.asarray(1e-3))
+    step = take_step(padded, jnp.asarray(1e-3), jnp.zeros(SEGMENTS + 1, dtype=bool))
     np.testing.assert_allclose(step.parameters, wanted.parameters, rtol=1e-10)
     np.testing.assert_array_equal(step.states[-1], 0.0)
-
-
-def leaves(found: Blocks):
-    return found.residual, found.by_parameter, found.by_state
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +149,29 @@ def small() -> tuple[Problem, Unknowns]:
     model = rig.reduced_model(omega_0=0.95 * rig.OMEGA_0, mu=6.0, alpha=0.0)
     segments = cut([Stretch(experiment, 0, 160)], 40)
     free = free_parameters(model, base_paths(model), {"alpha": 1.0})
-    problem = Problem(model, free, segments, jnp.asarray([[1 / 2e-3]]), jnp.ones(4), substeps=2)
+    problem = Problem(model, free, segments, jnp.asarray([[1 / 2e-3]]), jnp.ones(4), jnp.ones(2), substeps=2)
     return problem, Unknowns(free.pack(model), initial_states(model, segments))
+
+
+def solve(problem: Problem, start: Unknowns) -> optx.Solution:
+    descent = ArrowDescent(problem.segments.joined, problem.gap_weight, jnp.asarray(1e-3))
+    return optx.least_squares(
+        residual_with_blocks,
+        ArrowLevenbergMarquardt(descent, jnp.asarray(60), rtol=1e-9),
+        start,
+        args=problem,
+        max_steps=None,
+        throw=False,
+    )
+
+
+def assert_same_minimum(rows, found: np.ndarray, peer, unknowns: int):
+    """Sum of squares, and unknowns in units of their standard errors."""
+    assert np.sum(np.asarray(rows) ** 2) == pytest.approx(2 * peer.cost, rel=1e-9)
+    spread = np.sqrt(np.diag(np.linalg.inv(peer.jac.T @ peer.jac)))
+    # Much closer to each other than to the truth.
+    np.testing.assert_allclose((found - peer.x) / spread, 0.0, atol=1e-3)
+    assert 2 * peer.cost == pytest.approx(160 - unknowns, rel=0.4)
 
 
 def test_the_minimum_is_that_of_scipy(small):
@@ -107,7 +184,7 @@ def test_the_minimum_is_that_of_scipy(small):
         return Unknowns(jnp.asarray(y[:4]), jnp.asarray(y[4:].reshape(segments, states)))
 
     peer = least_squares(
-        lambda y: np.asarray(run(problem, unflatten(y))).ravel(),
+        lambda y: np.asarray(run(problem, unflatten(y))[0]).ravel(),
         flat(start),
         jac=lambda y: dense(jacobian(problem, unflatten(y)))[0],
         x_scale="jac",
@@ -115,21 +192,36 @@ def test_the_minimum_is_that_of_scipy(small):
         ftol=1e-13,
         gtol=1e-13,
     )
-    solution = optx.least_squares(
-        residual_with_blocks,
-        ArrowLevenbergMarquardt(rtol=1e-8, atol=1e-8),
-        start,
-        args=problem,
-        max_steps=60,
-        throw=False,
-    )
+    solution = solve(problem, start)
     assert solution.result == optx.RESULTS.successful
-    found = flat(solution.value)
     # The start was far: hundreds of times the final sum of squares.
-    assert np.sum(np.asarray(run(problem, start)) ** 2) > 20 * 2 * peer.cost
-    rows = np.asarray(run(problem, solution.value))
-    assert np.sum(rows**2) == pytest.approx(2 * peer.cost, rel=1e-9)
-    spread = np.sqrt(np.diag(np.linalg.inv(peer.jac.T @ peer.jac)))
-    # Much closer to each other than to the truth.
-    np.testing.assert_allclose((found - peer.x) / spread, 0.0, atol=1e-3)
-    assert 2 * peer.cost == pytest.approx(160 - found.size, rel=0.4)
+    assert np.sum(np.asarray(run(problem, start)[0]) ** 2) > 20 * 2 * peer.cost
+    assert_same_minimum(run(problem, solution.value)[0], flat(solution.value), peer, flat(start).size)
+
+
+def test_the_minimum_of_joined_segments_is_that_of_one_simulation(small):
+    problem, start = small
+    joined = eqx.tree_at(lambda p: p.segments.joined, problem, jnp.asarray([False, True, True, True]))
+    joined = eqx.tree_at(lambda p: p.gap_weight, joined, 3.0 / 2e-3 / jnp.asarray([1.0, rig.OMEGA_0]))
+    whole = cut([Stretch(rig.reduced_experiment(160, noise=2e-3), 0, 160)], 160)
+    single = eqx.tree_at(lambda p: p.segments, problem, whole)
+    run = eqx.filter_jit(residual)
+
+    def unflatten(y: np.ndarray) -> Unknowns:
+        return Unknowns(jnp.asarray(y[:4]), jnp.asarray(y[None, 4:]))
+
+    peer = least_squares(
+        lambda y: np.asarray(run(single, unflatten(y))[0]).ravel(),
+        np.concatenate([np.asarray(start.parameters), np.asarray(start.states)[0]]),
+        x_scale="jac",
+        jac="3-point",
+        xtol=1e-13,
+        ftol=1e-13,
+        gtol=1e-13,
+    )
+    solution = solve(joined, start)
+    assert solution.result == optx.RESULTS.successful
+    rows, gap = run(joined, solution.value)
+    np.testing.assert_allclose(np.asarray(gap) * np.asarray(joined.gap_weight), 0.0, atol=1e-9)
+    found = np.concatenate([np.asarray(solution.value.parameters), np.asarray(solution.value.states)[0]])
+    assert_same_minimum(rows, found, peer, found.size)

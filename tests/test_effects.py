@@ -41,7 +41,7 @@ START = jnp.asarray([0.3, 0.007, 5.0, 0.2])
 def outputs(model, torque, start, substeps=1):
     """What the encoders read. The drive's own states start at `start`, an effect's at rest."""
     state = model.rest().at[: start.size].set(start)
-    states = march(model, model.actuate(torque), None, state, solver=dfx.Tsit5(), substeps=substeps)
+    states, _ = march(model, model.actuate(torque), None, state, solver=dfx.Tsit5(), substeps=substeps)
     return jax.vmap(model.outputs)(states)
 
 
@@ -160,7 +160,7 @@ SPRUNG = jnp.asarray([0.2, 0.7, 3.0, 0.1]).at[0].add(50 * 0.7)  # twisted by 4 m
 def released(model):
     """States of a drive let go from a twist, without torque."""
     state = model.rest().at[:4].set(SPRUNG)
-    return march(model, NO_TORQUE, None, state, solver=dfx.Tsit5(), substeps=1)
+    return march(model, NO_TORQUE, None, state, solver=dfx.Tsit5(), substeps=1)[0]
 
 
 def spring(x, alpha):

@@ -25,7 +25,8 @@ def problem_of(experiment, model, paths, *, length=LENGTH, substeps=1, halo=0) -
     outputs = segments.measured.shape[-1]
     whitening = WHITENING if outputs == 2 else jnp.asarray([[1e4]])
     free = free_parameters(model, paths, {"alpha": 2e4})
-    return Problem(model, free, segments, whitening, jnp.ones(len(paths)), substeps=substeps)
+    gap_weight = jnp.ones(len(model.state_names))
+    return Problem(model, free, segments, whitening, jnp.ones(len(paths)), gap_weight, substeps=substeps)
 
 
 def first_states(motion: np.ndarray, length: int = LENGTH) -> jnp.ndarray:
@@ -92,9 +93,12 @@ def hidden_blocks(hidden):
 _residual = eqx.filter_jit(residual)
 
 
-def difference(problem: Problem, unknowns: Unknowns, change: Unknowns, step: float = 1e-6) -> np.ndarray:
-    """Central difference. The step is small because the derivative of |v| in the hysteresis jumps."""
-    up, down = (_residual(problem, jax.tree.map(lambda u, c, s=s: u + s * step * c, unknowns, change)) for s in (1, -1))
+def difference(problem: Problem, unknowns: Unknowns, change: Unknowns, step: float = 1e-6, part: int = 0) -> np.ndarray:
+    """Central difference of the residual or of the gaps. The step is small because the derivative of |v| in the
+    hysteresis jumps."""
+    up, down = (
+        _residual(problem, jax.tree.map(lambda u, c, s=s: u + s * step * c, unknowns, change))[part] for s in (1, -1)
+    )
     return (np.asarray(up) - np.asarray(down)) / (2 * step)
 
 
@@ -129,7 +133,7 @@ def test_blocks_by_state_are_differences(hidden, hidden_blocks):
 def test_a_segment_depends_on_its_own_state_only(hidden):
     problem, unknowns = hidden
     moved = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[1].add(jnp.asarray([0, 1e-4, 0, 0, 0.0])))
-    changed = np.any(np.asarray(_residual(problem, moved)) != np.asarray(_residual(problem, unknowns)), axis=1)
+    changed = np.any(np.asarray(_residual(problem, moved)[0]) != np.asarray(_residual(problem, unknowns)[0]), axis=1)
     np.testing.assert_array_equal(changed, [False, True, False])
 
 
@@ -152,11 +156,73 @@ def test_the_derivative_is_a_product_with_the_blocks(hidden, hidden_blocks):
     value, slope = eqx.filter_jit(lambda p, u, c: jax.jvp(lambda w: residual_with_blocks(w, p), (u,), (c,)))(
         problem, unknowns, change
     )
-    np.testing.assert_allclose(value, _residual(problem, unknowns), rtol=1e-12)
+    np.testing.assert_allclose(value.rows, _residual(problem, unknowns)[0], rtol=1e-12)
     expected = np.einsum("srp,p->sr", hidden_blocks.by_parameter, change.parameters)
     expected += np.einsum("srq,sq->sr", hidden_blocks.by_state, change.states)
-    np.testing.assert_allclose(slope, expected, atol=1e-9 * np.max(np.abs(expected)))
-    assert_column(slope, difference(problem, unknowns, change))
+    np.testing.assert_allclose(slope.rows, expected, atol=1e-9 * np.max(np.abs(expected)))
+    assert_column(slope.rows, difference(problem, unknowns, change))
+
+
+@pytest.fixture(scope="module")
+def joined(hidden) -> tuple[Problem, Unknowns]:
+    """The second and third segments continue the one before, and do not start where it ends."""
+    problem, unknowns = hidden
+    segments = eqx.tree_at(lambda s: s.joined, problem.segments, jnp.asarray([False, True, True]))
+    weight = jnp.asarray([1e2, 1e5, 1.0, 1e2, 1e3])
+    return eqx.tree_at(lambda p: (p.segments, p.gap_weight), problem, (segments, weight)), unknowns
+
+
+def test_gaps_are_starts_minus_ends(joined, hidden_blocks):
+    problem, unknowns = joined
+    rows, gap = (np.asarray(part) for part in _residual(problem, unknowns))
+    np.testing.assert_array_equal(gap[0], 0.0)
+    # One long segment passes the second start where the first segment ends.
+    experiment = rig.drive_experiment(COUNT)
+    whole = cut([Stretch(experiment, 0, COUNT)], COUNT, halo=2)
+    single = eqx.tree_at(lambda p: p.segments, problem, whole)
+    through = np.asarray(output_error(single, eqx.tree_at(lambda u: u.states, unknowns, unknowns.states[:1])))
+    measured = np.asarray(whole.measured)[0, LENGTH]
+    N = float(problem.model.drive.N)
+    start = np.asarray(unknowns.states)[1]
+    outputs = np.array([start[0] / N, start[0] / N - start[1]])
+    moved = np.array([gap[1, 0] / N, gap[1, 0] / N - gap[1, 1]])
+    np.testing.assert_allclose(outputs - (measured - through[0, LENGTH]), moved, rtol=1e-9)
+    # Joined segments inherit their hidden states: only the first has a prior.
+    np.testing.assert_array_equal(rows[1:, -1], 0.0)
+    np.testing.assert_array_equal(rows[0], np.asarray(hidden_blocks.residual)[0])
+
+
+def test_slopes_of_gaps_are_differences(joined):
+    problem, unknowns = joined
+    found = eqx.filter_jit(blocks)(problem, unknowns)
+    scale = np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])
+    for i in range(8):
+        change = Unknowns(jnp.eye(8)[i], jnp.zeros_like(unknowns.states))
+        expected = -difference(problem, unknowns, change, part=1) / scale
+        slopes = np.asarray(found.before_by_parameter)[:, :, i] / scale
+        np.testing.assert_allclose(slopes, expected, atol=1e-5 * np.max(np.abs(expected)))
+    for i in range(5):
+        # Only the first segment moves: the gap behind it shows its end.
+        own = np.zeros(unknowns.states.shape)
+        own[0, i] = scale[i]
+        expected = -difference(problem, unknowns, Unknowns(jnp.zeros(8), jnp.asarray(own)), part=1) / scale
+        slopes = np.asarray(found.before_by_state)[1, :, i] * scale[i] / scale
+        np.testing.assert_allclose(slopes, expected[1], atol=1e-5 * np.max(np.abs(expected)))
+    assert (np.asarray(found.before_by_state)[0] == 0).all()
+
+
+def test_the_derivative_of_weighted_gaps(joined):
+    problem, unknowns = joined
+    random = np.random.default_rng(4)
+    scale = np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])
+    change = Unknowns(jnp.asarray(random.normal(size=8)), jnp.asarray(random.normal(size=(3, 5)) * scale))
+    value, slope = eqx.filter_jit(lambda p, u, c: jax.jvp(lambda w: residual_with_blocks(w, p), (u,), (c,)))(
+        problem, unknowns, change
+    )
+    weight = np.asarray(problem.gap_weight)
+    np.testing.assert_allclose(value.gap, np.asarray(_residual(problem, unknowns)[1]) * weight, rtol=1e-12)
+    expected = difference(problem, unknowns, change, part=1) * weight
+    np.testing.assert_allclose(slope.gap, expected, atol=1e-5 * np.max(np.abs(expected)))
 
 
 def test_padding_does_not_matter(hidden, hidden_blocks):
@@ -181,7 +247,7 @@ def test_a_simulation_that_leaves_the_numbers_is_a_large_residual(hidden):
     problem, unknowns = hidden
     lost = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[0].set(jnp.inf))
     found = eqx.filter_jit(blocks)(problem, lost)
-    for leaf in jax.tree.leaves((found.residual[:, :-1], found.by_parameter, found.by_state)):
+    for leaf in jax.tree.leaves((found.residual[:, :-1], found.by_parameter, found.by_state, found.gap)):
         assert np.isfinite(leaf).all()
     assert np.max(np.abs(found.residual[0, :-1])) >= 1e8
-    np.testing.assert_allclose(found.residual[1], _residual(problem, unknowns)[1], rtol=1e-9)
+    np.testing.assert_allclose(found.residual[1], _residual(problem, unknowns)[0][1], rtol=1e-9)
