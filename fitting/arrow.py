@@ -18,6 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.residual import Blocks, LinearisedResidual, Unknowns
+from hdjax.where import where
 
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
 # across it, so it must go quickly where the model predicts well.
@@ -55,11 +56,11 @@ def chains(found: Blocks, joined: Bool[Array, " segments"]) -> Chains:
 
     def follow(before, inputs):
         continues, by_state, own = inputs
-        here = jnp.where(continues, by_state @ before + own, first)
+        here = where(continues, by_state @ before + own, first)
         return here, here
 
     _, path = jax.lax.scan(follow, first, (joined, found.before_by_state, added))
-    index = jnp.cumsum(jnp.where(joined, 0, 1)) - 1
+    index = jnp.cumsum(where(joined, 0, 1)) - 1
     return Chains(path[..., :parameters], path[..., parameters:-1], path[..., -1], jnp.maximum(index, 0))
 
 
@@ -128,9 +129,7 @@ def normal_equations(found: Blocks, joined: Bool[Array, " segments"]) -> ArrowSy
         [path.by_parameter, path.by_first, jnp.zeros_like(path.closing)[..., None], path.closing[..., None]], axis=2
     )
     above = jnp.broadcast_to(jnp.eye(parameters, through.shape[2]), (through.shape[0], parameters, through.shape[2]))
-    below = jnp.broadcast_to(
-        jnp.eye(1, through.shape[2], parameters + states), (through.shape[0], 1, through.shape[2])
-    )
+    below = jnp.broadcast_to(jnp.eye(1, through.shape[2], parameters + states), (through.shape[0], 1, through.shape[2]))
     change = jnp.concatenate([above, through, below], axis=1)
     total = jnp.einsum("sia,sij,sjb->sab", change, products, change)
     mine = slice(parameters, parameters + states)
@@ -156,14 +155,14 @@ def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "se
 def _diagonal(matrix: Array) -> Array:
     """The diagonal part of each matrix; where it is zero (padding), ones."""
     d = jnp.diagonal(matrix, axis1=-2, axis2=-1)
-    return jnp.where(d > 0, d, 1.0)[..., None] * jnp.broadcast_to(jnp.eye(d.shape[-1]), matrix.shape)
+    return where(d > 0, d, 1.0)[..., None] * jnp.broadcast_to(jnp.eye(d.shape[-1]), matrix.shape)
 
 
 def _solve_scaled(matrix: Array, right: Array) -> Array:
     """Solve a symmetric system after scaling its diagonal to one; a direction without information does not move."""
     d = jnp.diagonal(matrix)
-    scale = jnp.where(d > 0, 1.0 / jnp.sqrt(jnp.where(d > 0, d, 1.0)), 0.0)
-    empty = jnp.where(d > 0, 0.0, 1.0)
+    scale = where(d > 0, 1.0 / jnp.sqrt(where(d > 0, d, 1.0)), 0.0)
+    empty = where(d > 0, 0.0, 1.0)
     scaled = matrix * scale[:, None] * scale[None, :] + jnp.diag(empty + 1e-13)
     return scale[:, None] * jnp.linalg.solve(scaled, scale[:, None] * right)
 
@@ -211,7 +210,7 @@ class ArrowDescent(optx.AbstractDescent):
         # difference of the identity tells apart.
         moved: LinearisedResidual = jax.vmap(column, out_axes=-1)(jnp.eye(parameters + states))
         slopes = moved.gap / self.gap_weight[None, :, None]
-        own = jnp.where(self.joined[:, None, None], jnp.eye(states), 0.0)
+        own = where(self.joined[:, None, None], jnp.eye(states), 0.0)
         found = Blocks(
             residual=f_info.residual.rows,
             by_parameter=moved.rows[..., :parameters],
@@ -241,8 +240,8 @@ class GapTrustRegion(optx.AbstractSearch):
         size, accept, result, after = self.region.step(first_step, y, y_eval, f_info, f_eval_info, state)
         before = f_info.as_min()
         slight = ~accept & (jnp.abs(f_eval_info.as_min() - before) < self.slack * before)
-        after = jax.tree.map(lambda old, new: jnp.where(slight, old, new), state, after)
-        return jnp.where(slight, state.step_size, size), accept | slight, result, after
+        after = jax.tree.map(lambda old, new: where(slight, old, new), state, after)
+        return where(slight, state.step_size, size), accept | slight, result, after
 
 
 class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):

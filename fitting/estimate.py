@@ -27,18 +27,16 @@ _REWEIGHTINGS = 3
 _LONGEST_RETRY = 16
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
 _LONGEST_SEGMENT = 256
-# A gap between joined segments counts this many times what it would in the residual of the next sample.
-_GAP_WEIGHT = 3.0
 # Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other weights.
-_DAMPING = (np.asarray(1e-3), np.asarray(1e-9))
+_DAMPING = (1e-3, 1e-9)
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
 _RETRY_STEPS = 12
 # So many samples tell the noise to 1 %.
 _NOISE_SAMPLES = 5000
 _NOISE_STEPS = 30
-# A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: error about 1e-5 of x.
-_STEP_ANGLE = 0.3
+# A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6.
+_STEP_ANGLE = 0.15
 
 
 class Fit(eqx.Module):
@@ -100,8 +98,9 @@ def fit(
 
     Simulations start anew every `horizon` samples, and their initial states are fitted with the shared parameters.
     Longer horizons are cut into joined segments that run side by side; their gaps close as the fit converges, so that
-    the result is that of one simulation (multiple shooting). The outputs are weighed by the covariance of what is left over, which maximises the likelihood
-    of Gaussian errors of unknown covariance: an output that the model cannot follow loses its say.
+    the result is that of one simulation (multiple shooting). The outputs are weighed by the covariance of what is left
+    over, which maximises the likelihood of Gaussian errors of unknown covariance: an output that the model cannot
+    follow loses its say.
 
     Args:
         model: equations and starting values.
@@ -144,11 +143,11 @@ def fit(
     error = None
     for turn in range(_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, motion.x)
-        unknowns, error, covariance, success, taken = _solve(problem, unknowns, jnp.asarray(max_steps), _DAMPING[min(turn, 1)])
+        unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
             unknowns, changed = _retry_states(problem, unknowns)
             if changed:
-                unknowns, error, covariance, success, taken = _solve(problem, unknowns, jnp.asarray(max_steps), _DAMPING[1])
+                unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[1])
         before, objective = objective, _half_log_determinant(covariance)
         converged, steps = bool(success), steps + int(taken)
         if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
@@ -173,16 +172,20 @@ def _weighed(problem: Problem, covariance: Array, swing: float | Array) -> Probl
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
     return eqx.tree_at(
-        lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem.model, white, jnp.asarray(swing)))
+        lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, jnp.asarray(swing)))
     )
 
 
+def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float):
+    return _compiled_solve(problem, start, jnp.asarray(max_steps), jnp.asarray(damping))
+
+
 @eqx.filter_jit
-def _solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
+def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
     descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
     solution = optx.least_squares(
         residual_with_blocks,
-        ArrowLevenbergMarquardt(descent, max_steps),
+        ArrowLevenbergMarquardt(descent=descent, most_steps=max_steps),
         start,
         args=problem,
         max_steps=None,
@@ -228,7 +231,7 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
         part = eqx.tree_at(
             lambda p: (p.segments.weight, p.segments.joined), held, (masked, jnp.zeros_like(held.segments.joined))
         )
-        fresh, *_ = _solve(part, fresh, jnp.asarray(_RETRY_STEPS), _DAMPING[0])
+        fresh, *_ = _solve(part, fresh, _RETRY_STEPS, _DAMPING[0])
     _, _, new = _evaluate(problem, fresh)
     better = np.asarray(new < 0.99 * old) & suspect
     states = jnp.where(better[:, None], fresh.states, unknowns.states)
@@ -245,15 +248,20 @@ def segment_length(horizon: int) -> int:
     return min(horizon, _LONGEST_SEGMENT)
 
 
-def _gap_weight(model: Model, white: Array, swing: Array) -> Float[Array, " states"]:
-    """What the states count in a gap: an angle as much as in the residual, a rate as the angle that it becomes within
-    a radian of the oscillation, a hidden state by what the error does while it runs through its range."""
+def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " states"]:
+    """What the states count in a gap: about what the segment behind it would pay for it.
+
+    An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
+    state by what the error does while it runs through its range. Counted less, the residual that a closed gap costs
+    would look too dear.
+    """
+    model = problem.model
     motion = len(model.motion_states)
     angles = jnp.linalg.norm(white @ jax.jacfwd(model.outputs)(model.rest()), axis=0)[: motion // 2]
     rates = angles / model.drive.omega_0
     visible = 0.1 * swing * jnp.linalg.norm(white[:, -1])
     hidden = [visible / e.state_scale() for e in model.effects if e.states]
-    return _GAP_WEIGHT * jnp.concatenate([angles, rates, *hidden])
+    return np.sqrt(problem.segments.weight.shape[1]) * jnp.concatenate([angles, rates, *hidden])
 
 
 def _covariance(error: Array, segments: Segments) -> Array:
@@ -352,7 +360,7 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
         covariance = found.covariance
         for turn in range(_REWEIGHTINGS):
             part = _weighed(part, covariance, scales(found.stretches).x)
-            unknowns, _, covariance, _, _ = _solve(part, unknowns, jnp.asarray(_NOISE_STEPS), _DAMPING[min(turn, 1)])
+            unknowns, _, covariance, _, _ = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
         total, samples = total + covariance * jnp.sum(head), samples + float(jnp.sum(head))
     rows = piece * total.shape[0]
     return total / samples * (rows / (rows - len(found.model.motion_states)))

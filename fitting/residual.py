@@ -10,6 +10,7 @@ from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
 from hdjax.simulate import march
+from hdjax.where import where
 
 # Where a simulation has left the numbers, the residual is this many standard deviations: a rejected step.
 _LOST = 1e8
@@ -114,12 +115,12 @@ def residual(
     error = (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
     rows = white.reshape(white.shape[0], -1)
-    rows = jnp.where(jnp.isfinite(rows), rows, _LOST)
+    rows = where(jnp.isfinite(rows), rows, _LOST)
     joined = problem.segments.joined[:, None]
-    rows = jnp.concatenate([rows, jnp.where(joined, 0.0, _state_prior(problem, unknowns))], axis=1)
+    rows = jnp.concatenate([rows, where(joined, 0.0, _state_prior(problem, unknowns))], axis=1)
     gap = unknowns.states - jnp.roll(end, 1, axis=0)
-    gap = jnp.where(jnp.isfinite(gap), gap, _LOST)
-    return rows, jnp.where(joined, gap, 0.0)
+    gap = where(jnp.isfinite(gap), gap, _LOST)
+    return rows, where(joined, gap, 0.0)
 
 
 def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments hidden"]:
@@ -144,11 +145,11 @@ def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
         return jax.jvp(lambda u: residual(problem, u), (unknowns,), (tangent,))
 
     (value, gap), (columns, slopes) = jax.vmap(along, out_axes=(None, -1))(seeds)
-    columns = jnp.where(jnp.isfinite(columns), columns, 0.0)
-    slopes = jnp.where(jnp.isfinite(slopes), slopes, 0.0)
+    columns = where(jnp.isfinite(columns), columns, 0.0)
+    slopes = where(jnp.isfinite(slopes), slopes, 0.0)
     active = problem.active[None, None, :]
     # A gap is a segment's own initial state minus the end of the one before.
-    own = jnp.where(problem.segments.joined[:, None, None], jnp.eye(states), 0.0)
+    own = where(problem.segments.joined[:, None, None], jnp.eye(states), 0.0)
     return Blocks(
         residual=value,
         by_parameter=columns[..., :parameters] * active,
@@ -190,7 +191,7 @@ def _residual_jvp(primals, tangents):
         gap = gap - jnp.einsum("sqp,p->sq", found.before_by_parameter, tangent.parameters)
     if tangent.states is not None:
         before = jnp.roll(tangent.states, 1, axis=0)
-        own = jnp.where(problem.segments.joined[:, None], tangent.states, 0.0)
+        own = where(problem.segments.joined[:, None], tangent.states, 0.0)
         rows = rows + jnp.einsum("srq,sq->sr", found.by_state, tangent.states)
         gap = gap + own - jnp.einsum("sqk,sk->sq", found.before_by_state, before)
     return (

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import prev_fast_len
 
+from fitting.arrow import project
 from fitting.estimate import Fit, suggested_substeps
 from fitting.experiment import scales
 from fitting.free import FreeParameters, base_paths, effect_paths, strength_paths
 from fitting.residual import Problem, Unknowns, blocks
-from fitting.arrow import project
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
 

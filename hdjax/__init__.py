@@ -23,6 +23,15 @@ from hdjax.forcing import (
 from hdjax.forcing import (
     random_phase_multisine as random_phase_multisine,
 )
+from hdjax.fourier import (
+    FourierSeries as FourierSeries,
+)
+from hdjax.fourier import (
+    fourier_series as fourier_series,
+)
+from hdjax.fourier import (
+    harmonic_series as harmonic_series,
+)
 from hdjax.presets import PRESETS as PRESETS
 from hdjax.presets import hdc_40_050 as hdc_40_050
 from hdjax.results import Ending as Ending

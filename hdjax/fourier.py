@@ -54,6 +54,7 @@ class FourierSeries(eqx.Module):
         rates = jnp.broadcast_to(self.omega * jnp.arange(1.0, self.harmonics + 1.0), self.sine.shape)
         return FourierSeries(self.omega, jnp.zeros_like(self.mean), rates * self.sine, -rates * self.cosine)
 
+    @eqx.filter_jit
     def largest(self) -> Float[Array, "*coordinates"]:
         """Largest magnitude over a period, between samples too."""
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.noise import root
 from hdjax.parameters import as_scalar
+from hdjax.where import where
 
 
 class StationaryVariance(eqx.Module):
@@ -58,7 +59,7 @@ def stationary_density(
     nodes, width = _nodes()
     norm = gibbs.sigma * jnp.sqrt(gibbs.harmonic) * width * jnp.sum(gibbs.weight(nodes))
     norm = norm * gibbs.sigma * gibbs.omega_0 * np.sqrt(2.0 * np.pi)
-    return jnp.where(gibbs.exists, gibbs.weight(u) * jnp.exp(-(rate**2) / 2.0) / norm, 0.0)
+    return where(gibbs.exists, gibbs.weight(u) * jnp.exp(-(rate**2) / 2.0) / norm, 0.0)
 
 
 def stationary_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> StationaryVariance:
@@ -79,8 +80,8 @@ def stationary_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> Stationary
     weights = gibbs.weight(nodes)
     variance = gibbs.sigma_2 * gibbs.harmonic * jnp.sum(nodes**2 * weights) / jnp.sum(weights)
     return StationaryVariance(
-        x=jnp.where(gibbs.exists, variance, jnp.inf),
-        v=jnp.where(gibbs.exists, gibbs.sigma_2 * gibbs.omega_0**2, jnp.inf),
+        x=where(gibbs.exists, variance, jnp.inf),
+        v=where(gibbs.exists, gibbs.sigma_2 * gibbs.omega_0**2, jnp.inf),
     )
 
 
@@ -103,8 +104,8 @@ def linearised_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> Stationary
     gibbs = _gibbs(drive, S, noiseless=True)
     variance = 2.0 * gibbs.sigma_2 / (1.0 + jnp.sqrt(1.0 + 12.0 * gibbs.epsilon))
     return StationaryVariance(
-        x=jnp.where(gibbs.exists, variance, jnp.inf),
-        v=jnp.where(gibbs.exists, gibbs.sigma_2 * gibbs.omega_0**2, jnp.inf),
+        x=where(gibbs.exists, variance, jnp.inf),
+        v=where(gibbs.exists, gibbs.sigma_2 * gibbs.omega_0**2, jnp.inf),
     )
 
 
@@ -132,7 +133,7 @@ def coloured_variance(drive: Drive | ReducedDrive, rms: ArrayLike, correlation_t
     t_c = as_scalar(correlation_time)
     v = as_scalar(rms) ** 2 * t_c / (mu * (1.0 + mu * t_c + (omega_0 * t_c) ** 2))
     x = v * (1.0 + mu * t_c) / omega_0**2
-    return StationaryVariance(x=jnp.where(exists, x, jnp.inf), v=jnp.where(exists, v, jnp.inf))
+    return StationaryVariance(x=where(exists, x, jnp.inf), v=where(exists, v, jnp.inf))
 
 
 class _Gibbs(eqx.Module):
@@ -174,8 +175,8 @@ def _gibbs(drive: Drive | ReducedDrive, S: ArrayLike, *, noiseless: bool) -> _Gi
         if not isinstance(fine, Tracer) and not fine:
             raise ValueError(f"`{name}` must {range_} for a stationary law, but is {value}")
         exists = exists & fine
-    S = jnp.where(exists, S, 1.0)
-    alpha = jnp.where(exists, drive.alpha, 0.0)
+    S = where(exists, S, 1.0)
+    alpha = where(exists, drive.alpha, 0.0)
     sigma_2 = S / (2.0 * mu * omega_0**2)
     epsilon = alpha * sigma_2
     return _Gibbs(exists, omega_0, sigma_2, epsilon, harmonic=2.0 / (1.0 + jnp.sqrt(1.0 + 4.0 * epsilon)))
@@ -187,4 +188,4 @@ def _damped(drive: Drive | ReducedDrive) -> tuple[Array, Array, Array]:
         if not isinstance(value, Tracer) and not value > 0.0:
             raise ValueError(f"`drive.{name}` must be above zero for a stationary law, but is {value}")
     exists = (drive.mu > 0.0) & (drive.omega_0 > 0.0)
-    return exists, jnp.where(exists, drive.mu, 1.0), jnp.where(exists, drive.omega_0, 1.0)
+    return exists, where(exists, drive.mu, 1.0), where(exists, drive.omega_0, 1.0)

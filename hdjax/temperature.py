@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.parameters import Scalar, as_scalar, parameter
+from hdjax.where import where
 
 _Drive = TypeVar("_Drive", Drive, ReducedDrive)
 
@@ -126,5 +127,5 @@ def resonance_drift(
 
     omega_0, mu = jax.vmap(resonance)(temperatures)
     damped = mu > 0.0
-    peak = jnp.where(damped, as_scalar(forcing) / (jnp.where(damped, mu, 1.0) * omega_0), jnp.inf)
+    peak = where(damped, as_scalar(forcing) / (where(damped, mu, 1.0) * omega_0), jnp.inf)
     return ResonanceDrift(temperatures, omega_0, mu, peak)

@@ -17,8 +17,10 @@ from hdjax.response.amplitudes import (
     check_amplitudes,
     error_map,
     resonance_kind,
+    settled,
 )
-from hdjax.response.attractors import Attractor, Basins, PoincareSection, SweptSine
+from hdjax.response.attractors import Attractor, Basins
+from hdjax.response.coexisting import from_both_ends
 from hdjax.response.continuation import Branch, folds, frequency_response
 from hdjax.response.lyapunov import phase_portrait
 from hdjax.response.multiple_scales import PrimaryResonance
@@ -29,10 +31,19 @@ from hdjax.response.plots import (
     phase_portrait_plot,
     poincare_plot,
 )
+from hdjax.response.poincare import PoincareSection
 from hdjax.response.resonance import backbone, peak
+from hdjax.response.swept_sine import SweptSine
 
 MU, ALPHA = 0.02, 0.05
 DRIVE = ReducedDrive(mu=MU, omega_0=1.0, alpha=ALPHA)
+
+
+def test_slow_forcing_is_stable():
+    # A hundred natural oscillations within a period of the forcing.
+    (row,) = check_amplitudes(DRIVE, 0.05, 0.01).rows
+    assert row.stable
+    assert row.verdict == "holds to 1%"
 
 
 @pytest.mark.parametrize("omega", (0.34, 0.5, 1.02, 3.05))
@@ -137,6 +148,32 @@ def branch() -> Branch:
     return frequency_response(ReducedModel(DRIVE), harmonic_series(1.0, 0.05), 0.8, 1.3, points=150, harmonics=5)
 
 
+def test_a_range_that_ends_within_the_fold_has_two_branches():
+    def ends(fast: float) -> tuple[Branch, ...]:
+        return from_both_ends(ReducedModel(DRIVE), harmonic_series(1.0, 0.05), 0.8, fast, points=150, harmonics=5)
+
+    assert len(ends(1.3)) == 1
+    low, high = (float(f) for f in np.sort(np.asarray(folds(branch()).value)[:2]))
+    below, above = ends(0.5 * (low + high))
+    for found in (below, above):
+        omega = np.asarray(found.omega)[np.asarray(found.valid)]
+        assert omega.max() == pytest.approx(0.5 * (low + high), rel=1e-6)
+    assert float(below.amplitude[-1]) > 2.0 * float(above.amplitude[0])
+    assert float(above.omega[above.valid].min()) == pytest.approx(low, rel=1e-3)
+
+
+def test_time_integration_settles_onto_the_branch():
+    found = settled(branch(), motions=8)
+    omega, size = np.asarray(found.omega), np.asarray(found.amplitude)
+    assert size.size >= 6 and not np.asarray(found.escaped).any()
+    rows = [
+        int(np.argmin(np.hypot(branch().omega - w, branch().amplitude - a))) for w, a in zip(omega, size, strict=True)
+    ]
+    np.testing.assert_allclose(omega, np.asarray(branch().omega)[rows], rtol=1e-3)
+    np.testing.assert_allclose(size, np.asarray(branch().amplitude)[rows], rtol=1e-3)
+    assert np.asarray(branch().stable)[rows].all()
+
+
 def saved(figure, path) -> int:
     figure.savefig(path)
     return path.stat().st_size
@@ -149,7 +186,7 @@ def test_the_frequency_response_is_drawn_with_its_unstable_part(tmp_path):
     sweep = SweptSine(jnp.linspace(0.9, 1.0, 5), size, size, jnp.zeros((5, 2)), jnp.zeros(5, dtype=bool))
     figure = frequency_response_plot(
         branch(),
-        folds=folds(branch()),
+        folds=[folds(branch())],
         peak=peak(branch()),
         backbone=backbone(ReducedModel(DRIVE), jnp.linspace(0.1, 3.0, 10), harmonics=5),
         sweeps=(sweep, sweep),

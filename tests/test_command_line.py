@@ -13,7 +13,7 @@ import rig
 from fitting.command_line import main
 from fitting.free_run import WINDOW
 from fitting.model_file import StoredModel, to_json
-from hdjax import Model, TwoInertiaModel
+from hdjax import Model, TwoInertiaModel, hdc_40_050
 
 COUNT = 600
 DRIVE = """\
@@ -182,6 +182,28 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
         ("simulate", "--out", "log.csv/out.csv", "--duration", "0.05", "--forcing", "harmonic"),
         ("log.csv",),
     ),
+    "negative stiffness": (("amplitudes", "--K", "-1"), ("--K", "-1")),
+    "cubic coefficient that is no number": (("amplitudes", "--alpha", "nan"), ("--alpha", "nan")),
+    "endless torque": (("amplitudes", "--motor-torque", "inf"), ("--motor-torque", "inf")),
+    "torques that cancel": (("amplitudes", "--motor-torque", "0"), ("--motor-torque", "cancel")),
+    "negative frequency": (("amplitudes", "--omega", "100", "-5"), ("--omega", "-5")),
+    "no frequency": (("amplitudes", "--omega", "--alpha", "1"), ("--omega",)),
+    "no such drive": (("amplitudes", "--preset", "HFUC"), ("HFUC", "HDC-40-050")),
+    "no such model": (("amplitudes", "--model", "absent.json"), ("absent.json",)),
+    "amplitudes of a broken model": (("amplitudes", "--model", "broken.json"), ("broken.json",)),
+    "stiffness of a reduced model": (("amplitudes", "--model", "reduced.json", "--K", "1"), ("reduced.json", "--K")),
+    "pictures into a file": (("amplitudes", "--out", "log.csv"), ("--out", "log.csv")),
+    "speeds into a file": (("speeds", "--out", "log.csv/below"), ("--out", "log.csv")),
+    "negative damping": (("speeds", "--B_sp", "-0.1"), ("--B_sp", "-0.1")),
+    "speeds of a reduced model": (("speeds", "--model", "reduced.json"), ("reduced.json", "two inertias")),
+    "speeds of a broken model": (("speeds", "--model", "broken.json"), ("broken.json",)),
+    "speeds without a range": (("speeds", "--slowest", "500", "--fastest", "500"), ("--slowest", "--fastest")),
+    "speed without end": (("speeds", "--fastest", "inf"), ("--fastest", "inf")),
+    "speed beyond everything": (("speeds", "--fastest", "1e6"), ("--fastest", "36817")),
+    "speed below zero": (("speeds", "--slowest", "-3"), ("--slowest", "-3")),
+    "kinematic error that is no number": (("speeds", "--kinematic-error", "nan"), ("--kinematic-error",)),
+    "limit of nothing": (("speeds", "--limit", "0"), ("--limit",)),
+    "tables with an option": (("seed-tables", "--out", "out"), ("--out",)),
 }
 
 
@@ -195,6 +217,7 @@ def test_bad_use(arguments, words, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "broken.toml").write_text("[drive\nname = 3", encoding="utf-8")
     (tmp_path / "typo.toml").write_text("[drive]\nreduction_ratoi = 50\n", encoding="utf-8")
     (tmp_path / "broken.json").write_text('{"schema": "hdjax-model/1"', encoding="utf-8")
+    write_model(tmp_path, rig.reduced_model()).rename(tmp_path / "reduced.json")
     write_model(tmp_path, rig.drive_model())
     before = sorted(p.name for p in tmp_path.iterdir() if p.name != "cache")
     assert run(*arguments) == 2
@@ -275,3 +298,20 @@ def test_fit_then_predict(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run("predict", out / "model.json", log, "--drive", drive, "--out", predicted) == 0
     error = read_table(predicted)["dynamic_error"] - reduced_table()["dynamic_error"]
     assert np.sqrt(np.mean(error**2)) < 2e-3
+
+
+@pytest.mark.slow
+def test_speeds_to_avoid_of_the_preset(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    assert run("speeds", "--out", out) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert "1840.8 rpm  primary resonance of 2 cycles per revolution" in shown.out
+    assert sorted(p.name for p in out.iterdir()) == ["speeds.json", "speeds.png"]
+    content = json.loads((out / "speeds.json").read_text(encoding="utf-8"))
+    (band,) = content["avoid"]
+    # Undamped and linear, the swing is three errors where omega^2 differs from omega_0^2 by a third of it.
+    centre = float(hdc_40_050().omega_0) / 2.0 * 30.0 / np.pi
+    edges = (band["start_rpm"], band["end_rpm"])
+    assert edges == pytest.approx((centre * np.sqrt(2 / 3), centre * np.sqrt(4 / 3)), rel=1e-3)
+    assert content["two_motions_rpm"] is None

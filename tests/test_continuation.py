@@ -1,79 +1,25 @@
 """Branches and folds: each motion against scipy's integration, folds against multipliers and one-term theory."""
 
-from math import cos
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from branches import assert_whole, left_over, path, row, turns
+from orbits import duffing, duffing_rates, period_error
 
-from hdjax import Drive, ReducedDrive, ReducedModel, TwoInertiaModel
-from hdjax.fourier import FourierSeries, harmonic_series
-from hdjax.response.continuation import Branch, Folds, folds, follow, follow_fold, frequency_response
+from hdjax.fourier import harmonic_series
+from hdjax.response.continuation import Branch, Folds, folds, follow_fold, frequency_response
 from hdjax.response.harmonic_balance import balance
 
 HARMONICS, POINTS = 11, 300
 
 
-def duffing(zeta, alpha, omega_0=1.0) -> ReducedModel:
-    return ReducedModel(ReducedDrive(mu=2 * zeta * omega_0, omega_0=omega_0, alpha=alpha))
-
-
 def response(p) -> tuple[Branch, Folds]:
     """The branch and its folds over (zeta, alpha, forcing level, start, end, omega_0)."""
-    branch = frequency_response(
-        duffing(p[0], p[1], p[5]), harmonic_series(1.0, p[2]), p[3], p[4], points=POINTS, harmonics=HARMONICS
-    )
+    model = duffing(2 * p[0] * p[5], p[1], p[5])
+    branch = frequency_response(model, harmonic_series(1.0, p[2]), p[3], p[4], points=POINTS, harmonics=HARMONICS)
     return branch, folds(branch, at_most=2)
-
-
-def period_error(x: FourierSeries, mu: float, alpha: float, level: float, omega: float) -> float:
-    """Largest relative distance of a motion from scipy's integration over one period from its own start."""
-
-    def rates(t, y):
-        return y[1], level * cos(omega * t) - mu * y[1] - y[0] * (1 + alpha * y[0] * y[0])
-
-    t = np.linspace(0.0, 2 * np.pi / float(x.omega), 5)
-    rows = np.stack([x(jnp.asarray(t)), x.derivative()(jnp.asarray(t))], axis=1)
-    size = np.abs(rows).max(axis=0)
-    y, worst = rows[0], 0.0
-    for k in range(4):
-        y = solve_ivp(rates, (t[k], t[k + 1]), y, method="DOP853", rtol=1e-12, atol=1e-14 * size).y[:, -1]
-        worst = max(worst, (np.abs(y - rows[k + 1]) / size).max())
-    return worst
-
-
-def row(branch: Branch, i: int) -> FourierSeries:
-    return jax.tree.map(lambda leaf: leaf[i], branch.steady_states.x)
-
-
-def path(branch: Branch) -> np.ndarray:
-    return np.concatenate([branch.unknowns, np.asarray(branch.value / branch.scale)[:, None]], axis=1)
-
-
-def turns(branch: Branch) -> np.ndarray:
-    """Rows before a fold."""
-    slope = np.asarray(branch.tangents[:, -1])
-    return np.flatnonzero(slope[1:] * slope[:-1] < 0)
-
-
-def assert_whole(branch: Branch, start: float, end: float):
-    """Ends where it should, solves the system everywhere, and never jumps: chords are even."""
-    assert bool(branch.complete) and np.asarray(branch.valid).all()
-    value = np.asarray(branch.value)
-    # The last step's end is interpolated: good to a fraction of a step of 0.3 % of the range.
-    assert abs(value[0] - start) < 1e-9 * start and abs(value[-1] - end) < 1e-4 * end
-    if len(turns(branch)) == 0:
-        assert value.min() >= min(start, end) * (1 - 1e-9) and value.max() <= max(start, end) * (1 + 1e-4)
-    chords = np.linalg.norm(np.diff(path(branch), axis=0), axis=1)
-    assert chords.max() < 1.15 * np.median(chords) and chords.min() > 0.85 * np.median(chords)
-
-
-def left_over(branch: Branch) -> np.ndarray:
-    each = jax.vmap(lambda u, v, w: branch.at(v).residual(u, w))(branch.unknowns, branch.value, branch.omega)
-    return np.abs(np.asarray(each)).max(axis=1)
 
 
 def assert_energy_balance(branch: Branch, mu: float, level: float):
@@ -127,7 +73,8 @@ def drawn() -> np.ndarray:
 @pytest.fixture(scope="module")
 def lanes() -> tuple[Branch, Folds]:
     rows = jnp.asarray(np.concatenate([np.stack(list(NAMED.values())), drawn()]))
-    return eqx.filter_jit(eqx.filter_vmap(response))(rows)
+    # As numpy arrays, whose slices cost nothing.
+    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(response))(rows))
 
 
 def lane(lanes, name: str | int):
@@ -160,7 +107,9 @@ def test_its_motions_are_what_time_integration_gives(hardening):
     assert ALPHA * float(jnp.max(hardening.amplitude)) ** 2 > 0.4
     for i in (0, 30, first - 15, first - 1, first, first + 1, middle, second, second + 1, second + 15, POINTS - 1):
         assert float(hardening.steady_states.defect[i]) < 1e-8
-        assert period_error(row(hardening, i), 2 * ZETA, ALPHA, LEVEL, float(hardening.omega[i])) < 1e-8, i
+        assert (
+            period_error(duffing_rates(2 * ZETA, ALPHA, LEVEL, float(hardening.omega[i])), row(hardening, i)) < 1e-8
+        ), i
     # And they change there only.
     changes = np.flatnonzero(np.diff(stable.astype(int)))
     assert changes.size == 2 and np.abs(changes - turns(hardening)).max() <= 1
@@ -203,7 +152,7 @@ def test_branches_that_bend_far_or_are_thin(lanes, name):
     assert float(x.amplitudes[i, 0] * branch.omega[i]) == pytest.approx(level / (2 * zeta), rel=0.02)
     for j in (i, *turns(branch)):
         # Over a period of a drive so lightly damped, 1e-8 of the motion is 1e-4 of what the damping does.
-        assert period_error(row(branch, j), 2 * zeta, alpha, level, float(branch.omega[j])) < 1e-7
+        assert period_error(duffing_rates(2 * zeta, alpha, level, float(branch.omega[j])), row(branch, j)) < 1e-7
 
 
 def test_strong_nonlinearity(lanes):
@@ -213,7 +162,7 @@ def test_strong_nonlinearity(lanes):
     assert len(turns(branch)) == 2 and float(10.0 * jnp.max(branch.amplitude) ** 2) > 35
     i = int(np.argmax(np.asarray(branch.amplitude)))
     # Eleven harmonics leave a few 1e-7 there.
-    assert period_error(row(branch, i), 0.1, 10.0, 1.0, float(branch.omega[i])) < 1e-5
+    assert period_error(duffing_rates(0.1, 10.0, 1.0, float(branch.omega[i])), row(branch, i)) < 1e-5
 
 
 def test_drawn_branches_are_whole(lanes):
@@ -261,8 +210,23 @@ def test_a_multiplier_is_one_at_a_fold(lanes, hardening):
     assert 0 <= value[first:].min() - float(found.value[1]) < 1e-4
 
 
-def test_derivatives_of_folds_and_a_lane_alone(lanes, hardening):
-    """By zeta, alpha, forcing and omega_0, against differences of lanes; the lane is what a single run gives."""
+def test_derivatives_of_folds(lanes, hardening):
+    """By zeta, alpha, forcing and omega_0, against differences of lanes, each with a search of its own."""
+
+    @eqx.filter_jit
+    @jax.jacrev
+    def slope(p):
+        system = balance(duffing(2 * p[0] * p[3], p[1], p[3]), harmonic_series(1.0, p[2]), harmonics=HARMONICS)
+        return folds(eqx.tree_at(lambda b: b.system, hardening, system), at_most=2).value
+
+    ends = np.array([[lane(lanes, f"{sign}{j}")[1].value for j in range(4)] for sign in "+-"])
+    differences = ((ends[0] - ends[1]) / 2e-6).T
+    np.testing.assert_allclose(slope(jnp.asarray(AT[[0, 1, 2, 5]])), differences, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_derivatives_through_the_search_and_a_lane_alone(lanes, hardening):
+    """The whole way from the parameters to the folds; the lane is what a single run gives."""
 
     def values(p):
         branch, found = response(p)
@@ -291,12 +255,16 @@ def one_term_folds(zeta: float, kappa: float, level: float) -> list[float]:
     return sorted(shifts)
 
 
-def test_weak_nonlinearity_is_one_term_theory(lanes):
-    """Folds, and the cusp where they meet: sigma = sqrt(3) zeta, kappa A^2 / 4 = 8 zeta^3 / (3 sqrt(3))."""
-    branch, found = lane(lanes, "weak")
+def test_folds_of_a_weak_nonlinearity_are_those_of_one_term(lanes):
+    _, found = lane(lanes, "weak")
     shifts = np.sort(np.asarray(found.value)) - 1.0
     # Neglected: the shift itself, 5e-3, relative to one.
     np.testing.assert_allclose(shifts, one_term_folds(WEAK_ZETA, KAPPA, 1.6 * CRITICAL), rtol=0.01)
+
+
+def test_folds_meet_in_the_cusp_of_one_term(lanes):
+    """At sigma = sqrt(3) zeta, kappa A^2 / 4 = 8 zeta^3 / (3 sqrt(3))."""
+    branch, found = lane(lanes, "weak")
     for fold in (0, 1):
         track = follow_fold(branch, fold, "amplitude", 1.0, 0.3, steps=100)
         valid = np.asarray(track.valid)
@@ -312,72 +280,3 @@ def test_weak_nonlinearity_is_one_term_theory(lanes):
         assert factor[rising[-1]] > 1.0
         back = np.interp(1.0, factor[rising], omega[rising])
         assert back - 1.0 == pytest.approx(float(found.value[1 - fold]) - 1.0, rel=0.01)
-
-
-# -- a sub-harmonic, which is a closed curve --
-
-
-def test_a_subharmonic_closes_upon_itself():
-    level, omega = 3.0, 4.0
-    # One term beside the forced motion A cos(omega t) / (1 - omega^2).
-    wave = FourierSeries(1.0, jnp.zeros(()), jnp.asarray([1.0, 0.0, -level / (omega**2 - 1)]), jnp.asarray([0.1, 0, 0]))
-    system = (duffing(0.05, 1.0), harmonic_series(1.0, level), omega, 12.0)
-    branch = frequency_response(*system, points=200, harmonics=21, subharmonic=3, guess=wave)
-    assert bool(branch.complete) and np.asarray(branch.valid).all()
-    assert left_over(branch).max() < 1e-8
-    chords = np.linalg.norm(np.diff(path(branch), axis=0), axis=1)
-    assert chords.max() < 1.2 * np.median(chords)
-    assert np.linalg.norm(path(branch)[0] - path(branch)[-1]) < 1.5 * chords.max() + 0.1
-    assert len(turns(branch)) == 2
-    # Half of it stable; nowhere the motion of the forcing's own period.
-    stable = np.asarray(branch.stable)
-    assert 0.2 < stable.mean() < 0.8
-    assert np.asarray(branch.steady_states.x.amplitudes)[:, 0].min() > 0.3
-    first, second = turns(branch)
-    for i in (0, first, (first + second) // 2, second, 180):
-        x = row(branch, i)
-        assert float(x.omega) == pytest.approx(float(branch.omega[i]) / 3)
-        assert period_error(x, 0.1, 1.0, level, float(branch.omega[i])) < 1e-8, i
-
-
-# -- other parameters --
-
-
-def test_follow_the_forcing_amplitude():
-    """An S: two folds, with the same motion at the same amplitude as a frequency response has."""
-    system = balance(duffing(0.05, 1.0), harmonic_series(1.0, 0.1), harmonics=HARMONICS)
-    branch = follow(system, "amplitude", 0.1, 5.0, omega=1.35, points=POINTS)
-    assert_whole(branch, 0.1, 5.0)
-    assert len(turns(branch)) == 2
-    for i in (0, *turns(branch), sum(turns(branch)) // 2, POINTS - 1):
-        assert period_error(row(branch, i), 0.1, 1.0, 0.1 * float(branch.value[i]), 1.35) < 1e-7, i
-    found = folds(branch, at_most=2)
-    assert np.asarray(found.exists).all()
-    assert float(found.value[1]) < float(found.value[0])
-
-
-def test_follow_alpha():
-    system = balance(duffing(0.05, 0.0), harmonic_series(1.0, 0.1), harmonics=HARMONICS)
-    branch = follow(system, "alpha", 0.0, 2.0, omega=0.9, points=40)
-    assert bool(branch.complete) and np.asarray(branch.valid).all()
-    for i in (0, 13, 39):
-        assert period_error(row(branch, i), 0.1, float(branch.value[i]), 0.1, 0.9) < 1e-8, i
-
-
-def test_follow_the_stiffness_of_two_inertias():
-    """Linear: a closed form."""
-    drive = Drive(N=2.0, J_m=1.0, J_l=3.0, K=5.0, B_sp=0.6)
-    system = balance(TwoInertiaModel(drive), harmonic_series(1.0, 0.8), harmonics=2)
-    branch = follow(system, "K", 1.0, 9.0, omega=1.5, points=30)
-    assert bool(branch.complete) and np.asarray(branch.valid).all()
-    c = (4 * 1.0 + 3.0) / (4 * 1.0 * 3.0)
-    exact = 0.4 / np.abs(c * np.asarray(branch.value) - 1.5**2 + 1.5j * c * 0.6)
-    np.testing.assert_allclose(branch.steady_states.x.amplitudes[:, 0], exact, rtol=1e-9)
-    assert float(branch.value[0]) == pytest.approx(1.0) and float(branch.value[-1]) == pytest.approx(9.0, rel=1e-3)
-
-
-def test_too_few_steps_are_told():
-    branch = frequency_response(duffing(0.05, 1.0), harmonic_series(1.0, 0.08), 0.35, 2.0, points=20, steps=4)
-    assert not bool(branch.complete)
-    assert left_over(branch)[np.asarray(branch.valid)].max() < 1e-8
-    assert float(branch.value[-1]) < 1.9

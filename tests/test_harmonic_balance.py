@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from orbits import duffing, period_error
 from scipy.integrate import solve_ivp
 
-from hdjax import Drive, ReducedDrive, ReducedModel, TwoInertiaModel
+from hdjax import Drive, ReducedModel, TwoInertiaModel
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import MotorFriction
@@ -22,30 +23,6 @@ from hdjax.response.harmonic_balance import SteadyState, balance, solve
 
 SUFFICES = 1e-10
 """A defect below this says that the harmonics suffice for 1e-8: errors grow in a period, but by far less than 100."""
-
-
-def reduced(mu: float, omega_0: float = 1.0, alpha: float = 0.0) -> ReducedModel:
-    return ReducedModel(ReducedDrive(mu=mu, omega_0=omega_0, alpha=alpha))
-
-
-def period_error(rates, motion: FourierSeries, state) -> float:
-    """Largest relative distance of a series from scipy's integration over one period from its own start.
-
-    `state` turns (coordinates, their rates) into what `rates` integrates. Quarter by quarter, since an integrator's
-    interpolation is worse than its steps.
-    """
-    t = np.linspace(0.0, 2 * np.pi / float(motion.omega), 5)
-    rows = state(np.asarray(motion(jnp.asarray(t))), np.asarray(motion.derivative()(jnp.asarray(t))), t)
-    size = np.abs(rows).max(axis=0)
-    y, worst = rows[0], 0.0
-    for k in range(4):
-        y = solve_ivp(rates, (t[k], t[k + 1]), y, method="DOP853", rtol=1e-12, atol=1e-14 * size).y[:, -1]
-        worst = max(worst, (np.abs(y - rows[k + 1]) / size).max())
-    return worst
-
-
-def columns(x: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.ndarray:
-    return np.stack([x, v], axis=1)
 
 
 # -- drawn cases --
@@ -72,7 +49,7 @@ def draws() -> tuple[np.ndarray, ...]:
 
 
 def drawn(mu, omega_0, alpha, omega, mean, cosine, sine) -> SteadyState:
-    model = ReducedModel(ReducedDrive(mu=mu, omega_0=omega_0, alpha=alpha))
+    model = duffing(mu, alpha, omega_0)
     return solve(balance(model, FourierSeries(omega, mean, cosine, sine), harmonics=20), omega)
 
 
@@ -97,7 +74,7 @@ def test_drawn_cases_are_what_time_integration_gives(found):
             return y[1], push - mu * y[1] - omega_0**2 * y[0] * (1 + alpha * y[0] * y[0])
 
         x = jax.tree.map(lambda leaf, i=i: leaf[i], found).x
-        assert period_error(rates, x, columns) < 1e-8, i
+        assert period_error(rates, x) < 1e-8, i
 
 
 def test_energy_balance_of_the_drawn_cases(found):
@@ -118,7 +95,7 @@ def test_energy_balance_of_the_drawn_cases(found):
 
 def test_linear_drive():
     forcing = harmonic_series(43.0, np.array([300.0, 80.0]), np.array([0.4, -1.1]), mean=50.0)
-    steady = solve(balance(reduced(3.0, 50.0), forcing, harmonics=4), 43.0)
+    steady = solve(balance(duffing(3.0, 0.0, 50.0), forcing, harmonics=4), 43.0)
     rates = 43.0j * np.arange(3)
     phasors = np.array([50.0, 300 * np.exp(0.4j), 80 * np.exp(-1.1j)]) / (2500 + 3 * rates + rates**2)
     assert bool(steady.converged)
@@ -130,7 +107,7 @@ def test_linear_drive():
 
 def test_the_defect_falls_geometrically():
     """The motion is analytic in time; only odd harmonics exist, so that two more multiply it by the same factor."""
-    system = [balance(reduced(0.2, alpha=1.0), harmonic_series(1.0, 1.0), harmonics=h) for h in (5, 9, 13)]
+    system = [balance(duffing(0.2, 1.0), harmonic_series(1.0, 1.0), harmonics=h) for h in (5, 9, 13)]
     steady = [solve(s, 1.2) for s in system]
     assert all(bool(s.converged) for s in steady)
     ratios = np.diff(np.log([float(s.defect) for s in steady]))
@@ -142,7 +119,7 @@ def test_derivatives():
     """By mu, omega_0, alpha, forcing and frequency, against central differences."""
 
     def wave(p):
-        model = ReducedModel(ReducedDrive(mu=p[0], omega_0=p[1], alpha=p[2]))
+        model = duffing(p[0], p[2], p[1])
         x = solve(balance(model, harmonic_series(1.0, p[3]), harmonics=5), p[4]).x
         return jnp.stack([x.cosine[0], x.sine[0], x.cosine[2]])
 
@@ -246,7 +223,7 @@ def test_a_turning_drive_over_two_revolutions_is_that_over_one():
 
 
 def test_refusals():
-    plain, whole = reduced(0.1), TwoInertiaModel(DRIVE)
+    plain, whole = duffing(0.1, 0.0), TwoInertiaModel(DRIVE)
     with pytest.raises(ValueError, match="`bouc_wen` has memory"):
         balance(plain.with_effects(BoucWen(yield_twist=0.1)))
     with pytest.raises(ValueError, match="`torque_bias` has memory or acts on a logged torque"):
@@ -262,6 +239,6 @@ def test_refusals():
 
 
 def test_what_is_not_solved_says_so():
-    steady = solve(balance(reduced(0.01, alpha=1.0), harmonic_series(1.0, 1.0)), 1.1, max_steps=1)
+    steady = solve(balance(duffing(0.01, 1.0), harmonic_series(1.0, 1.0)), 1.1, max_steps=1)
     assert not bool(steady.converged)
     np.testing.assert_array_equal(steady.x.amplitudes, 0.0)

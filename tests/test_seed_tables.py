@@ -1,9 +1,12 @@
 """The seed's tables recomputed: what is wrong in them, and that nothing fits the second."""
 
+import jax
 import numpy as np
 import pytest
+from orbits import duffing_rates, duffing_slope, multipliers, period_error
 
 from hdjax import hdc_40_050
+from hdjax.response.seed_data import TABLE_2
 from hdjax.response.seed_fit import best_fit_of_table_2, fit_amplitudes
 from hdjax.response.seed_tables import Cell, as_text, seed_tables
 
@@ -61,29 +64,45 @@ def test_table_3_has_no_model_behind_it(tables):
     )
 
 
+def test_table_4_names_one_effect_of_the_stated_model(tables):
+    verdicts = {c.row: c.verdict for c in tables["Table 4"]}
+    stated = verdicts.pop("flexspline deformation")
+    assert stated.startswith("differs by a factor")
+    assert set(verdicts.values()) == {"does not follow from the stated model"}
+
+
 def test_the_figure_is_right_for_the_parameters_beside_it(tables):
-    verdicts = [c.verdict for c in tables["Figure 1"]]
-    assert verdicts[1] == "agrees"
-    # The largest of the last swings, and the mean rate, lie within a swing of the envelope's.
-    assert tables["Figure 1"][2].recomputed == pytest.approx(0.05, rel=0.02)
+    assert [c.verdict for c in tables["Figure 1"][:3]] == ["agrees"] * 3
+    assert all(c.verdict.startswith("differs by a factor") for c in tables["Figure 1"][3:])
 
 
-def test_nothing_fits_table_2(tables):
+@pytest.mark.slow
+def test_nothing_fits_table_2():
+    """Not even nearly undamped, with the most charitable motion at each frequency; which are motions indeed."""
     fit = best_fit_of_table_2()
-    assert fit.worst > 1.5 and fit.rms > 0.3
-    confirmed = [t for t in fit.time if t is not None]
-    assert len(confirmed) >= 3
-    for size, time in zip(fit.fitted, fit.time, strict=True):
-        assert time is None or time == pytest.approx(size, rel=1e-4)
+    assert fit.worst > 1.3 and fit.rms > 0.15
+    for i, omega in enumerate(fit.omega):
+        x = jax.tree.map(lambda leaf, i=i: leaf[i], fit.motions)
+        equation = duffing_rates(fit.mu, fit.alpha, fit.A, omega, fit.omega_0)
+        assert period_error(equation, x) < 1e-3
+        moduli = np.abs(multipliers(equation, duffing_slope(fit.mu, fit.alpha, fit.omega_0), x))
+        # So little damping takes less than the motion's error.
+        assert moduli.max() < 1.0 + 1e-4
     text = as_text((), fit)
-    assert "no parameters of the stated model" in text
+    assert "no parameters of the stated model" in text and "a sub-harmonic motion" in text
 
 
 def test_a_consistent_table_is_fitted():
     """Amplitudes of a linear response, far from its resonance: the same search finds parameters that give them."""
-    omega = (100.0, 300.0, 122.5, 40.83, 367.5)
+    omega = tuple(case.omega for case in TABLE_2)
     amplitude = tuple(500.0 / abs(complex(200.0**2 - w**2, 5.0 * w)) for w in omega)
-    fit = fit_amplitudes(omega, amplitude)
-    assert fit.worst < 1.01
+    fit = fit_amplitudes(omega, amplitude, bands=1, generations=30)
+    assert fit.worst < 1.02
     assert fit.omega_0 == pytest.approx(200.0, rel=0.02)
-    assert np.isfinite(fit.rms)
+    assert np.isfinite(fit.rms) and not any(fit.subharmonic)
+    assert "the table is consistent" in as_text((), fit)
+
+
+def test_a_table_without_amplitudes_is_refused():
+    with pytest.raises(ValueError, match="`omega` and `amplitude` must be of one length"):
+        fit_amplitudes((100.0,), (0.0,))

@@ -1,6 +1,7 @@
 """The check of the analytic amplitudes: multiple scales against harmonic balance against time integration."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -14,17 +15,22 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.dynamics import ReducedModel
 from hdjax.fourier import FourierSeries, harmonic_series
 from hdjax.parameters import as_scalar
+from hdjax.response.continuation import Branch
 from hdjax.response.floquet import is_stable, multipliers
 from hdjax.response.harmonic_balance import balance, solve
+from hdjax.response.marching import STEPS
 from hdjax.response.multiple_scales import (
     PrimaryResonance,
     Resonance,
+    SteadyStates,
     SubharmonicResonance,
     SuperharmonicResonance,
     first_order,
     second_order,
 )
+from hdjax.response.poincare import PoincareSection, period_of, poincare_section
 from hdjax.response.shooting import shoot, steady_series
+from hdjax.where import where
 
 Kind = Literal["off-resonance", "primary", "super-harmonic", "sub-harmonic"]
 KINDS: dict[Kind, Callable[[Drive | ReducedDrive, ArrayLike], Resonance]] = {
@@ -135,7 +141,10 @@ def check_amplitudes(
     kind = resonance_kind(float(drive.omega_0), omega)
     # Off resonance the super-harmonic's expansion holds too: its third harmonic is then merely not resonant.
     resonance = KINDS.get(kind, SuperharmonicResonance)
-    found = _check(resonance(drive, A), as_scalar(omega), harmonics)
+    at = resonance(drive, A)
+    # Stability needs a dozen steps for each natural oscillation within the period of the motion.
+    turns = at.forcing * float(drive.omega_0) / omega
+    found = _check(at, as_scalar(omega), harmonics, steps=max(64, 2 ** math.ceil(math.log2(12.0 * turns))))
     existing = np.flatnonzero(np.asarray(found.exists))
     rows = []
     for slot in existing:
@@ -167,26 +176,12 @@ class _Found(eqx.Module):
     stable: Bool[Array, "3"]
 
 
-@eqx.filter_jit
-def _check(resonance: Resonance, omega: Array, harmonics: int) -> _Found:
-    drive = resonance.drive
+def _check(resonance: Resonance, omega: Array, harmonics: int, steps: int) -> _Found:
+    drive, periods = resonance.drive, resonance.forcing
+    first, second, guesses = _expansions(resonance, omega, harmonics * periods)
     model = ReducedModel(ReducedDrive(mu=drive.mu, omega_0=drive.omega_0, alpha=drive.alpha))
-    forcing = harmonic_series(omega, resonance.A)
-    periods = resonance.forcing
-    system = balance(model, forcing, harmonics=harmonics * periods, subharmonic=periods)
-    first, second = first_order(resonance, omega), second_order(resonance, omega)
-
-    def numeric(slot: Array) -> tuple[Array, ...]:
-        guess = _where(second.branches.exists[slot], second.series(slot), first.series(slot))
-        steady = solve(system, omega, guess)
-        x = steady.x
-        start = jnp.stack([x(jnp.zeros(())), x.derivative()(jnp.zeros(()))])
-        orbit = shoot(model, forcing, start, periods=periods)
-        series = steady_series(model, forcing, orbit, harmonics=harmonics * periods)
-        stable = is_stable(multipliers(system, system.unknowns(x), omega))
-        return steady.converged, x.largest(), orbit.converged & steady.converged, series.largest(), stable
-
-    balanced, size, closed, time, stable = jax.vmap(numeric)(jnp.arange(3))
+    numeric = _numeric(model, harmonic_series(omega, resonance.A), guesses, harmonics * periods, periods, steps)
+    balanced, size, closed, time, stable = numeric
     return _Found(
         first.branches.exists,
         first.harmonics.largest(),
@@ -200,8 +195,75 @@ def _check(resonance: Resonance, omega: Array, harmonics: int) -> _Found:
     )
 
 
+@eqx.filter_jit
+def _expansions(resonance: Resonance, omega: Array, harmonics: int) -> tuple[SteadyStates, SteadyStates, FourierSeries]:
+    """First and second order, and the better of them on each branch."""
+    first, second = first_order(resonance, omega), second_order(resonance, omega)
+
+    def better(slot: Array) -> FourierSeries:
+        return _where(second.branches.exists[slot], second.series(slot), first.series(slot)).padded(harmonics)
+
+    return first, second, jax.vmap(better)(jnp.arange(3))
+
+
+@eqx.filter_jit
+def _numeric(
+    model: ReducedModel, forcing: FourierSeries, guesses: FourierSeries, harmonics: int, periods: int, steps: int
+) -> tuple[Array, ...]:
+    """By harmonic balance and by time integration, from each guess; one program for all resonances of one period."""
+    system = balance(model, forcing, harmonics=harmonics, subharmonic=periods)
+
+    def numeric(guess: FourierSeries) -> tuple[Array, ...]:
+        steady = solve(system, forcing.omega, guess)
+        x = steady.x
+        start = jnp.stack([x(jnp.zeros(())), x.derivative()(jnp.zeros(()))])
+        orbit = shoot(model, forcing, start, periods=periods)
+        series = steady_series(model, forcing, orbit, harmonics=harmonics)
+        stable = is_stable(multipliers(system, system.unknowns(x), forcing.omega, steps=steps))
+        return steady.converged, x.largest(), orbit.converged & steady.converged, series.largest(), stable
+
+    return jax.vmap(numeric)(guesses)
+
+
 def _where(condition: Array, a: FourierSeries, b: FourierSeries) -> FourierSeries:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+    return jax.tree.map(lambda x, y: where(condition, x, y), a, b)
+
+
+def settled(branch: Branch, *, motions: int = 24, off: float = 0.01, transient_periods: int = 1000) -> PoincareSection:
+    """Time integration from beside stable motions of a branch: where the branch is right, they settle back onto it.
+
+    A motion that is still on its way to another one after the transient is left out.
+
+    Args:
+        branch: a frequency response of a reduced drive, for which it computes the stability.
+        motions: how many to integrate, evenly along its stable part.
+        off: where to start, relative to the motion.
+        transient_periods: forcing periods before the motion is measured.
+    """
+    stable = np.flatnonzero(np.asarray(branch.valid & branch.stable))
+    if not stable.size:
+        raise ValueError("`branch` must have stable motions")
+    rows = stable[np.linspace(0.0, stable.size - 1.0, motions).round().astype(int)]
+    x = jax.tree.map(lambda leaf: leaf[rows], branch.steady_states.x)
+    zero = jnp.zeros(())
+    starts = (1.0 + off) * jax.vmap(lambda x: jnp.stack([x(zero), x.derivative()(zero)]))(x)
+    given = branch.system.forcing
+    turns = float(branch.system.model.drive.omega_0) / float(jnp.min(branch.omega[rows]))
+
+    def one(omega: Array, start: Array) -> PoincareSection:
+        forcing = FourierSeries(omega, given.mean, given.cosine, given.sine)
+        section = poincare_section(
+            branch.system.model,
+            forcing,
+            start[None],
+            transient_periods=transient_periods,
+            steps_per_period=STEPS * math.ceil(max(turns, forcing.harmonics)),
+        )
+        return jax.tree.map(lambda leaf: leaf[0], section)
+
+    found = eqx.filter_vmap(one)(branch.omega[rows], starts)
+    at_rest = np.flatnonzero(np.asarray(period_of(found)))
+    return jax.tree.map(lambda leaf: leaf[at_rest], found)
 
 
 class ErrorMap(eqx.Module):
@@ -261,16 +323,16 @@ def _errors(expansion: Callable[..., Resonance], harmonics: int, mu: Array, stre
         first, second = first_order(resonance, omega), second_order(resonance, omega)
         sizes = first.harmonics.largest()
         if expansion is PrimaryResonance:
-            slot = jnp.argmin(jnp.where(first.branches.exists, jnp.abs(first.branches.amplitude - 1.0), jnp.inf))
+            slot = jnp.argmin(where(first.branches.exists, jnp.abs(first.branches.amplitude - 1.0), jnp.inf))
         else:
-            slot = jnp.argmax(jnp.where(first.branches.stable, first.branches.amplitude, -1.0))
+            slot = jnp.argmax(where(first.branches.stable, first.branches.amplitude, -1.0))
         refined = second.branches.exists[slot]
         guess = _where(refined, second.series(slot), first.series(slot))
         system = balance(ReducedModel(drive), harmonic_series(1.0, A), harmonics=harmonics)
         steady = solve(system, omega, guess)
-        truth = jnp.where(steady.converged, steady.x.largest(), 1.0)
+        truth = where(steady.converged, steady.x.largest(), 1.0)
         errors = [jnp.abs(s / truth - 1.0) for s in (sizes[slot], second.harmonics.largest()[slot])]
-        first_error = jnp.where(steady.converged, errors[0], jnp.inf)
-        return first_error, jnp.where(steady.converged & refined, errors[1], jnp.inf)
+        first_error = where(steady.converged, errors[0], jnp.inf)
+        return first_error, where(steady.converged & refined, errors[1], jnp.inf)
 
     return jax.lax.map(lambda v: at(*v), (mu, strength, sigma), batch_size=256)

@@ -7,7 +7,9 @@ interpolated and every point asked for is corrected at once, as lanes of one pro
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxcont.core.scan_continuation import ScanResult, pseudo_arclength_scan
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -17,10 +19,12 @@ from hdjax.fourier import FourierSeries
 from hdjax.parameters import as_scalar
 from hdjax.response.floquet import is_stable, multipliers
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance, find_root
+from hdjax.where import where
 
 _TOLERANCE = 1e-9
-_SOLVED = 1e-8
-_CORRECTIONS = 2
+_SOLVED = 1e-11
+_FOLD_SOLVED = 1e-8
+_CORRECTIONS = 3
 _CHORDS = 3
 _ITERATIONS = 8
 _FOLD_TOLERANCE = 1e-11
@@ -54,7 +58,7 @@ class Branch(eqx.Module):
     @property
     def steady_states(self) -> SteadyState:
         """The motions, by row."""
-        return jax.vmap(self._steady_state)(self.value, self.omega, self.unknowns, self.valid)
+        return _branch_motions(self)
 
     @property
     def amplitude(self) -> Float[Array, " points"]:
@@ -64,7 +68,7 @@ class Branch(eqx.Module):
     @property
     def multipliers(self) -> Array:
         """Floquet multipliers by row."""
-        return _branch_multipliers(self)
+        return _branch_multipliers(self, _floquet_steps(self))
 
     @property
     def stable(self) -> Bool[Array, " points"]:
@@ -79,9 +83,6 @@ class Branch(eqx.Module):
         """The system's residual at a scaled value of the parameter; `omega` holds where it is not the parameter."""
         value = scaled * self.scale
         return self.at(value).residual(unknowns, value if self.parameter == "omega" else omega)
-
-    def _steady_state(self, value: Array, omega: Array, unknowns: Array, valid: Array) -> SteadyState:
-        return self.at(value).steady_state(unknowns, omega, valid)
 
 
 class Folds(eqx.Module):
@@ -190,7 +191,7 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
     p_0, p_1 = start / scale, end / scale
     start_and_end = jax.lax.stop_gradient((u_0, p_0, p_1))
     found = _continued(lambda u, p: still.residual(u, p, still_omega), *start_and_end, steps)
-    count, complete = _end(found, p_0, p_1, _longest_step(p_0, p_1, steps))
+    count, complete = _end(found, p_0, p_1, _longest_step(p_0, p_1, steps), positive=parameter == "omega")
     path = jnp.concatenate([found.states, found.params[:, None]], axis=1)
     predicted, tangents = _interpolated(path, found.tangents, count, p_1, points)
     corrected, tangents, left = jax.vmap(_correct, in_axes=(None, 0, 0))(residual, predicted, tangents)
@@ -209,29 +210,37 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
     )
 
 
-def _end(found, p_0: Array, p_1: Array, step: Array) -> tuple[Array, Array]:
-    """How many points of a continuation are the branch, and whether it came to its end or back to its start."""
+def _end(found, p_0: Array, p_1: Array, step: Array, *, positive: bool) -> tuple[Array, Array]:
+    """How many points of a continuation are the branch, and whether it came to its end or back to its start.
+
+    A positive parameter, the frequency, must not pass zero: behind it the same motions come back mirrored.
+    """
     index = jnp.arange(found.params.size)
     used = index < found.n_valid
     distance = jnp.linalg.norm(found.states - found.states[:1], axis=1) + jnp.abs(found.params - found.params[0])
-    away = jnp.cumsum(jnp.where(distance > step, 1, 0)) > 0
+    away = jnp.cumsum(where(distance > step, 1, 0)) > 0
     back = used & away & (distance < 0.75 * step) & (found.tangents @ found.tangents[0] > 0.5)
     closed = jnp.any(back)
     last = found.params[found.n_valid - 1]
     reached = (last - p_1) * jnp.sign(p_1 - p_0) >= 0.0
-    return jnp.where(closed, jnp.argmax(back) + 1, found.n_valid), reached | closed
+    count, complete = where(closed, jnp.argmax(back) + 1, found.n_valid), reached | closed
+    if positive:
+        passed = used & (found.params <= 0.0)
+        first = jnp.maximum(jnp.argmax(passed), 2)
+        count, complete = where(jnp.any(passed), jnp.minimum(first, count), count), complete & ~jnp.any(passed)
+    return count, complete
 
 
 def _interpolated(path: Array, tangents: Array, count: Array, p_1: Array, points: int) -> tuple[Array, Array]:
     """Points evenly along a branch, by cubic Hermite interpolation over its chord length, and their tangents."""
     used = jnp.arange(path.shape[0]) < count
-    chords = jnp.where(used[1:], jnp.linalg.norm(jnp.diff(path, axis=0), axis=1), 0.0)
+    chords = where(used[1:], jnp.linalg.norm(jnp.diff(path, axis=0), axis=1), 0.0)
     length = jnp.concatenate([jnp.zeros(1), jnp.cumsum(chords)])
     # The last step runs past the end of the range: stop at the end itself.
     before, after = path[count - 2, -1], path[count - 1, -1]
-    fraction = jnp.where(after == before, 1.0, jnp.clip((p_1 - before) / (after - before), 0.0, 1.0))
+    fraction = where(after == before, 1.0, jnp.clip((p_1 - before) / (after - before), 0.0, 1.0))
     overshoot = (after - p_1) * jnp.sign(after - before) > 0.0
-    end = length[-1] - jnp.where(overshoot, (1.0 - fraction) * chords[count - 2], 0.0)
+    end = length[-1] - where(overshoot, (1.0 - fraction) * chords[count - 2], 0.0)
     at = jnp.linspace(0.0, 1.0, points) * end
     left = jnp.clip(jnp.astype(jnp.searchsorted(length, at, side="right"), int) - 1, 0, count - 2)
     h = chords[left][:, None]
@@ -257,12 +266,30 @@ def _correct(residual, point: Array, tangent: Array) -> tuple[Array, Array, Arra
         tangent = direction / jnp.linalg.norm(direction)
     left = jnp.max(jnp.abs(residual(point[:-1], point[-1])))
     finite = jnp.isfinite(left) & jnp.all(jnp.isfinite(point))
-    return jnp.where(finite, point, 0.0), jnp.where(finite, tangent, 0.0), jnp.where(finite, left, jnp.inf)
+    return where(finite, point, 0.0), where(finite, tangent, 0.0), where(finite, left, jnp.inf)
 
 
 @eqx.filter_jit
-def _branch_multipliers(branch: Branch) -> Array:
-    return jax.vmap(lambda v, w, u: multipliers(branch.at(v), u, w))(branch.value, branch.omega, branch.unknowns)
+def _branch_motions(branch: Branch) -> SteadyState:
+    motions = jax.vmap(lambda value, omega, unknowns, valid: branch.at(value).steady_state(unknowns, omega, valid))
+    return motions(branch.value, branch.omega, branch.unknowns, branch.valid)
+
+
+@eqx.filter_jit
+def _branch_multipliers(branch: Branch, steps: int) -> Array:
+    each = jax.vmap(lambda v, w, u: multipliers(branch.at(v), u, w, steps=steps))
+    return each(branch.value, branch.omega, branch.unknowns)
+
+
+def _floquet_steps(branch: Branch) -> int:
+    """Steps of a period that resolve the natural oscillations within the longest, a power of two: few programs."""
+    if isinstance(branch.omega, Tracer):
+        return 64
+    slowest = np.min(np.asarray(branch.omega), where=np.asarray(branch.valid), initial=np.inf)
+    drive = branch.system.model.drive
+    hardening = 1.0 + 3.0 * np.maximum(drive.alpha, 0.0) * np.max(np.asarray(branch.amplitude)) ** 2
+    turns = float(branch.system.subharmonic * drive.omega_0 * np.sqrt(hardening) / slowest)
+    return int(np.clip(2 ** np.ceil(np.log2(12.0 * max(turns, 1.0))), 64, 4096))
 
 
 @eqx.filter_jit
@@ -290,15 +317,15 @@ def folds(branch: Branch, *, at_most: int = 4) -> Folds:
         given = (branch.system, branch.omega[i])
         y = optx.root_find(residual, solver, jax.lax.stop_gradient(guess), given, max_steps=30, throw=False).value
         left = jnp.max(jnp.abs(residual(y, given)))
-        return y, jnp.isfinite(left) & (left < _SOLVED)
+        return y, jnp.isfinite(left) & (left < _FOLD_SOLVED)
 
     y, converged = jax.vmap(locate)(index)
-    y = jnp.where((exists & converged)[:, None], y, 0.0)
+    y = where((exists & converged)[:, None], y, 0.0)
     return Folds(y[:, n] * branch.scale, y[:, :n], y[:, n + 1 :], exists & converged)
 
 
 def _fold_residual(branch: Branch, y: Array, omega: Array) -> Array:
-    """Zero where (unknowns, scaled parameter, null vector) are a fold (Seydel 2010, eq. 5.19)."""
+    """Zero where (unknowns, scaled parameter, null vector) are a fold (Seydel 2010, chapter 5)."""
     n = branch.unknowns.shape[1]
     u, p, v = y[:n], y[n], y[n + 1 :]
     left, along = jax.jvp(lambda u: branch.residual(u, p, omega), (u,), (v,))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hdjax.drive import Drive
 from hdjax.fourier import FourierSeries
@@ -75,35 +75,66 @@ def swing(branch: Branch) -> Float[Array, " points"]:
     return jax.vmap(of_one)(branch.steady_states.x)
 
 
-def speeds_to_avoid(branch: Branch, limit: float) -> list[SpeedBand]:
-    """Bands of speed in which a steady motion swings further than a limit.
+def can_persist(branch: Branch) -> Bool[Array, " points"]:
+    """Which motions of a branch a drive stays in, by row.
 
-    Of a motor under a periodic forcing only stable motions count. Where the motor rotates every motion does: past the
-    resonance a free motor at constant torque can't hold its speed (Sommerfeld), but a servo can.
+    Of a motor under a periodic forcing the stable ones. Where the motor rotates, all but those on the way back between
+    two folds: past the resonance a free motor at constant torque can't hold its speed (Sommerfeld), but a servo can.
+    """
+    if branch.system.rotating:
+        return branch.valid & (branch.tangents[:, -1] * branch.tangents[0, -1] > 0.0)
+    return branch.valid & branch.stable
+
+
+def speeds_to_avoid(*branches: Branch, limit: float) -> list[SpeedBand]:
+    """Bands of speed in which a steady motion that can persist swings beyond a limit.
 
     Args:
-        branch: `frequency_response(model, None, slow, fast, rotating=True)` of a drive with kinematic error; or of any
-            periodic forcing, where speed stands for its frequency.
+        *branches: `frequency_response(model, None, slow, fast, rotating=True)` of a drive with kinematic error, or
+            those of [`hdjax.response.from_both_ends`][]; or of any periodic forcing, where speed stands for its
+            frequency.
         limit: of the dynamic error's swing about its mean [rad].
     """
-    rotating = branch.system.rotating
-    keep = np.asarray(branch.valid if rotating else branch.valid & branch.stable)
-    order = np.argsort(np.asarray(branch.omega)[keep], kind="stable")
-    speed, size, amplitudes = (
-        np.asarray(a)[keep][order] for a in (branch.omega, swing(branch), branch.steady_states.x.amplitudes)
-    )
-    beyond = np.flatnonzero(size > limit)
-    bands = []
-    for group in np.split(beyond, np.flatnonzero(np.diff(beyond) > 1) + 1):
-        if group.size:
-            top = group[np.argmax(size[group])]
-            bands.append(
-                SpeedBand(
-                    float(speed[group[0]]),
-                    float(speed[group[-1]]),
-                    float(speed[top]),
-                    float(size[top]),
-                    int(np.argmax(amplitudes[top])) + 1,
-                )
+    return _merged([band for branch in branches for band in _bands(branch, limit)])
+
+
+def _bands(branch: Branch, limit: float) -> list[SpeedBand]:
+    """Bands of one branch, a run of its rows each."""
+    speed, size, amplitudes = (np.asarray(a) for a in (branch.omega, swing(branch), branch.steady_states.x.amplitudes))
+    lasting = np.asarray(can_persist(branch))
+    beyond = np.flatnonzero(lasting & (size > limit))
+
+    def crossing(inside: int, outside: int) -> float:
+        """Speed at which the limit is crossed between neighbouring rows, where there is such a row."""
+        if not 0 <= outside < size.size or not lasting[outside]:
+            return float(speed[inside])
+        return float(np.interp(limit, size[[outside, inside]], speed[[outside, inside]]))
+
+    found = []
+    for run in np.split(beyond, np.flatnonzero(np.diff(beyond) > 1) + 1):
+        if not run.size:
+            continue
+        first, last, top = (int(i) for i in (run[0], run[-1], run[np.argmax(size[run])]))
+        at = [crossing(first, first - 1), *speed[run], crossing(last, last + 1)]
+        found.append(
+            SpeedBand(
+                start=float(min(at)),
+                end=float(max(at)),
+                speed_at_peak=float(speed[top]),
+                amplitude=float(size[top]),
+                order=int(np.argmax(amplitudes[top])) + 1,
             )
+        )
+    return found
+
+
+def _merged(found: list[SpeedBand]) -> list[SpeedBand]:
+    """Bands that overlap as one: several motions coexist at a speed."""
+    bands: list[SpeedBand] = []
+    for band in sorted(found, key=lambda b: b.start):
+        if bands and band.start <= bands[-1].end:
+            before = bands.pop()
+            larger = max(before, band, key=lambda b: b.amplitude)
+            band = dataclasses.replace(larger, start=before.start, end=max(before.end, band.end))
+        bands.append(band)
     return bands

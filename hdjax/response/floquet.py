@@ -24,7 +24,7 @@ def monodromy(
         system: from [`hdjax.response.balance`][].
         unknowns: a solution of it.
         omega: forcing frequency [rad/s].
-        steps: of a period.
+        steps: of a period; at least a dozen for each natural oscillation within it, or the answer is wrong.
     """
     nodes = np.concatenate([[0.0], np.asarray(_TABLEAU.c)])
     phases = (np.arange(steps)[:, None] + nodes) / steps * (2 * np.pi)
@@ -59,7 +59,7 @@ def multipliers(
         system: from [`hdjax.response.balance`][].
         unknowns: a solution of it.
         omega: forcing frequency [rad/s].
-        steps: of a period.
+        steps: of a period; at least a dozen for each natural oscillation within it, or the answer is wrong.
     """
     matrix = monodromy(system, unknowns, omega, steps=steps)
     if matrix.shape[0] == 2:

@@ -231,13 +231,18 @@ def balance(
     )
     if system.samples <= 2 * harmonics:
         raise ValueError(f"`samples` must be above {2 * harmonics}, but is {system.samples}")
-    # The resonance's amplitude is the scale of the motion: A/(mu omega), where hardening raises omega.
-    drive = model.drive
-    still = jnp.zeros(system.coordinates * (2 * harmonics + 1))
+    return eqx.tree_at(lambda s: s.length, system, _resonance_length(system))
+
+
+@eqx.filter_jit
+def _resonance_length(system: BalancedMotion) -> Array:
+    """The resonance's amplitude as the scale of the motion: A/(mu omega), where hardening raises omega."""
+    drive = system.model.drive
+    still = jnp.zeros(system.coordinates * (2 * system.harmonics + 1))
     push = jnp.max(jnp.abs(system.residual(still, drive.omega_0)))
-    length = push * drive.omega_0 / jnp.maximum(drive.mu, 1e-6 * drive.omega_0)
+    length: Array = push * drive.omega_0 / jnp.maximum(drive.mu, 1e-6 * drive.omega_0)
     length = length / (1.0 + 0.75 * jnp.maximum(drive.alpha, 0.0) * length**2) ** 0.25
-    return eqx.tree_at(lambda s: s.length, system, jnp.where(length > 0, length, 1.0))
+    return jnp.where(length > 0, length, 1.0)
 
 
 def solve(

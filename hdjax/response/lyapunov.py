@@ -23,6 +23,7 @@ from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.dynamics import ReducedModel
 from hdjax.fourier import harmonic_series
 from hdjax.simulate import simulate
+from hdjax.where import where
 
 FAR = 10.0
 """Times the saddles' twist beyond which an unforced motion has escaped: nothing out there turns it back."""
@@ -41,7 +42,7 @@ def energy_rate(drive: Drive | ReducedDrive, v: Float[Array, "*n"]) -> Float[Arr
 def saddle(drive: Drive | ReducedDrive) -> Float[Array, ""]:
     """Twist `1/sqrt(-alpha)` of the saddles on either side [rad]; infinite where alpha >= 0, which has none."""
     softening = drive.alpha < 0.0
-    return jnp.where(softening, 1.0 / jnp.sqrt(jnp.where(softening, -drive.alpha, 1.0)), jnp.inf)
+    return where(softening, 1.0 / jnp.sqrt(where(softening, -drive.alpha, 1.0)), jnp.inf)
 
 
 def critical_energy(drive: Drive | ReducedDrive) -> Float[Array, ""]:
@@ -124,13 +125,13 @@ def _phase_portrait(drive, initial_states, times, points, rtol, atol, max_steps)
     states, escaped = jax.vmap(motion)(initial_states)
     x, v = states[..., 0], states[..., 1]
     furthest = jnp.max(jnp.abs(initial_states[:, 0]))
-    grid = jnp.linspace(-1.0, 1.0, points) * jnp.where(jnp.isfinite(edge), 1.25 * edge, furthest)
+    grid = jnp.linspace(-1.0, 1.0, points) * where(jnp.isfinite(edge), 1.25 * edge, furthest)
     damped = drive.mu != 0.0
     pull = drive.stiffness * restoring(grid, drive.alpha)
-    nullcline = jnp.where(damped, -pull / jnp.where(damped, drive.mu, 1.0), jnp.inf)
+    nullcline = where(damped, -pull / where(damped, drive.mu, 1.0), jnp.inf)
     # V_c - V(x, 0) is the square (omega_0^2 |alpha| / 4) (1/|alpha| - x^2)^2.
     inside = jnp.abs(grid) < edge
     softening = jnp.maximum(-drive.alpha, 0.0)
-    room = jnp.where(inside & (softening > 0.0), edge**2 - grid**2, 0.0)
-    level = drive.omega_0 * jnp.sqrt(softening / 2.0) * jnp.where(jnp.isfinite(room), room, 0.0)
+    room = where(inside & (softening > 0.0), edge**2 - grid**2, 0.0)
+    level = drive.omega_0 * jnp.sqrt(softening / 2.0) * where(jnp.isfinite(room), room, 0.0)
     return PhasePortrait(times, x, v, energy(drive, x, v), escaped, grid, nullcline, level)

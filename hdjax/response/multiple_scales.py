@@ -20,6 +20,7 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.fourier import FourierSeries, fourier_series
 from hdjax.parameters import as_scalar
 from hdjax.response.modulation import AdditiveModulation, Branches, Curve, Modulation, SubharmonicModulation
+from hdjax.where import where
 
 SAMPLES = 32  # of a period: the terms kept reach harmonic 15, and none of them folds onto those that are used.
 NEWTON_STEPS = 8
@@ -125,7 +126,7 @@ class Resonance(eqx.Module):
     def _points(self, curve: Curve) -> CurvePoints:
         a, s, exists = curve
         sigma = self.forcing * s
-        return CurvePoints(a, sigma, jnp.where(exists, self.omega(sigma), 0.0), exists)
+        return CurvePoints(a, sigma, where(exists, self.omega(sigma), 0.0), exists)
 
     def detuning(self, a: ArrayLike) -> CurvePoints:
         """Where the response has the amplitude `a` [rad]: left and right of the backbone."""
@@ -150,7 +151,7 @@ class Resonance(eqx.Module):
 class PrimaryResonance(Resonance):
     """`omega = omega_0 + sigma`: `x = a cos(omega t + psi)`.
 
-    `(mu^2/4 + (sigma - 3/8 omega_0 alpha a^2)^2) a^2 = A^2/(4 omega_0^2)` (Nayfeh & Mook eq. 4.1.19). The largest
+    `(mu^2/4 + (sigma - 3/8 omega_0 alpha a^2)^2) a^2 = A^2/(4 omega_0^2)` (Nayfeh & Mook section 4.1.1). The largest
     amplitude is `A/(mu omega_0)`.
     """
 
@@ -212,10 +213,10 @@ class SubharmonicResonance(Resonance):
         q, s, m = backbone_slope(self.drive), self.sigma(omega) / self.forcing, 0.5 * self.drive.mu
         exists = (q * s > 0) & (s * s >= 7 * m * m)
         # q C^2 between the roots of 7/4 E^2 - s E + m^2.
-        width = jnp.sqrt(jnp.where(exists, s * s - 7 * m * m, 0.0))
-        square = 2 / 7 * (jnp.abs(s) + jnp.stack([-width, width])) / jnp.where(exists, jnp.abs(q), 1.0)
-        C = jnp.where(exists, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-        C = jnp.where(square > 0, C, 0.0)
+        width = jnp.sqrt(where(exists, s * s - 7 * m * m, 0.0))
+        square = 2 / 7 * (jnp.abs(s) + jnp.stack([-width, width])) / where(exists, jnp.abs(q), 1.0)
+        C = where(exists, jnp.sqrt(where(square > 0, square, 1.0)), 0.0)
+        C = where(square > 0, C, 0.0)
         return Limits(C * 8 * self.drive.omega_0**2, C, exists)
 
 
@@ -252,7 +253,7 @@ def second_order(resonance: Resonance, omega: ArrayLike) -> SteadyStates:
         off = jnp.arange(H) != r
         free = drive.omega_0**2 - (x_0.omega * jnp.arange(1.0, H + 1.0)) ** 2
         load = fourier_series(x_0.omega, drive.mu * v + cubic * x**3, H)
-        response = [-jnp.where(off, c / jnp.where(off, free, 1.0), 0.0) for c in (load.cosine, load.sine)]
+        response = [-where(off, c / where(off, free, 1.0), 0.0) for c in (load.cosine, load.sine)]
         x_1 = FourierSeries(x_0.omega, jnp.zeros_like(x_0.mean), *response)
         load = fourier_series(x_0.omega, drive.mu * v + cubic * (x**3 + 3 * x**2 * jax.vmap(x_1)(times)), H)
         left = free[r] * z + jnp.stack([load.cosine[r], load.sine[r]]) - push
@@ -276,15 +277,15 @@ def second_order(resonance: Resonance, omega: ArrayLike) -> SteadyStates:
     # A last step below the square root of the precision: the next would be below rounding.
     converged = jnp.sum(change**2, axis=-1) <= jnp.finfo(z.dtype).eps * (size + resonance.C**2)
     distances = jnp.sum((z[:, None] - start[None]) ** 2, axis=-1)
-    nearest = jnp.argmin(jnp.where(branches.exists[None], distances, jnp.inf), axis=1)
+    nearest = jnp.argmin(where(branches.exists[None], distances, jnp.inf), axis=1)
     exists = branches.exists & converged & (nearest == jnp.arange(3))
     there = exists & (branches.amplitude > 0)
-    z = jnp.where(there[:, None], z, jnp.array([1.0, 0.0]))
-    amplitude = jnp.where(there, jnp.hypot(z[:, 0], z[:, 1]), 0.0)
-    phase = jnp.where(there, jnp.arctan2(-z[:, 1], z[:, 0]), 0.0)
+    z = where(there[:, None], z, jnp.array([1.0, 0.0]))
+    amplitude = where(there, jnp.hypot(z[:, 0], z[:, 1]), 0.0)
+    phase = where(there, jnp.arctan2(-z[:, 1], z[:, 0]), 0.0)
     plain = first_order(resonance, omega).harmonics
     cosine, sine = (
-        jnp.where(exists[:, None], refined, leading)
+        where(exists[:, None], refined, leading)
         for refined, leading in ((series.cosine, plain.cosine), (series.sine, plain.sine))
     )
     refined_branches = Branches(amplitude, phase, exists, exists & branches.stable)
@@ -306,7 +307,7 @@ def _solve_two(J: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
     """`J^-1 b`, or b where J is singular."""
     determinant = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
     solved = jnp.stack([J[1, 1] * b[0] - J[0, 1] * b[1], J[0, 0] * b[1] - J[1, 0] * b[0]])
-    return jnp.where(determinant == 0, b, solved / jnp.where(determinant == 0, 1.0, determinant))
+    return where(determinant == 0, b, solved / where(determinant == 0, 1.0, determinant))
 
 
 # As printed: the seed's own equations, errors included, to be shown beside the correct ones above. Each function gives
@@ -333,7 +334,7 @@ def printed_primary(drive: Drive | ReducedDrive, A: ArrayLike, omega: ArrayLike)
     A, omega = (jnp.asarray(v, dtype=float) for v in (A, omega))
     q = backbone_slope(drive)
     gap = drive.omega_0**2 - omega**2
-    shift = jnp.where(q == 0, 0.0, q * (A / gap) ** 2)
+    shift = where(q == 0, 0.0, q * (A / gap) ** 2)
     return jnp.abs(A) / (2 * drive.omega_0 * jnp.hypot(0.5 * drive.mu, omega - drive.omega_0 - shift))
 
 
@@ -358,9 +359,9 @@ def printed_subharmonic(
     resonance = SubharmonicResonance(drive, A)
     q, C = backbone_slope(drive), resonance.C
     room = (3 * q * C) ** 2 - 2.25 * drive.mu**2
-    half_width = jnp.sqrt(jnp.where(room > 0, room, 0.0))
+    half_width = jnp.sqrt(where(room > 0, room, 0.0))
     numerator = resonance.sigma(omega) - 3 * q * C**2 + jnp.sign(q) * jnp.stack([-half_width, half_width])
-    square = numerator / jnp.where(q == 0, 1.0, 6 * drive.omega_0 * q)
+    square = numerator / where(q == 0, 1.0, 6 * drive.omega_0 * q)
     exists = (q != 0) & (room >= 0) & (square > 0)
-    a = jnp.where(exists, jnp.sqrt(jnp.where(exists, square, 1.0)), 0.0)
+    a = where(exists, jnp.sqrt(where(exists, square, 1.0)), 0.0)
     return jnp.concatenate([jnp.zeros(1, a.dtype), a]), jnp.concatenate([jnp.ones(1, bool), exists])

@@ -50,17 +50,20 @@ class PrintedSource(NamedTuple):
     """A row of the seed's Table 4, with what is known of the source from elsewhere."""
 
     source: str
+    effect: str
     low: float
     high: float
-    known_low: float | None
-    known_high: float | None
     known: str
 
 
 TABLE_4 = (
-    PrintedSource("tooth meshing friction", 1e-3, 1e-2, 0.1 / 7160, 5.0 / 7160, "friction of 0.1 to 5 N m over K"),
-    PrintedSource("flexspline deformation", 1e-4, 1e-3, None, None, "the cubic's own part of the twist"),
-    PrintedSource("assembly imperfections", 1e-5, 1e-4, None, None, "no published range"),
-    PrintedSource("wave generator eccentricity", 1e-4, 1e-3, 0.75e-4, 2.9e-4, "vendors: 1.5e-4 to 5.8e-4 peak to peak"),
+    PrintedSource(
+        "tooth meshing friction", "Coulomb damping", 1e-3, 1e-2, "0.1 to 5 N m over K are 1.4e-5 to 7.0e-4 rad"
+    ),
+    PrintedSource("flexspline deformation", "cubic stiffness", 1e-4, 1e-3, "alpha x^3 at Table 2's largest amplitude"),
+    PrintedSource("assembly imperfections", "periodic forcing", 1e-5, 1e-4, "no published range"),
+    PrintedSource(
+        "wave generator eccentricity", "harmonic excitation", 1e-4, 1e-3, "vendors: 1.5e-4 to 5.8e-4 rad peak to peak"
+    ),
 )
 """Magnitudes [rad]."""

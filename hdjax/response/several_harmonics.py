@@ -21,6 +21,7 @@ from hdjax.forcing import MultiHarmonic
 from hdjax.parameters import as_scalar
 from hdjax.response.modulation import AdditiveModulation, Branches
 from hdjax.response.multiple_scales import backbone_slope
+from hdjax.where import where
 
 Kind = Literal["primary", "additive", "parametric", "sub-harmonic"]
 
@@ -61,7 +62,7 @@ def forced_shift(drive: Drive | ReducedDrive, forcing: MultiHarmonic) -> Array:
     A term of frequency 0 counts twice: its mean square is that of a constant.
     """
     x = forced_response(drive, forcing)
-    mean_square = jnp.where(x.omegas == 0, (x.amplitudes * jnp.cos(x.phases)) ** 2, 0.5 * x.amplitudes**2)
+    mean_square = where(x.omegas == 0, (x.amplitudes * jnp.cos(x.phases)) ** 2, 0.5 * x.amplitudes**2)
     return 4 * backbone_slope(drive) * jnp.sum(mean_square)
 
 
@@ -97,7 +98,7 @@ class OffResonance(eqx.Module):
         mu, (c, s) = self.drive.mu, self.z_0
         damped = mu != 0
         # The integral of a^2 / a_0^2.
-        elapsed = jnp.where(damped, -jnp.expm1(-mu * t) / jnp.where(damped, mu, 1.0), t)
+        elapsed = where(damped, -jnp.expm1(-mu * t) / where(damped, mu, 1.0), t)
         shift = forced_shift(self.drive, self.forcing) * t + backbone_slope(self.drive) * (c * c + s * s) * elapsed
         angle = self.drive.omega_0 * t + shift
         free = jnp.exp(-0.5 * mu * t) * (c * jnp.cos(angle) - s * jnp.sin(angle))
@@ -198,15 +199,15 @@ class CombinationResonance(eqx.Module):
         """The slow equation of the response, its phase counted from that of the feed."""
         c, s = self._feed
         square = c * c + s * s
-        e = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        e = where(square > 0, jnp.sqrt(where(square > 0, square, 1.0)), 0.0)
         return AdditiveModulation(self.drive.mu, backbone_slope(self.drive), forced_shift(self.drive, self.forcing), e)
 
     def branches(self) -> Branches:
         """All steady states of the resonant response, to first order."""
         c, s = self._feed
-        angle = jnp.arctan2(s, jnp.where((c == 0) & (s == 0), 1.0, c))
+        angle = jnp.arctan2(s, where((c == 0) & (s == 0), 1.0, c))
         states = self.modulation.branches(self.omega - self.drive.omega_0)
-        phase = jnp.where(states.amplitude > 0, states.phase + angle, 0.0)
+        phase = where(states.amplitude > 0, states.phase + angle, 0.0)
         return eqx.tree_at(lambda b: b.phase, states, phase)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from hdjax.dynamics import Model, ReducedModel, State
 from hdjax.fourier import FourierSeries, fourier_series
 from hdjax.simulate import Trajectory, no_torque, simulate
+from hdjax.where import where
 
 
 class PeriodicOrbit(eqx.Module):
@@ -133,7 +134,7 @@ def shoot(
             singular; shoot for the dynamic error of `ReducedModel(drive.reduced())`.
 
     References:
-        Nayfeh, A. H., Balachandran, B. (1995). Applied Nonlinear Dynamics, sections 3.2 and 6.4.
+        Nayfeh, A. H., Balachandran, B. (1995). Applied Nonlinear Dynamics, chapters 3 and 6.
     """
     require_reduced(model)
     solver = dfx.Dopri8() if solver is None else solver
@@ -195,7 +196,7 @@ def motion_size(model: ReducedModel, forcing: FourierSeries, state: State) -> Fl
     push = jnp.abs(forcing.mean) + jnp.sum(forcing.amplitudes)
     size = jnp.abs(state[0]) + jnp.abs(state[1]) / forcing.omega
     size = size + jnp.abs(drive.gain) * push / (forcing.omega**2 + drive.omega_0**2)
-    return jnp.where(size > 0.0, size, 1.0)
+    return where(size > 0.0, size, 1.0)
 
 
 def _run(model: Model, forcing: FourierSeries, times: Array, state: State, **options: Any) -> Trajectory:
@@ -225,14 +226,14 @@ def _shoot(model, forcing, guess, periods, options, tolerance, max_iterations) -
     newton = optx.Newton(rtol=tolerance, atol=tolerance)
     root = optx.root_find(miss, newton, start, (model, forcing), max_steps=max_iterations, throw=False)
     finite = jnp.all(jnp.isfinite(root.value))
-    scaled = jnp.where(finite, root.value, start)
+    scaled = where(finite, root.value, start)
     slope, residual = jax.jacfwd(miss_twice, has_aux=True)(scaled)
     usable = jnp.all(jnp.isfinite(slope)) & jnp.all(jnp.isfinite(residual))
-    matrix = jnp.eye(scale.size) + jnp.where(usable, slope, 0.0)
+    matrix = jnp.eye(scale.size) + where(usable, slope, 0.0)
     return (
         scale * scaled,
         matrix * scale[:, None] / scale[None, :],
         jnp.linalg.eigvals(matrix),
-        jnp.where(usable, jnp.max(jnp.abs(residual)), jnp.inf),
+        where(usable, jnp.max(jnp.abs(residual)), jnp.inf),
         (root.result == optx.RESULTS.successful) & finite & usable,
     )

@@ -1,0 +1,43 @@
+"""The response over a range of frequencies from both of its ends: where a fold lies beyond the range, they differ."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import ArrayLike
+
+from hdjax.dynamics import Model
+from hdjax.fourier import FourierSeries
+from hdjax.response.continuation import Branch, frequency_response
+
+_MARGIN = 1e-6
+_SAME = 1e-6
+
+
+def from_both_ends(
+    model: Model, forcing: FourierSeries | None, slow: ArrayLike, fast: ArrayLike, **options: Any
+) -> tuple[Branch, ...]:
+    """The branch that starts at the slow end of a range, and the one from the fast end where that is another one.
+
+    A hardening drive's branch may leave the range at large amplitude; what a drive does that comes from faster speeds
+    is then on the second branch. A softening drive's may turn back before the fast end. Rows are valid up to where a
+    branch leaves the range.
+
+    Args:
+        model: see [`hdjax.response.frequency_response`][], as for the other arguments.
+        forcing: its omega is not used.
+        slow: lowest forcing frequency [rad/s].
+        fast: highest forcing frequency [rad/s].
+        **options: of [`hdjax.response.frequency_response`][].
+    """
+    up, down = (
+        frequency_response(model, forcing, start, end, **options) for start, end in ((slow, fast), (fast, slow))
+    )
+    met = bool(up.complete & jnp.allclose(up.unknowns[-1], down.unknowns[0], rtol=0.0, atol=_SAME))
+    low, high = jnp.asarray(slow) * (1.0 - _MARGIN), jnp.asarray(fast) * (1.0 + _MARGIN)
+
+    def within(branch: Branch) -> Branch:
+        inside = jnp.cumsum((branch.omega < low) | (branch.omega > high)) == 0
+        return eqx.tree_at(lambda b: b.valid, branch, branch.valid & inside)
+
+    return (within(up),) if met else (within(up), within(down))
