@@ -198,8 +198,8 @@ def test_horizon_and_steps_follow_the_frequency():
     stretches = whole(rig.drive_experiment(400))
     slow, fast = rig.drive_model(K=rig.K / 100, alpha=0.0), rig.drive_model(K=100 * rig.K, alpha=0.0)
     assert suggested_substeps(slow, stretches) == 1
-    # omega_0 h = 3855 * 5e-4 = 1.93, at most 0.3 a step.
-    assert suggested_substeps(fast, stretches) == 7
+    # omega_0 h = 3855 * 5e-4 = 1.93, at most 0.15 a step.
+    assert suggested_substeps(fast, stretches) == 13
     # Six periods of 2 pi / (38.55 * 5e-4) = 326 samples, to the next power of two.
     assert short_horizon(slow, stretches) == 2048
     assert short_horizon(rig.drive_model(alpha=0.0), stretches) == 256

@@ -6,10 +6,7 @@ import numpy as np
 
 from hdjax.dynamics import Model
 from hdjax.fourier import FourierSeries
-from hdjax.response.marching import STEPS as STEPS
-from hdjax.response.poincare import PoincareSection as PoincareSection
-from hdjax.response.poincare import period_of, poincare_section
-from hdjax.response.swept_sine import SweptSine as SweptSine
+from hdjax.response.poincare import PoincareSection, period_of, poincare_section
 
 ESCAPED, UNSETTLED = -1, -2
 """Labels of starts that reach no periodic motion: beyond all numbers, and chaotic or not settled."""
