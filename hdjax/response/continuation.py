@@ -24,8 +24,8 @@ from hdjax.where import where
 _TOLERANCE = 1e-9
 _SOLVED = 1e-11
 _FOLD_SOLVED = 1e-8
-_CORRECTIONS = 3
-_CHORDS = 3
+_CORRECTIONS = 2
+_CHORDS = 5
 _ITERATIONS = 8
 _FOLD_TOLERANCE = 1e-11
 
