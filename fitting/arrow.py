@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.residual import Blocks, LinearisedResidual, Unknowns
+from fitting.residual import Blocks, LinearisedResidual, Unknowns, blocks_of_columns, seeds
 from hdjax.where import where
 
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
@@ -199,25 +199,10 @@ class ArrowDescent(optx.AbstractDescent):
         )
 
     def query(self, y: Unknowns, f_info, state: ArrowSystem) -> ArrowSystem:
-        parameters = y.parameters.shape[0]
-        segments, states = y.states.shape
-
-        def column(seed):
-            own = jnp.broadcast_to(seed[None, parameters:], (segments, states))
-            return f_info.jac.mv(Unknowns(seed[:parameters], own))
-
-        # One seed moves the same state of every segment: no row depends on two of them, and a gap on two that the
-        # difference of the identity tells apart.
-        moved: LinearisedResidual = jax.vmap(column, out_axes=-1)(jnp.eye(parameters + states))
-        slopes = moved.gap / self.gap_weight[None, :, None]
-        own = where(self.joined[:, None, None], jnp.eye(states), 0.0)
-        found = Blocks(
-            residual=f_info.residual.rows,
-            by_parameter=moved.rows[..., :parameters],
-            by_state=moved.rows[..., parameters:],
-            gap=f_info.residual.gap / self.gap_weight[None],
-            before_by_parameter=-slopes[..., :parameters],
-            before_by_state=own - slopes[..., parameters:],
+        moved: LinearisedResidual = jax.vmap(f_info.jac.mv, out_axes=-1)(seeds(y))
+        value, weight = f_info.residual, self.gap_weight[None]
+        found = blocks_of_columns(
+            value.rows, value.gap / weight, moved.rows, moved.gap / weight[:, :, None], self.joined
         )
         return normal_equations(found, self.joined)
 

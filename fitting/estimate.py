@@ -346,6 +346,7 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
     half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
     piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
     held = eqx.tree_at(lambda p: p.active, found.problem, jnp.zeros_like(found.problem.active))
+    swing = scales(found.stretches).x
     total, samples = jnp.zeros_like(found.covariance), 0.0
     # A piece is the head of a segment; segments that begin later have other heads.
     for offset in range(0, length - piece + 1, piece):
@@ -359,7 +360,7 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         covariance = found.covariance
         for turn in range(_REWEIGHTINGS):
-            part = _weighed(part, covariance, scales(found.stretches).x)
+            part = _weighed(part, covariance, swing)
             unknowns, _, covariance, _, _ = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
         total, samples = total + covariance * jnp.sum(head), samples + float(jnp.sum(head))
     rows = piece * total.shape[0]

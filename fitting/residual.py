@@ -100,12 +100,6 @@ def simulate_segments(
     return jax.vmap(one)(segments.torque, segments.load_torque, unknowns.states)
 
 
-def output_error(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments samples outputs"]:
-    """Measured minus simulated outputs, zero on padding."""
-    outputs, _ = simulate_segments(problem, unknowns)
-    return (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
-
-
 def residual(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
@@ -136,26 +130,41 @@ def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments
 
 def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
     """Residual and Jacobian from one simulation whose lanes are segments x sensitivities (forward mode)."""
-    parameters = unknowns.parameters.shape[0]
-    segments, states = unknowns.states.shape
-    seeds = jnp.eye(parameters + states)
 
-    def along(seed):
-        tangent = Unknowns(seed[:parameters], jnp.broadcast_to(seed[None, parameters:], (segments, states)))
+    def along(tangent: Unknowns):
         return jax.jvp(lambda u: residual(problem, u), (unknowns,), (tangent,))
 
-    (value, gap), (columns, slopes) = jax.vmap(along, out_axes=(None, -1))(seeds)
-    columns = where(jnp.isfinite(columns), columns, 0.0)
+    (value, gap), (columns, slopes) = jax.vmap(along, out_axes=(None, -1))(seeds(unknowns))
+    active = jnp.concatenate([problem.active, jnp.ones(unknowns.states.shape[1])])[None, None, :]
+    columns = where(jnp.isfinite(columns), columns, 0.0) * active
     slopes = where(jnp.isfinite(slopes), slopes, 0.0)
-    active = problem.active[None, None, :]
+    return blocks_of_columns(value, gap, columns, slopes * active, problem.segments.joined)
+
+
+def seeds(unknowns: Unknowns) -> Unknowns:
+    """Tangents, by row, that move one parameter, or one and the same state of every segment: no row of the residual
+    depends on the states of two segments."""
+    parameters = unknowns.parameters.shape[0]
+    segments, states = unknowns.states.shape
+
+    def seed(unit: Array) -> Unknowns:
+        return Unknowns(unit[:parameters], jnp.broadcast_to(unit[None, parameters:], (segments, states)))
+
+    return jax.vmap(seed)(jnp.eye(parameters + states))
+
+
+def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, joined: Array) -> Blocks:
+    """The blocks behind what [`seeds`][], along the last axis, do to residual (columns) and gaps (slopes)."""
+    states = gap.shape[1]
+    parameters = columns.shape[2] - states
     # A gap is a segment's own initial state minus the end of the one before.
-    own = where(problem.segments.joined[:, None, None], jnp.eye(states), 0.0)
+    own = where(joined[:, None, None], jnp.eye(states), 0.0)
     return Blocks(
         residual=value,
-        by_parameter=columns[..., :parameters] * active,
+        by_parameter=columns[..., :parameters],
         by_state=columns[..., parameters:],
         gap=gap,
-        before_by_parameter=-slopes[..., :parameters] * active,
+        before_by_parameter=-slopes[..., :parameters],
         before_by_state=own - slopes[..., parameters:],
     )
 

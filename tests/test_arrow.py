@@ -153,6 +153,9 @@ def small() -> tuple[Problem, Unknowns]:
     return problem, Unknowns(free.pack(model), initial_states(model, segments))
 
 
+TIGHT: dict[str, float] = {"xtol": 1e-13, "ftol": 1e-13, "gtol": 1e-13}
+
+
 def solve(problem: Problem, start: Unknowns) -> optx.Solution:
     descent = ArrowDescent(problem.segments.joined, problem.gap_weight, jnp.asarray(1e-3))
     return optx.least_squares(
@@ -188,9 +191,7 @@ def test_the_minimum_is_that_of_scipy(small):
         flat(start),
         jac=lambda y: dense(jacobian(problem, unflatten(y)))[0],
         x_scale="jac",
-        xtol=1e-13,
-        ftol=1e-13,
-        gtol=1e-13,
+        **TIGHT,
     )
     solution = solve(problem, start)
     assert solution.result == optx.RESULTS.successful
@@ -215,9 +216,7 @@ def test_the_minimum_of_joined_segments_is_that_of_one_simulation(small):
         np.concatenate([np.asarray(start.parameters), np.asarray(start.states)[0]]),
         x_scale="jac",
         jac="3-point",
-        xtol=1e-13,
-        ftol=1e-13,
-        gtol=1e-13,
+        **TIGHT,
     )
     solution = solve(joined, start)
     assert solution.result == optx.RESULTS.successful

@@ -9,7 +9,7 @@ import pytest
 import rig
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths, effect_paths, free_parameters
-from fitting.residual import Problem, Unknowns, blocks, output_error, residual, residual_with_blocks
+from fitting.residual import Problem, Unknowns, blocks, residual, residual_with_blocks, simulate_segments
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.hysteresis import BoucWen
@@ -27,6 +27,12 @@ def problem_of(experiment, model, paths, *, length=LENGTH, substeps=1, halo=0) -
     free = free_parameters(model, paths, {"alpha": 2e4})
     gap_weight = jnp.ones(len(model.state_names))
     return Problem(model, free, segments, whitening, jnp.ones(len(paths)), gap_weight, substeps=substeps)
+
+
+def output_error(problem: Problem, unknowns: Unknowns) -> jnp.ndarray:
+    """Measured minus simulated outputs, zero on padding."""
+    outputs, _ = simulate_segments(problem, unknowns)
+    return (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
 
 
 def first_states(motion: np.ndarray, length: int = LENGTH) -> jnp.ndarray:

@@ -1,7 +1,6 @@
 """The check of the analytic amplitudes: multiple scales against harmonic balance against time integration."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -16,9 +15,9 @@ from hdjax.dynamics import ReducedModel
 from hdjax.fourier import FourierSeries, harmonic_series
 from hdjax.parameters import as_scalar
 from hdjax.response.continuation import Branch
-from hdjax.response.floquet import is_stable, multipliers
+from hdjax.response.floquet import is_stable, multipliers, resolving_steps
 from hdjax.response.harmonic_balance import balance, solve
-from hdjax.response.marching import STEPS
+from hdjax.response.marching import transient_and_steps
 from hdjax.response.multiple_scales import (
     PrimaryResonance,
     Resonance,
@@ -142,9 +141,8 @@ def check_amplitudes(
     # Off resonance the super-harmonic's expansion holds too: its third harmonic is then merely not resonant.
     resonance = KINDS.get(kind, SuperharmonicResonance)
     at = resonance(drive, A)
-    # Stability needs a dozen steps for each natural oscillation within the period of the motion.
-    turns = at.forcing * float(drive.omega_0) / omega
-    found = _check(at, as_scalar(omega), harmonics, steps=max(64, 2 ** math.ceil(math.log2(12.0 * turns))))
+    steps = resolving_steps(at.forcing * float(drive.omega_0) / omega)
+    found = _check(at, as_scalar(omega), harmonics, steps)
     existing = np.flatnonzero(np.asarray(found.exists))
     rows = []
     for slot in existing:
@@ -248,20 +246,17 @@ def settled(branch: Branch, *, motions: int = 24, off: float = 0.01, transient_p
     zero = jnp.zeros(())
     starts = (1.0 + off) * jax.vmap(lambda x: jnp.stack([x(zero), x.derivative()(zero)]))(x)
     given = branch.system.forcing
-    turns = float(branch.system.model.drive.omega_0) / float(jnp.min(branch.omega[rows]))
+    model, omegas = branch.system.model, branch.omega[rows]
+    _, steps = transient_and_steps(model, omegas, given.harmonics, transient_periods, None)
 
     def one(omega: Array, start: Array) -> PoincareSection:
         forcing = FourierSeries(omega, given.mean, given.cosine, given.sine)
         section = poincare_section(
-            branch.system.model,
-            forcing,
-            start[None],
-            transient_periods=transient_periods,
-            steps_per_period=STEPS * math.ceil(max(turns, forcing.harmonics)),
+            model, forcing, start[None], transient_periods=transient_periods, steps_per_period=steps
         )
         return jax.tree.map(lambda leaf: leaf[0], section)
 
-    found = eqx.filter_vmap(one)(branch.omega[rows], starts)
+    found = eqx.filter_vmap(one)(omegas, starts)
     at_rest = np.flatnonzero(np.asarray(period_of(found)))
     return jax.tree.map(lambda leaf: leaf[at_rest], found)
 

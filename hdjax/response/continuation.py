@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hdjax.dynamics import Model
 from hdjax.fourier import FourierSeries
 from hdjax.parameters import as_scalar
-from hdjax.response.floquet import is_stable, multipliers
+from hdjax.response.floquet import is_stable, multipliers, resolving_steps
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance, find_root
 from hdjax.where import where
 
@@ -282,14 +282,14 @@ def _branch_multipliers(branch: Branch, steps: int) -> Array:
 
 
 def _floquet_steps(branch: Branch) -> int:
-    """Steps of a period that resolve the natural oscillations within the longest, a power of two: few programs."""
+    """Steps of a period that resolve the natural oscillations within the longest."""
     if isinstance(branch.omega, Tracer):
         return 64
     slowest = np.min(np.asarray(branch.omega), where=np.asarray(branch.valid), initial=np.inf)
     drive = branch.system.model.drive
     hardening = 1.0 + 3.0 * np.maximum(drive.alpha, 0.0) * np.max(np.asarray(branch.amplitude)) ** 2
     turns = float(branch.system.subharmonic * drive.omega_0 * np.sqrt(hardening) / slowest)
-    return int(np.clip(2 ** np.ceil(np.log2(12.0 * max(turns, 1.0))), 64, 4096))
+    return min(resolving_steps(turns), 4096)
 
 
 @eqx.filter_jit

@@ -1,5 +1,7 @@
 """Stability of a steady motion: the Floquet multipliers of its first variation over one period."""
 
+import math
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -69,6 +71,12 @@ def multipliers(
         half = jnp.astype(half, complex)
         return jnp.stack([half + root, half - root])
     return jnp.linalg.eigvals(matrix)
+
+
+def resolving_steps(turns: float) -> int:
+    """Steps of a period in which the drive oscillates so many times: a dozen for each, as a power of two (few shapes,
+    few programs)."""
+    return max(64, 2 ** math.ceil(math.log2(12.0 * max(turns, 1.0))))
 
 
 def is_stable(multipliers: Complex[Array, "*rows multipliers"]) -> Bool[Array, "*rows"]:
