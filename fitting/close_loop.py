@@ -169,7 +169,7 @@ def close_loop(
         residual_after=diagnose(current.training),
         hold=current.hold,
         setting=setting,
-        after_substeps=current.training.problem.substeps,
+        after_substeps=current.training.substeps,
         stretches=(training, validation),
         seconds=clock.laps,
     )
@@ -236,7 +236,7 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     halo = halo_for(training)
     best = base_fit(model, training, halo=halo)
     count = segment_count(training, segment_length(best.horizon))
-    setting = Setting(best.horizon, halo, best.problem.substeps, count)
+    setting = Setting(best.horizon, halo, best.substeps, count)
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
@@ -300,7 +300,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         horizon=longest,
         length=segment_length(setting.horizon),
         halo=setting.halo,
-        substeps=start.problem.substeps,
+        substeps=start.substeps,
         covariance=start.covariance,
         count=setting.count,
         states=start.unknowns.states,
@@ -312,7 +312,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         start.free.paths,
         horizon=setting.horizon,
         halo=setting.halo,
-        substeps=start.problem.substeps,
+        substeps=start.substeps,
         count=setting.count,
         covariance=start.covariance,
         hold_parameters=True,

@@ -2,6 +2,7 @@
 
 # ruff: noqa: E402
 
+import contextlib
 import os
 
 # XLA reads this once, when jax loads. With a warm cache it would warn at length that the processor lacks
@@ -46,6 +47,9 @@ from hdjax import (
     simulate,
 )
 
+# A log of usual length has too few lanes for more.
+_MOST_DEVICES = 8
+
 app = cyclopts.App(
     name="hdjax",
     help="The dynamic error of harmonic drives: simulate it, fit it to logs, and find what the model lacks.",
@@ -77,7 +81,7 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
         progress("free runs on held-out data")
         noise = measurement_noise(found)
         result = account(found, training, validation, noise=noise, halo=0)
-    stored = StoredModel(result.model, hold, found.problem.substeps, 0, noise)
+    stored = StoredModel(result.model, hold, found.substeps, 0, noise)
     paths = write_fit_report(
         out, result, rig=rig, noise=noise, hold=hold, model_json=to_json(stored), residual=diagnose(found)
     )
@@ -273,8 +277,10 @@ class _progress:
 
 
 def _set_up_jax() -> None:
-    """Double precision, and compiled programs kept between runs."""
+    """Double precision, a device for each core, and compiled programs kept between runs."""
     jax.config.update("jax_enable_x64", True)
+    with contextlib.suppress(RuntimeError):  # JAX has started: this is not the process' first command
+        jax.config.update("jax_num_cpu_devices", min(len(os.sched_getaffinity(0)), _MOST_DEVICES))
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdjax"
     try:
         cache.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,8 @@ from fitting.residual import (
     residual_with_blocks,
 )
 from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.devices import spread
+from hdjax.simulate import COMPILER_OPTIONS
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -70,6 +72,11 @@ class Fit(eqx.Module):
     def free(self) -> FreeParameters:
         """What was free."""
         return self.problem.free
+
+    @property
+    def substeps(self) -> int:
+        """Solver steps in a sample interval."""
+        return int(self.problem.substeps)
 
     @property
     def dynamic_error_std(self) -> float:
@@ -135,6 +142,7 @@ def fit(
     motion = scales(stretches)
     outputs = segments.measured.shape[-1]
     problem = Problem(model, free, segments, jnp.eye(outputs), active, jnp.ones(states.shape[1]), substeps=substeps)
+    problem, unknowns = spread((problem, unknowns), states.shape[0])
     if covariance is None:
         _, covariance, _ = _evaluate(problem, unknowns)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
@@ -153,8 +161,10 @@ def fit(
         if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
             break
     assert error is not None
+    # By way of the host: what is computed with the model alone need not run on every device.
+    values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
-        model=free.unpack(model, unknowns.parameters),
+        model=free.unpack(model, values),
         problem=_weighed(problem, covariance, motion.x) if reweigh else problem,
         unknowns=unknowns,
         error=error,
@@ -180,7 +190,7 @@ def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float):
     return _compiled_solve(problem, start, jnp.asarray(max_steps), jnp.asarray(damping))
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
 def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
     descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
     solution = optx.least_squares(
@@ -203,7 +213,7 @@ def _error_of_rows(problem: Problem, rows: Array) -> Array:
     return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
 def _evaluate(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array, Array]:
     """The output error, its covariance, and each segment's sum of squares."""
     rows, _ = residual(problem, unknowns)
@@ -376,11 +386,10 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, most: int = 8) -> in
         most: where to stop.
     """
     problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
-    substeps = problem.substeps
+    substeps = found.substeps
     error, _, _ = _evaluate(problem, found.unknowns)
     while substeps < most:
-        finer = dataclasses.replace(problem, substeps=2 * substeps)
-        better, _, _ = _evaluate(finer, found.unknowns)
+        better, _, _ = _evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns)
         white = np.asarray(better - error) @ np.asarray(problem.whitening).T
         mean_square = (white**2).sum(axis=(0, 1)) / float(problem.segments.count)
         if np.sqrt(mean_square.max()) < tolerance:

@@ -12,6 +12,7 @@ from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
 from fitting.residual import Problem, Unknowns, linearise, simulate_segments
 from hdjax import Model, TwoInertiaModel
+from hdjax.simulate import COMPILER_OPTIONS
 
 WINDOW = 50
 """Samples from which the initial state is taken."""
@@ -119,7 +120,7 @@ def free_run(
     return tuple(runs)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
 def _simulate(problem: Problem, unknowns: Unknowns) -> Array:
     return simulate_segments(problem, unknowns)[0]
 

@@ -4,16 +4,20 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
-from hdjax.simulate import march
+from hdjax.simulate import COMPILER_OPTIONS, march
 from hdjax.where import where
 
 # Where a simulation has left the numbers, the residual is this many standard deviations: a rejected step.
 _LOST = 1e8
+
+
+def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
+    return jnp.asarray(value, dtype=int)
 
 
 class Problem(eqx.Module):
@@ -28,7 +32,7 @@ class Problem(eqx.Module):
         gap_weight: what a unit of each state counts where a joined segment does not yet start where the one before
             it ends.
         solver: explicit Runge-Kutta solver of diffrax.
-        substeps: its steps in each sample interval.
+        substeps: its steps in each sample interval; data, so that finer steps need no other program.
         unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
     """
 
@@ -39,7 +43,7 @@ class Problem(eqx.Module):
     active: Float[Array, " parameters"]
     gap_weight: Float[Array, " states"]
     solver: dfx.AbstractERK = dfx.Tsit5()
-    substeps: int = eqx.field(static=True, default=1)
+    substeps: Int[Array, ""] = eqx.field(converter=_as_integer, default=1)
     unroll: bool = eqx.field(static=True, default=True)
 
 
@@ -71,6 +75,7 @@ class Blocks(eqx.Module):
     before_by_state: Float[Array, "segments states states"]
 
 
+@eqx.filter_jit
 def simulate_segments(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
@@ -169,7 +174,7 @@ def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, j
     )
 
 
-linearise = eqx.filter_jit(blocks)
+linearise = eqx.filter_jit(blocks, compiler_options=COMPILER_OPTIONS)
 """[`blocks`][], compiled once for all who look at a solution."""
 
 

@@ -21,6 +21,7 @@ from fitting.free import FreeParameters, base_paths, effect_paths, strength_path
 from fitting.residual import Problem, Unknowns, blocks
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
+from hdjax.simulate import COMPILER_OPTIONS
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -161,7 +162,7 @@ def _states(everything: Model, fit: Fit) -> Array:
     return jnp.stack(columns, axis=1)
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
 def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogates: Array):
     found = blocks(problem, unknowns)
     columns = project(found, problem.segments.joined)
