@@ -82,7 +82,7 @@ def frequency_response(
     slope = _mean_slope(model, experiments)
     resonance = math.sqrt(slope) / (2 * math.pi)
     width = abs(float(model.drive.mu)) / (2 * math.pi)
-    window = _window(max(u.size for u, _ in signals), step, width)
+    window = _window([u.size for u, _ in signals], step, width)
     signals = [(u, x) for u, x in signals if u.size >= window]
     if window < _SHORTEST or not any(np.ptp(u) > 0 for u, _ in signals):
         return None
@@ -120,10 +120,11 @@ def _on_grid(experiment: Experiment, step: float) -> tuple[np.ndarray, np.ndarra
     return np.interp(grid, time, u), np.interp(grid, time, x)
 
 
-def _window(samples: int, step: float, width: float) -> int:
+def _window(samples: Sequence[int], step: float, width: float) -> int:
     """Samples in a window: as many as resolve the resonance, as few as leave enough to average over."""
     wanted = _LINES / (width * step) if width > 0 else math.inf
-    allowed = min(max(wanted, 1024.0), 2.0 * samples / (_AVERAGES + 1), _LONGEST)
+    averaged = 2.0 * sum(samples) / (_AVERAGES + len(samples))
+    allowed = min(max(wanted, 1024.0), averaged, max(samples), _LONGEST)
     return 1 << int(math.log2(max(allowed, 1.0)))
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.compare import Account
+from fitting.compare import Account, excess
 from fitting.estimate import Fit
 from fitting.free_run import FreeRun
 
@@ -20,6 +20,7 @@ class Goodness(eqx.Module):
         data: measured numbers that were fitted (samples times outputs).
         parameters: free parameters.
         states: fitted entries of initial states.
+        error_over_noise: rms of what short simulations leave of each output, in units of its measurement noise.
         reduced_chi_square: mean square of the error in units of the measurement noise, per degree of freedom; of all
             outputs.
         log_likelihood: of Gaussian white errors with the covariance that is left over.
@@ -34,6 +35,7 @@ class Goodness(eqx.Module):
     data: int = eqx.field(static=True)
     parameters: int = eqx.field(static=True)
     states: int = eqx.field(static=True)
+    error_over_noise: dict[str, float]
     reduced_chi_square: float
     log_likelihood: float
     aic: float
@@ -63,11 +65,13 @@ def goodness(fit: Fit, account: Account, noise: Float[Array, "outputs outputs"])
     log_likelihood = -0.5 * samples * (outputs * (math.log(2 * math.pi) + 1) + float(log_determinant))
     count = parameters + states + outputs * (outputs + 1) // 2
     freedom = samples * outputs - parameters - states
+    names = ("motor angle", "dynamic error")[-outputs:]
     return Goodness(
         fit_percent={"training": fit_percent(account.training), "validation": fit_percent(account.validation)},
         data=samples * outputs,
         parameters=parameters,
         states=states,
+        error_over_noise=dict(zip(names, excess(fit, noise).tolist(), strict=True)),
         reduced_chi_square=chi_square / freedom if freedom > 0 else math.nan,
         log_likelihood=log_likelihood,
         aic=2 * count - 2 * log_likelihood,

@@ -180,11 +180,12 @@ def normality(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
     small = abs(skewness) < _SLIGHT_SKEWNESS and abs(kurtosis) < _SLIGHT_KURTOSIS
     verdict = _verdict(p_value, small)
     seen = f"skewness {skewness:+.2g}, excess kurtosis {kurtosis:+.2g}"
-    tails = "rare large values, such as outliers" if kurtosis > _SLIGHT_KURTOSIS else "no Gaussian noise"
+    lopsided = abs(skewness) > _SLIGHT_SKEWNESS
+    shape = "rare large values" if kurtosis > _SLIGHT_KURTOSIS else "lopsided" if lopsided else "too flat"
     says = {
         "passed": "Gaussian.",
         "slight": f"Nearly Gaussian ({seen}).",
-        "failed": f"Not Gaussian ({seen}): {tails}.",
+        "failed": f"Not Gaussian ({seen}): {shape}.",
     }[verdict]
     return ResidualTest("normality", float(statistic), 2, p_value, verdict, says)
 

@@ -8,6 +8,7 @@ import numpy as np
 from fitting.diagnostics import ResidualDiagnostics
 from fitting.formatting import axis_label, scaled_unit
 from fitting.plots.look import (
+    AFTER,
     FAINT,
     axis,
     axis_scale,
@@ -19,6 +20,7 @@ from fitting.plots.look import (
     vertical_line,
 )
 from fitting.plots.plot import Figure, Plot
+from fitting.residual_tests import InputCorrelation
 
 
 def spectrum(
@@ -86,7 +88,49 @@ def autocorrelation(before: ResidualDiagnostics, after: ResidualDiagnostics | No
     limit = float(before.white_limit)
     # At lag zero it is 1 by definition, which is not worth the height.
     reach = min(1.05, max(4 * limit, 1.1 * max(float(np.max(np.abs(a[1:]), initial=0.0)) for a in found)))
-    band = {
+    layout = {
+        "xaxis": axis(axis_label("lag", label)),
+        "yaxis": axis("autocorrelation", range=[-reach, reach]),
+        "shapes": [_band(limit)],
+    }
+    return Plot(
+        "autocorrelation",
+        "left_over",
+        "Memory of the residual",
+        "At lag zero it is 1. The grey band holds 95 % of the lags of white noise. "
+        "A residual that stays outside it is not noise.",
+        figure(traces, 300, **layout),
+    )
+
+
+def input_correlation(found: InputCorrelation, *, step: float) -> Plot:
+    """What the residual has to do with an input.
+
+    Args:
+        found: the correlations.
+        step: sampling interval [s].
+    """
+    factor, label = scaled_unit(step * float(found.lag[-1]), "s")
+    reach = max(3 * found.limit, 1.1 * float(np.max(np.abs(found.correlation))))
+    layout = {
+        "xaxis": axis(axis_label("residual after input by", label)),
+        "yaxis": axis("correlation", range=[-reach, reach]),
+        "shapes": [_band(found.limit)],
+    }
+    return Plot(
+        f"input-{found.name.replace(' ', '-')}",
+        "left_over",
+        f"Residual and {found.name}",
+        "The grey band holds 95 % of the correlations of a residual that has nothing to do with the input. Outside it "
+        "to the right, the model misses a part of the response; to the left only, the input responds to the error, as "
+        "under feedback.",
+        figure([line_trace(factor * step * found.lag, found.correlation, name="model", color=AFTER)], 280, **layout),
+    )
+
+
+def _band(limit: float) -> Figure:
+    """What is within chance, from -limit to limit."""
+    return {
         "type": "rect",
         "xref": "paper",
         "x0": 0,
@@ -98,19 +142,6 @@ def autocorrelation(before: ResidualDiagnostics, after: ResidualDiagnostics | No
         "line": {"width": 1, "color": FAINT},
         "layer": "below",
     }
-    layout = {
-        "xaxis": axis(axis_label("lag", label)),
-        "yaxis": axis("autocorrelation", range=[-reach, reach]),
-        "shapes": [band],
-    }
-    return Plot(
-        "autocorrelation",
-        "left_over",
-        "Memory of the residual",
-        "At lag zero it is 1. The grey band holds 95 % of the lags of white noise. "
-        "A residual that stays outside it is not noise.",
-        figure(traces, 300, **layout),
-    )
 
 
 def dependences(before: ResidualDiagnostics, after: ResidualDiagnostics | None, *, unit: str) -> Plot:

@@ -1,7 +1,6 @@
 """What a fit or a closed loop found, told to people (page, terminal) and to programs (JSON)."""
 
 from fitting.report.content import report_dict as report_dict
-from fitting.report.outcome import FitOnly as FitOnly
 from fitting.report.separating import separating_experiment as separating_experiment
 from fitting.report.text import report_text as report_text
 from fitting.report.unexplained import explained_share as explained_share

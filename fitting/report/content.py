@@ -13,7 +13,8 @@ from fitting import findings
 from fitting.close_loop import Loop
 from fitting.free_run import FreeRun
 from fitting.report.alternatives import alternatives
-from fitting.report.limits import largest_twist, limits
+from fitting.report.fit_content import fit_dict, meaning
+from fitting.report.limits import largest_twist, limits, parameter_note
 from fitting.report.outcome import Outcome
 from fitting.report.parameters import account_dict, effect_dict, no_account
 from fitting.report.summary import summary
@@ -42,7 +43,9 @@ def report_dict(
     units = {"dynamic_error": "rad", "forcing": "N m"} | dict(units or {})
     noise = float(np.sqrt(np.asarray(outcome.noise)[-1, -1]))
     x_max = largest_twist(outcome)
-    after = account_dict(outcome.after, units, x_max) if isinstance(outcome, Loop) else no_account()
+    is_loop = isinstance(outcome, Loop)
+    start = None if is_loop else outcome.start
+    after = account_dict(outcome.after, units, x_max) if is_loop else no_account()
     report = {
         "schema": SCHEMA,
         "version": version("hdjax"),
@@ -51,9 +54,13 @@ def report_dict(
         "summary": "",
         "units": units,
         "noise": {"dynamic_error": noise},
-        "before": account_dict(outcome.before, units, x_max),
+        "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
         "alternatives": alternatives(outcome),
+        "goodness": None,
+        "residual_tests": [],
+        "frequency_response": None,
+        "meaning": [],
         "dropped": list(outcome.dropped),
         "unexplained": unexplained(outcome, noise),
         "cannot_tell": [],
@@ -61,14 +68,20 @@ def report_dict(
         "setting": _setting(outcome),
         "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
         "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),
-        "seconds": dict(outcome.seconds or {}),
+        "seconds": dict(outcome.seconds),
         "logs": [_log_dict(*runs) for runs in zip(outcome.before.training, outcome.before.validation, strict=True)],
         "health": [{"log": log} | dataclasses.asdict(f) for log, f in health],
         "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
     }
+    if not is_loop:
+        report |= fit_dict(outcome, noise)
     report = _finite(report)
+    for side in ("before", "after"):
+        for path, estimate in report[side]["parameters"].items():
+            estimate["note"] = parameter_note(path, estimate, x_max, units["dynamic_error"])
     report["summary"] = summary(report)
-    report["cannot_tell"] = limits(report, outcome, x_max)
+    report["meaning"] = [] if is_loop else meaning(report)
+    report["cannot_tell"] = limits(report)
     return report
 
 

@@ -1,13 +1,12 @@
 """What the data can't tell, a sentence each."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from fitting import formatting
-from fitting.compare import Account
 from fitting.derived import NORMAL_95
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
@@ -17,16 +16,32 @@ _CORRELATED = 0.9
 
 
 _MOST_CORRELATIONS = 8
+_DAMPING = ("B_sp", "mu")
 
 
-def limits(report: Mapping[str, Any], outcome: Outcome, largest: float) -> list[str]:
+def parameter_note(path: str, estimate: Mapping[str, Any], x_max: float, x_unit: str) -> str | None:
+    """What must be said beside a parameter of the drive; None where its number speaks for itself.
+
+    Args:
+        path: the parameter's.
+        estimate: its entry of the report.
+        x_max: the largest measured twist.
+        x_unit: the twist's unit.
+    """
+    if estimate["at_bound"]:
+        return f"{path} ran into a limit of the fit: the logs don't hold it back, and its standard error means nothing."
+    if not estimate["identifiable"]:
+        return _unidentifiable(path, estimate, x_max, x_unit)
+    value = estimate["value"]
+    if path in _DAMPING and value is not None and value < 0:
+        return f"{path} is negative: such a drive would feed energy; look for a delay or a wrong hold of the torque."
+    return None
+
+
+def limits(report: Mapping[str, Any]) -> list[str]:
     """What these data can't tell, a sentence each."""
     final = report["after"] if report["after"]["parameters"] else report["before"]
-    notes = [
-        _unidentifiable(path, estimate, largest, report["units"]["dynamic_error"])
-        for path, estimate in final["parameters"].items()
-        if not estimate["identifiable"]
-    ]
+    notes = [e["note"] for e in final["parameters"].values() if e["note"]]
     for effect in report["after"]["effects"]:
         notes += _unidentifiable_parts(effect)
     for other in report["alternatives"]:
@@ -35,7 +50,7 @@ def limits(report: Mapping[str, Any], outcome: Outcome, largest: float) -> list[
                 f"A tie: {other['name']} ({plain_family(other['family'])}) explains the held-out data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
-    return notes + _correlated(outcome.after)
+    return notes + _correlated(final["correlations"])
 
 
 def _unidentifiable(path: str, estimate: Mapping[str, Any], largest: float, x_unit: str) -> str:
@@ -78,15 +93,12 @@ def _unidentifiable_parts(effect: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _correlated(account: Account) -> list[str]:
-    names = list(account.uncertainty.estimates)
-    matrix = np.asarray(account.uncertainty.correlation)
-    pairs = [(abs(matrix[i, j]), i, j) for i in range(len(names)) for j in range(i)]
-    strong = sorted((p for p in pairs if p[0] > _CORRELATED), reverse=True)
+def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
+    strong = [c for c in correlations if abs(c["value"] or 0.0) > _CORRELATED]
     notes = [
-        f"{names[j]} and {names[i]} are correlated by {formatting.number(float(matrix[i, j]), 3)}: the data determine "
-        "a combination of the two better than each."
-        for _, i, j in strong[:_MOST_CORRELATIONS]
+        f"{c['between'][0]} and {c['between'][1]} are correlated by {formatting.number(c['value'], 3)}: the data "
+        "determine a combination of the two better than each."
+        for c in strong[:_MOST_CORRELATIONS]
     ]
     if len(strong) > _MOST_CORRELATIONS:
         notes.append(f"{len(strong) - _MOST_CORRELATIONS} more pairs are correlated above {_CORRELATED}.")

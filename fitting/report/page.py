@@ -42,18 +42,19 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         "interval": lambda p: formatting.interval(p["ci95"], p["std"], p["unit"]),
         "family": plain_family,
         "code": _code,
+        "p_value": formatting.p_value,
         "symbol": _symbol,
     }
     final = report["after"] if report["after"]["parameters"] else report["before"]
-    return environment.get_template("report.html.jinja").render(
+    template = "fit.html.jinja" if report["decision"] == "fit_only" else "loop.html.jinja"
+    return environment.get_template(template).render(
         report=report,
-        final=final,
+        noise=report["noise"]["dynamic_error"],
         x_unit=report["units"]["dynamic_error"],
         chance=lambda effect: chance(effect, report),
         rows=parameter_rows(report, final),
-        drive_notes=[n for n in report["cannot_tell"] if n.split(" is not identifiable")[0] in final["parameters"]],
         changes=changes(report),
-        sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "found")},
+        sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found")},
         plotlyjs=Markup(get_plotlyjs()),
     )
 

@@ -31,8 +31,8 @@ def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[
                 "unit": unit,
                 "factor": factor,
                 "before": before,
-                "final": estimate,
-                "flagged": kind == "parameters" and not estimate["identifiable"],
+                "final": {"note": None} | estimate,
+                "flagged": kind == "parameters" and (estimate["at_bound"] or not estimate["identifiable"]),
             }
         )
     return rows

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
+from fitting.formatting import plain
+from fitting.report.fit_text import fit_lines
 from fitting.report.summary import chance
 
 
@@ -13,6 +15,10 @@ def report_text(report: Mapping[str, Any]) -> str:
     Args:
         report: from [`report_dict`][].
     """
+    return "\n".join(fit_lines(report) if report["decision"] == "fit_only" else _loop_lines(report))
+
+
+def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     unit = report["units"]["dynamic_error"]
     final = report["after"] if report["after"]["parameters"] else report["before"]
     lines = ["[Decision]", f"    {report['summary']}", "[Rms error of the free runs]"]
@@ -21,9 +27,9 @@ def report_text(report: Mapping[str, Any]) -> str:
         shown = [("before", report["before"]), ("after", report["after"])]
     lines.append("    " + " " * 12 + "".join(f"{n:>14}" for n, _ in shown))
     for key, label in (("training", "training"), ("validation", "held out")):
-        values = "".join(f"{_plain_number(a['rmse'][key]):>14}" for _, a in shown)
+        values = "".join(f"{plain(a['rmse'][key]):>14}" for _, a in shown)
         lines.append(f"    {label:12}{values} {unit}")
-    lines.append(f"    {'noise':12}{_plain_number(report['noise']['dynamic_error']):>14} {unit}")
+    lines.append(f"    {'noise':12}{plain(report['noise']['dynamic_error']):>14} {unit}")
     lines.append("[Parameters]")
     lines += _parameter_lines(final["parameters"])
     for effect in report["after"]["effects"]:
@@ -35,7 +41,7 @@ def report_text(report: Mapping[str, Any]) -> str:
         lines.append(f"[Alternative: {other['name']}] {kind}. {other['separating_experiment']}")
     for note in report["cannot_tell"]:
         lines.append(f"[Note] {note}")
-    return "\n".join(lines)
+    return lines
 
 
 def _parameter_lines(parameters: Mapping[str, Any]) -> list[str]:
@@ -49,11 +55,4 @@ def _parameter_line(estimate: Mapping[str, Any]) -> str:
     share = f" ({100 * std / abs(value):.2g} %)" if value and std is not None else ""
     flag = "" if estimate["identifiable"] else "  NOT IDENTIFIABLE"
     unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"
-    return (
-        f"{_plain_number(value, 6)} +/- {_plain_number(std, 2)}{share}{unit}"
-        f"  [{_plain_number(low, 6)}, {_plain_number(high, 6)}]{flag}"
-    )
-
-
-def _plain_number(value: float | None, digits: int = 4) -> str:
-    return "n/a" if value is None else f"{value:.{digits}g}"
+    return f"{plain(value, 6)} +/- {plain(std, 2)}{share}{unit}  [{plain(low, 6)}, {plain(high, 6)}]{flag}"

@@ -6,20 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Array, Float
-
 from fitting import findings
 from fitting.close_loop import Loop
-from fitting.compare import Account
-from fitting.diagnostics import ResidualDiagnostics
 from fitting.files import write_whole
+from fitting.fit_only import FitOnly
 from fitting.plots import Plot, fit_plots, plots
 from fitting.report.content import report_dict
-from fitting.report.outcome import FitOnly, Outcome
+from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
 from fitting.report.text import report_text
 from fitting.rig import Rig
-from hdjax import Hold
 
 
 def write_report(
@@ -62,28 +58,12 @@ def write_loop_report(out_dir: str | os.PathLike[str], loop: Loop, *, rig: Rig, 
 
 def write_fit_report(
     out_dir: str | os.PathLike[str],
-    account: Account,
+    fitted: FitOnly,
     *,
     rig: Rig,
-    noise: Float[Array, "outputs outputs"],
-    hold: Hold,
     model_json: str,
-    residual: ResidualDiagnostics | None = None,
-    seconds: Mapping[str, float] | None = None,
 ) -> dict[str, Path]:
-    """[`write_report`][] of a fit of a rig's logs.
-
-    Args:
-        out_dir: folder; made where absent.
-        account: the fitted model's.
-        rig: the drive and its logs.
-        noise: covariance of the measurement noise of the outputs.
-        hold: what the torque does between samples, as used.
-        model_json: the fitted model, as `hdjax predict` reads it.
-        residual: diagnostics of what the model leaves over; without it the page shows none.
-        seconds: where the time went.
-    """
-    fitted = FitOnly(account=account, noise=noise, hold=hold, residual=residual, seconds=dict(seconds or {}))
+    """[`write_report`][] of a fit of a rig's logs."""
     return write_report(out_dir, fitted, model_json=model_json, **_of_rig(rig))
 
 
@@ -92,9 +72,9 @@ def loop_text(loop: Loop, *, rig: Rig) -> str:
     return report_text(report_dict(loop, **_of_rig(rig)))
 
 
-def fit_text(account: Account, *, rig: Rig, noise: Float[Array, "outputs outputs"]) -> str:
+def fit_text(fitted: FitOnly, *, rig: Rig) -> str:
     """[`report_text`][] of a fit of a rig's logs."""
-    return report_text(report_dict(FitOnly(account=account, noise=noise), **_of_rig(rig)))
+    return report_text(report_dict(fitted, **_of_rig(rig)))
 
 
 def _of_rig(rig: Rig) -> dict[str, Any]:
@@ -109,5 +89,4 @@ def _of_rig(rig: Rig) -> dict[str, Any]:
 def _pictures(outcome: Outcome, report: Mapping[str, Any]) -> list[Plot]:
     if isinstance(outcome, Loop):
         return plots(outcome, units=report["units"])
-    noise, unit = report["noise"]["dynamic_error"], report["units"]["dynamic_error"]
-    return fit_plots(outcome.account, outcome.residual, noise=noise, unit=unit)
+    return fit_plots(outcome, units=report["units"])
