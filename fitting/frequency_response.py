@@ -42,6 +42,7 @@ class FrequencyResponse(eqx.Module):
         resonance: natural frequency of the linearised drive [Hz].
         width: of its peak at half power [Hz].
         averages: windows behind the estimate.
+        source: what the input is called.
     """
 
     frequency: Float[np.ndarray, " frequencies"]
@@ -53,6 +54,7 @@ class FrequencyResponse(eqx.Module):
     resonance: float
     width: float
     averages: int = eqx.field(static=True)
+    source: str = eqx.field(static=True)
 
     @property
     def resolution(self) -> float:
@@ -107,6 +109,7 @@ def frequency_response(
         resonance=resonance,
         width=width,
         averages=sum(windows),
+        source="torque" if isinstance(model.drive, Drive) else "forcing",
     )
 
 

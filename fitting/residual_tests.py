@@ -1,4 +1,4 @@
-"""Tests of what a fit leaves over: is it white, is it free of the input, is it Gaussian.
+"""Tests of what a fit leaves over: has it a mean, is it white, is it free of the input, is it Gaussian.
 
 With many samples a test sees correlations that no one would mind, so each verdict looks at the size as well as at the
 chance.
@@ -37,7 +37,7 @@ class ResidualTest(eqx.Module):
     """One test.
 
     Attributes:
-        name: "whiteness", "independence of ..." or "normality".
+        name: "zero mean", "whiteness", "independence of ..." or "normality".
         statistic: chi-squared distributed if all is well.
         degrees: its degrees of freedom.
         p_value: chance of so large a statistic if all is well.
@@ -89,16 +89,44 @@ def residual_tests(fit: Fit, diagnostics: ResidualDiagnostics) -> ResidualTests:
         diagnostics: of the same fit; its autocorrelation is used.
     """
     residual = left_over(fit)
-    residual = residual - residual.mean()
     step = fit.stretches[0].experiment.time_step
     memory = diagnostics.autocorrelation
-    tests = [whiteness(memory, residual.size)]
+    tests = [zero_mean(residual, memory), whiteness(memory, residual.size)]
+    residual = residual - residual.mean()
     inputs = []
     for name, signal in _inputs(fit).items():
         found, test = independence(residual, signal - signal.mean(), name=name, step=step)
         inputs.append(found)
         tests.append(test)
     return ResidualTests((*tests, normality(residual, memory)), tuple(inputs))
+
+
+def zero_mean(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarray, " lags"]) -> ResidualTest:
+    """Whether the residual's mean is zero, with a memory allowed for.
+
+    Args:
+        residual: as it is.
+        autocorrelation: its own, at lags 0, 1, 2, ...
+    """
+    n, mean, spread = residual.size, float(residual.mean()), float(residual.std()) or 1.0
+    statistic = n * (mean / spread) ** 2 / _memory(autocorrelation, n, power=1)
+    p_value = float(stats.chi2.sf(statistic, 1))
+    share = mean / float(np.sqrt(np.mean(residual**2)) or 1.0)
+    verdict = _verdict(p_value, abs(share) < _SLIGHT_CORRELATION)
+    says = {
+        "passed": "Its mean is zero within chance.",
+        "slight": f"Its mean is small, but not zero ({100 * share:+.2g} % of its rms).",
+        "failed": f"Its mean is not zero ({100 * share:+.2g} % of its rms): an offset of a sensor or of the torque.",
+    }[verdict]
+    return ResidualTest("zero mean", float(statistic), 1, p_value, verdict, says)
+
+
+def _memory(autocorrelation: np.ndarray, samples: int, *, power: int) -> float:
+    """By how much a memory inflates the variance of a mean of powers."""
+    r = autocorrelation[1:]
+    # What is within chance of zero would only add up.
+    r = np.where(np.abs(r) > _NORMAL_95 / np.sqrt(samples), r, 0.0)
+    return max(1.0 + 2.0 * float(np.sum(r**power)), 1.0)
 
 
 def whiteness(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> ResidualTest:
@@ -172,10 +200,8 @@ def normality(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
     """
     n = residual.size
     skewness, kurtosis = float(stats.skew(residual)), float(stats.kurtosis(residual))
-    # What is within chance of zero would only add up.
-    r = np.where(np.abs(autocorrelation[1:]) > _NORMAL_95 / np.sqrt(n), autocorrelation[1:], 0.0)
-    spread = [max(1.0 + 2.0 * float(np.sum(r**power)), 1.0) for power in (3, 4)]
-    statistic = n * (skewness**2 / (6.0 * spread[0]) + kurtosis**2 / (24.0 * spread[1]))
+    third, fourth = (_memory(autocorrelation, n, power=power) for power in (3, 4))
+    statistic = n * (skewness**2 / (6.0 * third) + kurtosis**2 / (24.0 * fourth))
     p_value = float(stats.chi2.sf(statistic, 2))
     small = abs(skewness) < _SLIGHT_SKEWNESS and abs(kurtosis) < _SLIGHT_KURTOSIS
     verdict = _verdict(p_value, small)

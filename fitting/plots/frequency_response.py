@@ -36,10 +36,11 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
     low, high = _view(found)
     magnitudes = factor * np.abs(found.model[(found.frequency >= low) & (found.frequency <= high)])
     forcing = pretty_unit(units.get("forcing", "N m"))
+    per = f"({forcing})" if " " in forcing or "/" in forcing else forcing
     layout = {
         "xaxis": axis("frequency [Hz]", anchor="y3", **axis_scale(True, low, high))
         | {"range": [float(np.log10(low)), float(np.log10(high))]},
-        "yaxis": axis(axis_label("magnitude", f"{unit}/({forcing})"), domain=[0.6, 1], exponentformat="power")
+        "yaxis": axis(axis_label("magnitude", f"{unit}/{per}"), domain=[0.6, 1], exponentformat="power")
         | axis_scale(True, float(np.min(magnitudes)) / 10, float(np.max(magnitudes)) * 10)
         | {"range": [float(np.log10(np.min(magnitudes) / 3)), float(np.log10(np.max(magnitudes) * 3))]},
         "yaxis2": axis("phase [°]", domain=[0.3, 0.54], range=[-285, 105], tickvals=[-270, -180, -90, 0, 90]),
@@ -50,10 +51,10 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
     return Plot(
         "frequency-response",
         "look",
-        "Frequency response from torque to dynamic error",
+        f"Frequency response from {found.source} to dynamic error",
         "Measured: cross-spectrum over input spectrum (H1). Model: the fitted drive with its stiffness averaged over "
         "the measured twist. Coherence is the share of the dynamic error's power that follows linearly from the "
-        "torque; where it is low, the measured curve means little.",
+        f"{found.source}; where it is low, the measured curve means little.",
         figure(traces, 560, **layout),
     )
 

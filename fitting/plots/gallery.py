@@ -44,8 +44,8 @@ def fit_plots(fitted: FitOnly, *, units: Mapping[str, str]) -> list[Plot]:
     unit = units.get("dynamic_error", "rad")
     step = 0.5 / float(fitted.residual.frequency[-1])
     found = _predictions(fitted.account, None, unit)
-    found += [input_correlation(c, step=step) for c in fitted.tests.inputs]
-    found += _residual_plots(fitted.account, fitted.residual, None, noise=_noise(fitted), unit=unit)
+    memory, *others = _residual_plots(fitted.account, fitted.residual, None, noise=_noise(fitted), unit=unit)
+    found += [memory, *(input_correlation(c, step=step) for c in fitted.tests.inputs), *others]
     if fitted.frequency_response is not None:
         found.append(bode(fitted.frequency_response, units=units))
     return found

@@ -29,7 +29,7 @@ def figure(traces: Sequence[Figure], height: int, **layout: Any) -> Figure:
         "plot_bgcolor": "#ffffff",
         "hovermode": "closest",
         "legend": {"orientation": "h", "x": 0, "y": legend, "yanchor": "bottom", "xanchor": "left"},
-        "showlegend": any(t.get("showlegend", True) and "name" in t for t in traces),
+        "showlegend": sum(t.get("showlegend", True) and "name" in t for t in traces) > 1,
     }
     return {"data": list(traces), "layout": look | layout}
 

@@ -69,7 +69,7 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
     notes = []
     if not report["goodness"]["converged"]:
         notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")
-    missing = [n for n in ("whiteness", "independence") if verdicts.get(n) == "failed"]
+    missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
     if over_noise is None:
         notes.append("The free run diverges on held-out data: the model doesn't stand for this drive.")
     elif missing:
@@ -77,6 +77,8 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
             "The residual is not noise: the model lacks something. Its parameters absorb a part of it, so that the "
             "truth may lie outside the intervals. `hdjax close-loop` looks for what is missing."
         )
+        if over_noise < _DRIFTED:
+            notes.append("The estimate of the measurement noise holds a part of what is missing: don't lean on it.")
     elif over_noise < _NOTHING_BUT_NOISE:
         notes.append("The model explains these logs down to the measurement noise.")
     if None not in rmse.values() and rmse["validation"] > _DRIFTED * rmse["training"]:
@@ -112,9 +114,11 @@ def _response_sentences(found: FrequencyResponse) -> list[str]:
     said = []
     band = coherent_band(found)
     if band:
-        said.append(f"The dynamic error follows the torque linearly from {_range(*band)} (coherence above 0.9).")
+        said.append(
+            f"The dynamic error follows the {found.source} linearly from {_range(*band)} (coherence above 0.9)."
+        )
     else:
-        said.append("Nowhere does the dynamic error follow the torque linearly (coherence above 0.9).")
+        said.append(f"Nowhere does the dynamic error follow the {found.source} linearly (coherence above 0.9).")
     own, seen = _hertz(found.resonance), resonance_seen(found)
     if not excites_resonance(found):
         said.append(f"The log does not excite the model's resonance at {own}.")
@@ -127,8 +131,8 @@ def _response_sentences(found: FrequencyResponse) -> list[str]:
     lacking = unexplained_band(found)
     if lacking:
         said.append(
-            f"From {_range(*lacking)} the torque is strong and noise is small, but the coherence is low: nonlinearity, "
-            "a disturbance, or an effect that the model lacks."
+            f"From {_range(*lacking)} the {found.source} is strong and noise is small, but the coherence is low: "
+            "nonlinearity, a disturbance, or an effect that the model lacks."
         )
     if found.width < 2 * found.resolution:
         said.append(

@@ -47,7 +47,7 @@ def _parameters(account: Mapping[str, Any]) -> list[str]:
     rows = [["", "value", "std error", "%", "95 % interval", "start", "unit", ""]]
     for path, e in entries.items():
         flag = "AT BOUND" if e["at_bound"] else "" if e["identifiable"] else "NOT IDENTIFIABLE"
-        rows.append([path, *_figures(e), plain(e["start"], 4), e["unit"], flag])
+        rows.append([path, *_figures(e), plain(e["start"], 5), e["unit"], flag])
     return _table(rows, left=(0, 6, 7)) + _prose([e["note"] for e in entries.values() if e["note"]])
 
 

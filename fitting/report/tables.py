@@ -27,6 +27,7 @@ def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[
         rows.append(
             {
                 "symbol": symbol,
+                "derived": kind == "derived",
                 "meaning": meaning,
                 "unit": unit,
                 "factor": factor,
