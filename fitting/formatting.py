@@ -121,10 +121,10 @@ def percent(share: float | None) -> str:
 
 
 def p_value(chance: float | None) -> str:
-    """What stands behind a p: "= 0.03"; below a billionth only that."""
+    """A p-value; below a billionth only that."""
     if chance is not None and chance < _LEAST_CHANCE:
         return "< 1e-9"
-    return f"= {plain(chance, 2)}"
+    return plain(chance, 2)
 
 
 def words(names: list[str]) -> str:

@@ -25,6 +25,8 @@ HIGH_COHERENCE, LOW_COHERENCE = 0.9, 0.6
 _WORTH_A_WORD = 0.05
 # Above it there is no peak to see.
 _OVERDAMPED = 0.6
+# Lines that a band may lack.
+_GAP = 3
 # Where a peak of the log counts as the model's, as a factor of frequency.
 _NEAR = 2.0
 
@@ -174,11 +176,11 @@ def resonance_seen(found: FrequencyResponse) -> float | None:
     """Frequency of the measured peak [Hz] near the model's resonance; None where there is none to see."""
     if not excites_resonance(found) or found.width > 2 * _OVERDAMPED * found.resonance:
         return None
-    usable = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / found.resonance)) < math.log(_NEAR))
-    index = np.flatnonzero(usable)
-    peak = int(index[np.argmax(np.abs(found.measured[index]))])
-    inside = index[0] < peak < index[-1]
-    return float(found.frequency[peak]) if inside else None
+    # A line beyond the excited ones is coherent by chance now and then; what holds the resonance is in one piece.
+    near = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / found.resonance)) < math.log(_NEAR))
+    band = min(_bands(near), key=lambda b: float(np.min(np.abs(found.frequency[b] - found.resonance))))
+    peak = int(band[np.argmax(np.abs(found.measured[band]))])
+    return float(found.frequency[peak]) if band[0] < peak < band[-1] else None
 
 
 def coherent_band(found: FrequencyResponse) -> tuple[float, float] | None:
@@ -196,10 +198,15 @@ def unexplained_band(found: FrequencyResponse) -> tuple[float, float] | None:
     return _widest(found, lacking)
 
 
-def _widest(found: FrequencyResponse, chosen: np.ndarray, gap: int = 3) -> tuple[float, float] | None:
-    index = np.flatnonzero(chosen)
-    if index.size == 0:
+def _widest(found: FrequencyResponse, chosen: np.ndarray) -> tuple[float, float] | None:
+    """Ends of the band of most lines."""
+    if not chosen.any():
         return None
-    runs = np.split(index, np.flatnonzero(np.diff(index) > gap) + 1)
-    longest = max(runs, key=lambda r: np.log(found.frequency[r[-1]] / found.frequency[r[0]]) + 1e-9 * r.size)
+    longest = max(_bands(chosen), key=len)
     return float(found.frequency[longest[0]]), float(found.frequency[longest[-1]])
+
+
+def _bands(chosen: np.ndarray) -> list[np.ndarray]:
+    """Chosen lines in bands, over gaps of a few lines."""
+    index = np.flatnonzero(chosen)
+    return np.split(index, np.flatnonzero(np.diff(index) > _GAP) + 1)

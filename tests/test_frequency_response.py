@@ -133,6 +133,14 @@ def test_a_log_below_the_resonance_does_not_excite_it():
     assert tail is not None and not excites_resonance(tail) and resonance_seen(tail) is None
 
 
+def test_lines_beyond_the_excited_ones_hide_no_peak():
+    """Where neither torque nor twist has power their ratio is anything."""
+    u = rig.multisine(COUNT, STEP, rms=1.0, low=1.0, high=1.3 * F_0, seed=6)
+    found = look(simulated(u, noise=1e-7), noise=1e-7)
+    assert found is not None
+    assert resonance_seen(found) == pytest.approx(F_0, abs=2 * found.resolution)
+
+
 def _cut(experiment: Experiment, start: int) -> Experiment:
     part = rig.reduced_log(
         experiment.measured[start:, -1], np.asarray(experiment.torque.coefficients)[start:, 0], step=STEP

@@ -12,6 +12,7 @@ from fitting.plots.plot import Plot
 # The first view reaches beyond the excited lines by this factor.
 _AROUND = 2.5
 _MOST_LINES = 2000
+_MEANINGLESS = 0.2
 
 
 def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
@@ -23,7 +24,8 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
     """
     kept = _shown(found)
     frequency = found.frequency[kept]
-    curves = (("measured (H1)", MEASURED, found.measured[kept]), ("model", AFTER, found.model[kept]))
+    measured = np.where(found.coherence > _MEANINGLESS, found.measured, np.nan)
+    curves = (("measured (H1)", MEASURED, measured[kept]), ("model", AFTER, found.model[kept]))
     largest = float(np.max(np.abs(found.model)))
     factor, unit = scaled_unit(largest, units.get("dynamic_error", "rad"))
     traces = []
@@ -54,7 +56,7 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
         f"Frequency response from {found.source} to dynamic error",
         "Measured: cross-spectrum over input spectrum (H1). Model: the fitted drive with its stiffness averaged over "
         "the measured twist. Coherence is the share of the dynamic error's power that follows linearly from the "
-        f"{found.source}; where it is low, the measured curve means little.",
+        f"{found.source}; where it is below {_MEANINGLESS}, the measured curve means nothing and is not drawn.",
         figure(traces, 560, **layout),
     )
 

@@ -102,7 +102,7 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> list[str]:
     """A line each, and a sentence for what did not pass."""
-    rows = [[t["name"], _VERDICTS[t["verdict"]], f"p {p_value(t['p_value'])}"] for t in tests]
+    rows = [["test", "verdict", "p"]] + [[t["name"], _VERDICTS[t["verdict"]], p_value(t["p_value"])] for t in tests]
     return _table(rows, left=(0, 1, 2)) + _prose([t["says"] for t in tests if t["verdict"] != "passed"])
 
 
