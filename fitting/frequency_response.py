@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.signal import cont2discrete, csd, freqz, welch
+from scipy.signal import StateSpace, csd, welch
 
 from fitting.experiment import Experiment
 from hdjax import Drive, Hold, Model
@@ -150,14 +151,15 @@ def _linear_response(
     frequency: np.ndarray, slope: float, mu: float, gain: float, *, hold: Hold, step: float
 ) -> np.ndarray:
     """Response of `x'' + mu x' + slope x = gain u` to a sampled input, from sample to sample."""
-    system = ([gain], [1.0, mu, slope])
+    s = 2j * np.pi * frequency
     methods = {"zero-order": "zoh", "linear": "foh"}
     if hold not in methods:
         # Smooth between samples: what is sampled is what acts.
-        s = 2j * np.pi * frequency
         return gain / (s**2 + mu * s + slope)
-    numerator, denominator, _ = cont2discrete(system, step, method=methods[hold])
-    return freqz(np.ravel(numerator), denominator, worN=frequency, fs=1.0 / step)[1]
+    oscillator: Any = StateSpace([[0.0, 1.0], [-slope, -mu]], [[0.0], [gain]], [[1.0, 0.0]], [[0.0]])
+    sampled = oscillator.to_discrete(step, method=methods[hold])
+    z = np.exp(s * step)[:, None, None]
+    return (sampled.C @ np.linalg.solve(z * np.eye(2) - sampled.A, sampled.B) + sampled.D)[:, 0, 0]
 
 
 def strong_lines(found: FrequencyResponse) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Each figure of merit by an independent route."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,11 +9,13 @@ from scipy import stats
 
 import rig
 from fitting.compare import Account
+from fitting.diagnostics import diagnose
 from fitting.estimate import Fit, fit
-from fitting.experiment import split
+from fitting.experiment import experiment_from_log, split
 from fitting.free import base_paths
 from fitting.free_run import FreeRun
 from fitting.goodness import Goodness, fit_percent, goodness
+from fitting.residual_tests import residual_tests
 from fitting.uncertainty import Uncertainty
 
 NOISE = np.array([[4e-10, 1e-10], [1e-10, 9e-10]])
@@ -19,7 +23,11 @@ NOISE = np.array([[4e-10, 1e-10], [1e-10, 9e-10]])
 
 @pytest.fixture(scope="module")
 def fitted() -> Fit:
-    training, _ = split([rig.drive_experiment(3000)])
+    torque = rig.drive_torque(3000)
+    log = rig.drive_log(rig.drive_motion(torque), torque, noise=1.0)
+    # So small that the motion does not show it.
+    log = dataclasses.replace(log, load_torque=1e-9 * np.random.default_rng(0).normal(size=3000))
+    training, _ = split([experiment_from_log(log, hold="zero-order", N=rig.N)])
     model = rig.drive_model()
     return fit(model, training, base_paths(model), horizon=256)
 
@@ -62,6 +70,15 @@ def test_error_over_noise(found: Goodness, error: np.ndarray):
     assert list(found.error_over_noise) == ["motor angle", "dynamic error"]
     # The fit's covariance has a floor, a billionth of the swing.
     assert list(found.error_over_noise.values()) == pytest.approx(list(rms / np.sqrt(np.diag(NOISE))), rel=1e-5)
+
+
+def test_every_input_is_tested(fitted: Fit):
+    found = residual_tests(fitted, diagnose(fitted))
+    assert [c.name for c in found.inputs] == ["motor torque", "load torque"]
+    assert {t.verdict for t in found.tests} == {"passed"}
+    (load,) = [t for t in found.tests if t.name == "independence of load torque"]
+    # White, so that each lag counts.
+    assert load.degrees == 26
 
 
 def run(measured: np.ndarray, predicted: np.ndarray) -> FreeRun:
