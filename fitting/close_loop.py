@@ -1,6 +1,5 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -19,6 +18,7 @@ from fitting.attribution import (
     halo_for,
     look,
 )
+from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.estimate import (
@@ -136,7 +136,7 @@ def close_loop(
     """
     if jnp.zeros(0).dtype != jnp.float64:
         raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
-    clock = _Clock()
+    clock = Clock()
     data: Data = {h: split(e) for h, e in experiments.items()}
     progress("finding starting values")
     base, setting, hold = _base_trial(model, data, hold)
@@ -175,21 +175,8 @@ def close_loop(
     )
 
 
-class _Clock:
-    """Seconds by stage."""
-
-    def __init__(self):
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now
-
-
 def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
-    """Fit a drive without effects, from starting values that the data supply.
+    """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -219,7 +206,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
     horizon = short_horizon(best.model, training)
     if best.horizon <= 2 * horizon <= 4 * best.horizon:
         return best
-    return fit(
+    refitted = fit(
         best.model,
         training,
         base_paths(best.model),
@@ -227,6 +214,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         halo=halo,
         substeps=suggested_substeps(best.model, training),
     )
+    return eqx.tree_at(lambda f: f.problem.model, refitted, best.problem.model)
 
 
 def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold]:

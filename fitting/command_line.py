@@ -20,15 +20,13 @@ import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
 
-from fitting.close_loop import base_fit, close_loop
-from fitting.compare import account
+from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
-from fitting.diagnostics import diagnose
 from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.estimate import measurement_noise
-from fitting.experiment import Stretch, split
+from fitting.experiment import Stretch
 from fitting.files import write_whole
+from fitting.fit_only import fit_only
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import read_log
 from fitting.model_file import StoredModel, read_model, to_json
@@ -39,7 +37,6 @@ from hdjax import (
     PRESETS,
     Chirp,
     Harmonic,
-    Hold,
     SimulationError,
     TwoInertiaModel,
     random_phase_multisine,
@@ -73,19 +70,10 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     """
     rig = read_rig(logs, drive)
     with _progress() as progress:
-        progress("fitting the base model")
-        holds: list[Hold] = list(rig.experiments) if rig.hold is None else [rig.hold]
-        fits = {h: base_fit(rig.model, split(rig.experiments[h])[0]) for h in holds}
-        hold = min(holds, key=lambda h: fits[h].objective)
-        found, (training, validation) = fits[hold], split(rig.experiments[hold])
-        progress("free runs on held-out data")
-        noise = measurement_noise(found)
-        result = account(found, training, validation, noise=noise, halo=0)
-    stored = StoredModel(result.model, hold, found.substeps, 0, noise)
-    paths = write_fit_report(
-        out, result, rig=rig, noise=noise, hold=hold, model_json=to_json(stored), residual=diagnose(found)
-    )
-    print(fit_text(result, rig=rig, noise=noise))
+        fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, progress=progress)
+    stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
+    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
+    print(fit_text(fitted, rig=rig))
     print(f"Report: {paths['report.html']}")
 
 
