@@ -19,6 +19,7 @@ import jax
 import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
 
 from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
@@ -27,6 +28,7 @@ from fitting.errors import DataError, InputError
 from fitting.experiment import Stretch
 from fitting.files import write_whole
 from fitting.fit_only import fit_only
+from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import read_log
 from fitting.model_file import StoredModel, read_model, to_json
@@ -63,11 +65,17 @@ DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias
 def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
+    Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
+    run that was cut off goes on where it stopped.
+
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json.
+        Folder for report.html, report.json and model.json; of a folder of logs for fleet.parquet.
     """
+    if any(path.is_dir() for path in logs):
+        _fit_fleet(logs, drive, out)
+        return
     rig = read_rig(logs, drive)
     with _progress() as progress:
         fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, progress=progress)
@@ -75,6 +83,23 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
     print(fit_text(fitted, rig=rig))
     print(f"Report: {paths['report.html']}")
+
+
+def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
+    if len(folders) > 1:
+        raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
+    read_drive_file(drive)
+    with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=Console(stderr=True)) as bar:
+        # In a pipe nothing is shown.
+        bar.disable = not bar.console.is_terminal
+        task = bar.add_task("logs", total=None)
+        table = fit_fleet(
+            folders[0], drive, out, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    print(fleet_text(table))
+    print(f"Table: {out / 'fleet.parquet'}")
+    if not (table["state"] == "fitted").any():
+        raise DataError(f"{folders[0]}: none of its {len(table)} logs could be fitted; the reasons stand above")
 
 
 @app.command(name="close-loop")
@@ -268,7 +293,7 @@ def _set_up_jax() -> None:
     """Double precision, a device for each core, and compiled programs kept between runs."""
     jax.config.update("jax_enable_x64", True)
     with contextlib.suppress(RuntimeError):  # JAX has started: this is not the process' first command
-        jax.config.update("jax_num_cpu_devices", min(len(os.sched_getaffinity(0)), _MOST_DEVICES))
+        jax.config.update("jax_num_cpu_devices", min(os.cpu_count() or 1, _MOST_DEVICES))
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdjax"
     try:
         cache.mkdir(parents=True, exist_ok=True)

@@ -269,3 +269,5 @@ _READERS: dict[str, Callable[[Path, tuple[str, ...]], LogTable]] = {
     ".hdf5": _read_hdf5,
     ".parquet": _read_parquet,
 }
+LOG_SUFFIXES = tuple(_READERS)
+"""How the names of log files end."""

@@ -15,13 +15,15 @@ _LEAST_LANES = 8
 def spread(tree: _Tree, lanes: int) -> _Tree:
     """Share the lanes of arrays among the devices of this process; every other array is on each of them.
 
-    Compiled programs follow where their arrays are. On one device, or where the lanes are few or can't be shared
-    evenly, everything stays where it is.
+    Compiled programs follow where their arrays are. Everything stays where it is on one device, where the lanes are
+    few or can't be shared evenly, and where `jax.default_device` names a device.
 
     Args:
         tree: arrays whose first axis is `lanes` long carry one lane a row.
         lanes: how many there are.
     """
+    if jax.config.jax_default_device is not None:
+        return tree
     devices = jax.local_devices()
     while len(devices) > 1 and (lanes % len(devices) or lanes // len(devices) < _LEAST_LANES):
         devices = devices[:-1]
