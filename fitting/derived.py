@@ -10,10 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from fitting.compare import Account
+from fitting.normal_law import NORMAL_95
 from hdjax import Drive, Model
-
-NORMAL_95 = 1.959963984540054
-"""Standard errors to either side that hold 95 % of a normal law."""
 
 Quantities = Mapping[str, tuple[Array, str]]
 """Value and unit by name."""

@@ -15,6 +15,7 @@ from scipy.signal import correlate
 from fitting.autocorrelation import autocovariance, left_over
 from fitting.diagnostics import ResidualDiagnostics
 from fitting.estimate import Fit
+from fitting.normal_law import NORMAL_95
 from hdjax import TwoInertiaModel
 
 Verdict = Literal["passed", "slight", "failed"]
@@ -23,7 +24,6 @@ LAGS = 25
 """Lags that the tests look at, as system identification toolboxes do."""
 
 _LEVEL = 0.01
-_NORMAL_95 = 1.959963984540054
 # Correlations below this are told as slight, however certain they are.
 _SLIGHT_CORRELATION = 0.1
 _SLIGHT_SKEWNESS, _SLIGHT_KURTOSIS = 0.2, 0.5
@@ -125,7 +125,7 @@ def _memory(autocorrelation: np.ndarray, samples: int, *, power: int) -> float:
     """By how much a memory inflates the variance of a mean of powers."""
     r = autocorrelation[1:]
     # What is within chance of zero would only add up.
-    r = np.where(np.abs(r) > _NORMAL_95 / np.sqrt(samples), r, 0.0)
+    r = np.where(np.abs(r) > NORMAL_95 / np.sqrt(samples), r, 0.0)
     return max(1.0 + 2.0 * float(np.sum(r**power)), 1.0)
 
 
@@ -186,7 +186,7 @@ def independence(
         "slight": f"What is left over follows the {name} a little ({told}).",
         "failed": f"What is left over follows the {name} ({told}): the model misses a part of the response to it.",
     }[verdict]
-    limit = _NORMAL_95 * float(np.sqrt(max(law[0], 0.0) / n))
+    limit = NORMAL_95 * float(np.sqrt(max(law[0], 0.0) / n))
     test = ResidualTest(f"independence of {name}", statistic, degrees, p_value, verdict, says)
     return InputCorrelation(name, lags.astype(float), both, limit), test
 

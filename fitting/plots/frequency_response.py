@@ -12,7 +12,7 @@ from fitting.plots.plot import Plot
 # The first view reaches beyond the excited lines by this factor.
 _AROUND = 2.5
 _MOST_LINES = 2000
-_MEANINGLESS = 0.2
+_MEANINGLESS = 0.5
 
 
 def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:

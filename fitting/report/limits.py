@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.derived import NORMAL_95
+from fitting.normal_law import NORMAL_95
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 
 # Beyond it two parameters are told as one combination.
 _CORRELATED = 0.9
-
-
 _MOST_CORRELATIONS = 8
 _DAMPING = ("B_sp", "mu")
 
@@ -106,4 +104,5 @@ def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def largest_twist(outcome: Outcome) -> float:
+    """The largest dynamic error on training data."""
     return max(float(np.max(np.abs(run.measured))) for run in outcome.before.training)
