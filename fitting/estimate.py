@@ -20,8 +20,7 @@ from fitting.residual import (
     residual_with_blocks,
 )
 from hdjax import Drive, Model, TwoInertiaModel
-from hdjax.devices import spread
-from hdjax.simulate import COMPILER_OPTIONS
+from hdjax.lanes import jit_lanes, spread
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -190,7 +189,7 @@ def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float):
     return _compiled_solve(problem, start, jnp.asarray(max_steps), jnp.asarray(damping))
 
 
-@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
+@jit_lanes
 def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
     descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
     solution = optx.least_squares(
@@ -213,7 +212,7 @@ def _error_of_rows(problem: Problem, rows: Array) -> Array:
     return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
 
 
-@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
+@jit_lanes
 def _evaluate(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array, Array]:
     """The output error, its covariance, and each segment's sum of squares."""
     rows, _ = residual(problem, unknowns)

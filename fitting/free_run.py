@@ -12,7 +12,7 @@ from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
 from fitting.residual import Problem, Unknowns, linearise, simulate_segments
 from hdjax import Model, TwoInertiaModel
-from hdjax.simulate import COMPILER_OPTIONS
+from hdjax.lanes import jit_lanes
 
 WINDOW = 50
 """Samples from which the initial state is taken."""
@@ -120,7 +120,7 @@ def free_run(
     return tuple(runs)
 
 
-@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
+@jit_lanes
 def _simulate(problem: Problem, unknowns: Unknowns) -> Array:
     return simulate_segments(problem, unknowns)[0]
 

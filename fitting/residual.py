@@ -9,7 +9,8 @@ from jaxtyping import Array, Float, Int
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
-from hdjax.simulate import COMPILER_OPTIONS, march
+from hdjax.lanes import jit_lanes
+from hdjax.simulate import march
 from hdjax.where import where
 
 # Where a simulation has left the numbers, the residual is this many standard deviations: a rejected step.
@@ -174,7 +175,7 @@ def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, j
     )
 
 
-linearise = eqx.filter_jit(blocks, compiler_options=COMPILER_OPTIONS)
+linearise = jit_lanes(blocks)
 """[`blocks`][], compiled once for all who look at a solution."""
 
 

@@ -21,7 +21,7 @@ from fitting.free import FreeParameters, base_paths, effect_paths, strength_path
 from fitting.residual import Problem, Unknowns, blocks
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
-from hdjax.simulate import COMPILER_OPTIONS
+from hdjax.lanes import jit_lanes
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -162,7 +162,7 @@ def _states(everything: Model, fit: Fit) -> Array:
     return jnp.stack(columns, axis=1)
 
 
-@eqx.filter_jit(compiler_options=COMPILER_OPTIONS)
+@jit_lanes
 def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogates: Array):
     found = blocks(problem, unknowns)
     columns = project(found, problem.segments.joined)

@@ -16,10 +16,6 @@ from hdjax.effects import ActuatorEffect
 from hdjax.results import Ending, SimulationError
 from hdjax.signals import PiecewisePolynomial, polynomial
 
-COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
-"""For `eqx.filter_jit` of programs whose lanes [`march`][] moves: twice as fast on a CPU that has such registers, since
-a step's stages then fit into them; without effect elsewhere."""
-
 
 class Trajectory(eqx.Module):
     """A simulated motion.
