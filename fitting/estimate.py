@@ -36,8 +36,8 @@ _RETRY_STEPS = 12
 # So many samples tell the noise to 1 %.
 _NOISE_SAMPLES = 5000
 _NOISE_STEPS = 30
-# A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6.
-_STEP_ANGLE = 0.15
+STEP_ANGLE = 0.15
+"""A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
 
 
 class Fit(eqx.Module):
@@ -330,10 +330,16 @@ def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
     return float(drive.omega_0) * float(np.sqrt(1.0 + stiffening))
 
 
-def suggested_substeps(model: Model, stretches: Sequence[Stretch]) -> int:
-    """Solver steps in a sample interval that resolve the fastest oscillation."""
+def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle: float = STEP_ANGLE) -> int:
+    """Solver steps in a sample interval that resolve the fastest oscillation.
+
+    Args:
+        model: supplies the natural frequency.
+        stretches: supply the sample interval, and the twist that hardens the spring.
+        step_angle: by which a step may turn the oscillation [rad].
+    """
     angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
-    return int(np.clip(np.ceil(angle / _STEP_ANGLE), 1, 16))
+    return int(np.clip(np.ceil(angle / step_angle), 1, 16))
 
 
 def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:
