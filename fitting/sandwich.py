@@ -30,6 +30,8 @@ _CHUNK_PERIODS = 2.0
 _OVERRULE = 0.99
 # A frequency's residual stands for its noise where at least this share of the noise is left in it.
 _LEAST_LEFT = 0.5
+# Nor is a cluster's residual enlarged beyond what this share of it would need.
+_LEAST_CLUSTER = 0.05
 # Eigenvalues of the scaled information below this are directions that the data do not see at all.
 _BLIND = 1e-12
 
@@ -83,11 +85,13 @@ class Covariance(eqx.Module):
     Attributes:
         robust: whatever the colour of the residual.
         classical: for a white residual.
+        unit: for a white residual of the variance that weighs the outputs, (J^T J)^-1.
         degrees_of_freedom: of the robust variances, as in Student's t.
     """
 
     robust: Float[np.ndarray, "parameters parameters"]
     classical: Float[np.ndarray, "parameters parameters"]
+    unit: Float[np.ndarray, "parameters parameters"]
     degrees_of_freedom: Float[np.ndarray, " parameters"]
 
 
@@ -117,28 +121,52 @@ def covariance(found: Linearised) -> Covariance:
     inverse, blind = _inverse(found.information)
     square = sum(float(np.sum(r.residual**2)) for r in found.records)
     classical = inverse * square / max(found.rows - found.fitted, 1)
-    scores = [np.einsum("nop,no->np", r.slopes, r.residual) @ inverse for r in found.records]
     simulations = sum(len(r.states) for r in found.records)
     if simulations >= _MANY_CHAINS + inverse.shape[0]:
         borders = [[start for start, _ in r.states] for r in found.records]
-        robust, freedom = _clustered(scores, borders)
+        robust, freedom = _clustered(found.records, borders, inverse)
     else:
         robust, freedom = _spectral(found.records, inverse)
-        chunks = [range(0, s.shape[0], found.chunk) for s in scores]
-        robust, freedom = _overruled(robust, freedom, *_clustered(scores, chunks))
+        chunks = [range(0, r.residual.shape[0], found.chunk) for r in found.records]
+        robust, freedom = _overruled(robust, freedom, *_clustered(found.records, chunks, inverse))
     unseen = inverse @ found.prior @ inverse + blind
-    return Covariance(robust + unseen, classical, freedom)
+    return Covariance(robust + unseen, classical, inverse, freedom)
 
 
-def _clustered(scores: Sequence[np.ndarray], borders: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance from sums of scores between borders, which are taken for independent; and its degrees of freedom."""
-    sums = np.concatenate([np.add.reduceat(s, list(b), axis=0) for s, b in zip(scores, borders, strict=True)])
-    count, parameters = sums.shape
-    left = max(count - parameters, 1)
-    square = np.sum(sums**2, axis=0)
+def directions(found: Float[np.ndarray, "parameters parameters"]) -> list[tuple[float, np.ndarray]]:
+    """Standard error along each principal axis of a covariance, and the axis with its largest entry positive; the
+    least certain first."""
+    values, vectors = np.linalg.eigh(found)
+    made = []
+    for value, axis in zip(values[::-1], vectors.T[::-1], strict=True):
+        made.append((float(np.sqrt(max(value, 0.0))), axis * np.sign(axis[np.argmax(np.abs(axis))])))
+    return made
+
+
+def _clustered(
+    records: Sequence[Record], borders: Sequence[Sequence[int]], inverse: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance from sums of scores between borders, which are taken for independent; and its degrees of freedom.
+
+    What a cluster's own share of the information has taken from its residual is put back (CR2 of Bell and McCaffrey
+    2002).
+    """
+    sums, shares = [], []
+    for record, starts in zip(records, borders, strict=True):
+        scores = np.einsum("nop,no->np", record.slopes, record.residual)
+        products = np.einsum("nop,noq->npq", record.slopes, record.slopes)
+        sums.append(np.add.reduceat(scores, list(starts), axis=0))
+        shares.append(np.add.reduceat(products, list(starts), axis=0))
+    values, vectors = np.linalg.eigh(inverse)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    left, axes = np.linalg.eigh(np.eye(len(root)) - root @ np.concatenate(shares) @ root)
+    white = np.concatenate(sums) @ root
+    turned = np.einsum("cpk,cp->ck", axes, white) / np.sqrt(np.maximum(left, _LEAST_CLUSTER))
+    found = np.einsum("cpk,ck->cp", axes, turned) @ root
     # A normal score's fourth power is three times the square of its variance.
-    equivalent = 3.0 * square**2 / np.maximum(np.sum(sums**4, axis=0), 1e-300)
-    return count / left * sums.T @ sums, np.clip(equivalent, 1.0, left)
+    square, fourth = np.sum(found**2, axis=0), np.sum(found**4, axis=0)
+    freedom = 3.0 * square**2 / np.maximum(fourth, 1e-300)
+    return found.T @ found, np.clip(freedom, 1.0, max(found.shape[0] - 1, 1))
 
 
 def _overruled(

@@ -42,11 +42,13 @@ class Uncertainty(eqx.Module):
         estimates: by dotted path.
         correlation: of the free parameters, in the order of `estimates`.
         covariance: robust, of the free vector (logarithms, or units of the parameters' scales).
+        unit_covariance: the same for white noise of the variance that weighs the outputs, (J^T J)^-1.
     """
 
     estimates: dict[str, Estimate]
     correlation: Float[np.ndarray, "parameters parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
+    unit_covariance: Float[np.ndarray, "parameters parameters"]
 
 
 def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertainty:
@@ -62,7 +64,7 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
     """
     free = fit.free
     if not free.paths:
-        return Uncertainty({}, np.zeros((0, 0)), np.zeros((0, 0)))
+    X
     found = covariance(linearised(fit) if regression is None else regression)
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
@@ -71,7 +73,7 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
         for i, path in enumerate(free.paths)
     }
     spread = np.sqrt(np.diag(found.robust))
-    return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust)
+    return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
 
 
 def _estimate(
