@@ -1,8 +1,8 @@
 """Intervals from the likelihood itself, where a parabola at the optimum does not tell its shape.
 
-Each point of a profile is a fit of everything else with one parameter held (Venzon and Moolgavkar 1988). All points are
-lanes of one program. The rise of the sum of squares that belongs to 95 % is scaled by what the residual's colour does to
-the parameter's variance (Kent 1982), and Student's t stands where a normal law would.
+Each point of a profile is a fit of everything else with one parameter held (Venzon and Moolgavkar 1988). All points
+are lanes of one program. The rise of the sum of squares that belongs to 95 % is scaled by what the residual's colour
+does to the parameter's variance (Kent 1982), and Student's t stands where a normal law would.
 """
 
 import dataclasses

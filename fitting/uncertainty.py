@@ -64,7 +64,8 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
     """
     free = fit.free
     if not free.paths:
-    X
+        empty = np.zeros((0, 0))
+        return Uncertainty({}, empty, empty, empty)
     found = covariance(linearised(fit) if regression is None else regression)
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
