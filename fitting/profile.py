@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from scipy.interpolate import PchipInterpolator
 from scipy.stats import t as student
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
@@ -23,9 +22,14 @@ from fitting.uncertainty import Uncertainty
 from hdjax.where import where
 
 # Points on each side, in units of the interval that the parabola gives; further rounds reach this much further.
-_GRID = (0.5, 1.0, 1.5, 2.0)
-_FURTHER = 4.0
+_GRID = np.array([0.5, 0.9, 1.1, 2.0])
+_FURTHER = 5.0
 _ROUNDS = 6
+# Then so many rounds divide what lies between the last point inside and the first one outside.
+_REFINEMENTS = 2
+_INNER = np.array([0.2, 0.4, 0.6, 0.8])
+# Roots beyond this are too far out for a straight line.
+_FAR = 2.0
 # Lanes take at most this many steps from where their neighbours are, with this damping at first.
 _STEPS = 20
 _DAMPING = 1e-6
@@ -44,7 +48,8 @@ class Profile(eqx.Module):
         path: dotted path.
         value: at the optimum, in SI units.
         values: where it was held, rising.
-        rise: of the sum of squares there, in units of what 95 % allows: the interval is where it is below one.
+        rise: of the sum of squares there, in units of what 95 % allows: the interval is where it is below one. Large
+            where no simulation reached the end of the log.
         ci95: interval; infinite where nothing within reach is excluded.
     """
 
@@ -78,15 +83,27 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
         lambda p: (p.model, p.active), fit.problem, (fit.model, fit.problem.active.at[index].set(0.0))
     )
     floor = _cost(problem, fit.unknowns)
-    offsets, roots = _walk(problem, fit.unknowns, index, reach, floor, allowed)
-    low, high = (_crossing(offsets, roots, sign) for sign in (-1.0, 1.0))
+    walk = _Walk.start(fit.unknowns, index, floor, float(allowed))
+    for turn in range(_ROUNDS):
+        steps = reach * _FURTHER**turn * _GRID
+        # Both sides are always walked, so that all rounds share one program.
+        walk = walk.extended(problem, np.concatenate([-steps, steps]))
+        if all(np.isfinite(walk.bracket(side)).all() for side in (-1.0, 1.0)):
+            break
+    for _ in range(_REFINEMENTS):
+        brackets = [walk.bracket(side) for side in (-1.0, 1.0)]
+        # A side without an end has nothing to divide: its points stand for nothing.
+        inner = [a + _INNER * (b - a) if np.isfinite([a, b]).all() else reach * _INNER for a, b in brackets]
+        walk = walk.extended(problem, np.concatenate(inner))
+    offsets, roots = walk.offsets, walk.roots
+    low, high = (walk.crossing(side) for side in (-1.0, 1.0))
     centre = float(fit.unknowns.parameters[index])
     values = np.array([_physical(fit, index, centre + o) for o in offsets])
     return Profile(
         path=path,
         value=estimate.value,
         values=values,
-        rise=roots**2,
+        rise=np.minimum(roots, 1e6) ** 2,
         ci95=(_physical(fit, index, centre + low), _physical(fit, index, centre + high)),
     )
 
@@ -116,48 +133,68 @@ def _inflation(fit: Fit, found: Uncertainty, index: int) -> float:
     return float(found.covariance[index, index] / found.unit_covariance[index, index])
 
 
-def _walk(
-    problem: Problem, optimum: Unknowns, index: int, reach: float, floor: float, allowed: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets of the held entry, rising, and the signed roots of the rises; outwards until both sides are excluded."""
-    offsets, roots = np.zeros(1), np.zeros(1)
-    states = np.asarray(optimum.states)[None]
-    vectors = np.asarray(optimum.parameters)[None]
-    sides = [-1.0, 1.0]
-    scale = reach
-    for _ in range(_ROUNDS):
-        # Both sides are always walked, so that all rounds share one program.
-        steps = np.concatenate([-scale * np.array(_GRID), scale * np.array(_GRID)])
-        nearest = np.argmin(np.abs(offsets[None, :] - steps[:, None]), axis=1)
-        start = vectors[nearest].copy()
-        start[:, index] = float(optimum.parameters[index]) + steps
-        solved, cost = _solve_lanes(problem, Unknowns(jnp.asarray(start), jnp.asarray(states[nearest])))
-        rise = np.maximum(np.nan_to_num(np.asarray(cost) - floor, nan=np.inf), 0.0)
-        root = np.sign(steps) * np.sqrt(np.minimum(rise / allowed, 1e12))
-        offsets, roots = np.concatenate([offsets, steps]), np.concatenate([roots, root])
-        vectors = np.concatenate([vectors, np.asarray(solved.parameters)])
-        states = np.concatenate([states, np.asarray(solved.states)])
-        order = np.argsort(offsets)
-        offsets, roots, vectors, states = offsets[order], roots[order], vectors[order], states[order]
-        if all(np.any(s * roots > 1.0) for s in sides):
-            break
-        scale *= _FURTHER
-    return offsets, roots
+class _Walk(eqx.Module):
+    """Points of a profile found so far, by rising offset of the held entry, and the fits there.
 
+    Attributes:
+        index: of the held entry.
+        floor: sum of squares at the optimum.
+        allowed: its rise that belongs to 95 %.
+        offsets: from the optimum.
+        roots: square roots of the rise, in units of what is allowed; a parabola makes them straight lines.
+        vectors: free vectors.
+        states: initial states.
+    """
 
-def _crossing(offsets: np.ndarray, roots: np.ndarray, sign: float) -> float:
-    """Where a side's signed root, which a parabola makes a straight line, first reaches one."""
-    side = sign * offsets >= 0
-    distance, height = np.abs(offsets[side]), np.abs(roots[side])
-    order = np.argsort(distance)
-    distance, height = distance[order], height[order]
-    above = np.flatnonzero(height > 1.0)
-    if not above.size:
-        return sign * np.inf
-    distance, height = distance[: above[0] + 1], height[: above[0] + 1]
-    rising = np.concatenate([[True], height[1:] > np.maximum.accumulate(height)[:-1]])
-    distance, height = distance[rising], height[rising]
-    return sign * float(PchipInterpolator(height, distance)(1.0))
+    index: int = eqx.field(static=True)
+    floor: float
+    allowed: float
+    offsets: np.ndarray
+    roots: np.ndarray
+    vectors: np.ndarray
+    states: np.ndarray
+
+    @staticmethod
+    def start(optimum: Unknowns, index: int, floor: float, allowed: float) -> "_Walk":
+        vectors, states = (np.asarray(a)[None] for a in (optimum.parameters, optimum.states))
+        return _Walk(index, floor, allowed, np.zeros(1), np.zeros(1), vectors, states)
+
+    def extended(self, problem: Problem, steps: np.ndarray) -> "_Walk":
+        """The walk with further points, each fitted from what its nearest neighbour found."""
+        settled = np.flatnonzero(np.isfinite(self.roots))
+        nearest = settled[np.argmin(np.abs(self.offsets[settled][None, :] - steps[:, None]), axis=1)]
+        start = self.vectors[nearest]
+        start[:, self.index] += steps - self.offsets[nearest]
+        *solved, cost = _solve_lanes(problem, jnp.asarray(start), jnp.asarray(self.states[nearest]))
+        rise = np.maximum(np.asarray(cost) - self.floor, 0.0) / self.allowed
+        new = (steps, np.sqrt(rise), *(np.asarray(a) for a in solved))
+        old = (self.offsets, self.roots, self.vectors, self.states)
+        joined = [np.concatenate(pair) for pair in zip(old, new, strict=True)]
+        order = np.argsort(joined[0])
+        return _Walk(self.index, self.floor, self.allowed, *(a[order] for a in joined))
+
+    def _side(self, side: float) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets on one side, from the optimum outwards, and their roots."""
+        mine = side * self.offsets >= 0
+        offsets, roots = self.offsets[mine], self.roots[mine]
+        return (offsets, roots) if side > 0 else (offsets[::-1], roots[::-1])
+
+    def bracket(self, side: float) -> tuple[float, float]:
+        """The last offset inside the interval and the first one outside; infinite where there is none."""
+        offsets, roots = self._side(side)
+        outside = np.flatnonzero(roots > 1.0)
+        if not outside.size:
+            return float(offsets[-1]), side * np.inf
+        return float(offsets[outside[0] - 1]), float(offsets[outside[0]])
+
+    def crossing(self, side: float) -> float:
+        """Where the interval ends."""
+        a, b = self.bracket(side)
+        if not np.isfinite(b):
+            return b
+        offsets, roots = self._side(side)
+        low, high = (min(float(roots[offsets == o][0]), _FAR) for o in (a, b))
+        return a + (b - a) * (1.0 - low) / (high - low)
 
 
 def _physical(fit: Fit, index: int, entry: float) -> float:
@@ -177,21 +214,23 @@ def _evaluate(problem: Problem, unknowns: Unknowns) -> Array:
 
 
 @eqx.filter_jit
-def _solve_lanes(problem: Problem, starts: Unknowns) -> tuple[Unknowns, Float[Array, " lanes"]]:
-    """Fit what is active from each start; and the sums of squares."""
+def _solve_lanes(
+    problem: Problem, parameters: Float[Array, "lanes parameters"], states: Float[Array, "lanes segments states"]
+) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes segments states"], Float[Array, " lanes"]]:
+    """Fit what is active from each start; parameters, states and sums of squares."""
 
-    def one(start: Unknowns) -> tuple[Unknowns, Array]:
+    def one(parameters: Array, states: Array) -> tuple[Array, Array, Array]:
         descent = ArrowDescent(problem.segments.joined, problem.gap_weight, jnp.asarray(_DAMPING))
         solution = optx.least_squares(
             residual_with_blocks,
             ArrowLevenbergMarquardt(descent=descent, most_steps=jnp.asarray(_STEPS)),
-            start,
+            Unknowns(parameters, states),
             args=problem,
             max_steps=None,
             throw=False,
         )
         end = solution.state.f_info.residual
         square = jnp.sum(end.rows**2) + jnp.sum(end.gap**2)
-        return solution.value, where(jnp.isfinite(square), square, jnp.inf)
+        return solution.value.parameters, solution.value.states, where(jnp.isfinite(square), square, jnp.inf)
 
-    return jax.vmap(one)(starts)
+    return jax.vmap(one)(parameters, states)
