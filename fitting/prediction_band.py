@@ -19,7 +19,8 @@ _NORMAL_95 = 1.959963984540054
 class PredictionBand(eqx.Module):
     """A free run and how well it is known, to first order.
 
-    What the model lacks is not in it: where a fit leaves more than measurement noise, so will its predictions.
+    What the model lacks is not in it: where a fit leaves more than measurement noise, so will its predictions. A run
+    that is found to begin at rest is known better than this.
 
     Attributes:
         run: the free run.
@@ -114,11 +115,12 @@ def _slopes(problem: Problem, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarra
     """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states."""
     found = linearise(problem, unknowns)
     count, samples, outputs = problem.segments.measured.shape
-    # The residual is measured minus simulated.
-    return tuple(
-        -np.asarray(a)[:, : samples * outputs].reshape(count, samples, outputs, -1)
-        for a in (found.by_parameter, found.by_state)
+    shape = (count, samples, outputs, -1)
+    by_parameter, by_state = (
+        np.asarray(a)[:, : samples * outputs].reshape(shape) for a in (found.by_parameter, found.by_state)
     )
+    # The residual is measured minus simulated.
+    return -by_parameter, -by_state
 
 
 def _band(

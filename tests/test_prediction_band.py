@@ -15,6 +15,8 @@ from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.uncertainty import Uncertainty, uncertainty
 
 COUNT, HORIZON, NOISE = 600, 128, 2e-3
+# From a moving drive on: one that begins at rest has no rate to be uncertain of.
+START, STOPS = 80, (COUNT, 330)
 COVARIANCE = jnp.asarray([[NOISE**2]])
 PATHS = ("mu", "omega_0", "alpha", "gain")
 
@@ -30,7 +32,7 @@ def fitted() -> tuple[Fit, Uncertainty]:
 def bands(fitted: tuple[Fit, Uncertainty]) -> tuple[PredictionBand, ...]:
     """Of a whole stretch and of its first half."""
     unseen = rig.reduced_experiment(COUNT, noise=NOISE, seed=5)
-    return prediction_bands(*fitted, [Stretch(unseen, 0, n) for n in (COUNT, COUNT // 2)], noise=COVARIANCE)
+    return prediction_bands(*fitted, [Stretch(unseen, START, n) for n in STOPS], noise=COVARIANCE)
 
 
 @pytest.fixture(scope="module")
@@ -50,23 +52,29 @@ def repeated(fitted: Fit, covariance: np.ndarray, noise: float, draws: int) -> n
         model = fitted.free.unpack(fitted.model, jnp.asarray(random.multivariate_normal(centre, covariance)))
         measured = clean.measured + noise * random.normal(size=(COUNT, 1))
         noisy = dataclasses.replace(clean, measured=measured)
-        run, _ = free_run(model, [Stretch(noisy, 0, n) for n in (COUNT, COUNT // 2)], covariance=given, substeps=2)
+        run, _ = free_run(model, [Stretch(noisy, START, n) for n in STOPS], covariance=given, substeps=2)
         runs.append(run.predicted)
     return np.std(runs, axis=0)
 
 
-def assert_same_spread(found: np.ndarray, expected: np.ndarray):
-    # 100 draws know a standard deviation to 7 %, and neighbouring samples share their draws.
-    assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.2)
+def assert_same_spread(found: np.ndarray, expected: np.ndarray, draws: int):
+    # What so many draws know of a standard deviation, three times; neighbouring samples share their draws.
+    known = 3.0 / np.sqrt(2 * draws)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(np.mean(expected**2)), rel=known)
     large = expected > 0.3 * expected.max()
-    np.testing.assert_allclose(found[large] / expected[large], 1.0, atol=0.4)
+    np.testing.assert_allclose(found[large] / expected[large], 1.0, atol=2 * known)
 
 
+def test_by_repetition(fitted: tuple[Fit, Uncertainty], band: PredictionBand):
+    found, known = fitted
+    assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 50), 50)
+
+
+@pytest.mark.slow
 def test_parameters_and_state_by_repetition(fitted: tuple[Fit, Uncertainty], band: PredictionBand):
     found, known = fitted
-    assert_same_spread(band.std_parameters, repeated(found, known.covariance, 0.0, 100))
-    assert_same_spread(band.std_state, repeated(found, 1e-20 * known.covariance, NOISE, 100))
-    assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 100))
+    assert_same_spread(band.std_parameters, repeated(found, known.covariance, 0.0, 150), 150)
+    assert_same_spread(band.std_state, repeated(found, 1e-20 * known.covariance, NOISE, 150), 150)
 
 
 def test_the_band_holds_the_log(band: PredictionBand):
@@ -82,8 +90,8 @@ def test_the_band_holds_the_log(band: PredictionBand):
 
 def test_several_stretches_are_taken_apart(bands: tuple[PredictionBand, ...]):
     whole, half = bands
-    assert half.std_state.shape == (COUNT // 2,)
-    np.testing.assert_allclose(half.std_predicted, whole.std_predicted[: COUNT // 2], rtol=1e-6)
+    assert half.std_state.shape == (STOPS[1] - START,)
+    np.testing.assert_allclose(half.std_predicted, whole.std_predicted[: STOPS[1] - START], rtol=1e-6)
 
 
 @pytest.mark.slow
