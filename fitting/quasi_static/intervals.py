@@ -13,14 +13,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student
 
-from fitting.quasi_static import CurveFit, correlation_length, scales, stretches
-from fitting.torque_twist import MEMORIES, SHAPE_NAMES, Blocks, Curve, Memory, loop, positive, remembered, twist
+from fitting.quasi_static.curve_fit import CurveFit, scales
+from fitting.quasi_static.stretches import correlation_length, stretches
+from fitting.quasi_static.torque_twist import (
+    MEMORIES,
+    SHAPE_NAMES,
+    Blocks,
+    Curve,
+    Memory,
+    loop,
+    positive,
+    remembered,
+    twist,
+)
 
 LOST_MOTION_SHARE = 0.04
 _RIDGE = 1e-10
 _BLIND = 1e-6
 # As for every positive parameter of a fit: known to better than a factor of about two.
 _VAGUE = 0.5
+# Beyond a factor of a thousand an interval says nothing.
+_NOT_AT_ALL = math.log(1e3)
 # Reaches that are tried for the width, over the torque's amplitude.
 _REACHES = (0.02, 0.04, 0.08, 0.16, 0.32)
 _KNEE_LEAST = 5
@@ -246,8 +259,10 @@ def _known(
 ) -> Known:
     value, slope = formula(fit.parameters), _slope(formula, fit, blocks)
     std, quantile = found.std(slope), found.quantile(slope)
+    if must_be_positive and quantile * std > _NOT_AT_ALL * abs(value):
+        return Known(value, std, None, unit, False, description, "the logs do not determine it at all")
     if must_be_positive and value > 0:
-        factor = math.exp(min(quantile * std / value, 50.0))
+        factor = math.exp(quantile * std / value)
         ends, identifiable = (value / factor, value * factor), std < _VAGUE * value
         reason = "" if identifiable else f"the logs determine it only to within a factor of {factor:.2g}"
     else:

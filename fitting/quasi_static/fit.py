@@ -1,0 +1,106 @@
+"""All curves fitted to quasi-static logs of one drive, and the one that held-out stretches ask for."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fitting.logs import Log
+from fitting.quasi_static.blocks import average
+from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish
+from fitting.quasi_static.intervals import Known, figures
+from fitting.quasi_static.stretches import FOLDS, stretches
+from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape
+
+
+@dataclass(frozen=True, eq=False)
+class QuasiStaticFit:
+    """The fits of all shapes, and which of them held-out stretches ask for.
+
+    Attributes:
+        blocks: What was fitted.
+        fits: By shape.
+        known: Figures with intervals, by shape.
+        held_out: Held-out misfit [rad] of each block, by shape.
+        stretch: Number of the stretch that each block was held out with, (n,).
+        chosen: The simplest shape that predicts held-out stretches about as well as the best one, among those whose own
+            figures the logs determine.
+    """
+
+    blocks: Blocks
+    fits: dict[Shape, CurveFit]
+    known: dict[Shape, dict[str, Known]]
+    held_out: dict[Shape, np.ndarray]
+    stretch: np.ndarray
+    chosen: Shape
+
+    @property
+    def best(self) -> CurveFit:
+        """The chosen shape's fit."""
+        return self.fits[self.chosen]
+
+
+def fit_quasi_static(
+    logs: Sequence[Log], *, rated_torque: float | None = None, hysteresis: bool = True
+) -> QuasiStaticFit:
+    """Fit all shapes of torque-twist curve to quasi-static logs of one drive, and choose one.
+
+    Args:
+        logs: Of kind "quasi-static", checked by [`fitting.quasi_static.preparation.prepare`][]. All share the curve and
+            the torque bias; each has its own twist zero and drift.
+        rated_torque: [N m], or None; without it the figures that vendors define by it are unknown.
+        hysteresis: Whether the way there and back may differ; a joint that turns one way all the time shows no such
+            thing, since the direction of its friction follows the motion.
+
+    Returns:
+        The fits.
+    """
+    blocks = average(logs)
+    fits = {shape: best_of(blocks, curves) for shape, curves in candidates(blocks, hysteresis).items()}
+    # One law of memory for all shapes: that of the most flexible one, which blames the memory for least.
+    memory = fits["three slopes"].curve.memory
+    for shape in SHAPES:
+        curve = replace(fits[shape].curve, memory=memory)
+        if curve != fits[shape].curve:
+            fits[shape] = best_of(blocks, [curve])
+    known = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
+    stretch = stretches(fits["three slopes"].residual, blocks.log)
+    held_out = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
+    return QuasiStaticFit(blocks, fits, known, held_out, stretch, _choice(known, held_out, stretch))
+
+
+def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
+    """Misfit [rad] of each block by the curve that was fitted without its stretch, (n,).
+
+    The torque of a stretch that is held out still moves the hysteresis, since it is an input; its twist is unseen.
+    """
+    count = int(stretch[-1]) + 1
+    # Drawn, since a regular comb could leave the same torque out at every pass.
+    fold = np.random.default_rng(0).permutation(np.arange(count) % FOLDS)[stretch]
+    misfit = np.empty_like(blocks.twist)
+    for i in range(FOLDS):
+        kept = polish(blocks, fit.curve, fit.parameters, fit.excess, (fold != i).astype(float))
+        misfit[fold == i] = kept.misfit[fold == i]
+    return misfit
+
+
+def _choice(known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarray], stretch: np.ndarray) -> Shape:
+    """The first shape whose held-out error is not clearly above the least, in the order from simple to flexible.
+
+    A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
+    """
+    able = [s for s in SHAPES if s == "linear" or all(known[s][n].identifiable for n in known[s] if _is_of_shape(n))]
+    least = min(able, key=lambda shape: float(np.mean(held_out[shape] ** 2)))
+    return next(s for s in able if s == least or not worse(held_out[s], held_out[least], stretch))
+
+
+def _is_of_shape(name: str) -> bool:
+    return name[0] in "KT" or name == "alpha"
+
+
+def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray) -> bool:
+    """Whether the first held-out misfit is clearly above the second: by more than one standard error over stretches."""
+    excess = np.bincount(stretch, one**2 - other**2)
+    spread = float(np.std(excess, ddof=1)) * math.sqrt(len(excess))
+    return float(np.sum(excess)) > spread
