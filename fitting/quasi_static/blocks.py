@@ -61,7 +61,7 @@ def _average(log: Log, most: int) -> dict[str, np.ndarray]:
     edges = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(branches, branches[1:], counts, strict=False)]
     edge = np.append(np.rint(np.concatenate(edges)), len(log)).astype(int)
     columns = {"torque": torque, "twist": log.dynamic_error, "time": log.time}
-    found = {key: np.add.reduceat(v, edge[:-1]) / np.diff(edge) for key, v in columns.items()}
+    found: dict[str, np.ndarray] = {key: np.add.reduceat(v, edge[:-1]) / np.diff(edge) for key, v in columns.items()}
     # Blocks of one size, whose centres are evenly spaced as third differences want them.
     found["noise"] = np.array([noise(means(values, size)) for values in (torque, log.dynamic_error)])
     firsts = np.cumsum(counts)[:-1]

@@ -155,6 +155,8 @@ def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
     if fit.chosen in ("linear", "two slopes"):
         bend = "second knee" if fit.chosen == "two slopes" else "knee"
         why = f"held-out stretches show no {bend} up to {reach}"
+        if fit.undetermined is not None:
+            why = "the curve bends more than the chosen one, but the logs do not determine where and how much"
         if fit.chosen == "linear":
             tell("K2", "N m/rad", "stiffness from T1 to T2", why)
             tell("T1", "N m", "torque at the first knee", why)
@@ -162,7 +164,8 @@ def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
         tell("T2", "N m", "torque at the second knee", why)
     if fit.chosen == "linear":
         alpha = fit.known["cubic"]["alpha"]
-        missing["alpha"] = dataclasses.replace(alpha, identifiable=False, reason=_alpha_reason(fit, alpha))
+        reason = _alpha_reason(fit, alpha) if fit.undetermined is None else alpha.reason or why
+        missing["alpha"] = dataclasses.replace(alpha, identifiable=False, reason=reason)
     if fit.best.curve.memory is None:
         why = "the torque does not turn back" if max(fit.blocks.reversals) == 0 else "the joint turned one way only"
         tell("hysteresis_width", "rad", "width of the loop at zero torque", why)
@@ -197,10 +200,16 @@ def _alpha_reason(fit: QuasiStaticFit, alpha: Known) -> str:
 
 def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFit) -> list[str]:
     known = report["before"]["parameters"]
+    reasons: dict[str, list[str]] = {}
+    for name, one in known.items():
+        if not one["identifiable"]:
+            reasons.setdefault(one["reason"], []).append(name)
     notes = [
-        f"{n} is not identifiable from these logs: {k['reason']}." for n, k in known.items() if not k["identifiable"]
+        f"{formatting.words(names)} {'is' if len(names) == 1 else 'are'} not identifiable from these logs: {reason}."
+        for reason, names in reasons.items()
     ]
-    notes += _about_hysteresis(known, data)
+    notes += _about_shape(report, fit)
+    notes += _about_hysteresis(known)
     notes += _about_motion(data)
     notes += _about_axes(fit)
     if not fit.best.curve.biased:
@@ -226,7 +235,20 @@ def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFi
     return notes
 
 
-def _about_hysteresis(known: Mapping[str, Any], data: QuasiStaticData) -> list[str]:
+def _about_shape(report: Mapping[str, Any], fit: QuasiStaticFit) -> list[str]:
+    shape = fit.undetermined
+    if shape is None:
+        return []
+    better, chosen = (report["shapes"][s]["rmse"]["validation"] for s in (shape, fit.chosen))
+    return [
+        f"The {PLAIN_SHAPE[shape]} predict{'s' if shape == 'cubic' else ''} held-out stretches better "
+        f"({formatting.quantity(better, 'rad')} rms, against {formatting.quantity(chosen, 'rad', like=better)}), but "
+        f"the logs do not determine all of its figures, so that the {PLAIN_SHAPE[fit.chosen]} stands: its stiffness is "
+        "a mean over the torque's range. Record several slow cycles over the whole range."
+    ]
+
+
+def _about_hysteresis(known: Mapping[str, Any]) -> list[str]:
     width = known.get("hysteresis_width")
     if width is None or width["value"] is None:
         return []
@@ -275,8 +297,8 @@ def _about_axes(fit: QuasiStaticFit) -> list[str]:
     if share < 1e-3:
         return []
     return [
-        "The noise of both axes was measured and weighed; what exceeds it was ascribed to the twist. If it were an error "
-        f"of the torque instead, the drive would be softer by up to {formatting.percent(share)}."
+        "The noise of both axes was measured and weighed; what exceeds it was ascribed to the twist. If it were an "
+        f"error of the torque instead, the drive would be softer by up to {formatting.percent(share)}."
     ]
 
 

@@ -184,7 +184,14 @@ def polish(
     low, high = _bounds(blocks, curve)
     inside = np.clip(start, low + 10 * steps, high - 10 * steps)
     found = least_squares(
-        residual, inside, jac=jacobian, bounds=(low, high), x_scale=1e5 * steps, xtol=1e-8, ftol=1e-9, max_nfev=60
+        residual,
+        inside,
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        bounds=(low, high),
+        x_scale=1e5 * steps,
+        xtol=1e-8,
+        ftol=1e-9,
+        max_nfev=60,
     )
     misfit, _ = _misfit(blocks, curve, found.x)
     return CurveFit(curve, found.x, found.fun, found.jac, misfit, excess)

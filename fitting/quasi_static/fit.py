@@ -40,6 +40,12 @@ class QuasiStaticFit:
         """The chosen shape's fit."""
         return self.fits[self.chosen]
 
+    @property
+    def undetermined(self) -> Shape | None:
+        """A shape that predicts held-out stretches clearly better, but whose figures the logs do not determine."""
+        least = min(SHAPES, key=lambda shape: float(np.mean(self.held_out[shape] ** 2)))
+        return least if worse(self.held_out[self.chosen], self.held_out[least], self.stretch) else None
+
 
 def fit_quasi_static(
     logs: Sequence[Log], *, rated_torque: float | None = None, hysteresis: bool = True
@@ -57,16 +63,18 @@ def fit_quasi_static(
         The fits.
     """
     blocks = average(logs)
-    fits = {shape: best_of(blocks, curves) for shape, curves in candidates(blocks, hysteresis).items()}
+    fits: dict[Shape, CurveFit] = {
+        shape: best_of(blocks, curves) for shape, curves in candidates(blocks, hysteresis).items()
+    }
     # One law of memory for all shapes: that of the most flexible one, which blames the memory for least.
     memory = fits["three slopes"].curve.memory
     for shape in SHAPES:
         curve = replace(fits[shape].curve, memory=memory)
         if curve != fits[shape].curve:
             fits[shape] = best_of(blocks, [curve])
-    known = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
+    known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
     stretch = stretches(fits["three slopes"].residual, blocks.log)
-    held_out = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
+    held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
     return QuasiStaticFit(blocks, fits, known, held_out, stretch, _choice(known, held_out, stretch))
 
 
@@ -90,7 +98,10 @@ def _choice(known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarr
 
     A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
     """
-    able = [s for s in SHAPES if s == "linear" or all(known[s][n].identifiable for n in known[s] if _is_of_shape(n))]
+    able: list[Shape] = ["linear"]
+    for shape in SHAPES[1:]:
+        if all(one.identifiable for name, one in known[shape].items() if _is_of_shape(name)):
+            able.append(shape)
     least = min(able, key=lambda shape: float(np.mean(held_out[shape] ** 2)))
     return next(s for s in able if s == least or not worse(held_out[s], held_out[least], stretch))
 

@@ -84,7 +84,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     rmse = report["before"]["rmse"]
     lines = ["[Fit of quasi-static logs]", f"    {report['summary']}", "[Rms error of the twist]"]
     lines += [
-        f"    {name:10}{rmse[key]:12.4g} rad" for name, key in (("training", "training"), ("held out", "validation"))
+        f"    {name:10}{rmse[key]:12.4g} rad" for name, key in (("fitted", "training"), ("held out", "validation"))
     ]
     lines.append("[Parameters]")
     known = report["before"]["parameters"]
