@@ -31,6 +31,8 @@ def average(logs: Sequence[Log]) -> Blocks:
     lengths = [len(part["path"]) for part in parts]
     before = np.repeat(np.cumsum([0, *lengths[:-1]]), sizes)
     whole = {key: np.concatenate([part[key] for part in parts]) for key in ("torque", "twist", "time", "path", "seat")}
+    torque_noise = float(np.mean([part["noise"][0] for part in parts]))
+    course = float(np.median(np.abs(np.diff(whole["torque"]))))
     return Blocks(
         torque=whole["torque"],
         twist=whole["twist"],
@@ -40,9 +42,11 @@ def average(logs: Sequence[Log]) -> Blocks:
         path_log=np.repeat(np.arange(len(logs)), lengths),
         seat=whole["seat"] + before,
         names=tuple(log.name for log in logs),
-        torque_noise=float(np.mean([part["noise"][0] for part in parts])),
+        torque_noise=torque_noise,
         # Even exact numbers have rounding; without a floor their weights would be infinite.
         twist_noise=max(float(np.mean([part["noise"][1] for part in parts])), 1e-7 * float(np.ptp(whole["twist"]))),
+        # The rows of a block are spread evenly over its course.
+        blur=math.hypot(torque_noise, course / math.sqrt(12.0)),
         rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
         reversals=tuple(len(part["path"]) - len(part["torque"]) for part in parts),
     )

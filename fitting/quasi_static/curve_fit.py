@@ -152,7 +152,7 @@ def _parameters(
     zeros = curve.logs * (2 if curve.drifting else 1)
     rest = list(solution[used : used + zeros])
     if reach is not None:
-        rest += [-2.0 * solution[-1], math.log(reach), *[0.0] * curve.logs]
+        rest += [-solution[-1] / compliances[0], math.log(reach), *[0.0] * curve.logs]
     return np.array([*shape, *([bias] if curve.biased else []), *rest], dtype=float)
 
 
@@ -198,9 +198,7 @@ def polish(
 
 
 def _residual(blocks: Blocks, curve: Curve, parameters: np.ndarray, branch: np.ndarray) -> np.ndarray:
-    x, slope = curve.without_memory(parameters, blocks)
-    if curve.memory is not None:
-        x = x - 0.5 * parameters[curve.place("width")] * branch
+    x, slope = curve.predict(parameters, blocks, branch)
     return (blocks.twist - x) / np.hypot(blocks.twist_noise, slope * blocks.torque_noise)
 
 
@@ -223,7 +221,7 @@ def scales(blocks: Blocks, curve: Curve) -> np.ndarray:
     """What counts as a large change of each parameter."""
     twist = 0.5 * float(np.ptp(blocks.twist))
     duration = float(np.ptp(blocks.time)) or 1.0
-    known = {"alpha": 1.0 / twist**2, "torque_bias": blocks.amplitude, "width": twist}
+    known = {"alpha": 1.0 / twist**2, "torque_bias": blocks.amplitude, "friction": blocks.amplitude}
     by_word = {"offset": twist, "drift": twist / duration}
     return np.array([known.get(name) or by_word.get(name.split()[0], 1.0) for name in curve.names])
 

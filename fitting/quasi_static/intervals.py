@@ -23,8 +23,6 @@ from fitting.quasi_static.torque_twist import (
     Memory,
     loop,
     positive,
-    remembered,
-    twist,
 )
 
 LOST_MOTION_SHARE = 0.04
@@ -135,8 +133,8 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
         rated_torque: [N m], or None; without it the figures that vendors define by it are unknown.
 
     Returns:
-        By name: K or K1, K2, K3 with T1, T2, alpha, torque_bias, drift, hysteresis_width, hysteresis_loss, lost_motion,
-        lost_motion_outer, as far as the curve has them.
+        By name: K or K1, K2, K3 with T1, T2, alpha, torque_bias, drift, hysteresis_torque, hysteresis_width,
+        hysteresis_loss, lost_motion and lost_motion_outer, as far as the curve has them.
     """
     curve = fit.curve
     found = scatter(fit, stretches(fit.residual, blocks.log))
@@ -201,7 +199,9 @@ def _formulas(curve: Curve, blocks: Blocks, rated_torque: float | None) -> dict[
                 False,
             )
     if curve.memory is not None:
-        size = blocks.amplitude
+        at, size = curve.place("friction"), blocks.amplitude
+        text = "friction torque behind the loop, half of its width along the torque"
+        found["hysteresis_torque"] = (lambda p, at=at: float(p[at]), "N m", text, False)
         text = f"width of the loop at zero torque, for torque cycles of +-{size:.3g} N m"
         found["hysteresis_width"] = (lambda p: _open(curve, p, size), "rad", text, False)
     return found | _by_rated_torque(curve, blocks, rated_torque)
@@ -240,12 +240,11 @@ def _open(curve: Curve, parameters: np.ndarray, amplitude: float) -> float:
 
 def _between(curve: Curve, parameters: np.ndarray, amplitude: float, torque: float) -> tuple[float, float]:
     """Twist from -torque to +torque [rad], along the middle of the loop and between its outer branches."""
-    ends, _ = twist(curve.shape, parameters, np.array([-torque, torque]))
-    if curve.memory is None:
-        return float(ends[1] - ends[0]), float(ends[1] - ends[0])
     at, rising, falling = loop(curve, parameters, amplitude)
+    ends = np.array([-torque, torque])
+    low, high = 0.5 * (np.interp(ends, at, rising) + np.interp(ends, at, falling))
     outer = np.interp(torque, at, falling) - np.interp(-torque, at, rising)
-    return float(ends[1] - ends[0]), float(outer)
+    return float(high - low), float(outer)
 
 
 def _known(
@@ -291,42 +290,36 @@ def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:
     low, high = local.ci95
     for memory in MEMORIES:
         for share in _REACHES:
-            other = _with_memory(fit, blocks, memory, share * blocks.amplitude)
+            reach = share * blocks.amplitude
+            other = _with_memory(fit, blocks, memory, reach)
             cost = float(other.residual @ other.residual)
             if free * (cost / best - 1.0) > student.ppf(0.975, max(1.0, free - 1.0)) ** 2:
                 continue
             found = scatter(other, stretches(fit.residual, blocks.log))
             direction = np.eye(len(other.parameters))[-1]
             half = found.quantile(direction) * found.std(direction)
-            # The last parameter is the width of the branches; the loop at zero torque is a fixed share of it.
-            alone = replace(curve, memory=memory)
-            unit_width = fit.parameters.copy()
-            unit_width[curve.place("width")], unit_width[curve.place("log reach")] = (
-                1.0,
-                math.log(share * blocks.amplitude),
-            )
-            opening = _open(alone, unit_width, blocks.amplitude)
-            low = min(low, opening * (other.parameters[-1] - half))
-            high = max(high, opening * (other.parameters[-1] + half))
+            alone, moved = replace(curve, memory=memory), fit.parameters.copy()
+            moved[curve.place("log reach")] = math.log(reach)
+            for friction in (other.parameters[-1] - half, other.parameters[-1] + half):
+                moved[curve.place("friction")] = friction
+                opening = _open(alone, moved, blocks.amplitude)
+                low, high = min(low, opening), max(high, opening)
     identifiable = not low <= 0.0 <= high
     reason = "" if identifiable else f"it could be told from zero only above {max(-low, high):.2g} rad"
     return replace(local, ci95=(low, high), identifiable=identifiable, reason=reason)
 
 
 def _with_memory(fit: CurveFit, blocks: Blocks, memory: Memory, reach: float) -> CurveFit:
-    """The fit with another law of memory, to first order in all other parameters; the width is the last parameter."""
-    curve, names = fit.curve, fit.curve.names
-    kept = [i for i, name in enumerate(names) if not name.startswith(("width", "log reach", "start"))]
-    width = fit.parameters[curve.place("width")]
+    """The fit with another law of memory, to first order in all other parameters; the friction is the last."""
+    curve = fit.curve
+    kept = [i for i, name in enumerate(curve.names) if not name.startswith(("friction", "log reach", "start"))]
+    moved = fit.parameters.copy()
+    moved[curve.place("log reach")] = math.log(reach)
+    changed = replace(curve, memory=memory).branch(moved, blocks)
     branch = curve.branch(fit.parameters, blocks)
-    starts = fit.parameters[curve.place("start 0") :]
-    each = [remembered(memory, blocks.path[blocks.path_log == i], reach, starts[i]) for i in range(curve.logs)]
-    changed = np.concatenate(each)[blocks.seat]
-    # The width's own column is half the branch over the noise.
-    _, slope = curve.elastic(fit.parameters, blocks.torque)
-    noise = np.hypot(math.hypot(blocks.twist_noise, fit.excess), slope * blocks.torque_noise)
-    column = 0.5 * changed / noise
-    matrix = np.column_stack([fit.jacobian[:, kept], column])
-    target = fit.residual - 0.5 * width * branch / noise
-    solution, *_ = np.linalg.lstsq(matrix, -target, rcond=None)
-    return replace(fit, parameters=solution, residual=target + matrix @ solution, jacobian=matrix)
+    _, slope = curve.predict(fit.parameters, blocks, branch)
+    weighed = slope / np.hypot(math.hypot(blocks.twist_noise, fit.excess), slope * blocks.torque_noise)
+    matrix = np.column_stack([fit.jacobian[:, kept], weighed * changed])
+    without = fit.residual - fit.parameters[curve.place("friction")] * weighed * branch
+    solution, *_ = np.linalg.lstsq(matrix, -without, rcond=None)
+    return replace(fit, parameters=solution, residual=without + matrix @ solution, jacobian=matrix)

@@ -41,7 +41,7 @@ def pictures(fit: QuasiStaticFit) -> list[Picture]:
 def _loops(fit: QuasiStaticFit) -> Picture:
     """Twist against torque: the blocks, and the curve that was fitted to them."""
     blocks, best = fit.blocks, fit.best
-    zero = _zero(fit)
+    zero = best.curve.zero(best.parameters, blocks)
     predicted = blocks.twist - best.misfit - zero
     measured = blocks.twist - zero
     factor, unit = scaled_unit(float(np.max(np.abs(measured))), "rad")
@@ -89,13 +89,6 @@ def _misfit_by_time(fit: QuasiStaticFit) -> Picture:
         "look like chance.",
         _figure(traces, 300, "time from the start [s]", axis_label("measured less fitted", unit)),
     )
-
-
-def _zero(fit: QuasiStaticFit) -> np.ndarray:
-    """Twist zero and drift of each block's log [rad]."""
-    best = fit.best
-    whole, _ = best.curve.without_memory(best.parameters, fit.blocks)
-    return whole - best.curve.elastic(best.parameters, fit.blocks.torque)[0]
 
 
 def _by_direction(blocks: Blocks, values: np.ndarray, *, name: str) -> list[Figure]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.special import ndtr
 
 Shape = Literal["linear", "cubic", "two slopes", "three slopes"]
 Memory = Literal["abrupt", "gradual"]
@@ -26,7 +27,9 @@ def positive(logarithm: np.ndarray | float) -> np.ndarray:
     return np.exp(np.clip(logarithm, -80.0, 80.0))
 
 
-def twist(shape: Shape, coefficients: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def twist(
+    shape: Shape, coefficients: np.ndarray, torque: np.ndarray, *, blur: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """The elastic twist under a torque, and its slope; odd in the torque.
 
     Two and three slopes are the vendors' straight lines through the origin: K1 up to T1, K2 from there to
@@ -36,6 +39,8 @@ def twist(shape: Shape, coefficients: np.ndarray, torque: np.ndarray) -> tuple[n
         shape: Of the curve.
         coefficients: As `SHAPE_NAMES` lists them; K in N m/rad, alpha in rad^-2, torques in N m.
         torque: Less the torque at the centre of the curve [N m], (n,).
+        blur: Standard deviation of the true torque around the stated one [N m]. What is expected then turns its knees
+            in a curve; straight parts stay as they are.
 
     Returns:
         Twist [rad] and its derivative with respect to the torque [rad/(N m)], both (n,).
@@ -51,10 +56,21 @@ def twist(shape: Shape, coefficients: np.ndarray, torque: np.ndarray) -> tuple[n
     x = compliances[0] * torque
     slope = np.full_like(torque, compliances[0])
     for knee, before, after in zip(knees, compliances[:-1], compliances[1:], strict=True):
-        beyond = torque - np.clip(torque, -knee, knee)
+        beyond, share = _beyond(torque, knee, blur)
         x = x + (after - before) * beyond
-        slope = np.where(beyond == 0, slope, after)
+        slope = slope + (after - before) * share
     return x, slope
+
+
+def _beyond(torque: np.ndarray, knee: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far the torque is expected beyond a knee on either side, with its sign, and the chance that it is beyond."""
+    if blur <= 0.0:
+        beyond = torque - np.clip(torque, -knee, knee)
+        return beyond, (beyond != 0).astype(float)
+    above, below = (torque - knee) / blur, (-torque - knee) / blur
+    chance_above, chance_below = ndtr(above), ndtr(below)
+    density = (np.exp(-0.5 * above**2) - np.exp(-0.5 * below**2)) / np.sqrt(2.0 * np.pi)
+    return blur * (above * chance_above - below * chance_below + density), chance_above + chance_below
 
 
 def _cubic(compliance: float, alpha: float, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,6 +135,7 @@ class Blocks:
         names: Of the logs.
         torque_noise: Standard deviation of the noise of a block's torque [N m].
         twist_noise: Likewise of its twist [rad].
+        blur: Standard deviation of the torque of a block's rows around its mean, noise and course together [N m].
         rows: Rows in a block, by log, nearly.
         reversals: Reversals of the torque, by log.
     """
@@ -133,6 +150,7 @@ class Blocks:
     names: tuple[str, ...]
     torque_noise: float
     twist_noise: float
+    blur: float
     rows: tuple[int, ...]
     reversals: tuple[int, ...]
 
@@ -166,7 +184,7 @@ class Curve:
         each = [f"offset {i}" for i in range(self.logs)]
         each += [f"drift {i}" for i in range(self.logs) if self.drifting]
         if self.memory is not None:
-            each += ["width", "log reach", *(f"start {i}" for i in range(self.logs))]
+            each += ["friction", "log reach", *(f"start {i}" for i in range(self.logs))]
         return (*SHAPE_NAMES[self.shape], *(["torque_bias"] if self.biased else []), *each)
 
     def place(self, name: str) -> int:
@@ -177,10 +195,12 @@ class Curve:
         """Torque over which the branch changes after a reversal [N m]."""
         return float(positive(parameters[self.place("log reach")]))
 
-    def elastic(self, parameters: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of the two branches above the twist zero [rad], and its slope, at a torque as logged."""
+    def elastic(
+        self, parameters: np.ndarray, torque: np.ndarray, *, blur: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Twist of the spring above the twist zero [rad], and its slope, at a torque as logged."""
         bias = parameters[self.place("torque_bias")] if self.biased else 0.0
-        return twist(self.shape, parameters, torque - bias)
+        return twist(self.shape, parameters, torque - bias, blur=blur)
 
     def branch(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
         """Which branch each block is on, from -1 to 1, (n,)."""
@@ -193,23 +213,28 @@ class Curve:
         ]
         return np.concatenate(each)[blocks.seat]
 
-    def without_memory(self, parameters: np.ndarray, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
-        """Twist [rad] of all terms but the hysteresis, and the elastic slope."""
-        x, slope = self.elastic(parameters, blocks.torque)
-        x = x + parameters[self.place("offset 0") + blocks.log]
-        if self.drifting:
-            x = x + parameters[self.place("drift 0") + blocks.log] * centred_time(blocks)
-        return x, slope
-
-    def predict(self, parameters: np.ndarray, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
+    def predict(
+        self, parameters: np.ndarray, blocks: Blocks, branch: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Twist [rad] and the slope of the elastic part [rad/(N m)] at each block, both (n,).
 
-        On loading the twist is half a width below the mean curve, on unloading as much above it.
+        Hysteresis is a friction torque beside the spring's, as `hdjax` has it: on loading it bears its full part of the
+        torque, on unloading it works against the spring.
+
+        Args:
+            parameters: As `names` lists them.
+            blocks: Where to look.
+            branch: From [`Curve.branch`][], where it is known already.
         """
-        x, slope = self.without_memory(parameters, blocks)
-        if self.memory is not None:
-            x = x - 0.5 * parameters[self.place("width")] * self.branch(parameters, blocks)
-        return x, slope
+        branch = self.branch(parameters, blocks) if branch is None else branch
+        friction = parameters[self.place("friction")] if self.memory is not None else 0.0
+        x, slope = self.elastic(parameters, blocks.torque - friction * branch, blur=blocks.blur)
+        return x + self.zero(parameters, blocks), slope
+
+    def zero(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
+        """Twist zero and drift of each block's log [rad], (n,)."""
+        x = parameters[self.place("offset 0") + blocks.log]
+        return x + parameters[self.place("drift 0") + blocks.log] * centred_time(blocks) if self.drifting else x
 
 
 def centred_time(blocks: Blocks) -> np.ndarray:
@@ -231,12 +256,13 @@ def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int =
         Torque less its centre [N m], twist while it rises and twist while it falls [rad], each (steps + 1,).
     """
     torque = np.linspace(-amplitude, amplitude, steps + 1)
-    elastic, _ = twist(curve.shape, parameters, torque)
     if curve.memory is None:
+        elastic, _ = twist(curve.shape, parameters, torque)
         return torque, elastic, elastic
     way = np.concatenate([torque, torque[-2::-1]])
-    reach = curve.reach(parameters)
     # After two cycles the loop has closed, wherever it began.
-    path = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), reach, -1.0)[-2 * steps - 1 :]
-    half = 0.5 * parameters[curve.place("width")]
-    return torque, elastic - half * path[: steps + 1], elastic - half * path[: steps - 1 : -1]
+    path = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), curve.reach(parameters), -1.0)
+    closed = path[-2 * steps - 1 :]
+    friction = parameters[curve.place("friction")]
+    x, _ = twist(curve.shape, parameters, way - friction * closed)
+    return torque, x[: steps + 1], x[: steps - 1 : -1]
