@@ -16,6 +16,8 @@ BLOCKS_PER_CYCLE = 100
 MOST_BLOCKS = 1500
 # A swing back by less than this share of the torque's range leaves the branch as it is, nearly.
 _REVERSAL = 0.05
+# Blocks in a branch of which the two at its ends may be left out.
+_LONG_BRANCH = 6
 _MEDIAN_TO_STD = 1.4826
 _THIRD_DIFFERENCE = math.sqrt(20.0)
 
@@ -48,7 +50,7 @@ def average(logs: Sequence[Log]) -> Blocks:
         # The rows of a block are spread evenly over its course.
         blur=math.hypot(torque_noise, course / math.sqrt(12.0)),
         rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
-        reversals=tuple(len(part["path"]) - len(part["torque"]) for part in parts),
+        reversals=tuple(int(part["reversals"]) for part in parts),
     )
 
 
@@ -69,10 +71,15 @@ def _average(log: Log, most: int) -> dict[str, np.ndarray]:
     # Blocks of one size, whose centres are evenly spaced as third differences want them.
     found["noise"] = np.array([noise(means(values, size)) for values in (torque, log.dynamic_error)])
     firsts = np.cumsum(counts)[:-1]
+    found["reversals"] = np.array(len(firsts))
     extremes = [_extreme(found["torque"], int(first)) for first in firsts]
     found["path"] = np.insert(found["torque"], firsts, extremes)
-    found["seat"] = np.arange(len(edge) - 1) + np.searchsorted(firsts, np.arange(len(edge) - 1), side="right")
-    return found
+    number = np.arange(len(edge) - 1)
+    found["seat"] = number + np.searchsorted(firsts, number, side="right")
+    # Beside a reversal the branch changes within a block, so that its mean is not on the curve.
+    beside = np.concatenate([firsts, firsts - 1])
+    kept = ~np.isin(number, beside) if np.min(counts) >= _LONG_BRANCH else np.full(len(number), True)
+    return found | {key: found[key][kept] for key in (*columns, "seat")}
 
 
 def _extreme(torque: np.ndarray, first: int) -> float:

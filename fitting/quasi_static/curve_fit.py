@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.quasi_static.torque_twist import MEMORIES, SHAPES, Blocks, Curve, Shape, centred_time, remembered
+from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Shape, centred_time, remembered
 
 # Both signs of torque must reach this share of the largest before the curve's symmetry can show its centre.
 _BOTH_SIGNS = 0.3
@@ -41,17 +41,13 @@ class CurveFit:
     excess: float
 
 
-def candidates(blocks: Blocks, hysteresis: bool) -> dict[Shape, list[Curve]]:
-    """The forms that the logs can tell something about, by shape."""
+def candidates(blocks: Blocks, shape: Shape, hysteresis: bool) -> list[Curve]:
+    """The forms of one shape that the logs can tell something about; they differ in their memory."""
     low, high = float(np.min(blocks.torque)), float(np.max(blocks.torque))
-    both_signs = min(-low, high) > _BOTH_SIGNS * max(-low, high)
+    biased = shape != "linear" and min(-low, high) > _BOTH_SIGNS * max(-low, high)
     drifting = min(blocks.reversals) >= 2 * _CYCLES_FOR_DRIFT
     memories = MEMORIES if hysteresis and max(blocks.reversals) > 0 else (None,)
-    logs = len(blocks.names)
-    return {
-        shape: [Curve(shape, memory, both_signs and shape != "linear", drifting, logs) for memory in memories]
-        for shape in SHAPES
-    }
+    return [Curve(shape, memory, biased, drifting, len(blocks.names)) for memory in memories]
 
 
 def best_of(blocks: Blocks, curves: Sequence[Curve]) -> CurveFit:
@@ -97,7 +93,8 @@ def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
         "two slopes": [(0.15,), (0.35,), (0.6,)],
         "three slopes": [(0.1, 0.35), (0.2, 0.6), (0.35, 0.7), (0.5, 0.8)],
     }[curve.shape]
-    reaches = [0.03 * size, 0.12 * size, 0.4 * size] if curve.memory else [None]
+    # Finely, since only the few blocks after a reversal know the reach, and it has local minima between them.
+    reaches = list(size * np.geomspace(0.02, 0.45, 12)) if curve.memory else [None]
     columns = _zero_columns(blocks, curve)
     tried = []
     for reach in reaches:
@@ -157,7 +154,7 @@ def _parameters(
 
 
 def polish(
-    blocks: Blocks, curve: Curve, start: np.ndarray, excess: float, weights: np.ndarray | None = None
+    blocks: Blocks, curve: Curve, start: np.ndarray, excess: float, weights: np.ndarray | None = None, *, most: int = 40
 ) -> CurveFit:
     """The curve of least weighed misfit near a starting point.
 
@@ -167,6 +164,7 @@ def polish(
         start: Parameters.
         excess: Standard deviation of what noise does not explain [rad].
         weights: Of the blocks, (n,), or None for one each; zero leaves a block out, though it still moves the memory.
+        most: Evaluations.
 
     Returns:
         The fit; residual and Jacobian carry the weights.
@@ -189,9 +187,9 @@ def polish(
         jac=jacobian,  # pyright: ignore[reportArgumentType]
         bounds=(low, high),
         x_scale=1e5 * steps,
-        xtol=1e-8,
-        ftol=1e-9,
-        max_nfev=60,
+        xtol=1e-7,
+        ftol=1e-8,
+        max_nfev=most,
     )
     misfit, _ = _misfit(blocks, curve, found.x)
     return CurveFit(curve, found.x, found.fun, found.jac, misfit, excess)

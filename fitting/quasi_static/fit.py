@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
 from fitting.logs import Log
 from fitting.quasi_static.blocks import average
@@ -63,15 +64,12 @@ def fit_quasi_static(
         The fits.
     """
     blocks = average(logs)
+    # One law of memory for all shapes: that which suits the most flexible one, since it blames the memory for least.
+    flexible = best_of(blocks, candidates(blocks, "three slopes", hysteresis))
     fits: dict[Shape, CurveFit] = {
-        shape: best_of(blocks, curves) for shape, curves in candidates(blocks, hysteresis).items()
-    }
-    # One law of memory for all shapes: that of the most flexible one, which blames the memory for least.
-    memory = fits["three slopes"].curve.memory
-    for shape in SHAPES:
-        curve = replace(fits[shape].curve, memory=memory)
-        if curve != fits[shape].curve:
-            fits[shape] = best_of(blocks, [curve])
+        shape: best_of(blocks, [c for c in candidates(blocks, shape, hysteresis) if c.memory == flexible.curve.memory])
+        for shape in SHAPES[:-1]
+    } | {"three slopes": flexible}
     known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
     stretch = stretches(fits["three slopes"].residual, blocks.log)
     held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
@@ -88,7 +86,7 @@ def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
     fold = np.random.default_rng(0).permutation(np.arange(count) % FOLDS)[stretch]
     misfit = np.empty_like(blocks.twist)
     for i in range(FOLDS):
-        kept = polish(blocks, fit.curve, fit.parameters, fit.excess, (fold != i).astype(float))
+        kept = polish(blocks, fit.curve, fit.parameters, fit.excess, (fold != i).astype(float), most=20)
         misfit[fold == i] = kept.misfit[fold == i]
     return misfit
 
@@ -111,7 +109,7 @@ def _is_of_shape(name: str) -> bool:
 
 
 def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray) -> bool:
-    """Whether the first held-out misfit is clearly above the second: by more than one standard error over stretches."""
+    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %."""
     excess = np.bincount(stretch, one**2 - other**2)
-    spread = float(np.std(excess, ddof=1)) * math.sqrt(len(excess))
-    return float(np.sum(excess)) > spread
+    error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
+    return float(np.mean(excess)) > float(student.ppf(0.95, len(excess) - 1)) * error

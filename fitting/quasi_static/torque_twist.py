@@ -4,6 +4,7 @@ Plain NumPy in double precision: the curve is algebraic, so that a fit takes mil
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -24,7 +25,7 @@ SHAPE_NAMES: dict[Shape, tuple[str, ...]] = {
 
 def positive(logarithm: np.ndarray | float) -> np.ndarray:
     """The positive number of that logarithm, finite wherever a search may wander."""
-    return np.exp(np.clip(logarithm, -80.0, 80.0))
+    return np.asarray(np.exp(np.clip(logarithm, -80.0, 80.0)))
 
 
 def twist(
@@ -111,7 +112,9 @@ def remembered(memory: Memory, torque: np.ndarray, reach: float, start: float) -
     path = [branch]
     if memory == "abrupt":
         for step in steps.tolist():
-            branch = min(1.0, max(-1.0, branch + step))
+            branch += step
+            # Comparisons, since this loop is where a fit spends its time and min and max take twice as long.
+            branch = 1.0 if branch > 1.0 else -1.0 if branch < -1.0 else branch
             path.append(branch)
     else:
         for towards, kept in zip(np.sign(steps).tolist(), np.exp(-np.abs(steps)).tolist(), strict=True):
@@ -178,7 +181,7 @@ class Curve:
     drifting: bool
     logs: int
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Of the parameters."""
         each = [f"offset {i}" for i in range(self.logs)]
@@ -187,9 +190,13 @@ class Curve:
             each += ["friction", "log reach", *(f"start {i}" for i in range(self.logs))]
         return (*SHAPE_NAMES[self.shape], *(["torque_bias"] if self.biased else []), *each)
 
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
     def place(self, name: str) -> int:
         """Index of a parameter."""
-        return self.names.index(name)
+        return self._places[name]
 
     def reach(self, parameters: np.ndarray) -> float:
         """Torque over which the branch changes after a reversal [N m]."""
