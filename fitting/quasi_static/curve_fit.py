@@ -85,7 +85,7 @@ def _excess(blocks: Blocks, misfit: np.ndarray, slope: np.ndarray) -> float:
 
 
 def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
-    """The two best starting points of a coarse grid over knees, bias and reach; the rest is linear there."""
+    """The best starting points of a grid over knees, bias and reach, no two with the same knees; the rest is linear."""
     size, middle = blocks.amplitude, 0.5 * float(np.max(blocks.torque) + np.min(blocks.torque))
     knees = {
         "linear": [()],
@@ -109,7 +109,8 @@ def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
                 rest = blocks.twist - matrix @ solution
                 tried.append((float(rest @ rest), solution, bias, [share * size for share in knee], reach))
     tried.sort(key=lambda t: t[0])
-    return [_parameters(blocks, curve, *t[1:]) for t in tried[:2]]
+    best, other = tried[0], next((t for t in tried if t[3] != tried[0][3]), None)
+    return [_parameters(blocks, curve, *t[1:]) for t in (best, other) if t is not None]
 
 
 def _path(blocks: Blocks, curve: Curve, reach: float) -> np.ndarray:

@@ -64,12 +64,7 @@ def fit_quasi_static(
         The fits.
     """
     blocks = average(logs)
-    # One law of memory for all shapes: that which suits the most flexible one, since it blames the memory for least.
-    flexible = best_of(blocks, candidates(blocks, "three slopes", hysteresis))
-    fits: dict[Shape, CurveFit] = {
-        shape: best_of(blocks, [c for c in candidates(blocks, shape, hysteresis) if c.memory == flexible.curve.memory])
-        for shape in SHAPES[:-1]
-    } | {"three slopes": flexible}
+    fits: dict[Shape, CurveFit] = {shape: best_of(blocks, candidates(blocks, shape, hysteresis)) for shape in SHAPES}
     known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
     stretch = stretches(fits["three slopes"].residual, blocks.log)
     held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
