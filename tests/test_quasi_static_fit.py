@@ -98,7 +98,7 @@ def test_logs_of_one_drive_share_the_curve_but_not_the_zero() -> None:
     logs[1] = replace(logs[1], dynamic_error=logs[1].dynamic_error - 3e-3, name="other")
     fit = fit_quasi_static(logs)
     best = fit.best
-    zeros = [best.parameters[best.curve.place(f"offset {i}")] for i in range(2)]
+    zeros = [best.parameters[best.curve.places[f"offset {i}"]] for i in range(2)]
     assert zeros[0] - zeros[1] == pytest.approx(3e-3, abs=3e-6)
     assert covers(fit.known["three slopes"]["K2"], K2)
 

@@ -80,7 +80,7 @@ def test_memory_depends_on_the_path_not_on_the_samples(memory) -> None:
 def test_a_loop_is_as_wide_as_its_friction_says() -> None:
     curve = Curve("linear", "abrupt", biased=False, drifting=False, logs=1)
     parameters = np.zeros(len(curve.names))
-    parameters[[0, curve.place("friction"), curve.place("log reach")]] = np.log(3e4), 4.0, np.log(6.0)
+    parameters[[0, curve.places["friction"], curve.places["log reach"]]] = np.log(3e4), 4.0, np.log(6.0)
     torque, rising, falling = loop(curve, parameters, 80.0)
     assert torque[100] == pytest.approx(0.0, abs=1e-12)
     assert falling[100] - rising[100] == pytest.approx(2 * 4.0 / 3e4, rel=1e-12)

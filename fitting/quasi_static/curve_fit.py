@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Shape, centred_time, remembered
+from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Shape, remembered
 
 # Both signs of torque must reach this share of the largest before the curve's symmetry can show its centre.
 _BOTH_SIGNS = 0.3
@@ -50,9 +50,28 @@ def candidates(blocks: Blocks, shape: Shape, hysteresis: bool) -> list[Curve]:
     return [Curve(shape, memory, biased, drifting, len(blocks.names)) for memory in memories]
 
 
-def best_of(blocks: Blocks, curves: Sequence[Curve]) -> CurveFit:
+def best_of(blocks: Blocks, curves: Sequence[Curve], simpler: CurveFit | None = None) -> CurveFit:
+    """The best fit among several forms, from several starting points.
+
+    Args:
+        blocks: To be fitted.
+        curves: The forms.
+        simpler: A fit that one of the forms contains; it is a starting point, so that more freedom never fits worse.
+    """
     found = [fit_curve(blocks, curve, start) for curve in curves for start in starts(blocks, curve)]
+    if simpler is not None:
+        same = [curve for curve in curves if curve.memory == simpler.curve.memory]
+        found += [fit_curve(blocks, curve, _grown(simpler, curve, blocks)) for curve in same]
     return min(found, key=lambda fit: float(np.mean(fit.misfit**2)))
+
+
+def _grown(fit: CurveFit, curve: Curve, blocks: Blocks) -> np.ndarray:
+    """Parameters with which a more flexible curve equals a fitted one."""
+    known = dict(zip(fit.curve.names, fit.parameters, strict=True))
+    stiffest = known.get("log K2", known["log K1"])
+    knee = math.log(0.35 * blocks.amplitude)
+    new = {"log K2": stiffest, "log K3": stiffest, "log T1": knee, "log gap": knee}
+    return np.array([known.get(name, new.get(name, 0.0)) for name in curve.names])
 
 
 def fit_curve(blocks: Blocks, curve: Curve, start: np.ndarray) -> CurveFit:
@@ -121,7 +140,7 @@ def _path(blocks: Blocks, curve: Curve, reach: float) -> np.ndarray:
 
 def _zero_columns(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
     own = [(blocks.log == i).astype(float) for i in range(curve.logs)]
-    return own + ([column * centred_time(blocks) for column in own] if curve.drifting else [])
+    return own + ([column * blocks.centred_time for column in own] if curve.drifting else [])
 
 
 def _basis(shape: Shape, torque: np.ndarray, knees: list[float]) -> list[np.ndarray]:
@@ -204,13 +223,20 @@ def _residual(blocks: Blocks, curve: Curve, parameters: np.ndarray, branch: np.n
 def _jacobian(blocks: Blocks, curve: Curve, parameters: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Central differences; the branch is followed anew only for what moves it."""
     held = curve.branch(parameters, blocks)
+    _, slope = curve.predict(parameters, blocks, held)
+    weight = 1.0 / np.hypot(blocks.twist_noise, slope * blocks.torque_noise)
     columns = []
     for i, (name, step) in enumerate(zip(curve.names, steps, strict=True)):
+        word, _, number = name.partition(" ")
+        if word in ("offset", "drift"):
+            own = weight * (blocks.log == int(number))
+            columns.append(-own if word == "offset" else -own * blocks.centred_time)
+            continue
         ends = []
         for sign in (1.0, -1.0):
             moved = parameters.copy()
             moved[i] += sign * step
-            branch = curve.branch(moved, blocks) if name.startswith(("log reach", "start")) else held
+            branch = curve.branch(moved, blocks) if word == "start" or name == "log reach" else held
             ends.append(_residual(blocks, curve, moved, branch))
         columns.append((ends[0] - ends[1]) / (2.0 * step))
     return np.column_stack(columns)

@@ -14,6 +14,8 @@ from fitting.quasi_static.intervals import Known, figures
 from fitting.quasi_static.stretches import FOLDS, stretches
 from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape
 
+_CONTAINED: dict[Shape, Shape] = {"cubic": "linear", "two slopes": "linear", "three slopes": "two slopes"}
+
 
 @dataclass(frozen=True, eq=False)
 class QuasiStaticFit:
@@ -64,7 +66,10 @@ def fit_quasi_static(
         The fits.
     """
     blocks = average(logs)
-    fits: dict[Shape, CurveFit] = {shape: best_of(blocks, candidates(blocks, shape, hysteresis)) for shape in SHAPES}
+    fits: dict[Shape, CurveFit] = {}
+    for shape in SHAPES:
+        forms = candidates(blocks, shape, hysteresis)
+        fits[shape] = best_of(blocks, forms, fits.get(_CONTAINED[shape]) if shape in _CONTAINED else None)
     known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
     stretch = stretches(fits["three slopes"].residual, blocks.log)
     held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}

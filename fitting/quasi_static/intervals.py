@@ -154,7 +154,7 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
 
 
 def _centred(fit: CurveFit, blocks: Blocks) -> np.ndarray:
-    bias = fit.parameters[fit.curve.place("torque_bias")] if fit.curve.biased else 0.0
+    bias = fit.parameters[fit.curve.places["torque_bias"]] if fit.curve.biased else 0.0
     return blocks.torque - bias
 
 
@@ -178,19 +178,19 @@ def _formulas(curve: Curve, blocks: Blocks, rated_torque: float | None) -> dict[
             text = text if lines else "stiffness" + (" at zero twist" if curve.shape == "cubic" else "")
             found[name] = (lambda p, i=i: float(positive(p[i])), "N m/rad", text, True)
     if lines:
-        first = curve.place("log T1")
+        first = curve.places["log T1"]
         found["T1"] = (lambda p: float(positive(p[first])), "N m", "torque at the first knee", True)
     if "log gap" in names:
-        gaps = slice(curve.place("log T1"), curve.place("log gap") + 1)
+        gaps = slice(curve.places["log T1"], curve.places["log gap"] + 1)
         found["T2"] = (lambda p: float(np.sum(positive(p[gaps]))), "N m", "torque at the second knee", True)
     if curve.shape == "cubic":
         found["alpha"] = (lambda p: float(p[1]), "rad^-2", "cubic coefficient, tau = K (x + alpha x^3)", False)
     if curve.biased:
-        at = curve.place("torque_bias")
+        at = curve.places["torque_bias"]
         found["torque_bias"] = (lambda p, at=at: float(p[at]), "N m", "torque at the centre of the curve", False)
     if curve.drifting:
         for i, name in enumerate(blocks.names):
-            at = curve.place(f"drift {i}")
+            at = curve.places[f"drift {i}"]
             text = f"drift of the twist in {name}"
             found["drift" if curve.logs == 1 else f"drift.{name}"] = (
                 lambda p, at=at: float(p[at]),
@@ -199,7 +199,7 @@ def _formulas(curve: Curve, blocks: Blocks, rated_torque: float | None) -> dict[
                 False,
             )
     if curve.memory is not None:
-        at, size = curve.place("friction"), blocks.amplitude
+        at, size = curve.places["friction"], blocks.amplitude
         text = "friction torque behind the loop, half of its width along the torque"
         found["hysteresis_torque"] = (lambda p, at=at: float(p[at]), "N m", text, False)
         text = f"width of the loop at zero torque, for torque cycles of +-{size:.3g} N m"
@@ -299,9 +299,9 @@ def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:
             direction = np.eye(len(other.parameters))[-1]
             half = found.quantile(direction) * found.std(direction)
             alone, moved = replace(curve, memory=memory), fit.parameters.copy()
-            moved[curve.place("log reach")] = math.log(reach)
+            moved[curve.places["log reach"]] = math.log(reach)
             for friction in (other.parameters[-1] - half, other.parameters[-1] + half):
-                moved[curve.place("friction")] = friction
+                moved[curve.places["friction"]] = friction
                 opening = _open(alone, moved, blocks.amplitude)
                 low, high = min(low, opening), max(high, opening)
     identifiable = not low <= 0.0 <= high
@@ -314,12 +314,12 @@ def _with_memory(fit: CurveFit, blocks: Blocks, memory: Memory, reach: float) ->
     curve = fit.curve
     kept = [i for i, name in enumerate(curve.names) if not name.startswith(("friction", "log reach", "start"))]
     moved = fit.parameters.copy()
-    moved[curve.place("log reach")] = math.log(reach)
+    moved[curve.places["log reach"]] = math.log(reach)
     changed = replace(curve, memory=memory).branch(moved, blocks)
     branch = curve.branch(fit.parameters, blocks)
     _, slope = curve.predict(fit.parameters, blocks, branch)
     weighed = slope / np.hypot(math.hypot(blocks.twist_noise, fit.excess), slope * blocks.torque_noise)
     matrix = np.column_stack([fit.jacobian[:, kept], weighed * changed])
-    without = fit.residual - fit.parameters[curve.place("friction")] * weighed * branch
+    without = fit.residual - fit.parameters[curve.places["friction"]] * weighed * branch
     solution, *_ = np.linalg.lstsq(matrix, -without, rcond=None)
     return replace(fit, parameters=solution, residual=without + matrix @ solution, jacobian=matrix)

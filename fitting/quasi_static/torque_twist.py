@@ -52,8 +52,9 @@ def twist(
     if shape == "cubic":
         return _cubic(float(positive(-coefficients[0])), coefficients[1], torque)
     slopes = 2 if shape == "two slopes" else 3
-    compliances = positive(-coefficients[:slopes])
-    knees = np.cumsum(positive(coefficients[slopes : len(SHAPE_NAMES[shape])]))
+    signs = [-1.0] * slopes + [1.0] * (slopes - 1)
+    exponentials = np.exp(np.clip(signs * coefficients[: 2 * slopes - 1], -80.0, 80.0))
+    compliances, knees = exponentials[:slopes], np.cumsum(exponentials[slopes:])
     x = compliances[0] * torque
     slope = np.full_like(torque, compliances[0])
     for knee, before, after in zip(knees, compliances[:-1], compliances[1:], strict=True):
@@ -157,6 +158,13 @@ class Blocks:
     rows: tuple[int, ...]
     reversals: tuple[int, ...]
 
+    @cached_property
+    def centred_time(self) -> np.ndarray:
+        """Time from the middle of each block's log [s], (n,)."""
+        logs = range(len(self.names))
+        middle = np.array([0.5 * np.sum(self.time[self.log == i][[0, -1]]) for i in logs])
+        return self.time - middle[self.log]
+
     @property
     def amplitude(self) -> float:
         """Half the range of the torque [N m]."""
@@ -191,29 +199,26 @@ class Curve:
         return (*SHAPE_NAMES[self.shape], *(["torque_bias"] if self.biased else []), *each)
 
     @cached_property
-    def _places(self) -> dict[str, int]:
+    def places(self) -> dict[str, int]:
+        """Index of each parameter, by name."""
         return {name: i for i, name in enumerate(self.names)}
-
-    def place(self, name: str) -> int:
-        """Index of a parameter."""
-        return self._places[name]
 
     def reach(self, parameters: np.ndarray) -> float:
         """Torque over which the branch changes after a reversal [N m]."""
-        return float(positive(parameters[self.place("log reach")]))
+        return float(positive(parameters[self.places["log reach"]]))
 
     def elastic(
         self, parameters: np.ndarray, torque: np.ndarray, *, blur: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Twist of the spring above the twist zero [rad], and its slope, at a torque as logged."""
-        bias = parameters[self.place("torque_bias")] if self.biased else 0.0
+        bias = parameters[self.places["torque_bias"]] if self.biased else 0.0
         return twist(self.shape, parameters, torque - bias, blur=blur)
 
     def branch(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
         """Which branch each block is on, from -1 to 1, (n,)."""
         if self.memory is None:
             return np.zeros_like(blocks.torque)
-        reach, start = self.reach(parameters), self.place("start 0")
+        reach, start = self.reach(parameters), self.places["start 0"]
         each = [
             remembered(self.memory, blocks.path[blocks.path_log == i], reach, parameters[start + i])
             for i in range(self.logs)
@@ -234,20 +239,14 @@ class Curve:
             branch: From [`Curve.branch`][], where it is known already.
         """
         branch = self.branch(parameters, blocks) if branch is None else branch
-        friction = parameters[self.place("friction")] if self.memory is not None else 0.0
+        friction = parameters[self.places["friction"]] if self.memory is not None else 0.0
         x, slope = self.elastic(parameters, blocks.torque - friction * branch, blur=blocks.blur)
         return x + self.zero(parameters, blocks), slope
 
     def zero(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
         """Twist zero and drift of each block's log [rad], (n,)."""
-        x = parameters[self.place("offset 0") + blocks.log]
-        return x + parameters[self.place("drift 0") + blocks.log] * centred_time(blocks) if self.drifting else x
-
-
-def centred_time(blocks: Blocks) -> np.ndarray:
-    """Time from the middle of each block's log [s], (n,)."""
-    middle = np.array([0.5 * np.sum(blocks.time[blocks.log == i][[0, -1]]) for i in range(len(blocks.names))])
-    return blocks.time - middle[blocks.log]
+        x = parameters[self.places["offset 0"] + blocks.log]
+        return x + parameters[self.places["drift 0"] + blocks.log] * blocks.centred_time if self.drifting else x
 
 
 def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int = 200) -> tuple[np.ndarray, ...]:
@@ -270,6 +269,6 @@ def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int =
     # After two cycles the loop has closed, wherever it began.
     path = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), curve.reach(parameters), -1.0)
     closed = path[-2 * steps - 1 :]
-    friction = parameters[curve.place("friction")]
+    friction = parameters[curve.places["friction"]]
     x, _ = twist(curve.shape, parameters, way - friction * closed)
     return torque, x[: steps + 1], x[: steps - 1 : -1]
