@@ -154,7 +154,7 @@ def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
 
     if fit.chosen in ("linear", "two slopes"):
         bend = "second knee" if fit.chosen == "two slopes" else "knee"
-        why = f"held-out stretches show no {bend} up to {reach}"
+        why = f"held-out stretches do not clearly show a {bend} up to {reach}"
         if fit.undetermined is not None:
             why = "the curve bends more than the chosen one, but the logs do not determine where and how much"
         if fit.chosen == "linear":
@@ -170,7 +170,7 @@ def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
         why = "the torque does not turn back" if max(fit.blocks.reversals) == 0 else "the joint turned one way only"
         tell("hysteresis_width", "rad", "width of the loop at zero torque", why)
     if rated is None:
-        why = "it is defined by the rated torque, so give [drive] rated_torque in the drive file"
+        why = "the rated torque defines it, so give [drive] rated_torque in the drive file"
         tell("lost_motion", "rad", "twist between -4 % and +4 % of rated torque", why)
         tell("hysteresis_loss", "rad", "width of the loop at zero torque, for cycles of rated torque", why)
     else:
@@ -186,7 +186,7 @@ def _alpha_reason(fit: QuasiStaticFit, alpha: Known) -> str:
     assert alpha.ci95 is not None
     visible = max(abs(alpha.ci95[0]), abs(alpha.ci95[1]))
     reason = (
-        f"held-out stretches ask for no bend at twists up to {formatting.quantity(largest, 'rad')}, where alpha below "
+        f"held-out stretches do not clearly show a bend at twists up to {formatting.quantity(largest, 'rad')}, where alpha below "
         f"{formatting.number(visible, 2)} rad^-2 can't be seen"
     )
     if visible > _TYPICAL_ALPHA:

@@ -28,8 +28,8 @@ from fitting.quasi_static.torque_twist import (
 LOST_MOTION_SHARE = 0.04
 _RIDGE = 1e-10
 _BLIND = 1e-6
-# As for every positive parameter of a fit: known to better than a factor of about two.
-_VAGUE = 0.5
+# As for every positive parameter of a fit, whose logarithm has a standard error below 0.5: half of its 95 % interval.
+_VAGUE = 0.98
 # Beyond a factor of a thousand an interval says nothing.
 _NOT_AT_ALL = math.log(1e3)
 # Reaches that are tried for the width, over the torque's amplitude.
@@ -262,7 +262,7 @@ def _known(
         return Known(value, std, None, unit, False, description, "the logs do not determine it at all")
     if must_be_positive and value > 0:
         factor = math.exp(quantile * std / value)
-        ends, identifiable = (value / factor, value * factor), std < _VAGUE * value
+        ends, identifiable = (value / factor, value * factor), quantile * std < _VAGUE * value
         reason = "" if identifiable else f"the logs determine it only to within a factor of {factor:.2g}"
     else:
         ends = (value - quantile * std, value + quantile * std)

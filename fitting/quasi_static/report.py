@@ -92,7 +92,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     lines += [f"    {name:{width}}  {_line(one)}" for name, one in known.items()]
     lines.append("[Shapes, by held-out error]")
     for shape, account in sorted(report["shapes"].items(), key=lambda item: item[1]["rmse"]["validation"]):
-        mark = "  chosen: the simplest that does about as well as the best" if shape == report["shape"] else ""
+        mark = "  chosen" if shape == report["shape"] else ""
         lines.append(f"    {PLAIN_SHAPE[shape]:14}{account['rmse']['validation']:12.4g} rad{mark}")
     lines += [f"[Note] {note}" for note in report["cannot_tell"]]
     lines += [f"[{f['severity']}] {f['log']}: {f['where']}: {f['what']}; {f['consequence']}" for f in report["health"]]
