@@ -155,6 +155,7 @@ def turned_round() -> dict[str, np.ndarray]:
         (angles(turn=2.0), ANGLES.replace("100", "90"), 1, "reduction_ratio"),
         (angles(), ANGLES.replace("reduction_ratio = 100", ""), 2, "reduction_ratio"),
         (table() | {"joint_torque": np.full(400, 3.0)}, "", 1, "joint_torque"),
+        (table() | {"joint_torque": np.random.default_rng(1).normal(size=400)}, "", 1, "does not follow"),
         (table() | {"twist": np.full(400, 1e-3)}, "", 1, "dynamic_error"),
         (table(), '[columns]\njoint_torque = { unit = "rad" }\n', 2, "joint_torque"),
         (table(), '[columns]\njoint_torque = "torqe"\n', 2, "torqe"),

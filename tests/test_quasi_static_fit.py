@@ -87,6 +87,12 @@ def test_without_hysteresis_the_width_may_be_zero() -> None:
     assert isinstance(width, Known) and covers(width, 0.0) and not width.identifiable
 
 
+def test_an_exact_line_is_a_line() -> None:
+    fit = fit_quasi_static([cycles(torque_cycles.line, torque_cycles.no_friction, twist_noise=0.0, torque_noise=0.0)])
+    assert fit.chosen == "linear"
+    assert fit.known["linear"]["K"].value == pytest.approx(K1, rel=1e-9)
+
+
 def test_torque_that_never_turns_back_says_nothing_of_hysteresis() -> None:
     fit = fit_quasi_static([cycles(torque_cycles.line, count=0.24)])
     assert fit.best.curve.memory is None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.quasi_static.fit import QuasiStaticFit, worse
+from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.stretches import stretches
@@ -119,12 +119,11 @@ def _estimate(known: Known) -> dict[str, Any]:
 
 
 def _alternative(fit: QuasiStaticFit, shape: Shape) -> dict[str, Any]:
-    one, other = fit.held_out[shape], fit.held_out[fit.chosen]
     return {
         "family": "stiffness_shape",
         "name": shape,
-        "validation_rmse": float(np.sqrt(np.mean(one**2))),
-        "separable": worse(one, other, fit.stretch) or worse(other, one, fit.stretch),
+        "validation_rmse": float(np.sqrt(np.mean(fit.held_out[shape] ** 2))),
+        "separable": fit.is_worse(shape, fit.chosen) or fit.is_worse(fit.chosen, shape),
         "separating_experiment": _SEPARATING,
     }
 
@@ -186,8 +185,8 @@ def _alpha_reason(fit: QuasiStaticFit, alpha: Known) -> str:
     assert alpha.ci95 is not None
     visible = max(abs(alpha.ci95[0]), abs(alpha.ci95[1]))
     reason = (
-        f"held-out stretches do not clearly show a bend at twists up to {formatting.quantity(largest, 'rad')}, where alpha below "
-        f"{formatting.number(visible, 2)} rad^-2 can't be seen"
+        f"held-out stretches do not clearly show a bend at twists up to {formatting.quantity(largest, 'rad')}, where "
+        f"alpha below {formatting.number(visible, 2)} rad^-2 can't be seen"
     )
     if visible > _TYPICAL_ALPHA:
         # At the same noise the twist of the cubic term grows with the cube of the twist.

@@ -47,7 +47,11 @@ class QuasiStaticFit:
     def undetermined(self) -> Shape | None:
         """A shape that predicts held-out stretches clearly better, but whose figures the logs do not determine."""
         least = min(SHAPES, key=lambda shape: float(np.mean(self.held_out[shape] ** 2)))
-        return least if worse(self.held_out[self.chosen], self.held_out[least], self.stretch) else None
+        return least if self.is_worse(self.chosen, least) else None
+
+    def is_worse(self, one: Shape, other: Shape) -> bool:
+        """Whether the first shape predicts held-out stretches clearly worse than the second."""
+        return worse(self.held_out[one], self.held_out[other], self.stretch, self.blocks.twist_noise)
 
 
 def fit_quasi_static(
@@ -73,7 +77,7 @@ def fit_quasi_static(
     known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
     stretch = stretches(fits["three slopes"].residual, blocks.log)
     held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
-    return QuasiStaticFit(blocks, fits, known, held_out, stretch, _choice(known, held_out, stretch))
+    return QuasiStaticFit(blocks, fits, known, held_out, stretch, _choice(known, held_out, stretch, blocks.twist_noise))
 
 
 def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
@@ -91,7 +95,9 @@ def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
     return misfit
 
 
-def _choice(known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarray], stretch: np.ndarray) -> Shape:
+def _choice(
+    known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarray], stretch: np.ndarray, noise: float
+) -> Shape:
     """The first shape whose held-out error is not clearly above the least, in the order from simple to flexible.
 
     A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
@@ -101,15 +107,19 @@ def _choice(known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarr
         if all(one.identifiable for name, one in known[shape].items() if _is_of_shape(name)):
             able.append(shape)
     least = min(able, key=lambda shape: float(np.mean(held_out[shape] ** 2)))
-    return next(s for s in able if s == least or not worse(held_out[s], held_out[least], stretch))
+    return next(s for s in able if s == least or not worse(held_out[s], held_out[least], stretch, noise))
 
 
 def _is_of_shape(name: str) -> bool:
     return name[0] in "KT" or name == "alpha"
 
 
-def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray) -> bool:
-    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %."""
+def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float) -> bool:
+    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %.
+
+    A difference of less than a hundredth of the noise's variance is none, or rounding would choose among exact fits.
+    """
     excess = np.bincount(stretch, one**2 - other**2)
     error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
-    return float(np.mean(excess)) > float(student.ppf(0.95, len(excess) - 1)) * error
+    clear = float(np.mean(excess)) > float(student.ppf(0.95, len(excess) - 1)) * error
+    return clear and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

@@ -11,6 +11,7 @@ from fitting.errors import DataError
 from fitting.findings import Finding
 from fitting.health import FREE_MOTION, examine, refuse_unfit
 from fitting.logs import SHORTEST, Log
+from fitting.quasi_static.blocks import means
 
 Motion = Literal["held", "one way", "both ways", "unknown"]
 
@@ -18,7 +19,8 @@ Motion = Literal["held", "one way", "both ways", "unknown"]
 LARGEST_TWIST = 0.1
 # Assumed: the part of the typical speed above which friction is that of steady motion.
 _STEADY = 0.7
-_CLEARLY_WRONG = -0.5
+# Correlation of means over a hundredth of the log; even a wide loop stays above it.
+_UNRELATED = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,14 @@ def _refuse_mix_ups(log: Log) -> None:
             f"{log.path}: the twist spans {span:.3g} rad, which is more than the {LARGEST_TWIST} rad that any gear "
             f"bears; {remedy}"
         )
-    if np.corrcoef(torque, twist)[0, 1] < _CLEARLY_WRONG:
+    size = max(1, len(log) // 100)
+    likeness = float(np.corrcoef(means(torque, size), means(twist, size))[0, 1])
+    if abs(likeness) < _UNRELATED:
+        raise DataError(
+            f"{log.path}: the twist does not follow the joint torque (their correlation is {likeness:.2g}); check which "
+            "columns they are, or record larger torque cycles"
+        )
+    if likeness < 0:
         raise DataError(
             f"{log.path}: the twist falls where the joint torque rises; give one of the two sign = -1 in [columns]"
         )
