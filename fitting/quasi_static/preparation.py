@@ -82,11 +82,13 @@ def _refuse_mix_ups(log: Log) -> None:
             f"bears; {remedy}"
         )
     size = max(1, len(log) // 100)
-    likeness = float(np.corrcoef(means(torque, size), means(twist, size))[0, 1])
+    with np.errstate(invalid="ignore"):
+        # Means that never change have no correlation.
+        likeness = float(np.nan_to_num(np.corrcoef(means(torque, size), means(twist, size))[0, 1]))
     if abs(likeness) < _UNRELATED:
         raise DataError(
-            f"{log.path}: the twist does not follow the joint torque (their correlation is {likeness:.2g}); check which "
-            "columns they are, or record larger torque cycles"
+            f"{log.path}: the twist does not follow the joint torque (their correlation is {likeness:.2g}); check "
+            "which columns they are, or record larger torque cycles"
         )
     if likeness < 0:
         raise DataError(
