@@ -23,18 +23,22 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
-from fitting.drive_file import read_drive_file
+from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.experiment import Stretch
 from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
-from fitting.logs import read_log
+from fitting.logs import Log, read_log
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.quasi_static import content as quasi_static_content
+from fitting.quasi_static import report as quasi_static_report
+from fitting.quasi_static.fit import fit_quasi_static
+from fitting.quasi_static.preparation import prepare
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import Rig, experiment, read_rig
+from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiment, read_rig, refuse_mixed, rig_of
 from hdjax import (
     PRESETS,
     Chirp,
@@ -66,17 +70,41 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
     Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
-    run that was cut off goes on where it stopped.
+    run that was cut off goes on where it stopped. Quasi-static logs (twist and joint torque) give stiffness, knees, hysteresis and
+    lost motion instead.
 
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json; of a folder of logs for fleet.parquet.
+        Folder for report.html, report.json and, but for quasi-static logs, model.json; of a folder of logs for
+        fleet.parquet.
     """
     if any(path.is_dir() for path in logs):
         _fit_fleet(logs, drive, out)
         return
-    rig = read_rig(logs, drive)
+    drive_file = read_drive_file(drive)
+    read = tuple(read_log(path, drive_file) for path in logs)
+    refuse_mixed(read)
+    if read[0].kind == "quasi-static":
+        _fit_quasi_static(read, drive_file, out)
+    else:
+        _fit_drive(rig_of(read, drive_file), out)
+
+
+def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
+    with _progress() as progress:
+        progress("fitting torque-twist curves")
+        data = prepare(logs, drive_file)
+        found = fit_quasi_static(
+            data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion
+        )
+        report = quasi_static_content.report_dict(data, found)
+    paths = quasi_static_report.write_report(out, report, found)
+    print(quasi_static_report.report_text(report))
+    print(f"Report: {paths['report.html']}")
+
+
+def _fit_drive(rig: Rig, out: Path) -> None:
     with _progress() as progress:
         fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, progress=progress)
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
@@ -89,9 +117,9 @@ def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
     if len(folders) > 1:
         raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
     read_drive_file(drive)
-    with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=Console(stderr=True)) as bar:
-        # In a pipe nothing is shown.
-        bar.disable = not bar.console.is_terminal
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("logs", total=None)
         table = fit_fleet(
             folders[0], drive, out, progress=lambda done, total: bar.update(task, completed=done, total=total)
@@ -149,6 +177,8 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     stored = read_model(model)
     drive_file = read_drive_file(drive)
     read = read_log(log, drive_file, outputs_until=WINDOW)
+    if read.kind == "quasi-static":
+        raise InputError(f"{log}: {WHY_NOT_QUASI_STATIC}")
     if (read.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
             f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"

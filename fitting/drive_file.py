@@ -23,8 +23,10 @@ SIGNALS = (
     "dynamic_error",
     "forcing",
     "motor_velocity",
+    "twist",
+    "joint_torque",
 )
-_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2"}
+_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2", "rated_torque": "N m"}
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
     "signals": ("torque_hold", "sample_rate"),
@@ -60,6 +62,7 @@ class DriveFile:
         torque_hold: What the torque does between samples, one of `HOLDS`, or None.
         sample_rate: Samples per second [Hz] of a log without time column, or None.
         columns: Signal name to its place in the log, only where the drive file states it.
+        rated_torque: At the output [N m], or None; lost motion is defined by it.
     """
 
     path: Path
@@ -70,6 +73,7 @@ class DriveFile:
     torque_hold: Hold | None
     sample_rate: float | None
     columns: dict[str, ColumnMap]
+    rated_torque: float | None = None
 
     def column_of(self, signal: str) -> ColumnMap:
         """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""

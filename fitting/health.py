@@ -22,7 +22,8 @@ DISTINCT_SHARE = 0.2
 COARSE_STEP = 0.1
 FEWEST = 50
 
-_UNITS = {"motor_torque": "N m", "load_torque": "N m", "motor_angle": "rad", "load_angle": "rad"}
+_INPUTS = {"drive": "motor_torque", "reduced": "forcing", "quasi-static": "joint_torque"}
+_UNITS = {"motor_torque": "N m", "load_torque": "N m", "joint_torque": "N m", "motor_angle": "rad", "load_angle": "rad"}
 
 
 def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
@@ -36,7 +37,7 @@ def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
         The findings of the reader, then those of the checks; refusals are among them.
     """
     checks = [_jitter(log), _excitation(log), _response(log), _channels(log, drive_file)]
-    if log.kind == "drive":
+    if log.motor_angle is not None and log.load_angle is not None:
         checks += [_wrapped(log), _ratio(log, drive_file), _velocity(log)]
     return (*log.findings, *(finding for check in checks for finding in check))
 
@@ -83,7 +84,7 @@ def _jitter(log: Log) -> Iterator[Finding]:
 
 
 def _excitation(log: Log) -> Iterator[Finding]:
-    name = "motor_torque" if log.kind == "drive" else "forcing"
+    name = _INPUTS[log.kind]
     values = _known(log, name)
     if values is None or not _is_constant(values):
         return
@@ -114,13 +115,13 @@ def _response(log: Log) -> Iterator[Finding]:
 
 
 def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
-    inputs = ("motor_torque", "load_torque") if log.kind == "drive" else ("forcing",)
+    inputs = ("motor_torque", "load_torque") if log.kind == "drive" else (_INPUTS[log.kind],)
     for name in inputs:
         values = _known(log, name)
         if values is not None and not _is_constant(values):
             yield from _clipped(name, values, None)
             yield from _quantised(log, name, values, 1.0, float(np.std(values)))
-    if log.kind == "reduced":
+    if log.kind != "drive":
         twist = _known(log, "dynamic_error")
         assert twist is not None
         if not _is_constant(twist):

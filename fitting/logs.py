@@ -19,9 +19,12 @@ from fitting.unit_strings import UnitError, convert, to_base
 
 DRIVE_SIGNALS = ("motor_angle", "load_angle", "motor_torque")
 REDUCED_SIGNALS = ("dynamic_error", "forcing")
+TWIST_SIGNALS = (("twist",), ("dynamic_error",), ("motor_angle", "load_angle"), ("load_angle",))
 OUTPUTS = ("motor_angle", "load_angle", "dynamic_error")
 OPTIONAL_SIGNALS = ("load_torque", "temperature")
 SHORTEST = 200
+
+Kind = Literal["drive", "reduced", "quasi-static"]
 
 _SI = {
     "time": "s",
@@ -31,9 +34,17 @@ _SI = {
     "load_torque": "N m",
     "temperature": "K",
     "motor_velocity": "rad/s",
+    "twist": "rad",
+    "joint_torque": "N m",
 }
 _UNSTATED = {"dynamic_error": "rad", "forcing": "rad/s^2"}
 _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
+_UNTIMED = Finding(
+    "note",
+    "there is no time column",
+    "time",
+    "the rows are taken to be in order of time, and a drift is counted per row",
+)
 _GAP = 5.0  # median steps, assumed; above it the hold of the torque is anybody's guess
 
 
@@ -44,7 +55,8 @@ class Log:
     Attributes:
         name: Stem of the file.
         path: The file.
-        kind: "drive" (angles and torque) or "reduced" (dynamic error and forcing).
+        kind: "drive" (angles and torque), "reduced" (dynamic error and forcing) or "quasi-static" (twist and joint
+            torque).
         time: Stamps [s], strictly increasing, in the file's own origin, (n,).
         motor_angle: theta_m [rad], (n,), or None for a reduced log.
         load_angle: theta_l [rad], (n,), or None.
@@ -58,11 +70,13 @@ class Log:
         motor_velocity: theta_m' [rad/s] as logged, (n,), or None; only checked against.
         outputs_until: Rows in which the output columns are known, or None for all. Later
             outputs may be NaN and nothing may look at them.
+        joint_torque: That the drive passes on [N m], positive where it twists the drive positively, (n,), or None
+            but for a quasi-static log.
     """
 
     name: str
     path: Path
-    kind: Literal["drive", "reduced"]
+    kind: Kind
     time: np.ndarray
     motor_angle: np.ndarray | None
     load_angle: np.ndarray | None
@@ -75,6 +89,7 @@ class Log:
     findings: tuple[Finding, ...] = ()
     motor_velocity: np.ndarray | None = None
     outputs_until: int | None = None
+    joint_torque: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -100,7 +115,7 @@ def read_log(path: str | PathLike[str], drive_file: DriveFile, *, outputs_until:
     table = read_table(path, [drive_file.column_of(signal).column for signal in SIGNALS])
     raw = {s: table.columns[c] for s in SIGNALS if (c := drive_file.column_of(s).column) in table.columns}
     kind = _kind(path, drive_file, table, raw)
-    used = [*(DRIVE_SIGNALS if kind == "drive" else REDUCED_SIGNALS), *OPTIONAL_SIGNALS]
+    used = [*_needed(kind, raw), *OPTIONAL_SIGNALS]
     used = [signal for signal in used if signal in raw]
     _refuse_unequal(path, drive_file, raw, used)
     start, stop = _inhabited(path, [raw[signal] for signal in used])
@@ -119,8 +134,14 @@ def read_log(path: str | PathLike[str], drive_file: DriveFile, *, outputs_until:
         if signal != "motor_velocity":
             _refuse_holes(path, drive_file, signal, raw[signal], start, rows)
         signals[signal], units[signal] = _to_si(path, drive_file, signal, raw[signal], start, stop)
-    time, time_findings = _time(path, drive_file, table, raw.get("time"), start, stop)
-    if kind == "drive":
+    if kind == "quasi-static" and "time" not in raw and not (drive_file.sample_rate or table.sample_rate):
+        # The curve does not depend on the rate; only a drift is then counted per row.
+        time, time_findings = np.arange(start, stop, dtype=float), (_UNTIMED,)
+    else:
+        time, time_findings = _time(path, drive_file, table, raw.get("time"), start, stop)
+    if kind == "quasi-static":
+        twist, units = _twist(path, drive_file, signals), {"dynamic_error": "rad"}
+    elif kind == "drive":
         assert drive_file.reduction_ratio is not None
         twist = signals["motor_angle"] / drive_file.reduction_ratio - signals["load_angle"]
         units = {"dynamic_error": "rad"}
@@ -145,10 +166,37 @@ def read_log(path: str | PathLike[str], drive_file: DriveFile, *, outputs_until:
         findings=(*findings, *time_findings),
         motor_velocity=signals.get("motor_velocity"),
         outputs_until=outputs_until,
+        joint_torque=signals.get("joint_torque") if kind == "quasi-static" else None,
     )
 
 
-def _kind(path: Path, drive_file: DriveFile, table: LogTable, raw: dict[str, RawColumn]) -> Literal["drive", "reduced"]:
+def _needed(kind: Kind, raw: dict[str, RawColumn]) -> tuple[str, ...]:
+    if kind == "quasi-static":
+        return (*_twist_signals(raw), "joint_torque")
+    return DRIVE_SIGNALS if kind == "drive" else REDUCED_SIGNALS
+
+
+def _twist_signals(raw: dict[str, RawColumn]) -> tuple[str, ...]:
+    """What the twist is made of in a quasi-static log; nothing where it is not there."""
+    return next((signals for signals in TWIST_SIGNALS if all(s in raw for s in signals)), ())
+
+
+def _twist(path: Path, drive_file: DriveFile, signals: dict[str, np.ndarray]) -> np.ndarray:
+    """Twist [rad] of a quasi-static log."""
+    if "load_angle" not in signals:
+        return signals["twist"] if "twist" in signals else signals["dynamic_error"]
+    if "motor_angle" not in signals:
+        # A locked motor: the output turns by the twist alone, against it.
+        return -signals["load_angle"]
+    if drive_file.reduction_ratio is None:
+        raise InputError(
+            f"{drive_file.path}: [drive] reduction_ratio is missing, which the motor and load angles of {path} need to "
+            "become a twist; add it"
+        )
+    return signals["motor_angle"] / drive_file.reduction_ratio - signals["load_angle"]
+
+
+def _kind(path: Path, drive_file: DriveFile, table: LogTable, raw: dict[str, RawColumn]) -> Kind:
     stated_but_absent = [s for s in drive_file.columns if s not in raw]
     if stated_but_absent:
         signal = stated_but_absent[0]
@@ -162,6 +210,11 @@ def _kind(path: Path, drive_file: DriveFile, table: LogTable, raw: dict[str, Raw
     if is_drive and is_reduced:
         # A drive log may carry a derived dynamic error; only a stated one displaces the angles.
         is_drive = not all(signal in drive_file.columns for signal in REDUCED_SIGNALS)
+    if "joint_torque" in raw and _twist_signals(raw):
+        stated = drive_file.columns
+        only_stated = "joint_torque" in stated and not ("motor_torque" in stated or "forcing" in stated)
+        if only_stated or not (is_drive or is_reduced):
+            return "quasi-static"
     if is_drive:
         for key in _DRIVE_KEYS:
             if getattr(drive_file, key) is None:

@@ -13,6 +13,11 @@ from fitting.health import examine, refuse_unfit
 from fitting.logs import Log, read_log
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 
+WHY_NOT_QUASI_STATIC = (
+    "a quasi-static log holds nothing of the resonance, so that there is no motion to simulate; `hdjax fit` finds its "
+    "stiffness and hysteresis, and for the rest record a drive log with motor torque"
+)
+
 
 class Rig(eqx.Module):
     """One drive and its logs.
@@ -44,12 +49,14 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
         DataError: for logs that can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
-    logs = tuple(read_log(path, drive_file) for path in log_paths)
-    kinds = {log.kind for log in logs}
-    if len(kinds) > 1:
-        raise InputError(
-            f"{log_paths[0]} and the other logs: drive logs and reduced logs can't be fitted together; run them apart"
-        )
+    return rig_of(tuple(read_log(path, drive_file) for path in log_paths), drive_file)
+
+
+def rig_of(logs: tuple[Log, ...], drive_file: DriveFile) -> Rig:
+    """[`read_rig`][] for logs that have been read."""
+    refuse_mixed(logs)
+    if logs[0].kind == "quasi-static":
+        raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
     findings = {}
     for log in logs:
         findings[log.name] = examine(log, drive_file)
@@ -63,6 +70,19 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
         findings=findings,
         error_unit=logs[0].units.get("dynamic_error", "rad"),
     )
+
+
+def refuse_mixed(logs: Sequence[Log]) -> None:
+    """Nothing when all logs are of one kind.
+
+    Raises:
+        InputError: They are of several kinds.
+    """
+    kinds = sorted({log.kind for log in logs})
+    if len(kinds) > 1:
+        raise InputError(
+            f"{logs[0].path} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
+        )
 
 
 def base_model(drive_file: DriveFile, log: Log) -> Model:
