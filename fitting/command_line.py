@@ -70,8 +70,8 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
     Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
-    run that was cut off goes on where it stopped. Quasi-static logs (twist and joint torque) give stiffness, knees, hysteresis and
-    lost motion instead.
+    run that was cut off goes on where it stopped. Quasi-static logs (twist and joint torque) give stiffness, knees,
+    hysteresis and lost motion instead.
 
     Parameters
     ----------
