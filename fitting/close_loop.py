@@ -39,6 +39,9 @@ from hdjax.effects import CATALOGUE, Effect
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
 _LONG_STEPS = 20
+# By how many standard errors the steps of the final fit may move its parameters, and how many steps a sample may take.
+_SHIFT = 0.2
+_MOST_SUBSTEPS = 32
 # What the long fit may cost on short segments, in the objective: 2 % of the error.
 _LONG_LOSS = 0.02
 # Starts that are fitted in full; more than these are compared as they are first.
@@ -151,10 +154,10 @@ def close_loop(
     final = _long_fit(current, training, setting)
     clock.lap("final fit")
     progress("free runs on held-out data")
-    before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
-    after = before
+    after = account(final, training, validation, noise=noise, halo=setting.halo)
+    before = after
     if current is not base:
-        after = account(final, training, validation, noise=noise, halo=setting.halo)
+        before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
     findings = _findings(base, current, rounds, data, setting, before, after, noise)
     clock.lap("free runs")
     return Loop(
@@ -169,7 +172,7 @@ def close_loop(
         residual_after=diagnose(current.training),
         hold=current.hold,
         setting=setting,
-        after_substeps=current.training.substeps,
+        after_substeps=final.substeps,
         stretches=(training, validation),
         seconds=clock.laps,
     )
@@ -281,6 +284,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
     """
     start = current.training
     longest = max(len(s) for s in training)
+    substeps = needed_substeps(start, shift=_SHIFT, most=_MOST_SUBSTEPS)
     long = fit(
         current.model,
         training,
@@ -288,7 +292,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         horizon=longest,
         length=segment_length(setting.horizon),
         halo=setting.halo,
-        substeps=start.substeps,
+        substeps=substeps,
         covariance=start.covariance,
         count=setting.count,
         states=start.unknowns.states,
@@ -300,7 +304,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         start.free.paths,
         horizon=setting.horizon,
         halo=setting.halo,
-        substeps=start.substeps,
+        substeps=substeps,
         count=setting.count,
         covariance=start.covariance,
         hold_parameters=True,

@@ -10,12 +10,13 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
+from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, project
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import FreeParameters, free_parameters
 from fitting.residual import (
     Problem,
     Unknowns,
+    linearise,
     residual,
     residual_with_blocks,
 )
@@ -382,22 +383,37 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
     return total / samples * (rows / (rows - len(found.model.motion_states)))
 
 
-def needed_substeps(found: Fit, *, tolerance: float = 0.05, most: int = 8) -> int:
+def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:
     """Solver steps in a sample interval that keep the step error below a fraction of the residual.
 
     Args:
         found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
         tolerance: largest rms difference in units of the residual's standard deviation.
+        shift: by how many standard errors the difference may move the parameters. An error too small to be seen in a
+            sample adds up over all of them.
         most: where to stop.
     """
     problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
     substeps = found.substeps
+    columns = project(linearise(problem, found.unknowns), problem.segments.joined) if np.isfinite(shift) else None
     error, _, _ = _evaluate(problem, found.unknowns)
     while substeps < most:
         better, _, _ = _evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns)
-        white = np.asarray(better - error) @ np.asarray(problem.whitening).T
-        mean_square = (white**2).sum(axis=(0, 1)) / float(problem.segments.count)
-        if np.sqrt(mean_square.max()) < tolerance:
+        white = (better - error) @ problem.whitening.T
+        mean_square = float(jnp.max(jnp.sum(white**2, axis=(0, 1)) / problem.segments.count))
+        moved = 0.0 if columns is None else _standard_errors_moved(columns, white)
+        if np.sqrt(mean_square) < tolerance and moved < shift:
             break
         substeps, error = 2 * substeps, better
     return substeps
+
+
+def _standard_errors_moved(columns: Array, white: Array) -> float:
+    """How far a whitened output error would move the parameters, in standard errors of their joint estimate."""
+    rows = white.reshape(white.shape[0], -1)
+    columns = columns[:, : rows.shape[1]]
+    gradient = np.asarray(jnp.einsum("srp,sr->p", columns, rows))
+    information = np.asarray(jnp.einsum("srp,srq->pq", columns, columns))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    return float(np.sqrt(max(0.0, (scale * gradient) @ inverse @ (scale * gradient))))
