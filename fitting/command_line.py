@@ -30,10 +30,11 @@ from fitting.experiment import Stretch, split
 from fitting.files import write_whole
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import read_log
+from fitting.masks import masked
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import Rig, experiment, read_rig
+from fitting.rig import Rig, experiments, read_rig
 from hdjax import (
     PRESETS,
     Chirp,
@@ -54,7 +55,9 @@ app.command(amplitudes)
 app.command(seed_tables)
 app.command(speeds)
 
-Logs = Annotated[list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5 or Parquet.", negative="")]
+Logs = Annotated[
+    list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
+]
 DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
 
 
@@ -131,12 +134,12 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     """
     stored = read_model(model)
     drive_file = read_drive_file(drive)
-    read = read_log(log, drive_file, outputs_until=WINDOW)
+    read = masked(read_log(log, drive_file, outputs_until=WINDOW))
     if (read.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
             f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"
         )
-    ready = experiment(read, drive_file, stored.hold)
+    (ready,) = experiments(read, drive_file, stored.hold)
     (run,) = free_run(
         stored.model,
         [Stretch(ready, 0, len(ready))],
@@ -146,7 +149,11 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     )
     if not np.isfinite(run.predicted).all():
         raise DataError(f"{log}: the model's free run leaves the numbers; check the torque column's unit and sign")
-    _write_table(out, {"time": run.time, "dynamic_error": run.predicted})
+    rows = slice(None) if ready.rows is None else ready.rows
+    _write_table(out, {"time": run.time[rows], "dynamic_error": run.predicted[rows]})
+    for finding in read.findings:
+        if finding.severity == "warning":
+            print(f"hdjax: {log}: {finding}", file=sys.stderr)
     print(f"Prediction: {out}")
 
 
