@@ -29,12 +29,10 @@ from fitting.estimate import measurement_noise
 from fitting.experiment import Stretch, split
 from fitting.files import write_whole
 from fitting.free_run import WINDOW, free_run
-from fitting.logs import read_log
-from fitting.masks import masked
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import Rig, experiments, read_rig
+from fitting.rig import Rig, experiments, read_rig, ready_log
 from hdjax import (
     PRESETS,
     Chirp,
@@ -134,7 +132,7 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     """
     stored = read_model(model)
     drive_file = read_drive_file(drive)
-    read = masked(read_log(log, drive_file, outputs_until=WINDOW))
+    read = ready_log(log, drive_file, outputs_until=WINDOW)
     if (read.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
             f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"
@@ -150,7 +148,7 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     if not np.isfinite(run.predicted).all():
         raise DataError(f"{log}: the model's free run leaves the numbers; check the torque column's unit and sign")
     rows = slice(None) if ready.rows is None else ready.rows
-    _write_table(out, {"time": run.time[rows], "dynamic_error": run.predicted[rows]})
+    _write_table(out, {"time": run.time[rows], "dynamic_error": run.predicted[rows] + read.zero})
     for finding in read.findings:
         if finding.severity == "warning":
             print(f"hdjax: {log}: {finding}", file=sys.stderr)

@@ -115,7 +115,7 @@ def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     for name in inputs:
         values = _known(log, name)
         if values is not None and not _is_constant(values):
-            yield from _inputs(name, values)
+            yield from _inputs(name, values, log.time)
             yield from _quantised(log, name, values, 1.0, float(np.std(values)))
     if log.kind == "reduced":
         twist = _known(log, "dynamic_error")
@@ -133,7 +133,7 @@ def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
         yield from _quantised(log, name, values, side, spread)
 
 
-def _inputs(name: str, values: np.ndarray) -> Iterator[Finding]:
+def _inputs(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
     """What is odd about an input; it acts in the fit as it was logged all the same."""
     for rows, level, count in clipped(values, None):
         yield Finding(
@@ -142,7 +142,7 @@ def _inputs(name: str, values: np.ndarray) -> Iterator[Finding]:
             f"{name}, first in data row {rows[0] + 1}",
             "the channel looks clipped, which bends stiffness and damping unless the drive was at its limit",
         )
-    spikes = glitches(values)
+    spikes = glitches(values, time)
     if len(spikes):
         yield Finding(
             "note",

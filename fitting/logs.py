@@ -31,9 +31,6 @@ VELOCITIES = ("motor_velocity", "load_velocity")
 _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
 _SLOWEST = 60.0  # s between samples; no drive's resonance is that slow, but nanoseconds taken for seconds are
 _FEWEST_INPUTS = 50
-_LARGEST_TWIST = 0.02  # rad, more than any gear twists, assumed
-_OFFSET = 3.0  # standard deviations, assumed
-_NO_MEAN = 0.1  # likewise, of an input
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +47,7 @@ class Log:
         motor_torque: T_m [N m], (n,), or None.
         load_torque: T_l [N m], positive along +theta_l, (n,), or None.
         temperature: [K], (n,), or None.
-        dynamic_error: x, (n,); theta_m/N - theta_l [rad] in a drive log, less an offset that no torque explains.
+        dynamic_error: x, (n,); theta_m/N - theta_l [rad] in a drive log, less `zero`.
         forcing: F, (n,), or None for a drive log.
         units: Units of `dynamic_error` and, in a reduced log, of `forcing`.
         findings: What was seen while reading; `health.examine` adds to it.
@@ -60,6 +57,7 @@ class Log:
         trusted: Rows whose outputs were measured and are believed, (n,), or None for all. Others hold something finite.
         input_known: Rows in which motor torque or forcing was sampled, (n,), or None for all.
         pieces: First row and one past the last of each stretch between gaps, or None for the whole log.
+        zero: What was taken off the dynamic error, since no torque explains it.
     """
 
     name: str
@@ -81,6 +79,7 @@ class Log:
     trusted: np.ndarray | None = None
     input_known: np.ndarray | None = None
     pieces: tuple[tuple[int, int], ...] | None = None
+    zero: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time)
@@ -162,7 +161,6 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None) -> Log:
     else:
         twist = signals["dynamic_error"]
         units = {signal: channels[signal].unit for signal in REDUCED_SIGNALS}
-    offset, told = _offset(twist[trusted], signals[input_name], kind, units["dynamic_error"])
     log = Log(
         name=path.stem,
         path=path,
@@ -173,10 +171,10 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None) -> Log:
         motor_torque=signals.get("motor_torque"),
         load_torque=signals.get("load_torque"),
         temperature=signals.get("temperature"),
-        dynamic_error=twist - offset,
+        dynamic_error=twist,
         forcing=signals.get("forcing"),
         units=units,
-        findings=(*findings, *told),
+        findings=tuple(findings),
         motor_velocity=signals.get("motor_velocity"),
         load_velocity=signals.get("load_velocity"),
         outputs_until=outputs_until,
@@ -280,27 +278,6 @@ def _interpolate(
         if not known.all():
             signals[name] = np.interp(time, time[known], signals[name][known])
     return tuple(findings)
-
-
-def _offset(twist: np.ndarray, torque: np.ndarray, kind: str, unit: str) -> tuple[float, tuple[Finding, ...]]:
-    """What two encoders that were never zeroed together add to the twist.
-
-    A spring that is held away from zero needs a mean torque, and no gear twists by more than a degree; what neither
-    explains is an offset. A smaller one can't be told from a load, and stays.
-    """
-    mean, spread = float(np.median(twist)), float(np.std(twist))
-    unexplained = abs(float(np.mean(torque))) < _NO_MEAN * float(np.std(torque)) and abs(mean) > _OFFSET * spread > 0
-    impossible = kind == "drive" and abs(mean) > _LARGEST_TWIST and abs(mean) > _OFFSET * spread
-    if not (unexplained or impossible):
-        return 0.0, ()
-    finding = Finding(
-        "warning" if not unexplained else "note",
-        f"the dynamic error stands {mean:.4g} {unit} off zero, around which it moves by {spread:.3g} {unit} rms",
-        "dynamic_error",
-        "the sensors were not zeroed together, so that its median was taken as zero; K is as good as ever, but a "
-        "preload is lost, and alpha is that around the median",
-    )
-    return mean, (finding,)
 
 
 def _kind(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, RawColumn]) -> Literal["drive", "reduced"]:

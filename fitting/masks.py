@@ -15,6 +15,7 @@ DROPOUT = 40.0  # likewise, of what stands out from eleven neighbours
 LONGEST_DROPOUT = 5
 CLIFF = 5.0  # times the steps around
 PATTERN = 0.13
+EVEN = 0.1  # of a step
 CLIPPED_SHARE = 0.002
 FROZEN_SHARE = 0.05
 FEWEST = 50
@@ -49,20 +50,20 @@ def _untrusted(log: Log) -> Iterator[tuple[np.ndarray, Finding]]:
     known = np.ones(len(log), dtype=bool) if log.trusted is None else log.trusted
     known = known[:until]
     if log.kind == "reduced":
-        yield from _of_channel("dynamic_error", log.dynamic_error[:until], None, known)
+        yield from _of_channel("dynamic_error", log.dynamic_error[:until], None, known, log.time[:until])
         return
     assert log.motor_angle is not None and log.load_angle is not None
     motor, load = log.motor_angle[:until], log.load_angle[:until]
-    yield from _of_channel("motor_angle", motor, load, known)
-    yield from _of_channel("load_angle", load, motor, known)
+    yield from _of_channel("motor_angle", motor, load, known, log.time[:until])
+    yield from _of_channel("load_angle", load, motor, known, log.time[:until])
 
 
 def _of_channel(
-    name: str, values: np.ndarray, other: np.ndarray | None, known: np.ndarray
+    name: str, values: np.ndarray, other: np.ndarray | None, known: np.ndarray, time: np.ndarray
 ) -> Iterator[tuple[np.ndarray, Finding]]:
     if len(values) < 12 or np.all(values == values[0]):
         return
-    spikes = np.setdiff1d(glitches(values), np.flatnonzero(~known))
+    spikes = np.setdiff1d(glitches(values, time), np.flatnonzero(~known))
     if len(spikes):
         yield (
             spikes,
@@ -106,7 +107,7 @@ def _without(values: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return kept, values[kept]
 
 
-def glitches(values: np.ndarray) -> np.ndarray:
+def glitches(values: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Rows whose value is an outlier to its neighbours, singly or a few in a row.
 
     A smooth motion, however quick, is foretold by a cubic through the neighbours; a real impact is a kink in the angle,
@@ -114,13 +115,17 @@ def glitches(values: np.ndarray) -> np.ndarray:
 
     Args:
         values: of one channel, (n,), finite.
+        time: its stamps [s], (n,); where they jitter, a lone sample is not judged.
     """
     found = np.zeros(len(values), dtype=bool)
     padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
     foretold = (4 * (padded[1:-3] + padded[3:-1]) - padded[:-4] - padded[4:]) / 6
     off = values - foretold
     scale = _spread(off)
-    size = np.abs(off)
+    step = np.pad(np.diff(time), (2, 3), mode="edge")
+    uneven = np.abs(step / np.median(step) - 1) > EVEN
+    uneven = np.lib.stride_tricks.sliding_window_view(uneven, 5)[: len(values)].any(axis=1)
+    size = np.where(uneven, 0.0, np.abs(off))
     for k in np.flatnonzero(size > SPIKE * scale) if scale > 0 else ():
         if not 2 <= k < len(values) - 2 or size[k] < size[k - 2 : k + 3].max():
             continue

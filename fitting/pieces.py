@@ -15,7 +15,7 @@ _LATE = 1.5  # typical steps; what is longer lacks a sample, where the sampling 
 _GAP = 5.0  # likewise, where the sampling jitters
 _LONGEST_BRIDGE = 16
 _BRIDGE_ERROR = 0.02
-_ENOUGH = 0.5
+_ENOUGH = 0.9
 
 
 class Sampling:
@@ -33,8 +33,13 @@ class Sampling:
         step = np.diff(time)
         self.step = float(np.median(step))
         regular = np.mean(np.abs(step / self.step - 1) < _REGULAR) > 0.9
-        self.gaps = np.flatnonzero(step > (_LATE if regular else _GAP) * self.step)
-        self.missing = np.maximum(1, np.rint(np.minimum(step[self.gaps] / self.step, 1e9)) - 1).astype(int)
+        steps = np.minimum(step / self.step, 1e9)
+        # A late stamp has a long step before it and a short one behind it; nothing is missing there.
+        around = np.pad(steps, 1, constant_values=1.0)
+        lacking = np.rint(around[:-2] + around[1:-1] + around[2:]) - 3
+        lacking = np.where(steps > _GAP, np.rint(steps) - 1, np.minimum(lacking, np.rint(steps) - 1))
+        self.gaps = np.flatnonzero((steps > (_LATE if regular else _GAP)) & (lacking > 0))
+        self.missing = lacking[self.gaps].astype(int)
 
 
 def bridged(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from fitting.findings import Finding
 from fitting.health import examine, refuse_unfit
 from fitting.logs import Log, read_log
 from fitting.masks import masked
+from fitting.zero import zeroed
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 
 
@@ -46,7 +47,7 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
         DataError: for logs that can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
-    logs = _with_own_names([masked(read_log(path, drive_file)) for path in log_paths])
+    logs = _with_own_names([ready_log(path, drive_file) for path in log_paths])
     kinds = {log.kind for log in logs}
     if len(kinds) > 1:
         raise InputError(
@@ -65,6 +66,12 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
         findings=findings,
         error_unit=logs[0].units.get("dynamic_error", "rad"),
     )
+
+
+def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
+    """A log that was read, its wrong samples masked, and its dynamic error zeroed; arguments as in
+    [`fitting.logs.read_log`][]."""
+    return zeroed(masked(read_log(path, drive_file, outputs_until=outputs_until)), drive_file)
 
 
 def base_model(drive_file: DriveFile, log: Log) -> Model:
