@@ -1,7 +1,9 @@
 """The raw columns of a log file, in the file's own names and units, whatever its format."""
 
+import os
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
@@ -88,10 +90,24 @@ def _text(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTab
 
 
 def _parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    names = tuple(pl.read_parquet_schema(source))
-    found = [name for name in wanted if name in names]
-    frame = pl.read_parquet(source, columns=found, use_statistics=False)
+    with _quiet():
+        names = tuple(pl.read_parquet_schema(source))
+        found = [name for name in wanted if name in names]
+        frame = pl.read_parquet(source, columns=found, use_statistics=False)
     return RawTable(names, {n: _column_from_series(path, frame[n]) for n in found})
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep off the terminal what Rust writes there of corrupt bytes, before it raises."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _column_from_series(path: Path, series: pl.Series) -> RawColumn:

@@ -187,10 +187,19 @@ def _cells(lines: list[str], delimiter: str, width: int, places: list[int]) -> p
     if delimiter == " ":
         lines = [" ".join(line.split()) for line in lines]
     source = "\n".join(line for line in lines if line.strip()).encode()
+    try:
+        return _parsed(source, delimiter, width, places, '"')
+    except pl.exceptions.PolarsError:
+        # A quotation mark that stands alone would swallow the rest of the file.
+        return _parsed(source, delimiter, width, places, None)
+
+
+def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote: str | None) -> pl.DataFrame:
     return pl.read_csv(
         BytesIO(source),
         separator=delimiter,
         comment_prefix="#",
+        quote_char=quote,
         has_header=False,
         schema={f"c{i}": pl.String for i in range(width)},
         columns=places,

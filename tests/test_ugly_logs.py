@@ -1,0 +1,104 @@
+"""Spoilt logs give a result or one clear sentence: no traceback, no hang, no NaN."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mutations
+from fitting.command_line import main
+from fitting.drive_file import read_drive_file
+from fitting.errors import DataError, InputError
+from fitting.health import examine, refuse_unfit
+from fitting.logs import Log
+from fitting.rig import ready_log
+
+# A log of 600 rows takes milliseconds; a loaded machine may take a hundred times as long.
+LONGEST = 20.0
+
+
+def outcome(log_path: Path, drive_path: Path) -> Log | ValueError:
+    """The log, ready to be fitted, or the refusal."""
+    try:
+        drive = read_drive_file(drive_path)
+        log = ready_log(log_path, drive)
+        findings = examine(log, drive)
+        for finding in findings:
+            assert "\n" not in str(finding)
+            assert not {"nan", "inf"} & set(finding.what.replace(",", " ").split()), str(finding)
+        refuse_unfit(findings, log)
+    except (InputError, DataError) as error:
+        return error
+    return log
+
+
+def assert_sound(found: Log | ValueError, log_path: Path, drive_path: Path) -> None:
+    """A log without a number that is none, or one sentence that names the file."""
+    if isinstance(found, ValueError):
+        message = str(found)
+        assert len(message.splitlines()) == 1 and message.isprintable(), message
+        assert str(log_path) in message or str(drive_path) in message, message
+        assert 30 < len(message) < 1200, message
+        return
+    columns = [value for key, value in vars(found).items() if isinstance(value, np.ndarray) and "velocity" not in key]
+    assert all(np.isfinite(column).all() for column in columns if column.dtype == float)
+    assert {column.shape for column in columns} == {(len(found),)}
+    assert (np.diff(found.time) > 0).all()
+    for start, stop in found.pieces or ():
+        assert 0 <= start < stop <= len(found)
+
+
+def check(seed: int, folder: Path) -> bool:
+    """Whether a spoilt log can be fitted all the same."""
+    log_path, drive_path = mutations.spoilt_case(seed, folder / str(seed))
+    begin = time.monotonic()
+    found = outcome(log_path, drive_path)
+    assert time.monotonic() - begin < LONGEST
+    assert_sound(found, log_path, drive_path)
+    return isinstance(found, Log)
+
+
+@pytest.mark.parametrize("block", range(8))
+def test_spoilt_logs_give_a_log_or_a_sentence(block: int, tmp_path: Path):
+    fitted = [check(seed, tmp_path) for seed in range(20 * block, 20 * block + 20)]
+    # Neither are all refused nor all let through: the mutations bite, and the gate is no wall.
+    assert 0 < sum(fitted) < len(fitted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", range(10))
+def test_a_thousand_spoilt_logs(block: int, tmp_path: Path):
+    for seed in range(1000 + 100 * block, 1100 + 100 * block):
+        check(seed, tmp_path)
+
+
+@pytest.mark.slow
+def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch):
+    """The fit itself, on spoilt logs that the gate lets through: a report without a NaN, or one sentence."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    fitted = 0
+    for seed in range(200, 300):
+        log_path, drive_path = mutations.spoilt_case(seed, tmp_path / str(seed))
+        if isinstance(outcome(log_path, drive_path), ValueError):
+            continue
+        out = tmp_path / str(seed) / "out"
+        capfd.readouterr()
+        try:
+            main(["fit", str(log_path), "--drive", str(drive_path), "--out", str(out)])
+            code = 0
+        except SystemExit as end:
+            code = int(end.code or 0)
+        told = capfd.readouterr()
+        if code == 0:
+            text = (out / "report.json").read_text(encoding="utf-8")
+            # Python would read and write NaN and Infinity as if they were JSON.
+            json.loads(text, parse_constant=lambda name: pytest.fail(f"{seed}: {name} in report.json"))
+            assert "nan" not in told.out.lower().split(), told.out
+        else:
+            assert code in (1, 2) and told.err.startswith("hdjax: ") and told.err.count("\n") == 1, (seed, told.err)
+            assert not out.exists()
+        fitted += 1
+        if fitted == 12:
+            return
