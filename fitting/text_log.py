@@ -2,7 +2,6 @@
 
 import csv
 import re
-from collections import Counter
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +13,7 @@ from fitting.raw_table import RawColumn, RawTable, column_from_text, split_unit
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
+_LETTER = re.compile(r"[^\W\d_]")
 # Lines above the table that are worth reading; a file whose numbers begin later is no log.
 _PREAMBLE = 2000
 _NUMBER = re.compile(
@@ -54,11 +54,11 @@ def read_text(path: Path, raw: bytes, wanted: tuple[str, ...]) -> RawTable:
     dialect = _dialect(lines)
     if dialect is None:
         return RawTable(_header_alone(lines))
-    header, unit_row = _header(path, lines, dialect)
+    header, unit_row, first = _header(path, lines, dialect)
     width = max(dialect.width, len(header))
     places = [p for name in wanted if (p := _place(path, header, name)) is not None]
     asked = [name for name in wanted if _place(path, header, name) is not None]
-    frame = _cells(lines[dialect.first :], dialect.delimiter, width, sorted(set(places)))
+    frame = _cells(lines[first:], dialect.delimiter, width, sorted(set(places)))
     columns = {}
     for name, place in zip(asked, places, strict=True):
         column = column_from_text(frame[f"c{place}"], comma_parts_cells=dialect.delimiter == ",")
@@ -100,45 +100,53 @@ def _is_number(cell: str) -> bool:
     return bool(_NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell))
 
 
-def _is_row(cells: list[str]) -> bool:
-    """Whether a line's cells look like samples: numbers, perhaps with blanks and a word among them."""
+def _numeric_share(cells: list[str]) -> float:
     filled = [cell for cell in cells if cell]
-    return bool(filled) and sum(map(_is_number, filled)) > 0.5 * len(filled)
+    return sum(map(_is_number, filled)) / len(filled) if filled else 0.0
 
 
 def _dialect(lines: list[str]) -> _Dialect | None:
-    """The delimiter under which most lines are rows of numbers of one width."""
+    """The delimiter under which the lines are rows of numbers of one width, with as many names above."""
     begin = next((i for i, line in enumerate(lines[:_PREAMBLE]) if re.match(r"""[\s"']*[-+.,;|\t]*[0-9]""", line)), 0)
     sample = list(enumerate(lines[: begin + _LOOKED_AT]))
-    best, most = None, (0, 0, 0)
+    best, most = None, (False, 0.0, 0, 0)
     for rank, delimiter in enumerate(_DELIMITERS):
-        widths: Counter[int] = Counter()
+        shares: dict[int, float] = {}
         where: dict[int, int] = {}
         for index, line in sample:
             if line.strip() == "" or line.lstrip().startswith("#"):
                 continue
             cells = _split(line, delimiter)
-            if _is_row(cells):
-                widths[len(cells)] += 1
+            share = _numeric_share(cells)
+            # A row of samples may have blanks and a word in it.
+            if share > 0.5:
+                shares[len(cells)] = shares.get(len(cells), 0.0) + share
                 where.setdefault(len(cells), index)
-        if not widths:
+        if not shares:
             continue
-        width, count = max(widths.items(), key=lambda item: (item[1], item[0]))
-        # Two widths: a decimal comma taken for a delimiter gives ragged rows, the true delimiter does not.
-        score = (count if width > 1 else 0, width if delimiter != " " else 2, -rank)
+        width = max(shares, key=lambda w: (shares[w], w))
+        found = _Dialect(delimiter, width, where[width])
+        # A decimal comma taken for the delimiter gives cells that are no numbers, and no header.
+        score = (width > 1 and bool(_heads(lines, found)), shares[width] if width > 1 else 0.0, width, -rank)
         if score > most:
-            best, most = _Dialect(delimiter, width, where[width]), score
+            best, most = found, score
     return best
 
 
-def _header(path: Path, lines: list[str], dialect: _Dialect) -> tuple[list[str], list[str]]:
-    """Names of the columns, and the row of units below them where there is one."""
-    above = [line.strip() for line in lines[: dialect.first] if re.search(r"[^\W\d_]", line)]
+def _heads(lines: list[str], dialect: _Dialect) -> list[list[str]]:
+    """The one or two lines above the numbers that could name their columns."""
+    above = [line for line in lines[: dialect.first] if _LETTER.search(line)][-2:]
     # numpy.savetxt and its like write the header as a comment.
-    rows = [_split(line.lstrip("#%/!").strip(), dialect.delimiter) for line in above[-2:]]
-    rows = [row for row in rows if _could_head(row, dialect.width)]
+    rows = [_split(line.strip().lstrip("#%/!").strip(), dialect.delimiter) for line in above]
+    return [row for row in rows if _could_head(row, dialect.width)]
+
+
+def _header(path: Path, lines: list[str], dialect: _Dialect) -> tuple[list[str], list[str], int]:
+    """Names of the columns, the row of units below them where there is one, and the first line behind both."""
+    above = [i for i, line in enumerate(lines[: dialect.first]) if _LETTER.search(line)]
+    rows = _heads(lines, dialect)
     if not rows:
-        last = len(_split(above[-1].lstrip("#%/! "), dialect.delimiter)) if above else 0
+        last = len(_split(lines[above[-1]].lstrip("#%/! "), dialect.delimiter)) if above else 0
         commas = dialect.delimiter == "," and 1 < last <= dialect.width // 2
         mend = "export it with semicolons between cells, if its decimal sign is a comma" if commas else ""
         raise InputError(
@@ -146,8 +154,8 @@ def _header(path: Path, lines: list[str], dialect: _Dialect) -> tuple[list[str],
             f"numbers; {mend or 'write the column names into its first line'}"
         )
     if len(rows) == 2 and _are_units(rows[1]):
-        return rows[0], [cell.strip("[]()") for cell in rows[1]]
-    return rows[-1], []
+        return rows[0], [cell.strip("[]()") for cell in rows[1]], above[-1] + 1
+    return rows[-1], [], above[-1] + 1
 
 
 def _could_head(cells: list[str], width: int) -> bool:
@@ -187,11 +195,16 @@ def _cells(lines: list[str], delimiter: str, width: int, places: list[int]) -> p
     if delimiter == " ":
         lines = [" ".join(line.split()) for line in lines]
     source = "\n".join(line for line in lines if line.strip()).encode()
-    try:
-        return _parsed(source, delimiter, width, places, '"')
-    except pl.exceptions.PolarsError:
-        # A quotation mark that stands alone would swallow the rest of the file.
-        return _parsed(source, delimiter, width, places, None)
+    if b'"' in source:
+        rows = sum(bool(line.strip()) and not line.startswith("#") for line in lines)
+        try:
+            found = _parsed(source, delimiter, width, places, '"')
+        except pl.exceptions.PolarsError:
+            found = None
+        # A quotation mark that stands alone swallows the rest of the file.
+        if found is not None and found.height == rows:
+            return found
+    return _parsed(source, delimiter, width, places, None)
 
 
 def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote: str | None) -> pl.DataFrame:

@@ -130,7 +130,7 @@ def _unwrap(mender: _Mender, second: float) -> None:
             turns[wraps + 1] = 1.0
             mender.time = (ticks + span * np.cumsum(turns)) / second
             mender.say(
-                "note", f"the clock wraps at {span:.10g} in {len(wraps)} places", wraps[0] + 1, "it was unwrapped"
+                "note", f"the clock wraps at {span:.10g} in {len(wraps)} places", int(wraps[0]) + 1, "it was unwrapped"
             )
             return
 

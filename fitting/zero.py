@@ -13,6 +13,7 @@ _OFFSET = 3.0  # standard deviations, assumed
 _NO_MEAN = 0.1  # likewise, of an input
 _WIDTHS = (16, 32, 64, 128, 256)
 _EVEN = 0.2
+_FEWEST = 25
 
 
 def zeroed(log: Log, drive_file: DriveFile) -> Log:
@@ -39,7 +40,7 @@ def zeroed(log: Log, drive_file: DriveFile) -> Log:
         unexplained = balanced and abs(middle) > _OFFSET * spread > 0 and log.outputs_until is None
         if not (impossible or unexplained):
             return log
-        offset = middle if log.outputs_until is not None else _relaxed(log, torque, drive_file.load_inertia, middle)
+        offset = _relaxed(log, torque, drive_file.load_inertia, middle)
     unit = log.units["dynamic_error"]
     finding = Finding(
         "note" if unexplained else "warning",
@@ -61,8 +62,10 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
     x = log.dynamic_error - middle
     for width in _WIDTHS:
         windows = _windows(log, width)
-        if len(windows) < 40:
+        if len(windows) < _FEWEST:
             continue
+        # A short beginning of a log can't tell a cubic from a line.
+        powers = 4 if log.outputs_until is None else 2
         s = (np.arange(width) + 0.5) / width * 2 - 1
         half = 0.5 * width * float(np.median(np.diff(log.time)))
         bump, slope = (1 - s**2) ** 4, -8 * s * (1 - s**2) ** 3 / half
@@ -71,7 +74,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
         def against(signal: np.ndarray, shape: np.ndarray, windows: np.ndarray = windows, width: int = width):
             return np.lib.stride_tricks.sliding_window_view(signal, width)[windows] @ shape
 
-        spring = [against(x**k, bump) for k in range(4)]
+        spring = [against(x**k, bump) for k in range(powers)]
         if log.kind == "drive":
             assert log.motor_angle is not None and log.load_angle is not None
             rows = [*spring, -against(x, slope)]
@@ -87,7 +90,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
         found = np.linalg.lstsq(matrix / norm, right, rcond=1e-9)[0]
         missed = float(np.linalg.norm(matrix / norm @ found - right) / np.linalg.norm(right))
         found = found / norm
-        relaxed = _root(found[:4], float(np.ptp(x)))
+        relaxed = _root(found[:powers], float(np.ptp(x[: log.outputs_until])))
         if missed < best and found[1] > 0 and relaxed is not None:
             best, root = missed, middle + relaxed
     return root if best < 0.5 else middle
@@ -96,11 +99,11 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
 def _windows(log: Log, width: int) -> np.ndarray:
     """First rows of windows, overlapping by three quarters, in which sampling is even and all outputs are believed."""
     step = np.diff(log.time)
-    good = np.concatenate((np.abs(step / np.median(step) - 1) < _EVEN, [True]))
+    good = np.concatenate((np.abs(step / np.median(step) - 1) < _EVEN, [True]))[: log.outputs_until]
     if log.trusted is not None:
-        good &= log.trusted
+        good &= log.trusted[: log.outputs_until]
     bad = np.concatenate(([0], np.cumsum(~good)))
-    first = np.arange(0, len(good) - width + 1, max(1, width // 4))
+    first = np.arange(0, len(good) - width + 1, max(1, min(width // 4, len(good) // 50)))
     return first[bad[first + width] == bad[first]]
 
 

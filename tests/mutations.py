@@ -247,7 +247,9 @@ def damage(random: Random, path: Path) -> Path:
         raw = bytearray(random.bytes(int(random.choice([0, 1, 2000]))))
     path.write_bytes(bytes(raw))
     if how == 5:
-        path = path.rename(path.with_name(f"log{random.choice(['.csv', '.mat', '.h5', '.parquet', '.gz', '.xyz', ''])}"))
+        path = path.rename(
+            path.with_name(f"log{random.choice(['.csv', '.mat', '.h5', '.parquet', '.gz', '.xyz', ''])}")
+        )
     return path
 
 
@@ -255,11 +257,31 @@ def drive_text(random: Random, spoilt: bool) -> bytes:
     """A drive file, with whatever nonsense in it."""
     content = {table: dict(keys) for table, keys in DRIVE.items()}
     odd = [
-        "1e400", "-1", "0", "nan", "inf", "true", '""', '"a\\nb"', "[1, 2]", "{ a = 1 }", "0x" + "f" * 6000, "1979-05-27",
-        '"5 kg m^2"', '"9**9**9"', '"rev / 16777216"', '{ column = "time", unit = "deg" }', '{ unit = "9^9^9^9" }',
-        '{ column = "", sign = -1 }', '{ column = "motor_angle", unit = "1e-300 rad" }', '{ offset = 1e300 }',
-        '{ column = "motor_torque", unit = "mN m", sign = -1, offset = 3 }', '{ time = "time" }', '"time"', '{ unit = "ms" }',
-    ]  # fmt: skip
+        "1e400",
+        "-1",
+        "0",
+        "nan",
+        "inf",
+        "true",
+        '""',
+        '"a\\nb"',
+        "[1, 2]",
+        "{ a = 1 }",
+        "0x" + "f" * 6000,
+        "1979-05-27",
+        '"5 kg m^2"',
+        '"9**9**9"',
+        '"rev / 16777216"',
+        '{ column = "time", unit = "deg" }',
+        '{ unit = "9^9^9^9" }',
+        '{ column = "", sign = -1 }',
+        '{ column = "motor_angle", unit = "1e-300 rad" }',
+        "{ offset = 1e300 }",
+        '{ column = "motor_torque", unit = "mN m", sign = -1, offset = 3 }',
+        '{ time = "time" }',
+        '"time"',
+        '{ unit = "ms" }',
+    ]
     keys = ["reduction_ratio", "motor_inertia", "load_inertia", "name", "torque_hold", "sample_rate", "nonsense"]
     keys += ["time", "motor_angle", "load_angle", "motor_torque", "temperature", "motor_velocity", "forcing"]
     for _ in range(int(random.choice([1, 1, 3])) if spoilt else 0):

@@ -4,10 +4,10 @@ import json
 import time
 from pathlib import Path
 
+import mutations
 import numpy as np
 import pytest
 
-import mutations
 from fitting.command_line import main
 from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
@@ -75,9 +75,9 @@ def test_a_thousand_spoilt_logs(block: int, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch):
+@pytest.mark.usefixtures("own_cache")
+def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     """The fit itself, on spoilt logs that the gate lets through: a report without a NaN, or one sentence."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     fitted = 0
     for seed in range(200, 300):
         log_path, drive_path = mutations.spoilt_case(seed, tmp_path / str(seed))
@@ -94,7 +94,7 @@ def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest
         if code == 0:
             text = (out / "report.json").read_text(encoding="utf-8")
             # Python would read and write NaN and Infinity as if they were JSON.
-            json.loads(text, parse_constant=lambda name: pytest.fail(f"{seed}: {name} in report.json"))
+            json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in report.json"))
             assert "nan" not in told.out.lower().split(), told.out
         else:
             assert code in (1, 2) and told.err.startswith("hdjax: ") and told.err.count("\n") == 1, (seed, told.err)
