@@ -137,15 +137,15 @@ def _place(path: Path, asked: str, held: Mapping[str, Any], parting: str) -> tup
     for form in (plain, plain.replace(".", parting), plain.replace("/", parting)):
         if form in held:
             return form, column
-    inside = [name for name in held if name.startswith(plain + parting)]
-    if inside:
-        raise not_numbers(path, plain, "is a struct or group", f"name what is inside, such as '{inside[0]}'")
     leaves = [name for name in held if name.rpartition(parting)[2] == plain]
     if len(leaves) > 1:
         raise InputError(
             f"{path}: '{asked}' is the name of several datasets ({', '.join(leaves[:6])}); "
             "give the full path of one of them in [columns] of the drive file"
         )
+    inside = [name for name in held if name.startswith(plain + parting)]
+    if inside and not leaves:
+        raise not_numbers(path, plain, "is a struct or group", f"name what is inside, such as '{inside[0]}'")
     return (leaves[0], column) if leaves else (None, None)
 
 

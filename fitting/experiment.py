@@ -148,6 +148,12 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
     drive_log = log.kind == "drive"
     input_samples = log.motor_torque if drive_log else log.forcing
     assert input_samples is not None
+    lasts = (log.time[-1] - log.time[0]) / np.median(np.diff(log.time))
+    if lasts > _MOST_PUT_IN * len(log):
+        raise DataError(
+            f"{log.path}: the log is mostly gaps, since its {len(log)} samples are spread over {lasts:.3g} sampling "
+            "intervals; cut it into logs without gaps"
+        )
     known = np.ones(len(log), dtype=bool) if log.input_known is None else log.input_known.copy()
     known[[0, -1]] = True
     stamps, samples = bridged(log.time[known], input_samples[known])
@@ -184,11 +190,6 @@ def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     step = np.diff(time)
     usual = max(float(np.median(step)), float(np.median(np.diff(log.time))))
     lacking = np.where(step > _LONGEST_STEP * usual, np.rint(step / usual) - 1, 0.0)
-    if lacking.sum() > _MOST_PUT_IN * len(log):
-        raise DataError(
-            f"{log.path}: the log is mostly gaps, since {lacking.sum():.3g} samples are missing between {len(log)}; "
-            "cut it into logs without gaps"
-        )
     if lacking.any():
         count = lacking.astype(int)
         part = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in count if n])

@@ -11,16 +11,17 @@ from fitting.logs import Log
 
 # All thresholds are assumed: they part the practice logs from their faults by a wide margin.
 SPIKE = 12.0  # robust standard deviations of what neighbours do not foretell
-DROPOUT = 40.0  # likewise, of what stands out from eleven neighbours
+DROPOUT = 40.0  # likewise, of a step
 LONGEST_DROPOUT = 5
-CLIFF = 5.0  # times the steps around
+CLIFF = 10.0  # times the steps around
 PATTERN = 0.13
 EVEN = 0.1  # of a step
 CLIPPED_SHARE = 0.002
+CLIPPED_MOTION = 0.02
 FROZEN_SHARE = 0.05
 FEWEST = 50
 MOST = 0.5
-_NORMAL = 1.96
+_LONE = np.array([-2 / 3, 1 / 6])
 
 
 def masked(log: Log) -> Log:
@@ -129,35 +130,36 @@ def glitches(values: np.ndarray, time: np.ndarray) -> np.ndarray:
     for k in np.flatnonzero(size > SPIKE * scale) if scale > 0 else ():
         if not 2 <= k < len(values) - 2 or size[k] < size[k - 2 : k + 3].max():
             continue
-        # A lone sample is missed by its neighbours' cubics by -2/3 of it, and by those farther off by 1/6.
-        beside = off[[k - 1, k + 1, k - 2, k + 2]] / off[k]
-        if np.max(np.abs(beside - np.array([-2 / 3, -2 / 3, 1 / 6, 1 / 6]))) < PATTERN:
+        # A lone sample is missed by its neighbours' cubics by -2/3 of it, and by those farther off by 1/6; another one
+        # close by spoils this on its own side only.
+        before, behind = off[[k - 1, k - 2]] / off[k], off[[k + 1, k + 2]] / off[k]
+        if min(np.max(np.abs(before - _LONE)), np.max(np.abs(behind - _LONE))) < PATTERN:
             found[k] = True
-    for start, stop in _dropouts(values, scale):
+    rows = np.arange(len(values))
+    calm = np.interp(rows, rows[~found], values[~found])
+    for start, stop in _dropouts(calm, scale):
         found[start:stop] = True
     return np.flatnonzero(found)
 
 
 def _dropouts(values: np.ndarray, noise: float) -> Iterator[tuple[int, int]]:
     """First row and one past the last of each few samples in a row that stand off between two cliffs."""
-    window = 2 * LONGEST_DROPOUT + 1
-    if len(values) <= 4 * window:
-        return
-    stands_out = values - median_filter(values, window, mode="nearest")
-    far = np.abs(stands_out) > DROPOUT * max(_spread(stands_out), noise, _resolution(values))
-    step = np.abs(np.diff(values))
-    for start, stop in zip(*runs(far), strict=True):
-        if start < 1 or stop >= len(values) or stop - start > LONGEST_DROPOUT:
-            continue
-        # A quick motion climbs to its peak in steps like those before and after.
-        around = np.concatenate([step[max(0, start - 1 - window) : start - 1], step[stop : stop + window]])
-        if min(step[start - 1], step[stop - 1]) > CLIFF * around.max(initial=0.0):
-            yield int(start), int(stop)
+    change = np.diff(values)
+    step = np.abs(change)
+    usual = median_filter(step, 4 * LONGEST_DROPOUT + 1, mode="nearest")
+    cliffs = np.flatnonzero(step > np.maximum(CLIFF * usual, DROPOUT * max(noise, _resolution(values))))
+    for down, up in zip(cliffs[:-1], cliffs[1:], strict=True):
+        heights = change[down], change[up]
+        returns = abs(values[up + 1] - values[down]) < 0.3 * min(map(abs, heights))
+        if up - down <= LONGEST_DROPOUT and heights[0] * heights[1] < 0 and returns:
+            yield int(down) + 1, int(up) + 1
 
 
 def _spread(off: np.ndarray) -> float:
-    """Standard deviation of the body of a distribution: its 95 % quantile, as if it were normal."""
-    return float(np.quantile(np.abs(off), 0.95)) / _NORMAL
+    """Standard deviation of the body of a distribution, as if it were normal."""
+    # A few wrong samples are a large share of a short record.
+    share, deviations = (0.95, 1.960) if len(off) > 200 else (0.8, 1.282)
+    return float(np.quantile(np.abs(off), share)) / deviations
 
 
 def _resolution(values: np.ndarray) -> float:
@@ -192,7 +194,7 @@ def clipped(values: np.ndarray, other: np.ndarray | None) -> Iterator[tuple[np.n
             continue
         if other is not None:
             moved = sum(np.ptp(other[a:b]) for a, b in zip(starts, stops, strict=True))
-            if moved < FROZEN_SHARE * np.ptp(other):
+            if moved < CLIPPED_MOTION * np.ptp(other):
                 continue
         rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
         yield rows, float(level), len(starts)

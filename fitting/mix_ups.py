@@ -161,10 +161,9 @@ def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
 
 def _closest(factor: float, known: Mapping[str, float], usual: float, tolerance: float = RATIO_TOLERANCE) -> str | None:
     """The explanation of a factor, unless it is as near to the usual one."""
-    for words, value in known.items():
-        if abs(value / usual - 1) > 2 * tolerance and abs(factor / value - 1) < tolerance:
-            return words
-    return None
+    words, value = min(known.items(), key=lambda item: abs(factor / item[1] - 1))
+    likely = abs(value / usual - 1) > 2 * tolerance and abs(factor / value - 1) < tolerance
+    return words if likely else None
 
 
 def _momentum(log: Log, drive_file: DriveFile) -> Iterator[Finding]:

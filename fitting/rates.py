@@ -13,6 +13,7 @@ from fitting.raw_table import RawColumn
 # Assumed: an interpolation error of this share of the rms twist is worth a warning, or spoils the fit.
 _NOTICED = 0.01
 _SPOILT = 0.2
+_RESOLVED = 0.3
 
 
 def on_one_grid(columns: Mapping[str, RawColumn], path: object) -> dict[str, RawColumn]:
@@ -82,10 +83,12 @@ def angles_together(
     inside = (at >= time[known][0]) & (at <= time[known][-1])
     moved = np.full(len(time), np.nan)
     moved[np.flatnonzero(wanted)[inside]] = spline(at[inside])
-    # Half of the samples foretell the other half; a cubic's error falls by sixteen with half the step.
+    # Half of the samples foretell the other half; a cubic's error falls by sixteen with half the step, if it resolves
+    # the motion at all.
     sparse = CubicSpline(time[known][::2], quick[known][::2])
-    error = float(np.std(sparse(time[known][1:-1:2]) - quick[known][1:-1:2])) / 16
-    error = error / ratio if motor_is_quicker else error
+    error = float(np.std(sparse(time[known][1:-1:2]) - quick[known][1:-1:2]))
+    error /= 16 if error < _RESOLVED * np.std(np.diff(quick[known])) else 1
+    error /= ratio if motor_is_quicker else 1
     motor, load = (moved, load) if motor_is_quicker else (motor, moved)
     twist = float(np.nanstd(motor / ratio - load))
     if error > _SPOILT * twist:
