@@ -27,10 +27,9 @@ def read_mat(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
         wanted: names such as "T", "run.T", "logs(2).T" or "data(:,3)"; the last part alone where it is unique.
     """
     # Imported here because they cost as much as all the rest of a CSV user's start.
-    import h5py
     import scipy.io
 
-    if h5py.is_hdf5(source):
+    if _is_hdf5(source):
         return read_hdf5(path, source, wanted)
     held = scipy.io.loadmat(source, simplify_cells=True)
     arrays: dict[str, Any] = {}
@@ -38,6 +37,13 @@ def read_mat(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
         if not name.startswith("__"):
             _flatten(name, value, arrays, _DEEPEST)
     return _table(path, arrays, wanted, ".", lambda name: arrays[name], lambda name: None)
+
+
+def _is_hdf5(source: Path | BytesIO) -> bool:
+    """Whether a file is HDF5; MATLAB puts 512 bytes of its own before it."""
+    with source.open("rb") if isinstance(source, Path) else BytesIO(source.getvalue()[:4096]) as file:
+        head = file.read(4096)
+    return any(head[at : at + 8] == b"\x89HDF\r\n\x1a\n" for at in (0, 512, 1024, 2048))
 
 
 def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:

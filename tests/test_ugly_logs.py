@@ -60,7 +60,7 @@ def check(seed: int, folder: Path) -> bool:
     return isinstance(found, Log)
 
 
-@pytest.mark.parametrize("block", range(8))
+@pytest.mark.parametrize("block", range(6))
 def test_spoilt_logs_give_a_log_or_a_sentence(block: int, tmp_path: Path):
     fitted = [check(seed, tmp_path) for seed in range(20 * block, 20 * block + 20)]
     # Neither are all refused nor all let through: the mutations bite, and the gate is no wall.
