@@ -8,6 +8,7 @@ import mutations
 import numpy as np
 import pytest
 
+import rig
 from fitting.command_line import main
 from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
@@ -50,6 +51,15 @@ def assert_sound(found: Log | ValueError, log_path: Path, drive_path: Path) -> N
         assert 0 <= start < stop <= len(found)
 
 
+def fit(log_path: Path, drive_path: Path, out: Path) -> int:
+    """The exit code of a fit on the command line."""
+    try:
+        main(["fit", str(log_path), "--drive", str(drive_path), "--out", str(out)])
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
 def check(seed: int, folder: Path) -> bool:
     """Whether a spoilt log can be fitted all the same."""
     log_path, drive_path = mutations.spoilt_case(seed, folder / str(seed))
@@ -85,11 +95,7 @@ def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest
             continue
         out = tmp_path / str(seed) / "out"
         capfd.readouterr()
-        try:
-            main(["fit", str(log_path), "--drive", str(drive_path), "--out", str(out)])
-            code = 0
-        except SystemExit as end:
-            code = int(end.code or 0)
+        code = fit(log_path, drive_path, out)
         told = capfd.readouterr()
         if code == 0:
             text = (out / "report.json").read_text(encoding="utf-8")
@@ -102,3 +108,34 @@ def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest
         fitted += 1
         if fitted == 12:
             return
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_cache")
+def test_an_ugly_log_gives_the_same_drive(tmp_path: Path):
+    """Latin-1, decimal commas, degrees, a gap, a dropped sample, blanks, spikes, encoders that were never zeroed."""
+    count, random = 6000, np.random.default_rng(0)
+    torque = rig.drive_torque(count)
+    log = rig.drive_log(rig.drive_motion(torque), torque)
+    assert log.motor_angle is not None and log.load_angle is not None
+    motor, load = np.rad2deg(log.motor_angle), np.rad2deg(log.load_angle - 0.7)
+    load[random.integers(100, count - 100, 12)] += 0.2 * random.normal(size=12)
+    motor[random.integers(0, count, 20)] = np.nan
+    kept = np.delete(np.arange(count), [*range(2000, 2300), 4000])
+    rows = [";".join("" if np.isnan(c[i]) else f"{c[i]:.12g}" for c in (log.time, motor, load, torque)) for i in kept]
+    text = "Prüfstand 3\ntime;motor_angle;load_angle;motor_torque\ns;°;°;Nm\n" + "\n".join(rows).replace(".", ",")
+    path, drive, out = tmp_path / "log.csv", tmp_path / "drive.toml", tmp_path / "out"
+    path.write_text(text, encoding="latin-1")
+    drive.write_bytes(mutations.drive_text(np.random.default_rng(0), spoilt=False))
+    assert fit(path, drive, out) == 0
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    found = report["before"]["parameters"]
+    for name, truth in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}.items():
+        # Four standard errors, and the bridged sample's share of one.
+        assert abs(found[name]["value"] - truth) < 5 * found[name]["std"], name
+    noise = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
+    assert report["before"]["rmse"]["validation"] < 1.1 * noise
+    assert [log["name"] for log in report["logs"]] == ["log, part 1", "log, part 2"]
+    told = " ".join(finding["what"] for finding in report["health"])
+    for words in ("20 rows", "1 gaps", "1 samples of motor_torque", "12 samples stand out", "off zero"):
+        assert words in told
