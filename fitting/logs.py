@@ -112,55 +112,27 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None) -> Log:
     raw = {s: table.columns[c] for s in SIGNALS if (c := drive_file.column_of(s).column) in table.columns}
     kind = _kind(path, drive_file, table, raw)
     required = DRIVE_SIGNALS if kind == "drive" else REDUCED_SIGNALS
-    used = [s for s in (*required, *OPTIONAL_SIGNALS) if s in raw]
-    velocities = [s for s in VELOCITIES if s in raw and kind == "drive"]
-    raw = {
-        s: _with_own_clock(path, drive_file, table, s, c) for s, c in raw.items() if s in (*used, *velocities, "time")
-    }
-    raw = on_one_grid(raw, path)
-    _refuse_unequal(path, drive_file, raw, used)
-    start, stop = _inhabited(path, [raw[signal] for signal in used])
-    findings = [*_blank_rows(start, len(raw[used[0]].values) - stop)]
-    if stop - start < SHORTEST:
-        raise DataError(
-            f"{path}: the log has {stop - start} rows, which is fewer than the {SHORTEST} that "
-            "a fit needs; record a longer one"
-        )
+    raw, start, stop, blank = _inhabited(path, drive_file, table, raw, required)
     channels = {}
-    for signal in [*used, *velocities]:
-        rows = start + outputs_until if outputs_until is not None and signal in (*OUTPUTS, *VELOCITIES) else stop
-        channels[signal] = channel(path, drive_file, signal, _cut(raw[signal], start, stop, rows), first_row=start)
-        findings += channels[signal].findings
+    for signal in raw:
+        if signal != "time":
+            is_output = outputs_until is not None and signal in (*OUTPUTS, *VELOCITIES)
+            column = _cut(raw[signal], start, stop, start + outputs_until if is_output and outputs_until else stop)
+            channels[signal] = channel(path, drive_file, signal, column, first_row=start)
     base = _time(path, drive_file, table, raw.get("time"), channels, start, stop)
     if len(base.time) < SHORTEST:
         raise DataError(f"{path}: only {len(base.time)} rows have a stamp of their own; a fit needs {SHORTEST}")
-    findings += base.findings
+    findings = [*blank, *(f for c in channels.values() for f in c.findings), *base.findings]
     signals = {name: found.values[base.rows] for name, found in channels.items()}
+    ratio = drive_file.reduction_ratio or 1.0
     if kind == "drive" and outputs_until is None:
-        assert drive_file.reduction_ratio is not None
-        motor, load, moved = angles_together(
-            base.time, signals["motor_angle"], signals["load_angle"], drive_file.reduction_ratio, path
-        )
+        motor, load, moved = angles_together(base.time, signals["motor_angle"], signals["load_angle"], ratio, path)
         signals |= {"motor_angle": motor, "load_angle": load}
         findings += moved
-    trusted, blank = _trusted(path, drive_file, signals, outputs_until)
-    input_name = required[-1]
-    known = np.isfinite(signals[input_name])
-    if known.sum() < _FEWEST_INPUTS:
-        raise InputError(
-            f"{path}: {_column(drive_file, input_name)} is a number in {known.sum()} rows only; name the right column"
-        )
-    spans, gaps = pieces(base.time, signals[input_name], known, base.restarts, input_name)
-    if not spans or (outputs_until is not None and _lacks(spans, len(known))):
-        raise DataError(_gaps(path, input_name, gaps, outputs_until))
-    findings += [*blank, *gaps, *_interpolate(path, drive_file, base.time, signals)]
-    if kind == "drive":
-        assert drive_file.reduction_ratio is not None
-        twist = signals["motor_angle"] / drive_file.reduction_ratio - signals["load_angle"]
-        units = {"dynamic_error": "rad"}
-    else:
-        twist = signals["dynamic_error"]
-        units = {signal: channels[signal].unit for signal in REDUCED_SIGNALS}
+    trusted, untold = _trusted(path, drive_file, signals, outputs_until)
+    known, spans, gaps = _input(path, drive_file, base, signals, required[-1], outputs_until)
+    findings += [*untold, *gaps, *_interpolate(path, drive_file, base.time, signals)]
+    is_drive = kind == "drive"
     log = Log(
         name=path.stem,
         path=path,
@@ -171,9 +143,9 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None) -> Log:
         motor_torque=signals.get("motor_torque"),
         load_torque=signals.get("load_torque"),
         temperature=signals.get("temperature"),
-        dynamic_error=twist,
+        dynamic_error=signals["motor_angle"] / ratio - signals["load_angle"] if is_drive else signals["dynamic_error"],
         forcing=signals.get("forcing"),
-        units=units,
+        units={"dynamic_error": "rad"} if is_drive else {signal: channels[signal].unit for signal in REDUCED_SIGNALS},
         findings=tuple(findings),
         motor_velocity=signals.get("motor_velocity"),
         load_velocity=signals.get("load_velocity"),
@@ -248,15 +220,29 @@ def _trusted(
     return trusted, tuple(findings)
 
 
-def _lacks(spans: Sequence[tuple[int, int]], count: int) -> bool:
-    """Whether pieces are more than one, or miss more than a sample or two at the ends of the log."""
-    return len(spans) != 1 or spans[0][0] > 2 or spans[0][1] < count - 2
-
-
-def _gaps(path: Path, name: str, gaps: Sequence[Finding], outputs_until: int | None) -> str:
-    seen = gaps[0].what if gaps else f"{name} is unknown at its ends"
-    wanted = f"no stretch of {SHORTEST} rows is left" if outputs_until is None else "a prediction needs it throughout"
-    return f"{path}: {seen}, so that {name} is not known there and {wanted}; record the log without gaps"
+def _input(
+    path: Path,
+    drive_file: DriveFile,
+    base: TimeBase,
+    signals: Mapping[str, np.ndarray],
+    name: str,
+    outputs_until: int | None,
+) -> tuple[np.ndarray, tuple[tuple[int, int], ...], tuple[Finding, ...]]:
+    """In which rows the input is known, the pieces in which it is or can be bridged, and what there is to tell."""
+    known = np.isfinite(signals[name])
+    if known.sum() < _FEWEST_INPUTS:
+        raise InputError(
+            f"{path}: {_column(drive_file, name)} is a number in {known.sum()} rows only; name the right column"
+        )
+    whole = outputs_until is not None
+    spans, gaps = pieces(base.time, signals[name], known, base.restarts, name, whole=whole)
+    # A sample or two at the ends may be held.
+    lacks = len(spans) != 1 or spans[0][0] > 2 or spans[0][1] < len(known) - 2
+    if not spans or (whole and lacks):
+        seen = gaps[0].what if gaps else f"{name} is unknown at its ends"
+        wanted = "a prediction needs it throughout" if whole else f"no stretch of {SHORTEST} rows is left"
+        raise DataError(f"{path}: {seen}, so that {name} is not known there and {wanted}; record the log without gaps")
+    return known, spans, gaps
 
 
 def _interpolate(
@@ -335,16 +321,29 @@ def _refuse_unequal(path: Path, drive_file: DriveFile, raw: dict[str, RawColumn]
             )
 
 
-def _inhabited(path: Path, columns: Sequence[RawColumn]) -> tuple[int, int]:
-    """First row and one past the last row in which any column has something."""
-    filled = np.zeros(len(columns[0].values), dtype=bool)
-    for column in columns:
-        filled |= ~np.isnan(column.values)
-        filled[column.text_rows] = True
+def _inhabited(
+    path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, RawColumn], required: Sequence[str]
+) -> tuple[dict[str, RawColumn], int, int, tuple[Finding, ...]]:
+    """The columns that matter on one grid, and the first row and one past the last in which any has something."""
+    used = [s for s in (*required, *OPTIONAL_SIGNALS) if s in raw]
+    velocities = VELOCITIES if "motor_angle" in required else ()
+    raw = {s: raw[s] for s in (*used, *velocities, "time") if s in raw}
+    raw = on_one_grid({s: _with_own_clock(path, drive_file, table, s, c) for s, c in raw.items()}, path)
+    _refuse_unequal(path, drive_file, raw, used)
+    filled = np.zeros(len(raw[used[0]].values), dtype=bool)
+    for signal in used:
+        filled |= ~np.isnan(raw[signal].values)
+        filled[raw[signal].text_rows] = True
     rows = np.flatnonzero(filled)
     if len(rows) == 0:
         raise InputError(f"{path}: the log has no rows with numbers; export it again")
-    return int(rows[0]), int(rows[-1]) + 1
+    start, stop = int(rows[0]), int(rows[-1]) + 1
+    if stop - start < SHORTEST:
+        raise DataError(
+            f"{path}: the log has {stop - start} rows, which is fewer than the {SHORTEST} that "
+            "a fit needs; record a longer one"
+        )
+    return raw, start, stop, _blank_rows(start, len(filled) - stop)
 
 
 def _blank_rows(leading: int, trailing: int) -> tuple[Finding, ...]:

@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import median_filter
 
+from fitting.errors import DataError
 from fitting.findings import Finding
 from fitting.logs import Log
+from fitting.pieces import SHORTEST
 
 # All thresholds are assumed: they part the practice logs from their faults by a wide margin.
 SPIKE = 12.0  # robust standard deviations of what neighbours do not foretell
@@ -20,7 +22,6 @@ CLIPPED_SHARE = 0.002
 CLIPPED_MOTION = 0.02
 FROZEN_SHARE = 0.05
 FEWEST = 50
-MOST = 0.5
 _LONE = np.array([-2 / 3, 1 / 6])
 
 
@@ -32,18 +33,36 @@ def masked(log: Log) -> Log:
 
     Args:
         log: as read.
+
+    Raises:
+        DataError: Hardly an output can be believed.
     """
     wrong, findings = np.zeros(len(log), dtype=bool), []
     for rows, finding in _untrusted(log):
         findings.append(finding)
         wrong[rows] = True
-    if not wrong.any():
+    if wrong.any():
+        trusted = ~wrong if log.trusted is None else log.trusted & ~wrong
+        log = replace(log, findings=(*log.findings, *findings), trusted=trusted)
+    return _where_seen(log)
+
+
+def _where_seen(log: Log) -> Log:
+    """The log without the pieces in which hardly an output is believed."""
+    if log.trusted is None or log.outputs_until is not None:
         return log
-    trusted = ~wrong if log.trusted is None else log.trusted & ~wrong
-    if trusted.mean() < 1 - MOST and log.outputs_until is None:
-        # Then it is no fault but the nature of the channel; the findings stay, as a warning.
-        return replace(log, findings=(*log.findings, *findings))
-    return replace(log, findings=(*log.findings, *findings), trusted=trusted)
+    pieces = log.pieces or ((0, len(log)),)
+    kept = tuple((a, b) for a, b in pieces if log.trusted[a:b].sum() >= SHORTEST // 2)
+    if not kept:
+        raise DataError(
+            f"{log.path}: only {log.trusted.sum()} of {len(log)} rows have outputs that can be believed, since "
+            f"{log.findings[-1].what}; mend the sensor or record another log"
+        )
+    if len(kept) == len(pieces):
+        return log
+    what = f"{len(pieces) - len(kept)} of {len(pieces)} stretches have fewer than {SHORTEST // 2} believable rows"
+    finding = Finding("warning", what, "all outputs", "they were left out")
+    return replace(log, pieces=kept, findings=(*log.findings, finding))
 
 
 def _untrusted(log: Log) -> Iterator[tuple[np.ndarray, Finding]]:

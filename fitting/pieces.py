@@ -99,7 +99,13 @@ def bridge_error(values: np.ndarray, missing: int) -> float:
 
 
 def pieces(
-    time: np.ndarray, values: np.ndarray, known: np.ndarray, restarts: Sequence[int] | np.ndarray, name: str
+    time: np.ndarray,
+    values: np.ndarray,
+    known: np.ndarray,
+    restarts: Sequence[int] | np.ndarray,
+    name: str,
+    *,
+    whole: bool = False,
 ) -> tuple[tuple[tuple[int, int], ...], tuple[Finding, ...]]:
     """The pieces of a log in which its input is known or can be bridged.
 
@@ -109,6 +115,7 @@ def pieces(
         known: in which rows it is.
         restarts: rows in which a recording starts anew.
         name: of the input.
+        whole: whether the log is wanted in one piece, so that short gaps are bridged for better or worse.
 
     Returns:
         First row and one past the last of each piece, and what was found. No piece is left where the log is nothing
@@ -123,8 +130,8 @@ def pieces(
     fresh = np.isin(rows[sampling.gaps + 1], restarts)
     breaks = sampling.gaps[wide | fresh]
     spans = _between(rows, breaks)
-    if sum(b - a for a, b in spans) < _ENOUGH * len(time):
-        # Samples are missing everywhere: short gaps are bridged for better or worse.
+    if whole or sum(b - a for a, b in spans) < _ENOUGH * len(time):
+        # Where samples are missing everywhere, leaving them out would leave little.
         wide &= np.diff(sampling.time)[sampling.gaps] > _GAP * sampling.step
         breaks = sampling.gaps[wide | fresh]
         spans = _between(rows, breaks)
@@ -167,5 +174,5 @@ def _of_bridges(sampling: Sampling, rows: np.ndarray, bridges: np.ndarray, error
         f"time, first in data row {rows[bridges[0] + 1] + 1}",
         f"they were put in from their neighbours, which elsewhere is right to {100 * worst:.2g} % of its rms"
         if known
-        else "the gaps lie too close to leave them out, so that the torque there is a guess and the fit suffers",
+        else "nothing foretells them, but leaving them out would cost too much: the torque there is a guess",
     )

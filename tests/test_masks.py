@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.errors import DataError
 from fitting.logs import Log
 from fitting.masks import glitches, masked
 
@@ -133,3 +134,14 @@ def test_later_outputs_are_not_looked_at():
 
     log = replace(spoilt(DRIVE_LOG, "load_angle", change), outputs_until=50)
     np.testing.assert_array_equal(untrusted(log), [30])
+
+
+def test_a_piece_without_believable_outputs_is_left_out():
+    trusted = np.ones(COUNT, dtype=bool)
+    trusted[1050:2000] = False
+    log = replace(DRIVE_LOG, trusted=trusted, pieces=((0, 1000), (1000, 2000), (2000, COUNT)))
+    found = masked(log)
+    assert found.pieces == ((0, 1000), (2000, COUNT))
+    assert "1 of 3 stretches" in found.findings[-1].what
+    with pytest.raises(DataError, match="50 of 4000 rows"):
+        masked(replace(log, trusted=np.arange(COUNT) < 50, findings=found.findings))

@@ -102,6 +102,12 @@ def test_gaps_everywhere_are_bridged_for_better_or_worse():
     assert finding.severity == "warning" and "a guess" in finding.consequence
 
 
+def test_a_log_that_is_wanted_whole_is_bridged_over_short_gaps():
+    kept = without(700, 701)
+    (span,), (finding,) = pieces(TIME[kept], WHITE[kept], KNOWN[kept], (), "motor_torque", whole=True)
+    assert span == (0, COUNT - 2) and finding.severity == "warning"
+
+
 def test_pauses_everywhere_leave_nothing():
     spans, findings = split(WHITE, np.flatnonzero(np.arange(COUNT) % 100 < 50))
     assert spans == () and len(findings) == 1
