@@ -192,7 +192,10 @@ def _shape(random: Random, values: np.ndarray) -> object:
 
 
 def _mat(random: Random, table: Table, path: Path) -> None:
-    held = {k if k.isidentifier() and not k.startswith("_") else f"v{i}": v for i, (k, v) in enumerate(table.items())}
+    held = {
+        k if k.isascii() and k.isidentifier() and not k.startswith("_") else f"v{i}": v
+        for i, (k, v) in enumerate(table.items())
+    }
     content: dict[str, object] = {k[:31]: _shape(random, v) if random.random() < 0.2 else v for k, v in held.items()}
     if random.random() < 0.3:
         for _ in range(int(random.choice([1, 3, 20]))):
