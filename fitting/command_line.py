@@ -30,7 +30,7 @@ from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
-from fitting.logs import Log, read_log
+from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.quasi_static import content as quasi_static_content
 from fitting.quasi_static import report as quasi_static_report
@@ -38,7 +38,7 @@ from fitting.quasi_static.fit import fit_quasi_static
 from fitting.quasi_static.preparation import prepare
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiment, read_rig, refuse_mixed, rig_of
+from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
 from hdjax import (
     PRESETS,
     Chirp,
@@ -61,7 +61,9 @@ app.command(amplitudes)
 app.command(seed_tables)
 app.command(speeds)
 
-Logs = Annotated[list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5 or Parquet.", negative="")]
+Logs = Annotated[
+    list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
+]
 DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
 
 
@@ -83,8 +85,7 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
         _fit_fleet(logs, drive, out)
         return
     drive_file = read_drive_file(drive)
-    read = tuple(read_log(path, drive_file) for path in logs)
-    refuse_mixed(read)
+    read = ready_logs(logs, drive_file)
     if read[0].kind == "quasi-static":
         _fit_quasi_static(read, drive_file, out)
     else:
@@ -176,14 +177,14 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     """
     stored = read_model(model)
     drive_file = read_drive_file(drive)
-    read = read_log(log, drive_file, outputs_until=WINDOW)
+    read = ready_log(log, drive_file, outputs_until=WINDOW)
     if read.kind == "quasi-static":
         raise InputError(f"{log}: {WHY_NOT_QUASI_STATIC}")
     if (read.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
             f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"
         )
-    ready = experiment(read, drive_file, stored.hold)
+    (ready,) = experiments(read, drive_file, stored.hold)
     (run,) = free_run(
         stored.model,
         [Stretch(ready, 0, len(ready))],
@@ -193,7 +194,11 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     )
     if not np.isfinite(run.predicted).all():
         raise DataError(f"{log}: the model's free run leaves the numbers; check the torque column's unit and sign")
-    _write_table(out, {"time": run.time, "dynamic_error": run.predicted})
+    rows = slice(None) if ready.rows is None else ready.rows
+    _write_table(out, {"time": run.time[rows], "dynamic_error": run.predicted[rows] + read.zero})
+    for finding in read.findings:
+        if finding.severity == "warning":
+            print(f"hdjax: {log}: {finding}", file=sys.stderr)
     print(f"Prediction: {out}")
 
 

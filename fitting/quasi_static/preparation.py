@@ -9,8 +9,10 @@ import numpy as np
 from fitting.drive_file import DriveFile
 from fitting.errors import DataError
 from fitting.findings import Finding
-from fitting.health import FREE_MOTION, examine, refuse_unfit
-from fitting.logs import SHORTEST, Log
+from fitting.health import examine, refuse_unfit
+from fitting.logs import Log
+from fitting.mix_ups import FREE_MOTION
+from fitting.pieces import SHORTEST
 from fitting.quasi_static.blocks import means
 
 Motion = Literal["held", "one way", "both ways", "unknown"]
@@ -58,7 +60,7 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile) -> QuasiStaticData:
         seen = examine(log, drive_file)
         refuse_unfit(seen, log)
         _refuse_mix_ups(log)
-        kept, motion, more = _steady(log, drive_file)
+        kept, motion, more = _steady(_measured(log), drive_file)
         ready.append(kept)
         motions.append(motion)
         findings[log.name] = (*seen, *more)
@@ -140,6 +142,15 @@ def _steady(log: Log, drive_file: DriveFile) -> tuple[Log, Motion, tuple[Finding
         "these rows were left out, since friction at rest has no known sign",
     )
     return _rows(log, steady), motion, (told,)
+
+
+def _measured(log: Log) -> Log:
+    """The rows in which torque and angles were measured; the findings of the reader tell of the others."""
+    kept = np.ones(len(log), dtype=bool)
+    for known in (log.trusted, log.input_known):
+        if known is not None:
+            kept &= known
+    return log if kept.all() else replace(_rows(log, kept), trusted=None, input_known=None)
 
 
 def _rows(log: Log, kept: np.ndarray) -> Log:
