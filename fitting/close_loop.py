@@ -19,6 +19,7 @@ from fitting.attribution import (
     halo_for,
     look,
 )
+from fitting.base_fit import base_fit
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.estimate import (
@@ -27,12 +28,8 @@ from fitting.estimate import (
     measurement_noise,
     needed_substeps,
     segment_length,
-    short_horizon,
-    suggested_substeps,
 )
 from fitting.experiment import Experiment, Stretch, segment_count, split
-from fitting.free import base_paths
-from fitting.starting_values import starting_models
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -41,8 +38,6 @@ Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 _LONG_STEPS = 20
 # What the long fit may cost on short segments, in the objective: 2 % of the error.
 _LONG_LOSS = 0.02
-# Starts that are fitted in full; more than these are compared as they are first.
-_REFINED_STARTS = 2
 # A residual this much larger than the measurement noise is not noise.
 _EXCESS = 1.5
 # Share of the unexplained variance that found effects must remove to be called the explanation.
@@ -186,47 +181,6 @@ class _Clock:
         now = time.perf_counter()
         self.laps[name] = now - self._last
         self._last = now
-
-
-def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
-    """Fit a drive without effects, from starting values that the data supply.
-
-    Args:
-        model: the base model; its stiffness and damping are only placeholders.
-        training: the data.
-        halo: intervals of torque before a segment.
-    """
-    starts = starting_models(model, training)
-    # Judged on equally short segments, a start with the wrong frequency can't hide.
-    horizon = min(short_horizon(s, training) for s in starts)
-    substeps = max(suggested_substeps(s, training) for s in starts)
-
-    def fitted(start: Model, *, hold_parameters: bool) -> Fit:
-        return fit(
-            start,
-            training,
-            base_paths(start),
-            horizon=horizon,
-            halo=halo,
-            substeps=substeps,
-            hold_parameters=hold_parameters,
-            max_steps=20 if hold_parameters else 60,
-        )
-
-    if len(starts) > _REFINED_STARTS:
-        starts = sorted(starts, key=lambda s: fitted(s, hold_parameters=True).objective)[:_REFINED_STARTS]
-    best = min((fitted(s, hold_parameters=False) for s in starts), key=lambda f: f.objective)
-    horizon = short_horizon(best.model, training)
-    if best.horizon <= 2 * horizon <= 4 * best.horizon:
-        return best
-    return fit(
-        best.model,
-        training,
-        base_paths(best.model),
-        horizon=horizon,
-        halo=halo,
-        substeps=suggested_substeps(best.model, training),
-    )
 
 
 def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold]:
