@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from fitting.estimate import Fit, fit, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
+from fitting.outliers import without_glitches, without_lone_errors
 from fitting.starting_values import starting_models
 from hdjax import Model
 
@@ -21,6 +22,8 @@ from hdjax import Model
 _TRIAL_STEPS = 10
 # A start whose trial is this much worse than the best (in the objective: 10 % of the error) is given up.
 _HOPELESS = 0.1
+# Rounds of leaving out what stands alone; each tells the noise better, and so shows smaller outliers.
+_CLEANINGS = 3
 # Lags of the test for whiteness, and the chance that it takes white noise for anything else.
 _LAGS = 20
 _FALSE_ALARM = 1e-3
@@ -37,20 +40,34 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
     Raises:
         DataError: where the data supply no starting values.
     """
+    training = without_glitches(training)
     best = _coarse_fit(starting_models(model, training), training, halo)
     horizon = short_horizon(best.model, training)
-    if best.horizon <= 2 * horizon <= 4 * best.horizon:
-        return best
-    segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
-    return fit(
-        best.model,
-        training,
-        base_paths(best.model),
-        horizon=horizon,
-        halo=halo,
-        substeps=suggested_substeps(best.model, training),
-        states=initial_states(best.model, segments),
-    )
+    if not best.horizon <= 2 * horizon <= 4 * best.horizon:
+        segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
+        best = fit(
+            best.model,
+            training,
+            base_paths(best.model),
+            horizon=horizon,
+            halo=halo,
+            substeps=suggested_substeps(best.model, training),
+            states=initial_states(best.model, segments),
+        )
+    for _ in range(_CLEANINGS):
+        cleaned = without_lone_errors(best)
+        if cleaned is None:
+            break
+        best = fit(
+            best.model,
+            cleaned,
+            base_paths(best.model),
+            horizon=best.horizon,
+            halo=halo,
+            substeps=best.problem.substeps,
+            states=best.unknowns.states,
+        )
+    return best
 
 
 def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> Fit:

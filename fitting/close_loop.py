@@ -30,6 +30,7 @@ from fitting.estimate import (
     segment_length,
 )
 from fitting.experiment import Experiment, Stretch, segment_count, split
+from fitting.outliers import with_weights
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -134,7 +135,7 @@ def close_loop(
     clock = _Clock()
     data: Data = {h: split(e) for h, e in experiments.items()}
     progress("finding starting values")
-    base, setting, hold = _base_trial(model, data, hold)
+    base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
     current, rounds, dropped = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
@@ -183,18 +184,20 @@ class _Clock:
         self._last = now
 
 
-def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold]:
-    """The base model fitted under the stated hold, or under the one that suits it best."""
+def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold, Data]:
+    """The base model fitted under the stated hold, or under the one that suits it best, and the data without the
+    samples that its fit does not believe."""
     first = hold if hold is not None else next(iter(data))
     training = data[first][0]
     halo = halo_for(training)
     best = base_fit(model, training, halo=halo)
+    data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
     count = segment_count(training, segment_length(best.horizon))
     setting = Setting(best.horizon, halo, best.problem.substeps, count)
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
-    return chosen, setting, chosen.hold
+    return chosen, setting, chosen.hold, data
 
 
 def _add_effects(

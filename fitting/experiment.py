@@ -22,6 +22,8 @@ class Experiment(eqx.Module):
         load_torque: torque on the load [N m], or None.
         measured: (theta_m/N, dynamic error) [rad] by row, or the dynamic error alone.
         motor_angle: measured motor angle [rad], or None in a reduced log.
+        weight: 1 for a sample whose outputs count, 0 for one that was put in or is not believed; None where all count.
+            The outputs of a sample without weight are something finite in between.
     """
 
     name: str = eqx.field(static=True)
@@ -30,6 +32,7 @@ class Experiment(eqx.Module):
     load_torque: PiecewisePolynomial | None
     measured: Float[np.ndarray, "n outputs"]
     motor_angle: Float[np.ndarray, " n"] | None
+    weight: Float[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return self.time.size
@@ -67,7 +70,7 @@ class Segments(eqx.Module):
             has something to reach back to.
         load_torque: coefficients of the load torque, or None.
         measured: outputs at the samples.
-        weight: 1 for a sample, 0 for padding.
+        weight: 1 for a sample whose outputs count, 0 for the others and for padding.
         joined: whether a segment starts where the one before it ends.
         halo: intervals before each segment's first sample.
     """
@@ -186,9 +189,15 @@ def _cut_one(stretch: Stretch, length: int, pieces: int, halo: int) -> tuple[np.
         torque,
         coefficients[np.clip(own, 0, last)],
         experiment.measured[np.clip(own, 0, stretch.stop - 1)],
-        (own < stretch.stop).astype(float),
+        _weight(experiment, own) * (own < stretch.stop),
         np.arange(begin.size) % pieces != 0,
     )
+
+
+def _weight(experiment: Experiment, index: np.ndarray) -> np.ndarray:
+    if experiment.weight is None:
+        return np.ones(index.shape)
+    return experiment.weight[np.clip(index, 0, len(experiment) - 1)]
 
 
 def scales(stretches: Sequence[Stretch]) -> Scales:
