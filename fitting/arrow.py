@@ -75,6 +75,7 @@ class ArrowSystem(eqx.Module):
         shared_gradient: sum of J_p^T r.
         own_gradient: J_c^T r of each chain.
         chains: how segments' states follow from shared parameters and chains' first states.
+        yardstick: what damping of the shared parameters is relative to.
     """
 
     shared: Float[Array, "parameters parameters"]
@@ -83,12 +84,13 @@ class ArrowSystem(eqx.Module):
     shared_gradient: Float[Array, "parameters 2"]
     own_gradient: Float[Array, "segments states 2"]
     chains: Chains
+    yardstick: Float[Array, " parameters"]
 
     def eliminate(self, damping: Array, closing: Array) -> tuple[Array, Array, Array, Array]:
         """Solve each chain for its own first state.
 
         Args:
-            damping: relative to the diagonals.
+            damping: relative to the yardstick of the shared parameters and to the diagonals of the chains.
             closing: share of the gaps that the step closes.
 
         Returns:
@@ -100,7 +102,7 @@ class ArrowSystem(eqx.Module):
         right = jnp.concatenate([self.coupling, (self.own_gradient @ share)[:, :, None]], axis=2)
         solved = jax.vmap(_solve_scaled)(own, right)
         response, own_step = solved[:, :, :-1], solved[:, :, -1]
-        shared = self.shared + damping * _diagonal(self.shared)
+        shared = self.shared + damping * jnp.diag(where(self.yardstick > 0, self.yardstick, 1.0))
         matrix = shared - jnp.einsum("sqp,sqr->pr", self.coupling, response)
         gradient = self.shared_gradient @ share - jnp.einsum("sqp,sq->p", self.coupling, own_step)
         return matrix, gradient, response, own_step
@@ -133,13 +135,15 @@ def normal_equations(found: Blocks, joined: Bool[Array, " segments"]) -> ArrowSy
     change = jnp.concatenate([above, through, below], axis=1)
     total = jnp.einsum("sia,sij,sjb->sab", change, products, change)
     mine = slice(parameters, parameters + states)
+    shared = jnp.sum(total[:, :parameters, :parameters], axis=0)
     return ArrowSystem(
-        shared=jnp.sum(total[:, :parameters, :parameters], axis=0),
+        shared=shared,
         own=path.collect(total[:, mine, mine]),
         coupling=path.collect(total[:, mine, :parameters]),
         shared_gradient=jnp.sum(total[:, :parameters, parameters + states :], axis=0),
         own_gradient=path.collect(total[:, mine, parameters + states :]),
         chains=path,
+        yardstick=jnp.diagonal(shared),
     )
 
 
@@ -168,7 +172,8 @@ def _solve_scaled(matrix: Array, right: Array) -> Array:
 
 
 class ArrowDescent(optx.AbstractDescent):
-    """Damped Gauss-Newton steps by elimination of the segments' states; damping is relative to diag(J^T J).
+    """Damped Gauss-Newton steps by elimination of the segments' states; damping is relative to diag(J^T J), for the
+    shared parameters to the largest that it has been.
 
     Attributes:
         joined: whether a segment starts where the one before it ends.
@@ -196,6 +201,7 @@ class ArrowDescent(optx.AbstractDescent):
                 closing=zeros[:, :, 0],
                 index=jnp.zeros(segments, dtype=int),
             ),
+            yardstick=jnp.zeros(parameters),
         )
 
     def query(self, y: Unknowns, f_info, state: ArrowSystem) -> ArrowSystem:
@@ -204,7 +210,10 @@ class ArrowDescent(optx.AbstractDescent):
         found = blocks_of_columns(
             value.rows, value.gap / weight, moved.rows, moved.gap / weight[:, :, None], self.joined
         )
-        return normal_equations(found, self.joined)
+        system = normal_equations(found, self.joined)
+        # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
+        # most that it has ever shown (Moré 1978).
+        return eqx.tree_at(lambda s: s.yardstick, system, jnp.maximum(system.yardstick, state.yardstick))
 
     def step(self, step_size: Array, state: ArrowSystem) -> tuple[Unknowns, optx.RESULTS]:
         damping = self.damping / jnp.maximum(step_size, 1e-30)
@@ -212,11 +221,15 @@ class ArrowDescent(optx.AbstractDescent):
 
 
 class GapTrustRegion(optx.AbstractSearch):
-    """optimistix' trust region, but a step that hardly changes the sum of squares is taken in any case: to close the
-    last of the gaps costs a little residual, which no finite weight of the gaps repays."""
+    """optimistix' trust region, but two kinds of step are taken in any case: one that hardly changes the sum of
+    squares, and one that closes most of the gaps for a little more residual. No finite weight of the gaps repays what
+    closing the last of them costs.
+    """
 
     region: optx.ClassicalTrustRegion = _REGION
     slack: float = 1e-4
+    closed: float = 0.25
+    dearest: float = 1.5
 
     def init(self, y, f_info_struct):
         return self.region.init(y, f_info_struct)
@@ -224,9 +237,13 @@ class GapTrustRegion(optx.AbstractSearch):
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         size, accept, result, after = self.region.step(first_step, y, y_eval, f_info, f_eval_info, state)
         before = f_info.as_min()
-        slight = ~accept & (jnp.abs(f_eval_info.as_min() - before) < self.slack * before)
-        after = jax.tree.map(lambda old, new: where(slight, old, new), state, after)
-        return where(slight, state.step_size, size), accept | slight, result, after
+        slight = jnp.abs(f_eval_info.as_min() - before) < self.slack * before
+        rows, gap = (jnp.sum(part**2) for part in (f_info.residual.rows, f_info.residual.gap))
+        new_rows, new_gap = (jnp.sum(part**2) for part in (f_eval_info.residual.rows, f_eval_info.residual.gap))
+        closing = (new_gap < self.closed * gap) & (new_rows < self.dearest * rows)
+        anyway = ~accept & (slight | closing)
+        after = jax.tree.map(lambda old, new: where(anyway, old, new), state, after)
+        return where(anyway, state.step_size, size), accept | anyway, result, after
 
 
 class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):

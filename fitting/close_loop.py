@@ -18,6 +18,7 @@ from fitting.attribution import (
     halo_for,
     look,
 )
+from fitting.base_fit import base_fit
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
@@ -27,12 +28,9 @@ from fitting.estimate import (
     measurement_noise,
     needed_substeps,
     segment_length,
-    short_horizon,
-    suggested_substeps,
 )
 from fitting.experiment import Experiment, Stretch, segment_count, split
-from fitting.free import base_paths
-from fitting.starting_values import starting_models
+from fitting.outliers import with_weights
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -44,8 +42,6 @@ _SHIFT = 0.2
 _MOST_SUBSTEPS = 32
 # What the long fit may cost on short segments, in the objective: 2 % of the error.
 _LONG_LOSS = 0.02
-# Starts that are fitted in full; more than these are compared as they are first.
-_REFINED_STARTS = 2
 # A residual this much larger than the measurement noise is not noise.
 _EXCESS = 1.5
 # Share of the unexplained variance that found effects must remove to be called the explanation.
@@ -142,7 +138,7 @@ def close_loop(
     clock = Clock()
     data: Data = {h: split(e) for h, e in experiments.items()}
     progress("finding starting values")
-    base, setting, hold = _base_trial(model, data, hold)
+    base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
     current, rounds, dropped = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
@@ -178,60 +174,20 @@ def close_loop(
     )
 
 
-def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
-    """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
-
-    Args:
-        model: the base model; its stiffness and damping are only placeholders.
-        training: the data.
-        halo: intervals of torque before a segment.
-    """
-    starts = starting_models(model, training)
-    # Judged on equally short segments, a start with the wrong frequency can't hide.
-    horizon = min(short_horizon(s, training) for s in starts)
-    substeps = max(suggested_substeps(s, training) for s in starts)
-
-    def fitted(start: Model, *, hold_parameters: bool) -> Fit:
-        return fit(
-            start,
-            training,
-            base_paths(start),
-            horizon=horizon,
-            halo=halo,
-            substeps=substeps,
-            hold_parameters=hold_parameters,
-            max_steps=20 if hold_parameters else 60,
-        )
-
-    if len(starts) > _REFINED_STARTS:
-        starts = sorted(starts, key=lambda s: fitted(s, hold_parameters=True).objective)[:_REFINED_STARTS]
-    best = min((fitted(s, hold_parameters=False) for s in starts), key=lambda f: f.objective)
-    horizon = short_horizon(best.model, training)
-    if best.horizon <= 2 * horizon <= 4 * best.horizon:
-        return best
-    refitted = fit(
-        best.model,
-        training,
-        base_paths(best.model),
-        horizon=horizon,
-        halo=halo,
-        substeps=suggested_substeps(best.model, training),
-    )
-    return eqx.tree_at(lambda f: f.problem.model, refitted, best.problem.model)
-
-
-def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold]:
-    """The base model fitted under the stated hold, or under the one that suits it best."""
+def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold, Data]:
+    """The base model fitted under the stated hold, or under the one that suits it best, and the data without the
+    samples that its fit does not believe."""
     first = hold if hold is not None else next(iter(data))
     training = data[first][0]
     halo = halo_for(training)
     best = base_fit(model, training, halo=halo)
+    data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
     count = segment_count(training, segment_length(best.horizon))
     setting = Setting(best.horizon, halo, best.substeps, count)
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
-    return chosen, setting, chosen.hold
+    return chosen, setting, chosen.hold, data
 
 
 def _add_effects(

@@ -292,8 +292,13 @@ def _half_log_determinant(covariance: Array) -> float:
 
 
 def initial_states(model: Model, segments: Segments) -> Float[Array, "segments states"]:
-    """Each segment's first state from a local polynomial through its first samples; hidden states at rest."""
-    count = min(9, segments.measured.shape[1])
+    """Each segment's first state from a local polynomial through its first samples; hidden states at rest.
+
+    A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
+    """
+    step = float(np.median(np.diff(np.asarray(segments.torque.knots))))
+    quarter = 0.5 * np.pi / float(model.drive.omega_0) / step
+    count = min(segments.measured.shape[1], int(np.clip(np.ceil(quarter), 5, _LONGEST_SEGMENT)))
     measured = np.asarray(segments.measured[:, :count])
     halo = segments.halo
     t = np.asarray(segments.torque.knots[:, halo : halo + count])

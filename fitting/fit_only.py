@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.attribution import Round
+from fitting.base_fit import base_fit
 from fitting.clock import Clock
-from fitting.close_loop import Finding, base_fit
+from fitting.close_loop import Finding
 from fitting.compare import Account, account
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.estimate import measurement_noise
@@ -87,12 +88,12 @@ def fit_only(
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, split(experiments[h])[0]) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
-    found, (training, validation) = fits[hold], split(experiments[hold])
+    found, (_, validation) = fits[hold], split(experiments[hold])
     clock.lap("fit")
     noise = measurement_noise(found)
     clock.lap("measurement noise")
     progress("free runs on held-out data")
-    result = account(found, training, validation, noise=noise, halo=0)
+    result = account(found, found.stretches, validation, noise=noise, halo=0)
     clock.lap("free runs and standard errors")
     residual = diagnose(found)
     tests = residual_tests(found, residual)

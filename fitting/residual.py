@@ -13,7 +13,8 @@ from hdjax.lanes import jit_lanes
 from hdjax.simulate import march
 from hdjax.where import where
 
-# Where a simulation has left the numbers, the residual is this many standard deviations: a rejected step.
+# A simulation that runs away, or leaves the numbers, is this many standard deviations off: a rejected step. (Its own
+# size would overflow where it is squared.)
 _LOST = 1e8
 
 
@@ -115,11 +116,11 @@ def residual(
     error = (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
     rows = white.reshape(white.shape[0], -1)
-    rows = where(jnp.isfinite(rows), rows, _LOST)
+    rows = where(jnp.abs(rows) < _LOST, rows, _LOST)
     joined = problem.segments.joined[:, None]
     rows = jnp.concatenate([rows, where(joined, 0.0, _state_prior(problem, unknowns))], axis=1)
     gap = unknowns.states - jnp.roll(end, 1, axis=0)
-    gap = where(jnp.isfinite(gap), gap, _LOST)
+    gap = where(jnp.abs(gap) < _LOST, gap, _LOST)
     return rows, where(joined, gap, 0.0)
 
 

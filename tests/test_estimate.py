@@ -15,7 +15,7 @@ from fitting.estimate import (
     suggested_substeps,
     whitening,
 )
-from fitting.experiment import Stretch, cut
+from fitting.experiment import Stretch, cut, experiment_from_log
 from fitting.free import base_paths
 from fitting.uncertainty import uncertainty
 from hdjax.effects.friction import CoulombFriction
@@ -187,6 +187,18 @@ def test_initial_states_of_a_smooth_motion():
     # A cubic through eight intervals, a quarter of a period: a few percent of the rates.
     off = np.max(np.abs(np.asarray(states) - expected), axis=0) / np.max(np.abs(expected), axis=0)
     np.testing.assert_array_less(off, [0.01, 0.01, 0.15, 0.15])
+
+
+def test_initial_speeds_of_a_noisy_oversampled_motion():
+    forcing = np.repeat(rig.reduced_forcing(100), 20)
+    step = rig.REDUCED_STEP / 20
+    motion = rig.reduced_motion(forcing, step=step)
+    log = rig.reduced_log(motion[:, 0], forcing, noise=0.1 * np.std(motion[:, 0]), step=step)
+    segments = cut(whole(experiment_from_log(log, hold="zero-order")), 200, count=10)
+    states = np.asarray(initial_states(rig.reduced_model(), segments))
+    off = np.sqrt(np.mean((states - motion[::200]) ** 2, axis=0)) / np.std(motion, axis=0)
+    # 87 samples in a quarter period; from nine of them the speed would be mere noise.
+    np.testing.assert_array_less(off, [0.2, 0.5])
 
 
 def test_whitening_inverts_the_covariance():

@@ -1,0 +1,132 @@
+"""The base model's fit, from nothing but the log: starting values, coarse fits from each, and the best one refined.
+
+Short simulations find their minimum from far away, because a wrong frequency can't run out of phase; long ones use the
+data fully. So each start is fitted over short horizons first, and the best goes on to longer ones from the states that
+it has found.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from scipy.stats import chi2
+
+from fitting.estimate import Fit, fit, initial_states, segment_length, short_horizon, suggested_substeps
+from fitting.experiment import Stretch, cut
+from fitting.free import base_paths
+from fitting.outliers import without_glitches, without_lone_errors
+from fitting.starting_values import starting_models
+from hdjax import Model
+
+# Iterations that tell a start that leads somewhere from one that does not.
+_TRIAL_STEPS = 10
+# A start whose trial is this much worse than the best (in the objective: 10 % of the error) is given up.
+_HOPELESS = 0.1
+# Rounds of leaving out what stands alone; each tells the noise better, and so shows smaller outliers.
+_CLEANINGS = 3
+# Lags of the test for whiteness, and the chance that it takes white noise for anything else.
+_LAGS = 20
+_FALSE_ALARM = 1e-3
+
+
+def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
+    """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
+
+    Args:
+        model: the base model; its stiffness and damping are only placeholders.
+        training: the data.
+        halo: intervals of torque before a segment.
+
+    Raises:
+        DataError: where the data supply no starting values.
+    """
+    training = without_glitches(training)
+    best = _coarse_fit(starting_models(model, training), training, halo)
+    start = best.problem.model
+    horizon = short_horizon(best.model, training)
+    if not best.horizon <= 2 * horizon <= 4 * best.horizon:
+        segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
+        best = fit(
+            best.model,
+            training,
+            base_paths(best.model),
+            horizon=horizon,
+            halo=halo,
+            substeps=suggested_substeps(best.model, training),
+            states=initial_states(best.model, segments),
+        )
+    for _ in range(_CLEANINGS):
+        cleaned = without_lone_errors(best)
+        if cleaned is None:
+            break
+        best = fit(
+            best.model,
+            cleaned,
+            base_paths(best.model),
+            horizon=best.horizon,
+            halo=halo,
+            substeps=best.substeps,
+            states=best.unknowns.states,
+        )
+    return eqx.tree_at(lambda f: f.problem.model, best, start)
+
+
+def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> Fit:
+    """The best of the fits from each start, over horizons that suit the fastest of them."""
+    # Judged on equally short segments, a start with the wrong frequency can't hide.
+    horizon = segment_length(min(short_horizon(s, training) for s in starts))
+    substeps = max(suggested_substeps(s, training) for s in starts)
+
+    def fitted(start: Model, *, max_steps: int = 60, hold_parameters: bool = False) -> Fit:
+        return fit(
+            start,
+            training,
+            base_paths(start),
+            horizon=horizon,
+            halo=halo,
+            substeps=substeps,
+            max_steps=max_steps,
+            hold_parameters=hold_parameters,
+        )
+
+    held = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
+    best = fitted(held[0])
+    if len(starts) == 1 or leaves_white_noise(best):
+        return best
+    trials = sorted((fitted(s, max_steps=_TRIAL_STEPS) for s in held[1:]), key=lambda f: f.objective)
+    for trial in trials:
+        if trial.objective < best.objective + _HOPELESS:
+            best = min(best, fitted(trial.model), key=lambda f: f.objective)
+    return best
+
+
+def leaves_white_noise(found: Fit) -> bool:
+    """Whether nothing is left of the dynamic error that a better minimum could explain: a test of its first
+    autocorrelations (Ljung and Box 1978)."""
+    kept = np.asarray(found.problem.segments.weight)
+    error = np.asarray(found.error)[..., -1] * kept
+    count = kept.sum()
+    power = np.sum(error**2)
+    if not power > 0:
+        return True
+    lags = np.arange(1, min(_LAGS, error.shape[1] // 2) + 1)
+    correlation = np.array([np.sum(error[:, k:] * error[:, :-k]) for k in lags]) / power
+    pairs = np.array([np.sum(kept[:, k:] * kept[:, :-k]) for k in lags])
+    # Each correlation has a variance of pairs / count^2.
+    statistic = np.sum(correlation**2 * count**2 / pairs)
+    return bool(statistic < chi2.isf(_FALSE_ALARM, lags.size))
+
+
+def _as_followed(found: Fit) -> tuple[Stretch, ...]:
+    """The stretches with the outputs that the fit gives in place of the measured ones."""
+    length = found.error.shape[1]
+    parts, first = [], 0
+    for stretch in found.stretches:
+        pieces = -(-len(stretch) // length)
+        error = np.asarray(found.error[first : first + pieces]).reshape(pieces * length, -1)[: len(stretch)]
+        first += pieces
+        measured = stretch.experiment.measured.copy()
+        measured[stretch.start : stretch.stop] -= error
+        parts.append(Stretch(dataclasses.replace(stretch.experiment, measured=measured), stretch.start, stretch.stop))
+    return tuple(parts)

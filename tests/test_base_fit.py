@@ -1,0 +1,114 @@
+"""From the log alone to the right minimum, where the way there is hard."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.base_fit import base_fit, leaves_white_noise
+from fitting.estimate import Fit, fit
+from fitting.experiment import Experiment, Stretch, experiment_from_log
+from fitting.free import base_paths
+from fitting.outliers import left_out
+from fitting.starting_values import starting_models
+from fitting.uncertainty import uncertainty
+
+PLACEHOLDER = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
+COUNT = 1000
+NOISE = 1e-3
+PERIOD = 2 * np.pi / rig.OMEGA_0
+
+
+def whole(experiment: Experiment) -> list[Stretch]:
+    return [Stretch(experiment, 0, len(experiment))]
+
+
+def assert_recovered(found: Fit, truth: dict[str, float], *, within: float = 4.0):
+    for path, estimate in uncertainty(found).estimates.items():
+        assert abs(estimate.value - truth[path]) < within * estimate.std, (path, estimate)
+
+
+@pytest.fixture(scope="module")
+def clean() -> Experiment:
+    return rig.reduced_experiment(COUNT, noise=NOISE)
+
+
+@pytest.fixture(scope="module")
+def found(clean) -> Fit:
+    return base_fit(PLACEHOLDER, whole(clean))
+
+
+TRUTH = {"mu": rig.MU, "omega_0": rig.OMEGA_0, "alpha": rig.REDUCED_ALPHA, "gain": rig.GAIN}
+
+
+def test_a_plain_log(found: Fit):
+    assert found.converged
+    assert_recovered(found, TRUTH)
+    assert found.dynamic_error_std == pytest.approx(NOISE, rel=0.1)
+    # Gaussian noise has no outliers: the data are the very ones that were given.
+    assert left_out(found.stretches) == 0
+    assert found.stretches[0].experiment.weight is None
+
+
+def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
+    assert leaves_white_noise(found)
+    off = fit(
+        rig.reduced_model(omega_0=1.01 * rig.OMEGA_0),
+        whole(clean),
+        base_paths(PLACEHOLDER),
+        horizon=found.horizon,
+        substeps=found.problem.substeps,
+        hold_parameters=True,
+    )
+    assert not leaves_white_noise(off)
+
+
+@pytest.mark.parametrize("size", [15 * NOISE, 20.0])
+def test_spikes_cost_no_more_than_their_samples(found: Fit, clean, size: float):
+    random = np.random.default_rng(3)
+    # One sample in a hundred, never two beside each other; the twist itself is of order 1.
+    rows = 7 + 100 * np.arange(COUNT // 100) + random.integers(0, 80, COUNT // 100)
+    measured = clean.measured.copy()
+    measured[rows] += size * random.choice([-1.0, 1.0], rows.size)[:, None]
+    spoiled = base_fit(PLACEHOLDER, whole(dataclasses.replace(clean, measured=measured)))
+    weight = spoiled.stretches[0].experiment.weight
+    assert weight is not None
+    np.testing.assert_array_equal(np.flatnonzero(weight == 0), rows)
+    estimates = uncertainty(found).estimates
+    for path, estimate in estimates.items():
+        # A hundredth of the information moves an estimate by about a tenth of its standard error.
+        assert abs(float(spoiled.model.get(path)) - estimate.value) < 0.5 * estimate.std, path
+    assert spoiled.dynamic_error_std == pytest.approx(found.dynamic_error_std, rel=0.05)
+
+
+def test_a_frequency_that_the_torque_has_does_not_pass_for_the_drive_s_own():
+    """An undriven oscillator at the frequency of a harmonic torque follows the log better, at first sight, than the
+    drive with a damping that is far off."""
+    zeta, step = 0.018, PERIOD / 8.6
+    forcing = 3 * rig.GAIN * np.cos(0.46 * rig.OMEGA_0 * np.arange(1500) * step)
+    x = rig.reduced_motion(forcing, mu=2 * zeta * rig.OMEGA_0, alpha=0.0, step=step)[:, 0]
+    random = np.random.default_rng(0)
+    logged = forcing + 0.015 * np.std(forcing) * random.normal(size=forcing.size)
+    log = rig.reduced_log(x, logged, noise=0.013 * np.std(x), step=step)
+    stretches = whole(experiment_from_log(log, hold="zero-order"))
+    starts = starting_models(PLACEHOLDER, stretches)
+    assert any(abs(float(s.get("omega_0")) / (0.46 * rig.OMEGA_0) - 1) < 0.1 for s in starts)
+    result = base_fit(PLACEHOLDER, stretches)
+    assert float(result.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=0.02)
+    assert float(result.model.get("gain")) == pytest.approx(rig.GAIN, rel=0.05)
+
+
+def test_a_noisy_oversampled_softening_drive():
+    """Speeds guessed from a few noisy samples would throw the simulation over its saddle."""
+    step, count = PERIOD / 150, 1500
+    forcing = 10.0 * np.sign(np.sin(0.37 * rig.OMEGA_0 * np.arange(count) * step))
+    motion = rig.reduced_motion(forcing, alpha=0.0, mu=10.0, step=step)[:, 0]
+    alpha = -0.3 / np.max(np.abs(motion)) ** 2
+    x = rig.reduced_motion(forcing, alpha=alpha, mu=10.0, step=step)[:, 0]
+    assert -0.7 < alpha * np.max(np.abs(x)) ** 2 < -0.2
+    log = rig.reduced_log(x, forcing, noise=0.1 * np.std(x), step=step)
+    result = base_fit(PLACEHOLDER, whole(experiment_from_log(log, hold="zero-order")))
+    assert result.converged
+    assert_recovered(result, {"mu": 10.0, "omega_0": rig.OMEGA_0, "alpha": alpha, "gain": rig.GAIN})
+    assert float(result.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=0.1)
