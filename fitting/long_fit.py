@@ -1,6 +1,7 @@
 """The last fit, over simulations as long as the logs, where small errors of a parameter add up and show."""
 
 from fitting.estimate import Fit, fit, needed_substeps
+from hdjax import Model
 
 _STEPS = 20
 # By how many standard errors the solver's steps may move the parameters, and how many steps a sample may take.
@@ -18,32 +19,35 @@ def long_fit(start: Fit) -> Fit:
     Args:
         start: a fit over shorter horizons.
     """
-    segments = start.problem.segments
-    count, length = segments.weight.shape
-    substeps = needed_substeps(start, shift=_SHIFT, most=_MOST_SUBSTEPS)
-    long = fit(
-        start.model,
-        start.stretches,
-        start.free.paths,
-        horizon=max(len(s) for s in start.stretches),
-        length=length,
-        halo=segments.halo,
-        substeps=substeps,
-        covariance=start.covariance,
-        count=count,
-        states=start.unknowns.states,
-        max_steps=_STEPS,
-    )
-    check = fit(
-        long.model,
-        start.stretches,
-        start.free.paths,
-        horizon=start.horizon,
-        length=length,
-        halo=segments.halo,
-        substeps=substeps,
-        count=count,
-        covariance=start.covariance,
-        hold_parameters=True,
-    )
+    whole = max(len(s) for s in start.stretches)
+    long = _again(start, start.model, horizon=whole, substeps=_fine_enough(start))
+    # Long horizons know the parameters better, and so ask for finer steps.
+    substeps = _fine_enough(long)
+    if substeps > long.substeps:
+        long = _again(long, long.model, horizon=whole, substeps=substeps)
+    check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True)
     return long if check.objective < start.objective + _LOSS else start
+
+
+def _fine_enough(found: Fit) -> int:
+    return needed_substeps(found, shift=_SHIFT, most=_MOST_SUBSTEPS)
+
+
+def _again(found: Fit, model: Model, *, horizon: int, substeps: int, hold_parameters: bool = False) -> Fit:
+    """A fit of the same data, from its states and on segments of its length, which share its compiled program."""
+    segments = found.problem.segments
+    count, length = segments.weight.shape
+    return fit(
+        model,
+        found.stretches,
+        found.free.paths,
+        horizon=horizon,
+        length=length,
+        halo=segments.halo,
+        substeps=substeps,
+        covariance=found.covariance,
+        count=count,
+        states=None if hold_parameters else found.unknowns.states,
+        max_steps=_STEPS,
+        hold_parameters=hold_parameters,
+    )
