@@ -32,6 +32,7 @@ from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import read_log
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
 from fitting.rig import Rig, experiment, read_rig
@@ -62,7 +63,7 @@ DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias
 
 
 @app.command
-def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
+def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False, seed: int = 0) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
     Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
@@ -72,17 +73,36 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     ----------
     out
         Folder for report.html, report.json and model.json; of a folder of logs for fleet.parquet.
+    posterior
+        Draw from the posterior as well (minutes), and write the draws to posterior.parquet. Needs the extra
+        `posterior`.
+    seed
+        Of the draws.
     """
+    if posterior:
+        _check_posterior(logs)
     if any(path.is_dir() for path in logs):
         _fit_fleet(logs, drive, out)
         return
     rig = read_rig(logs, drive)
     with _progress() as progress:
-        fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, progress=progress)
+        fitted = fit_only(
+            rig.model, rig.experiments, hold=rig.hold, seed=seed if posterior else None, progress=progress
+        )
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
     paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
     print(fit_text(fitted, rig=rig))
     print(f"Report: {paths['report.html']}")
+
+
+def _check_posterior(logs: list[Path]) -> None:
+    for path in logs:
+        if path.is_dir():
+            raise InputError(f"{path}: --posterior is for log files of one drive, but this is a folder; name its logs")
+    try:
+        sampler()
+    except ImportError as error:
+        raise InputError(f"--posterior: {error}") from error
 
 
 def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:

@@ -16,6 +16,8 @@ from fitting.estimate import measurement_noise
 from fitting.experiment import Experiment, split
 from fitting.frequency_response import FrequencyResponse, frequency_response
 from fitting.goodness import Goodness, goodness
+from fitting.posterior import Posterior, posterior
+from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.residual_tests import ResidualTests, residual_tests
 from hdjax import Hold, Model
 
@@ -32,6 +34,8 @@ class FitOnly(eqx.Module):
         tests: of the same.
         goodness: figures of merit.
         frequency_response: of the logs and of the model; None where the logs are too short for it.
+        bands: how well the free runs along held-out data are known.
+        posterior: draws, where they were asked for.
         seconds: where the time went.
     """
 
@@ -43,6 +47,8 @@ class FitOnly(eqx.Module):
     tests: ResidualTests
     goodness: Goodness
     frequency_response: FrequencyResponse | None
+    bands: tuple[PredictionBand, ...]
+    posterior: Posterior | None
     seconds: dict[str, float]
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()
@@ -69,6 +75,7 @@ def fit_only(
     experiments: dict[Hold, tuple[Experiment, ...]],
     *,
     hold: Hold | None = None,
+    seed: int | None = None,
     progress: Callable[[str], None] = _silent,
 ) -> FitOnly:
     """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.close_loop`][].
@@ -77,10 +84,12 @@ def fit_only(
         model: the base model; its stiffness and damping are only placeholders.
         experiments: the same logs under each assumption about the torque between samples.
         hold: the assumption that the user states; where None, the one that suits the model best.
+        seed: of draws from the posterior; where None, none are made.
         progress: told what is being done.
 
     Raises:
         DataError: where no oscillator fits the data.
+        ImportError: where draws are asked for and blackjax is not installed.
     """
     clock = Clock()
     progress("fitting the base model")
@@ -92,7 +101,8 @@ def fit_only(
     noise = measurement_noise(found)
     clock.lap("measurement noise")
     progress("free runs on held-out data")
-    result = account(found, training, validation, noise=noise, halo=0)
+    result = account(found, training, validation, noise=noise, halo=0, profiles=True)
+    bands = prediction_bands(found, result.uncertainty, validation, noise=noise, runs=result.validation)
     clock.lap("free runs and standard errors")
     residual = diagnose(found)
     tests = residual_tests(found, residual)
@@ -100,6 +110,11 @@ def fit_only(
         found.model, experiments[hold], hold=hold, noise=float(np.sqrt(np.asarray(noise)[-1, -1]))
     )
     clock.lap("diagnostics")
+    draws = None
+    if seed is not None:
+        progress("drawing from the posterior")
+        draws = posterior(found, result.uncertainty, seed=seed)
+        clock.lap("posterior")
     return FitOnly(
         account=result,
         start=found.problem.model,
@@ -109,5 +124,7 @@ def fit_only(
         tests=tests,
         goodness=goodness(found, result, noise),
         frequency_response=response,
+        bands=bands,
+        posterior=draws,
         seconds=clock.laps,
     )

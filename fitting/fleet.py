@@ -23,6 +23,7 @@ import polars as pl
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly, fit_only
+from fitting.formatting import in_log_words
 from fitting.log_table import LOG_SUFFIXES
 from fitting.rig import Rig, read_rig
 from hdjax import SimulationError
@@ -75,7 +76,7 @@ def fit_fleet(
 
     Returns:
         A row for each log: what became of it, and for each parameter its value, standard error, 95 % interval and
-        whether the log tells it.
+        what that is from, whether the log tells the parameter, and if not, why.
 
     Raises:
         InputError: where there are no logs.
@@ -145,6 +146,7 @@ def _row(name: str, drive: Path, state: State, message: str, **figures: object) 
 def _figures(rig: Rig, fitted: FitOnly) -> Row:
     """What the table tells of a fit."""
     log, account, goodness = rig.logs[0], fitted.account, fitted.goodness
+    units = {"dynamic_error": "rad", "forcing": "N m"} | log.units
     found: Row = {
         "kind": log.kind,
         "samples": len(log),
@@ -164,7 +166,11 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
             f"{path}_std": estimate.std,
             f"{path}_low": low,
             f"{path}_high": high,
+            f"{path}_interval": estimate.interval,
             f"{path}_identifiable": estimate.identifiable,
+            f"{path}_note": in_log_words(
+                account.identifiability.note(path) or "", response=units["dynamic_error"], forcing=units["forcing"]
+            ),
         }
     return found
 
