@@ -10,7 +10,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.metadata import version
 from io import BytesIO
@@ -20,6 +20,7 @@ from typing import Any, Literal
 import jax
 import polars as pl
 
+from fitting.compare import Account
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly, fit_only
@@ -146,7 +147,6 @@ def _row(name: str, drive: Path, state: State, message: str, **figures: object) 
 def _figures(rig: Rig, fitted: FitOnly) -> Row:
     """What the table tells of a fit."""
     log, account, goodness = rig.logs[0], fitted.account, fitted.goodness
-    units = {"dynamic_error": "rad", "forcing": "N m"} | log.units
     found: Row = {
         "kind": log.kind,
         "samples": len(log),
@@ -159,7 +159,19 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
         "error_over_noise": goodness.error_over_noise["dynamic error"],
         "fit_percent_validation": goodness.fit_percent["validation"],
     }
+    return found | parameter_columns(account, log.units)
+
+
+def parameter_columns(account: Account, units: Mapping[str, str]) -> Row:
+    """What the table tells of each parameter.
+
+    Args:
+        account: the fitted model's.
+        units: of `dynamic_error` and, in a reduced log, of `forcing`.
+    """
+    found: Row = {}
     for path, estimate in account.uncertainty.estimates.items():
+        note = account.identifiability.note(path) or ""
         low, high = estimate.ci95
         found |= {
             path: estimate.value,
@@ -168,9 +180,7 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
             f"{path}_high": high,
             f"{path}_interval": estimate.interval,
             f"{path}_identifiable": estimate.identifiable,
-            f"{path}_note": in_log_words(
-                account.identifiability.note(path) or "", response=units["dynamic_error"], forcing=units["forcing"]
-            ),
+            f"{path}_note": in_log_words(note, response=units["dynamic_error"], forcing=units.get("forcing", "N m")),
         }
     return found
 

@@ -128,7 +128,8 @@ def with_profiles(fit: Fit, found: Uncertainty) -> Uncertainty:
             estimates[path] = dataclasses.replace(
                 estimate, ci95=(low, high), identifiable=bool(known), interval="profile"
             )
-    return eqx.tree_at(lambda u: u.estimates, found, estimates, is_leaf=lambda x: isinstance(x, dict))
+    # `tree_at` would sort the dictionary, and the covariance is in its order.
+    return dataclasses.replace(found, estimates=estimates)
 
 
 def _inflation(fit: Fit, found: Uncertainty, index: int) -> float:

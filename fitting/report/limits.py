@@ -72,7 +72,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
 def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
     strong = [c for c in correlations if abs(c["value"] or 0.0) > _CORRELATED]
     notes = [
-        f"{c['between'][0]} and {c['between'][1]} are correlated by {formatting.number(c['value'], 3)}: the data "
+        f"{c['between'][0]} and {c['between'][1]} are correlated by {c['value']:+.3f}: the data "
         "determine a combination of the two better than each."
         for c in strong[:_MOST_CORRELATIONS]
     ]
