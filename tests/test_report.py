@@ -282,17 +282,21 @@ def test_a_fit_tells_all_that_fitters_expect(fitted: FitOnly):
 
 
 def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
-    looked: list[Uncertainty] = []
+    def doubt(found: Fit, known: Uncertainty) -> Uncertainty:
+        alpha = dataclasses.replace(
+            known.estimates["alpha"], ci95=(-900.0, math.inf), identifiable=False, interval="profile"
+        )
+        return dataclasses.replace(known, estimates=known.estimates | {"alpha": alpha})
 
-    def no_doubt(found: Fit, known: Uncertainty) -> Uncertainty:
-        looked.append(known)
-        return known
-
-    monkeypatch.setattr("fitting.compare.with_profiles", no_doubt)
+    monkeypatch.setattr("fitting.compare.with_profiles", doubt)
     log = rig.drive_experiment(3000)
     good = report_dict(fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (log,)}, hold=HOLD))
-    # A fit alone has its intervals looked at; see the tests of profiles for what comes of it.
-    assert len(looked) == 1
+    # What a profile says of an interval goes before the parabola, in the reason as well.
+    alpha = good["before"]["parameters"]["alpha"]
+    assert (alpha["interval"], alpha["ci95"]) == ("profile", [-900.0, None])
+    assert alpha["note"].startswith(
+        "alpha is not identifiable from these logs: they leave it open above -9e+02 rad^-2."
+    )
     # 600 samples know a share of 95 % to 1 %.
     assert good["goodness"]["band_coverage"] == pytest.approx(0.95, abs=0.03)
     assert {t["verdict"] for t in good["residual_tests"]} == {"passed"}
