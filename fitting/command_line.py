@@ -32,6 +32,7 @@ from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.posterior import sampler
 from fitting.quasi_static import content as quasi_static_content
 from fitting.quasi_static import report as quasi_static_report
 from fitting.quasi_static.fit import fit_quasi_static
@@ -68,7 +69,7 @@ DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias
 
 
 @app.command
-def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
+def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False, seed: int = 0) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
     Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
@@ -80,7 +81,14 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     out
         Folder for report.html, report.json and, but for quasi-static logs, model.json; of a folder of logs for
         fleet.parquet.
+    posterior
+        Draw from the posterior as well (minutes), and write the draws to posterior.parquet. Needs the extra
+        `posterior`.
+    seed
+        Of the draws.
     """
+    if posterior:
+        _check_posterior(logs)
     if any(path.is_dir() for path in logs):
         _fit_fleet(logs, drive, out)
         return
@@ -89,7 +97,7 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     if read[0].kind == "quasi-static":
         _fit_quasi_static(read, drive_file, out)
     else:
-        _fit_drive(rig_of(read, drive_file), out)
+        _fit_drive(rig_of(read, drive_file), out, seed if posterior else None)
 
 
 def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
@@ -105,13 +113,23 @@ def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -
     print(f"Report: {paths['report.html']}")
 
 
-def _fit_drive(rig: Rig, out: Path) -> None:
+def _fit_drive(rig: Rig, out: Path, seed: int | None) -> None:
     with _progress() as progress:
-        fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, progress=progress)
+        fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, seed=seed, progress=progress)
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
     paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
     print(fit_text(fitted, rig=rig))
     print(f"Report: {paths['report.html']}")
+
+
+def _check_posterior(logs: list[Path]) -> None:
+    for path in logs:
+        if path.is_dir():
+            raise InputError(f"{path}: --posterior is for log files of one drive, but this is a folder; name its logs")
+    try:
+        sampler()
+    except ImportError as error:
+        raise InputError(f"--posterior: {error}") from error
 
 
 def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:

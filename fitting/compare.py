@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
 from fitting.free_run import FreeRun, free_run, rms_error
+from fitting.identifiability import Identifiability, identifiability
+from fitting.profile import with_profiles
 from fitting.uncertainty import Uncertainty, uncertainty
 from hdjax import Model
 
@@ -21,12 +23,14 @@ class Account(eqx.Module):
         uncertainty: of what was fitted.
         training: free runs along the training stretches.
         validation: free runs along the held-out stretches.
+        identifiability: what the logs can't tell of it.
     """
 
     model: Model
     uncertainty: Uncertainty
     training: tuple[FreeRun, ...]
     validation: tuple[FreeRun, ...]
+    identifiability: Identifiability
 
     @property
     def training_rmse(self) -> float:
@@ -46,8 +50,9 @@ def account(
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int,
+    profiles: bool = False,
 ) -> Account:
-    """Free runs and standard errors of a fit.
+    """Free runs and standard errors of a fit, and what it can't tell.
 
     Args:
         fit: the fitted model.
@@ -55,9 +60,14 @@ def account(
         validation: stretches that were not.
         noise: covariance of the measurement noise.
         halo: intervals of torque before a stretch.
+        profiles: whether doubtful intervals are taken from the likelihood's profile, which compiles a program of its
+            own.
     """
     seen, unseen = _runs(fit, training, validation, noise, halo)
-    return Account(model=fit.model, uncertainty=uncertainty(fit), training=seen, validation=unseen)
+    found = uncertainty(fit)
+    if profiles:
+        found = with_profiles(fit, found)
+    return Account(fit.model, found, seen, unseen, identifiability(fit, found))
 
 
 def validation_rmse(

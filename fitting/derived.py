@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
+from scipy.stats import t as student
 
 from fitting.compare import Account
-from fitting.normal_law import NORMAL_95
 from hdjax import Drive, Model
 
 Quantities = Mapping[str, tuple[Array, str]]
@@ -24,16 +24,18 @@ class Derived(eqx.Module):
         value: in `unit`.
         std: standard error to first order.
         unit: SI unit.
+        degrees_of_freedom: of Student's t behind the interval.
     """
 
     value: float
     std: float
     unit: str = eqx.field(static=True)
+    degrees_of_freedom: float
 
     @property
     def ci95(self) -> tuple[float, float]:
         """95 % interval."""
-        half = NORMAL_95 * self.std
+        half = float(student.ppf(0.975, self.degrees_of_freedom)) * self.std
         return self.value - half, self.value + half
 
 
@@ -60,10 +62,26 @@ def derived(account: Account, quantities: Callable[[Model], Quantities]) -> dict
         scaled = slopes * spread
         variance = np.einsum("ip,pq,iq->i", scaled, np.asarray(account.uncertainty.correlation), scaled)
         errors = np.sqrt(variance)
+    freedom = _degrees_of_freedom(scaled, np.array([e.degrees_of_freedom for e in estimates.values()]))
     return {
-        name: Derived(float(value), float(error), unit)
-        for (name, (value, unit)), error in zip(known.items(), errors, strict=True)
+        name: Derived(float(value), float(error), unit, float(own))
+        for (name, (value, unit)), error, own in zip(known.items(), errors, freedom, strict=True)
     }
+
+
+def _degrees_of_freedom(
+    scaled: Float[np.ndarray, "quantities parameters"], own: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, " quantities"]:
+    """Degrees of freedom of each quantity's variance, from the parameters' own and what they contribute to the error.
+
+    The harmonic mean, weighed by the parameters' shares of the sum of squared contributions: exact for one parameter
+    or where all have the same, and fewer than Satterthwaite's where errors are independent.
+    """
+    with np.errstate(all="ignore"):
+        shares = scaled**2 / np.sum(scaled**2, axis=1, keepdims=True)
+        freedom = 1.0 / (shares @ (1.0 / own))
+    # A quantity that follows from no fitted parameter is certain.
+    return np.where(np.isnan(freedom), np.inf, freedom)
 
 
 def drive_figures(model: Model, x_max: float) -> dict[str, tuple[Array, str]]:

@@ -17,6 +17,9 @@ from fitting.estimate import measurement_noise
 from fitting.experiment import Experiment, split
 from fitting.frequency_response import FrequencyResponse, frequency_response
 from fitting.goodness import Goodness, goodness
+from fitting.long_fit import long_fit
+from fitting.posterior import Posterior, posterior
+from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.residual_tests import ResidualTests, residual_tests
 from hdjax import Hold, Model
 
@@ -33,6 +36,8 @@ class FitOnly(eqx.Module):
         tests: of the same.
         goodness: figures of merit.
         frequency_response: of the logs and of the model; None where the logs are too short for it.
+        bands: how well the free runs along held-out data are known.
+        posterior: draws, where they were asked for.
         seconds: where the time went.
     """
 
@@ -44,6 +49,8 @@ class FitOnly(eqx.Module):
     tests: ResidualTests
     goodness: Goodness
     frequency_response: FrequencyResponse | None
+    bands: tuple[PredictionBand, ...]
+    posterior: Posterior | None
     seconds: dict[str, float]
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()
@@ -70,6 +77,7 @@ def fit_only(
     experiments: dict[Hold, tuple[Experiment, ...]],
     *,
     hold: Hold | None = None,
+    seed: int | None = None,
     progress: Callable[[str], None] = _silent,
 ) -> FitOnly:
     """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.close_loop`][].
@@ -78,22 +86,28 @@ def fit_only(
         model: the base model; its stiffness and damping are only placeholders.
         experiments: the same logs under each assumption about the torque between samples.
         hold: the assumption that the user states; where None, the one that suits the model best.
+        seed: of draws from the posterior; where None, none are made.
         progress: told what is being done.
 
     Raises:
         DataError: where no oscillator fits the data.
+        ImportError: where draws are asked for and blackjax is not installed.
     """
     clock = Clock()
     progress("fitting the base model")
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, split(experiments[h])[0]) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
-    found, (_, validation) = fits[hold], split(experiments[hold])
-    clock.lap("fit")
-    noise = measurement_noise(found)
+    base, (_, validation) = fits[hold], split(experiments[hold])
+    clock.lap("base fit")
+    noise = measurement_noise(base)
     clock.lap("measurement noise")
+    progress("final fit over long horizons")
+    found = long_fit(base)
+    clock.lap("final fit")
     progress("free runs on held-out data")
-    result = account(found, found.stretches, validation, noise=noise, halo=0)
+    result = account(found, found.stretches, validation, noise=noise, halo=0, profiles=True)
+    bands = prediction_bands(found, result.uncertainty, validation, noise=noise, runs=result.validation)
     clock.lap("free runs and standard errors")
     residual = diagnose(found)
     tests = residual_tests(found, residual)
@@ -101,14 +115,21 @@ def fit_only(
         found.model, experiments[hold], hold=hold, noise=float(np.sqrt(np.asarray(noise)[-1, -1]))
     )
     clock.lap("diagnostics")
+    draws = None
+    if seed is not None:
+        progress("drawing from the posterior")
+        draws = posterior(found, result.uncertainty, seed=seed)
+        clock.lap("posterior")
     return FitOnly(
         account=result,
-        start=found.problem.model,
+        start=base.problem.model,
         noise=noise,
         hold=hold,
         residual=residual,
         tests=tests,
         goodness=goodness(found, result, noise),
         frequency_response=response,
+        bands=bands,
+        posterior=draws,
         seconds=clock.laps,
     )

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.metadata import version
 from io import BytesIO
@@ -20,9 +20,11 @@ from typing import Any, Literal
 import jax
 import polars as pl
 
+from fitting.compare import Account
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly, fit_only
+from fitting.formatting import in_log_words
 from fitting.log_table import LOG_SUFFIXES
 from fitting.rig import Rig, read_rig
 from hdjax import SimulationError
@@ -75,7 +77,7 @@ def fit_fleet(
 
     Returns:
         A row for each log: what became of it, and for each parameter its value, standard error, 95 % interval and
-        whether the log tells it.
+        what that is from, whether the log tells the parameter, and if not, why.
 
     Raises:
         InputError: where there are no logs.
@@ -157,14 +159,28 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
         "error_over_noise": goodness.error_over_noise["dynamic error"],
         "fit_percent_validation": goodness.fit_percent["validation"],
     }
+    return found | parameter_columns(account, log.units)
+
+
+def parameter_columns(account: Account, units: Mapping[str, str]) -> Row:
+    """What the table tells of each parameter.
+
+    Args:
+        account: the fitted model's.
+        units: of `dynamic_error` and, in a reduced log, of `forcing`.
+    """
+    found: Row = {}
     for path, estimate in account.uncertainty.estimates.items():
+        note = account.identifiability.note(path) or ""
         low, high = estimate.ci95
         found |= {
             path: estimate.value,
             f"{path}_std": estimate.std,
             f"{path}_low": low,
             f"{path}_high": high,
+            f"{path}_interval": estimate.interval,
             f"{path}_identifiable": estimate.identifiable,
+            f"{path}_note": in_log_words(note, response=units["dynamic_error"], forcing=units.get("forcing", "N m")),
         }
     return found
 

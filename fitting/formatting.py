@@ -19,9 +19,12 @@ _PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n", -12: "p"}
 
 def pretty_unit(unit: str) -> str:
     """A unit with superscripts; nothing for a pure number."""
-    if unit == "1":
-        return ""
-    return re.sub(r"\^(-?[0-9n]+)", lambda m: m.group(1).translate(_SUPERSCRIPT), unit)
+    return "" if unit == "1" else superscripts(unit)
+
+
+def superscripts(text: str) -> str:
+    """Text whose whole powers are raised."""
+    return re.sub(r"\^(-?[0-9n]+)(?![0-9.])", lambda m: m.group(1).translate(_SUPERSCRIPT), text)
 
 
 def scaled_unit(magnitude: float, unit: str) -> tuple[float, str]:
@@ -88,7 +91,7 @@ def interval(ends: Ends, std: float | None, unit: str) -> str:
     """An interval, to the digits that the standard error leaves."""
     if std is None or not math.isfinite(std) or std <= 0:
         return f"{quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
-    return _together(ends, std, unit, "{0} to {1}")
+    return _span(ends, std, unit)
 
 
 def in_factor(value: float | None, std: float | None, factor: float) -> str:
@@ -104,7 +107,27 @@ def interval_in_factor(ends: Ends, std: float | None, factor: float) -> str:
     """[`interval`][] for a column whose head states the unit."""
     if std is None or not math.isfinite(std) or std <= 0:
         return "—"
-    return _together(ends, std, "1", "{0} to {1}", factor)
+    return _span(ends, std, "1", factor)
+
+
+def _span(ends: Ends, std: float, unit: str, factor: float | None = None) -> str:
+    known = [e for e in ends if e is not None]
+    return _together(known, std, unit, open_interval(ends), factor) if known else open_interval(ends)
+
+
+def open_interval(ends: Ends) -> str:
+    """A pattern for the known ends of an interval: "{0} to {1}", or which one is missing."""
+    low, high = (e is not None for e in ends)
+    if low and high:
+        return "{0} to {1}"
+    return "above {0}" if low else "below {0}" if high else "unbounded"
+
+
+def value_in_factor(value: float | None, std: float | None, factor: float) -> str:
+    """A value alone for such a column, to the digits that the standard error leaves."""
+    if value is None or std is None or not math.isfinite(std) or std <= 0:
+        return number(None if value is None else factor * value, 4)
+    return _together((value,), std, "1", "{0}", factor)
 
 
 def percent(share: float | None) -> str:
@@ -158,6 +181,13 @@ def in_log_units(unit: str, *, response: str, forcing: str, place: Place = "mesh
     _multiply(mesh, _powers(response), 1)
     _multiply(replaced, _powers(forcing) if place == "actuator" else mesh, torque)
     return _spell(replaced)
+
+
+def in_log_words(sentence: str, *, response: str, forcing: str) -> str:
+    """A sentence about a reduced drive, with the log's units in place of `[x]` and `[u]`."""
+    for symbol, unit in (("[x]", response), ("[u]", forcing)):
+        sentence = sentence.replace(symbol, f"({unit})" if re.search(r"[ /^]", unit) else unit)
+    return sentence
 
 
 def _powers(unit: str) -> dict[str, int]:

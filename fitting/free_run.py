@@ -81,22 +81,8 @@ def free_run(
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    windows = [s.beginning(window) for s in stretches]
-    paths, length, count = (), max(window, *(len(w) for w in windows)), len(stretches)
-    if like is not None and _holds(like, count, length):
-        paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
-    starts = fit(
-        model,
-        windows,
-        paths,
-        horizon=length,
-        length=length,
-        halo=halo,
-        substeps=substeps,
-        covariance=covariance,
-        reweigh=False,
-        hold_parameters=True,
-        count=count,
+    starts = fitted_starts(
+        model, stretches, covariance=covariance, halo=halo, substeps=substeps, window=window, like=like
     )
     states = _rest_where_at_rest(model, starts, len(stretches))
     length = max(len(s) for s in stretches)
@@ -127,6 +113,36 @@ def free_run(
             )
         )
     return tuple(runs)
+
+
+def fitted_starts(
+    model: Model,
+    stretches: Sequence[Stretch],
+    *,
+    covariance: Float[Array, "outputs outputs"],
+    halo: int,
+    substeps: int,
+    window: int = WINDOW,
+    like: Fit | None = None,
+) -> Fit:
+    """Initial states fitted to the first `window` samples of each stretch; arguments as in [`free_run`][]."""
+    windows = [s.beginning(window) for s in stretches]
+    paths, length, count = (), max(window, *(len(w) for w in windows)), len(stretches)
+    if like is not None and _holds(like, count, length):
+        paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
+    return fit(
+        model,
+        windows,
+        paths,
+        horizon=length,
+        length=length,
+        halo=halo,
+        substeps=substeps,
+        covariance=covariance,
+        reweigh=False,
+        hold_parameters=True,
+        count=count,
+    )
 
 
 @jit_lanes

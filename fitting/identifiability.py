@@ -15,6 +15,7 @@ from fitting.residual import Blocks, Problem, linearise
 from fitting.sandwich import directions
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import TwoInertiaModel
+from hdjax.parameters import ParameterInfo
 
 # Two standard errors along a direction that are more than 40 % leave it open.
 _WEAK = 0.2
@@ -28,7 +29,7 @@ _STEP = 1e-4
 # A positive parameter below this share of its start has run to zero.
 _VANISHED = 1e-3
 # Next to a bound: within this share of it.
-_AT_BOUND = 1e-3
+_AT_BOUND = 0.01
 
 
 class Direction(eqx.Module):
@@ -72,19 +73,17 @@ class Identifiability(eqx.Module):
         reasons: by path of each parameter that is not identifiable, a sentence that says why and what would help.
         directions: of the free parameters, the least determined first.
         held: what was taken from the drive file.
-        bounds: sentences about parameters that ended at a bound.
+        bounds: by path of each parameter that ended at a bound, a sentence that says so.
     """
 
     reasons: dict[str, str]
     directions: tuple[Direction, ...]
     held: tuple[Held, ...]
-    bounds: tuple[str, ...]
+    bounds: dict[str, str]
 
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """All that there is to say, in order of importance."""
-        weak = tuple(d.sentence for d in self.directions if d.sentence is not None)
-        return (*self.reasons.values(), *weak, *self.bounds, *(h.sentence for h in self.held))
+    def note(self, path: str) -> str | None:
+        """Why a parameter's number can't be relied on; None where it can."""
+        return self.bounds.get(path) or self.reasons.get(path)
 
 
 def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
@@ -95,14 +94,17 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
         found: its uncertainty.
     """
     if not fit.free.paths:
-        return Identifiability({}, (), (), ())
+        return Identifiability({}, (), (), {})
     estimates = found.estimates
     x_max = scales(fit.stretches).x_max
+    x_unit = "rad" if isinstance(fit.model, TwoInertiaModel) else "[x]"
+    known, first = fit.model.parameters(), fit.problem.model
+    bounds = {p: at_bound(p, float(known[p][0]), known[p][1], start=float(first.get(p))) for p in estimates}
     return Identifiability(
-        reasons={p: reason(e, x_max=x_max) for p, e in estimates.items() if not e.identifiable},
+        reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in estimates.items() if not e.identifiable},
         directions=_directions(fit, found),
         held=_held(fit, found),
-        bounds=tuple(s for s in (_at_bound(fit, p) for p in estimates) if s is not None),
+        bounds={p: sentence for p, sentence in bounds.items() if sentence is not None},
     )
 
 
@@ -124,32 +126,44 @@ def needed_samples(estimate: Estimate, size: float) -> float:
     return (_reach(estimate) / abs(size)) ** 2 if size else np.inf
 
 
-def reason(estimate: Estimate, *, x_max: float) -> str:
+def reason(estimate: Estimate, *, x_max: float, x_unit: str) -> str:
     """Why a parameter is not identifiable, and what would help.
 
     Args:
         estimate: of the parameter.
         x_max: largest twist in the fitted logs.
+        x_unit: unit of the twist.
     """
-    path, unit = estimate.path, estimate.unit
+    path, unit = estimate.path, "" if estimate.unit == "1" else f" {estimate.unit}"
     low, high = estimate.ci95
     largest = max(abs(low), abs(high))
     opening = f"{path} is not identifiable from these logs"
-    if not np.isfinite(largest) or low * high > 0:
-        return f"{opening}: they leave it open between {low:.2g} and {high:.2g} {unit}."
-    if path != "alpha":
-        more = needed_samples(estimate, estimate.value)
-        return (
-            f"{opening}: it may be anything up to {largest:.2g} {unit} either way; "
-            f"to tell {estimate.value:.2g} {unit} from zero would need {more:.2g} times the samples."
+    if low >= 0 or high <= 0 or not np.isfinite(largest):
+        known = f"they leave it open {_between(low, high, unit)}"
+    elif path == "alpha":
+        known = (
+            f"|alpha| is at most {largest:.2g}{unit}, so that alpha x^2 is at most {largest * x_max**2:.2g} at their "
+            f"largest twist of {x_max:.2g} {x_unit}"
         )
-    twist = needed_twist(estimate, estimate.value, x_max=x_max)
-    more = needed_samples(estimate, estimate.value)
+    else:
+        known = f"it may be anything up to {largest:.2g}{unit} either way"
+    samples = needed_samples(estimate, estimate.value)
+    if low >= 0 or high <= 0 or not np.isfinite(samples):
+        return f"{opening}: {known}."
+    twist = f"a twist above {needed_twist(estimate, estimate.value, x_max=x_max):.2g} {x_unit}, or "
     return (
-        f"{opening}: |alpha| is at most {largest:.2g} {unit}, so that alpha x^2 is at most {largest * x_max**2:.2g} at "
-        f"their largest twist of {x_max:.2g}. To tell {estimate.value:.2g} {unit} from zero they would need a "
-        f"twist above {twist:.2g}, or {more:.2g} times the samples."
+        f"{opening}: {known}. To tell {estimate.value:.2g}{unit} from zero they would need "
+        f"{twist if path == 'alpha' else ''}{samples:.2g} times the samples."
     )
+
+
+def _between(low: float, high: float, unit: str) -> str:
+    """An interval in words, whose ends may be infinite."""
+    if not np.isfinite([low, high]).any():
+        return "on both sides"
+    if not np.isfinite(high):
+        return f"above {low:.2g}{unit}"
+    return f"between {low:.2g} and {high:.2g}{unit}" if np.isfinite(low) else f"below {high:.2g}{unit}"
 
 
 def _reach(estimate: Estimate) -> float:
@@ -208,16 +222,27 @@ def _words(items: list[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
-def _at_bound(fit: Fit, path: str) -> str | None:
-    """A sentence about a parameter that ended at a bound of its domain."""
-    value, info = fit.model.parameters()[path]
-    start, now = float(fit.problem.model.get(path)), float(value)
+def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> str | None:
+    """A sentence about a parameter that ended at a bound of its domain; None where it did not.
+
+    Args:
+        path: of the parameter.
+        value: fitted.
+        info: of the parameter.
+        start: what the fit started from.
+    """
     low, high = info.bounds
-    if info.positive and now < _VANISHED * start:
-        return f"{path} ran from {start:.2g} to {now:.2g} {info.unit}, towards its bound at zero: the logs want none."
-    for bound in (low, high):
-        if bound and np.isfinite(bound) and abs(now - bound) <= _AT_BOUND * abs(bound):
-            return f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense."
+    if info.positive and value < _VANISHED * start:
+        return (
+            f"{path} ran from {start:.2g} to {value:.2g} {info.unit}, towards its bound at zero: the logs want none, "
+            "and its standard error means nothing."
+        )
+    for bound, beyond in ((low, value < low), (high, value > high)):
+        if beyond or (bound and np.isfinite(bound) and abs(value - bound) <= _AT_BOUND * abs(bound)):
+            return (
+                f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense, and "
+                "its standard error means nothing."
+            )
     return None
 
 
@@ -279,7 +304,7 @@ def _products(fit: Fit, held: tuple[str, ...]) -> Float[Array, "all all"]:
         )
         rows.append((up.residual - down.residual) / (2 * _STEP))
         gaps.append((up.gap - down.gap) / (2 * _STEP))
-    return _wider(problem, found, jnp.stack(rows, axis=-1), jnp.stack(gaps, axis=-1))
+    return _wider(problem.segments.joined, found, jnp.stack(rows, axis=-1), jnp.stack(gaps, axis=-1))
 
 
 def _with_held(problem: Problem, path: str, value: float) -> Problem:
@@ -287,7 +312,7 @@ def _with_held(problem: Problem, path: str, value: float) -> Problem:
 
 
 @eqx.filter_jit
-def _wider(problem: Problem, found: Blocks, rows: Array, gaps: Array) -> Array:
+def _wider(joined: Array, found: Blocks, rows: Array, gaps: Array) -> Array:
     """The products of the parameters' columns with further ones beside them."""
     wider = eqx.tree_at(
         lambda b: (b.by_parameter, b.before_by_parameter),
@@ -297,5 +322,5 @@ def _wider(problem: Problem, found: Blocks, rows: Array, gaps: Array) -> Array:
             jnp.concatenate([found.before_by_parameter, -gaps], axis=2),
         ),
     )
-    projected = project(wider, problem.segments.joined)
+    projected = project(wider, joined)
     return jnp.einsum("srp,srq->pq", projected, projected)

@@ -84,7 +84,7 @@ def posterior(
     """
     if not fit.free.paths:
         raise ValueError("`fit` must have free parameters, but has none")
-    _sampler()
+    sampler()
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
     root = np.linalg.cholesky(found.unit_covariance)
     keys = jax.random.split(jax.random.key(seed), chains)
@@ -105,8 +105,12 @@ def posterior(
     )
 
 
-def _sampler() -> Any:
-    """The library that samples."""
+def sampler() -> Any:
+    """The library that samples.
+
+    Raises:
+        ImportError: where it is not installed.
+    """
     try:
         import blackjax  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -131,7 +135,7 @@ def _sample(
     problem: Problem, optimum: Unknowns, root: Array, keys: Array, warmup: int, draws: int
 ) -> tuple[Array, Array, Array, Array]:
     """Whitened draws by chain, number of divergences, R-hat and effective sample size by parameter."""
-    blackjax = _sampler()
+    blackjax = sampler()
 
     def density(z: Array) -> Array:
         return _log_density(root @ z, (problem, optimum))

@@ -5,15 +5,14 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from fitting.estimate import Fit, fit, whitening
+from fitting.estimate import Fit, whitening
 from fitting.experiment import Stretch, cut
-from fitting.free_run import WINDOW, FreeRun, free_run
+from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
+from fitting.normal_law import NORMAL_95
 from fitting.residual import Problem, Unknowns, linearise
 from fitting.uncertainty import Uncertainty
-
-_NORMAL_95 = 1.959963984540054
 
 
 class PredictionBand(eqx.Module):
@@ -48,8 +47,21 @@ class PredictionBand(eqx.Module):
     @property
     def band95(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Where 95 % of the measured samples are expected."""
-        reach = _NORMAL_95 * self.std_measured
+        reach = NORMAL_95 * self.std_measured
         return self.run.predicted - reach, self.run.predicted + reach
+
+    @property
+    def inside(self) -> Bool[np.ndarray, " n"]:
+        """Which measured samples are in the band; none is where the run left the numbers."""
+        low, high = self.band95
+        return (low <= self.run.measured) & (self.run.measured <= high)
+
+
+def coverage(bands: Sequence[PredictionBand]) -> float:
+    """Share of the measured samples of several runs that lie in their bands; NaN where a band is not known."""
+    if not all(np.isfinite(b.std_predicted).all() for b in bands):
+        return np.nan
+    return float(np.mean(np.concatenate([b.inside for b in bands])))
 
 
 def prediction_bands(
@@ -60,6 +72,7 @@ def prediction_bands(
     noise: Float[Array, "outputs outputs"],
     halo: int = 0,
     window: int = WINDOW,
+    runs: Sequence[FreeRun] | None = None,
 ) -> tuple[PredictionBand, ...]:
     """Free runs along stretches, with their bands.
 
@@ -70,22 +83,15 @@ def prediction_bands(
         noise: covariance of the outputs' measurement noise.
         halo: intervals of torque before the start, for delays.
         window: samples for the initial state.
+        runs: the free runs along the stretches, where they are at hand.
     """
     substeps = fitted.substeps
-    runs = free_run(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window)
-    windows = [Stretch(s.experiment, s.start, min(s.start + window, s.stop)) for s in stretches]
-    starts = fit(
-        fitted.model,
-        windows,
-        (),
-        horizon=window,
-        length=window,
-        halo=halo,
-        substeps=substeps,
-        covariance=noise,
-        reweigh=False,
-        hold_parameters=True,
-        count=len(stretches),
+    if runs is None:
+        runs = free_run(
+            fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window, like=fitted
+        )
+    starts = fitted_starts(
+        fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window, like=fitted
     )
     whole = _whole(fitted, stretches, halo, substeps)
     states = starts.unknowns.states[: len(stretches)]
@@ -131,7 +137,12 @@ def _band(
     covariance: np.ndarray,
     window: int,
 ) -> PredictionBand:
-    """The band of one run, from the derivatives of its outputs."""
+    """The band of one run, from the derivatives of its outputs; it has no width where they left the numbers."""
+    variance = np.linalg.inv(white)
+    std_noise = float(np.sqrt((variance @ variance.T)[-1, -1]))
+    if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
+        unknown = np.full(len(by_parameter), np.nan)
+        return PredictionBand(run, unknown, unknown, std_noise)
     seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
     moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
     # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
@@ -140,10 +151,9 @@ def _band(
     inverse = np.linalg.pinv(seen / size, rcond=1e-10) / size[:, None]
     total = by_parameter[:, -1] - by_state[:, -1] @ (inverse @ moved)
     spread = by_state[:, -1] @ inverse
-    variance = np.linalg.inv(white)
     return PredictionBand(
         run=run,
         std_parameters=np.sqrt(np.maximum(np.einsum("np,pq,nq->n", total, covariance, total), 0.0)),
         std_state=np.linalg.norm(spread, axis=1),
-        std_noise=float(np.sqrt((variance @ variance.T)[-1, -1])),
+        std_noise=std_noise,
     )

@@ -125,8 +125,11 @@ def with_profiles(fit: Fit, found: Uncertainty) -> Uncertainty:
         moved = max(abs(low - old[0]), abs(high - old[1])) if np.isfinite([low, high]).all() else np.inf
         if moved > _ASYMMETRIC * half:
             known = high / low < np.exp(2.0) if logarithmic and low > 0 else not low <= 0.0 <= high
-            estimates[path] = dataclasses.replace(estimate, ci95=(low, high), identifiable=bool(known))
-    return eqx.tree_at(lambda u: u.estimates, found, estimates, is_leaf=lambda x: isinstance(x, dict))
+            estimates[path] = dataclasses.replace(
+                estimate, ci95=(low, high), identifiable=bool(known), interval="profile"
+            )
+    # `tree_at` would sort the dictionary, and the covariance is in its order.
+    return dataclasses.replace(found, estimates=estimates)
 
 
 def _inflation(fit: Fit, found: Uncertainty, index: int) -> float:
@@ -200,7 +203,8 @@ class _Walk(eqx.Module):
 def _physical(fit: Fit, index: int, entry: float) -> float:
     """The value that an entry of the free vector stands for."""
     if fit.free.logarithmic[index]:
-        return float(np.exp(np.clip(entry, -700.0, 700.0)))
+        with np.errstate(over="ignore"):
+            return float(np.exp(entry))
     return entry * float(fit.free.scale[index])
 
 

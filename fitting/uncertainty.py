@@ -1,5 +1,7 @@
 """How well the data determine each parameter, also where the model is not quite right."""
 
+from typing import Literal
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +25,7 @@ class Estimate(eqx.Module):
         identifiable: whether the data tell the parameter from zero; of a positive parameter, whether they know it
             to better than a factor of about two.
         degrees_of_freedom: of Student's t behind the interval.
+        interval: whether `ci95` is from the curvature at the optimum or from the likelihood's profile.
     """
 
     path: str = eqx.field(static=True)
@@ -33,6 +36,7 @@ class Estimate(eqx.Module):
     unit: str = eqx.field(static=True)
     identifiable: bool
     degrees_of_freedom: float = np.inf
+    interval: Literal["curvature", "profile"] = eqx.field(static=True, default="curvature")
 
 
 class Uncertainty(eqx.Module):

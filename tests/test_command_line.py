@@ -1,11 +1,14 @@
 """What a user types: one sentence and an exit code where it can't be done, and a file where it can."""
 
+import importlib.util
 import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import polars as pl
 import pytest
 
 import rig
@@ -140,6 +143,10 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "unknown subcommand": (("calibrate", "log.csv"), ("calibrate",)),
     "broken drive file": (("fit", "log.csv", "--drive", "broken.toml", "--out", "out"), ("broken.toml", "TOML")),
     "unknown key": (("fit", "log.csv", "--drive", "typo.toml", "--out", "out"), ("reduction_ratoi", "did you mean")),
+    "draws of a folder": (
+        ("fit", ".", "--drive", "drive.toml", "--out", "out", "--posterior"),
+        ("--posterior", "folder"),
+    ),
     "unknown format": (("fit", "log.xyz", "--drive", "drive.toml", "--out", "out"), ("log.xyz",)),
     "negative number of effects": (
         ("close-loop", "log.csv", "--drive", "drive.toml", "--out", "out", "--max-effects", "-1"),
@@ -283,6 +290,33 @@ def test_a_prediction_that_leaves_the_numbers_is_refused(tmp_path: Path, capsys:
     assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 1
     assert_one_line(capsys, str(log), "leaves the numbers")
     assert not out.exists()
+
+
+def test_draws_without_the_extra_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, "blackjax", None)
+    log = write_table(tmp_path / "log.csv", table())
+    assert run("fit", log, "--drive", write_drive(tmp_path), "--out", tmp_path / "out", "--posterior") == 2
+    assert_one_line(capsys, "--posterior", "pip install 'hdjax[posterior]'")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("blackjax") is None, reason="needs blackjax, the extra `posterior`")
+def test_fit_with_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    log = write_table(tmp_path / "log.csv", reduced_table())
+    drive = write_drive(tmp_path, '[signals]\ntorque_hold = "zero-order"\n')
+    out = tmp_path / "out"
+    assert run("fit", log, "--drive", drive, "--out", out, "--posterior") == 0
+    shown = capsys.readouterr()
+    assert shown.err == "" and "[Posterior]" in shown.out
+    assert sorted(p.name for p in out.iterdir()) == ["model.json", "posterior.parquet", "report.html", "report.json"]
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    draws = pl.read_parquet(out / "posterior.parquet")
+    estimate = report["before"]["parameters"]["omega_0"]
+    assert draws["omega_0"].mean() == pytest.approx(estimate["value"], abs=estimate["std"])
+    assert len(draws) == report["posterior"]["chains"] * report["posterior"]["draws"]
 
 
 @pytest.mark.slow

@@ -1,11 +1,15 @@
 """Figures that follow from the parameters, and their standard errors, against draws from the parameters' law."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from scipy import stats
 
 import rig
 from fitting.compare import Account
 from fitting.derived import derived, drive_figures
+from fitting.identifiability import Identifiability
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Model
 
@@ -16,7 +20,10 @@ def account_of(model: Model, std: dict[str, float], correlation: np.ndarray) -> 
     estimates = {
         path: Estimate(path, float(model.get(path)), error, error, (0.0, 1.0), "1", True) for path, error in std.items()
     }
-    return Account(model, Uncertainty(estimates, correlation), (), ())
+    spread = np.array(list(std.values()))
+    covariance = correlation * np.outer(spread, spread)
+    found = Uncertainty(estimates, correlation, covariance, covariance)
+    return Account(model, found, (), (), Identifiability({}, (), (), {}))
 
 
 def test_drive_by_draws():
@@ -55,3 +62,27 @@ def test_reduced_drive_leaves_out_its_own_parameters():
     assert found["zeta"].value == pytest.approx(zeta)
     assert found["zeta"].std == pytest.approx(zeta * np.hypot(0.01 / rig.MU, 0.1 / rig.OMEGA_0))
     assert found["stiffness_at_full_twist"].unit == "1/s^2"
+
+
+def with_freedom(account: Account, freedom: dict[str, float]) -> Account:
+    estimates = {
+        p: dataclasses.replace(e, degrees_of_freedom=freedom[p]) for p, e in account.uncertainty.estimates.items()
+    }
+    return dataclasses.replace(account, uncertainty=dataclasses.replace(account.uncertainty, estimates=estimates))
+
+
+def test_intervals_know_how_well_the_errors_are_known():
+    """Student's t of a parameter that a quantity follows from; between those of several where they share the error."""
+    std = {"mu": 0.01, "omega_0": 0.1, "alpha": 0.02, "gain": 0.1}
+    freedom = {"mu": 4.0, "omega_0": 30.0, "alpha": 7.0, "gain": 2.0}
+    account = with_freedom(account_of(rig.reduced_model(), std, np.eye(4)), freedom)
+    found = derived(account, lambda m: drive_figures(m, 0.5))
+    for name, path in (("natural_frequency", "omega_0"), ("nonlinear_share", "alpha")):
+        low, high = found[name].ci95
+        assert high - low == pytest.approx(2 * stats.t.ppf(0.975, freedom[path]) * found[name].std), name
+    # The damping ratio's error is mostly that of mu.
+    assert freedom["mu"] < found["zeta"].degrees_of_freedom < 1.1 * freedom["mu"]
+    # No more than Satterthwaite gives to independent errors, whose variances are known so well.
+    shares = np.array([0.01 / rig.MU, 0.1 / rig.OMEGA_0]) ** 2
+    satterthwaite = shares.sum() ** 2 / np.sum(shares**2 / [freedom["mu"], freedom["omega_0"]])
+    assert found["zeta"].degrees_of_freedom <= satterthwaite

@@ -8,8 +8,11 @@ import pytest
 
 import fitting.fleet
 import rig
+from fitting.compare import Account
 from fitting.errors import DataError, InputError
-from fitting.fleet import find_logs, fit_fleet, fleet_text
+from fitting.fleet import find_logs, fit_fleet, fleet_text, parameter_columns
+from fitting.identifiability import Identifiability
+from fitting.uncertainty import Estimate, Uncertainty
 
 COUNT = 1200
 DRIVE = '[drive]\nname = "cells"\n[signals]\ntorque_hold = "zero-order"\n'
@@ -58,11 +61,12 @@ def test_each_log_is_fitted_on_its_own(tmp_path: Path, drive: Path):
         assert (row["state"], row["message"]) == ("fitted", "")
         assert abs(row["omega_0"] - omega_0) < 5 * row["omega_0_std"]
         assert row["omega_0_low"] < row["omega_0"] < row["omega_0_high"]
-        assert row["omega_0_identifiable"]
+        assert row["omega_0_identifiable"] and row["omega_0_note"] == "" and row["omega_0_interval"] == "curvature"
         assert row["samples"] == COUNT
     assert rows["bad.csv"]["state"] == "refused"
     assert "bad.csv" in rows["bad.csv"]["message"]
     assert rows["bad.csv"]["omega_0"] is None
+    assert rows["bad.csv"]["omega_0_note"] is None
     assert pl.read_parquet(tmp_path / "out" / "fleet.parquet").equals(table)
     assert "3 logs: 2 fitted, 1 refused" in fleet_text(table)
 
@@ -154,3 +158,17 @@ def test_which_files_are_logs(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no log files"):
         find_logs(tmp_path / "empty")
+
+
+def test_why_a_parameter_is_not_told():
+    """The reason stands beside the flag, in the log's units."""
+    estimates = {
+        "alpha": Estimate("alpha", 1.0, 2.0, 2.0, (-3.0, 5.0), "1/[x]^2", False),
+        "mu": Estimate("mu", 1.0, 0.1, 0.1, (0.8, 1.2), "1/s", True),
+    }
+    nothing = np.zeros((0, 0))
+    found = Identifiability({"alpha": "alpha is at most 5 1/[x]^2"}, (), (), {})
+    account = Account(rig.reduced_model(), Uncertainty(estimates, nothing, nothing, nothing), (), (), found)
+    columns = parameter_columns(account, {"dynamic_error": "V", "forcing": "A"})
+    assert columns["alpha_note"] == "alpha is at most 5 1/V^2" and columns["mu_note"] == ""
+    assert (columns["alpha_low"], columns["alpha_identifiable"]) == (-3.0, False)

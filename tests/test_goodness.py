@@ -15,6 +15,7 @@ from fitting.experiment import experiment_from_log, split
 from fitting.free import base_paths
 from fitting.free_run import FreeRun
 from fitting.goodness import Goodness, fit_percent, goodness
+from fitting.identifiability import Identifiability
 from fitting.residual_tests import residual_tests
 from fitting.uncertainty import Uncertainty
 
@@ -35,7 +36,9 @@ def fitted() -> Fit:
 @pytest.fixture(scope="module")
 def found(fitted: Fit) -> Goodness:
     runs = (run(np.arange(5.0), np.arange(5.0)),)
-    result = Account(fitted.model, Uncertainty({}, np.zeros((0, 0))), runs, runs)
+    nothing = np.zeros((0, 0))
+    unknown = Identifiability({}, (), (), {})
+    result = Account(fitted.model, Uncertainty({}, nothing, nothing, nothing), runs, runs, unknown)
     return goodness(fitted, result, jnp.asarray(NOISE))
 
 

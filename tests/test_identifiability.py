@@ -9,8 +9,9 @@ import pytest
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.identifiability import identifiability, needed_samples, needed_twist, reason
+from fitting.identifiability import at_bound, identifiability, needed_samples, needed_twist, reason
 from fitting.uncertainty import Estimate, uncertainty
+from hdjax.parameters import ParameterInfo
 
 COUNT, HORIZON, NOISE = 1000, 128, 2e-3
 DRIVE_COUNT, DRIVE_HORIZON = 2000, 256
@@ -46,7 +47,7 @@ def test_alpha_needs_the_twist_that_it_is_said_to_need(faint: tuple[Fit, Estimat
     assert not seen[0.6].identifiable and seen[1.7].identifiable
     # The cube of the twist, as long as the motion is nearly linear; the two know their noise to some 20 %.
     assert seen[0.6].std_classical / seen[1.7].std_classical == pytest.approx((1.7 / 0.6) ** 3, rel=0.2)
-    assert f"{max(map(abs, alpha.ci95)) * x_max**2:.2g}" in reason(alpha, x_max=x_max)
+    assert f"{max(map(abs, alpha.ci95)) * x_max**2:.2g}" in reason(alpha, x_max=x_max, x_unit="[x]")
 
 
 def test_samples_add_up_as_their_square_root(faint: tuple[Fit, Estimate]):
@@ -61,7 +62,8 @@ def test_sentences_of_a_faint_log(faint: tuple[Fit, Estimate]):
     assert set(result.reasons) == {"alpha"}
     assert result.reasons["alpha"].startswith("alpha is not identifiable from these logs: |alpha| is at most")
     assert "they would need a twist above" in result.reasons["alpha"]
-    assert result.sentences == tuple(result.reasons.values())
+    assert result.note("alpha") == result.reasons["alpha"] and result.note("mu") is None
+    assert result.bounds == {} and not any(d.sentence for d in result.directions)
     # One direction is weak, and it is that of alpha.
     weakest = result.directions[0]
     assert abs(weakest.weights["alpha"]) > 0.99
@@ -125,9 +127,44 @@ def test_stiffness_where_an_inertia_is_fitted_too(drive: Fit):
 
 def test_a_parameter_that_ran_to_zero(drive: Fit):
     gone = eqx.tree_at(lambda f: f.model, drive, drive.model.replace({"K": 1e-5 * rig.K}))
-    (sentence,) = identifiability(gone, uncertainty(drive)).bounds
-    assert sentence.startswith("K ran from") and "towards its bound at zero" in sentence
-    assert identifiability(drive, uncertainty(drive)).bounds == ()
+    result = identifiability(gone, uncertainty(drive))
+    assert set(result.bounds) == {"K"}
+    assert result.bounds["K"].startswith("K ran from") and "towards its bound at zero" in result.bounds["K"]
+    assert result.note("K") == result.bounds["K"]
+    assert identifiability(drive, uncertainty(drive)).bounds == {}
+
+
+@pytest.mark.parametrize(
+    ("value", "bounds", "start", "stopped"),
+    [
+        (7160.0, (0.0, 1e9), 7000.0, False),
+        (9.95e8, (0.0, 1e9), 7000.0, True),
+        (1.1e9, (0.0, 1e9), 7000.0, True),
+        (1e-5, (0.0, 1e9), 7000.0, True),
+        (1e-5, (0.0, 1e9), 2e-5, False),
+        (-0.3, (-np.inf, np.inf), 0.2, False),
+        (0.5, (0.5, 2.0), 1.0, True),
+    ],
+)
+def test_bounds(value: float, bounds: tuple[float, float], start: float, stopped: bool):
+    info = ParameterInfo("1", "", "", bounds, "base")
+    assert (at_bound("K", value, info, start=start) is not None) is stopped
+
+
+@pytest.mark.parametrize(
+    ("path", "ci95", "words"),
+    [
+        ("K", (0.0, 3e4), "K is not identifiable from these logs: they leave it open between 0 and 3e+04 rad."),
+        ("K", (2.0, np.inf), "they leave it open above 2 rad."),
+        ("c", (-np.inf, 3.0), "they leave it open below 3 rad. To tell 1 rad from zero they would need 15 times"),
+        ("c", (-np.inf, np.inf), "they leave it open on both sides. To tell"),
+        ("c", (-1.0, 3.0), "it may be anything up to 3 rad either way. To tell"),
+        ("alpha", (-1.0, 3.0), "alpha x^2 is at most 12 at their largest twist of 2 V. To tell 1 rad from zero they"),
+    ],
+)
+def test_reasons_of_open_intervals(path: str, ci95: tuple[float, float], words: str):
+    estimate = Estimate(path, 1.0, 2.0, 2.0, ci95, "rad", False)
+    assert words in reason(estimate, x_max=2.0, x_unit="V")
 
 
 def test_a_reduced_log_holds_nothing(faint: tuple[Fit, Estimate]):

@@ -115,6 +115,9 @@ def test_a_parameter_that_the_log_hardly_bounds():
     # Beyond -1/x^2 the spring has no way back; the segments' own states leave some room.
     x_max = np.max(np.abs(rig.reduced_experiment(COUNT, rms=1.0).measured))
     assert -2.0 / x_max**2 < low
+    assert better.estimates["alpha"].interval == "profile" and better.estimates["omega_0"].interval == "curvature"
+    # Correlations are in the order of the estimates.
+    assert list(better.estimates) == list(known.estimates)
     # What is well known keeps its interval.
     assert better.estimates["omega_0"].ci95 == known.estimates["omega_0"].ci95
 

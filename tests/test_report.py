@@ -1,5 +1,6 @@
 """The report says what the loop found, in numbers that others can read, and is written whole or not at all."""
 
+import dataclasses
 import json
 import math
 import os
@@ -11,17 +12,21 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 import plotly.graph_objects as go
+import polars as pl
 import pytest
+from scipy import stats
 
 import rig
 from fitting import formatting
 from fitting.attribution import Verdict
 from fitting.close_loop import Loop, close_loop
 from fitting.diagnostics import Dependence
+from fitting.estimate import Fit
 from fitting.experiment import Experiment, split
 from fitting.findings import Finding
 from fitting.fit_only import FitOnly, fit_only
 from fitting.plots import decimated, fit_plots, plots
+from fitting.posterior import Posterior
 from fitting.report import (
     explained_share,
     report_dict,
@@ -29,8 +34,8 @@ from fitting.report import (
     separating_experiment,
     write_report,
 )
-from fitting.report.parameters import at_bound
 from fitting.starting_values import starting_models
+from fitting.uncertainty import Uncertainty
 from hdjax import Hold
 from hdjax.effects import FAMILIES
 from hdjax.effects.actuation import TorqueBias
@@ -73,6 +78,22 @@ def write_page(folder: Path, outcome: Loop | FitOnly) -> str:
     start, end = text.index("<script>"), text.index("</script>")
     assert "plotly.js" in text[start : start + 200]
     return text[:start] + text[end:]
+
+
+def with_estimate(outcome, side: str, path: str, **changes):
+    """An outcome with another estimate of a parameter."""
+    account = getattr(outcome, side)
+    known = account.uncertainty.estimates
+    estimates = known | {path: dataclasses.replace(known[path], **changes)}
+    changed = dataclasses.replace(account, uncertainty=dataclasses.replace(account.uncertainty, estimates=estimates))
+    return dataclasses.replace(outcome, **{side: changed})
+
+
+def with_limits(outcome, side: str, **changes):
+    """An outcome whose logs can't tell other things."""
+    account = getattr(outcome, side)
+    changed = dataclasses.replace(account.identifiability, **changes)
+    return dataclasses.replace(outcome, **{side: dataclasses.replace(account, identifiability=changed)})
 
 
 def leaves(value: object) -> Iterator[object]:
@@ -169,16 +190,17 @@ def test_share_that_a_dependence_explains():
     assert explained_share(noise, 1.0) < 0.01
 
 
-def test_alpha_that_cannot_be_seen_says_from_where_it_could(loop: Loop):
-    def vague(estimate):
-        return eqx.tree_at(
-            lambda e: (e.value, e.std, e.ci95, e.identifiable), estimate, (50.0, 1e3, (-1910.0, 2010.0), False)
-        )
+VAGUE = "alpha is not identifiable from these logs: |alpha| is at most 2e+03 rad^-2"
 
-    blind = eqx.tree_at(lambda x: x.after.uncertainty.estimates["alpha"], loop, replace_fn=vague)
+
+def test_what_is_not_identifiable_is_told_once_and_why(loop: Loop):
+    blind = with_estimate(loop, "after", "alpha", value=50.0, std=1e3, ci95=(-1910.0, 2010.0), identifiable=False)
+    blind = with_limits(blind, "after", reasons={"alpha": VAGUE, "motor_friction.T_c": "T_c is open"})
     found = report_dict(blind)
-    (note,) = [n for n in found["cannot_tell"] if n.startswith("alpha")]
-    assert "1960 rad⁻²" not in note and "2000 rad⁻²" in note and "largest measured twist" in note
+    assert [n for n in found["cannot_tell"] if n.startswith("alpha")] == [VAGUE]
+    assert "T_c is open" in found["cannot_tell"]
+    assert found["identifiability"]["reasons"]["alpha"] == found["after"]["parameters"]["alpha"]["note"] == VAGUE
+    assert found["before"]["parameters"]["alpha"]["note"] is None
     assert "NOT IDENTIFIABLE" in report_text(found)
 
 
@@ -259,9 +281,24 @@ def test_a_fit_tells_all_that_fitters_expect(fitted: FitOnly):
     assert found["frequency_response"]["excited"] and found["seconds"]["fit"] > 0
 
 
-def test_a_perfect_model_is_told_so():
+def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
+    def doubt(found: Fit, known: Uncertainty) -> Uncertainty:
+        alpha = dataclasses.replace(
+            known.estimates["alpha"], ci95=(-900.0, math.inf), identifiable=False, interval="profile"
+        )
+        return dataclasses.replace(known, estimates=known.estimates | {"alpha": alpha})
+
+    monkeypatch.setattr("fitting.compare.with_profiles", doubt)
     log = rig.drive_experiment(3000)
     good = report_dict(fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (log,)}, hold=HOLD))
+    # What a profile says of an interval goes before the parabola, in the reason as well.
+    alpha = good["before"]["parameters"]["alpha"]
+    assert (alpha["interval"], alpha["ci95"]) == ("profile", [-900.0, None])
+    assert alpha["note"].startswith(
+        "alpha is not identifiable from these logs: they leave it open above -9e+02 rad^-2."
+    )
+    # 600 samples know a share of 95 % to 1 %.
+    assert good["goodness"]["band_coverage"] == pytest.approx(0.95, abs=0.03)
     assert {t["verdict"] for t in good["residual_tests"]} == {"passed"}
     assert good["meaning"] == ["The model explains these logs down to the measurement noise."]
     assert good["goodness"]["reduced_chi_square"] == pytest.approx(1.0, abs=0.1)
@@ -270,9 +307,11 @@ def test_a_perfect_model_is_told_so():
 
 def test_a_diverged_fit_has_a_report_too(fitted: FitOnly, tmp_path: Path):
     broken = eqx.tree_at(lambda f: f.account.validation[0].predicted, fitted, replace_fn=lambda p: p * np.inf)
+    broken = eqx.tree_at(lambda f: f.bands[0].std_parameters, broken, replace_fn=lambda s: s * np.nan)
     broken = eqx.tree_at(lambda f: f.goodness.fit_percent["validation"], broken, -math.inf)
     found = report_dict(broken)
     assert found["goodness"]["fit_percent"]["validation"] is None
+    assert found["goodness"]["band_coverage"] is None
     assert any("diverges" in sentence for sentence in found["meaning"])
     assert "n/a" in report_text(found)
     assert "diverged" in write_page(tmp_path, broken)
@@ -287,6 +326,7 @@ def test_text_of_a_fit_is_aligned(fitted: FitOnly):
         "Result",
         "Parameters",
         "Derived",
+        "What this log can't tell",
         "Correlations above 0.1",
         "Goodness",
         "Residual",
@@ -308,39 +348,114 @@ def test_text_of_a_fit_is_aligned(fitted: FitOnly):
 
 def test_flags_have_a_sentence(fitted: FitOnly, tmp_path: Path):
     """A parameter that stopped at its bound, one that the data do not know, and a damping that feeds energy."""
-
-    def told(path: str, value: float, ci95: tuple[float, float], identifiable: bool) -> FitOnly:
-        return eqx.tree_at(
-            lambda f: (lambda e: (e.value, e.ci95, e.identifiable))(f.account.uncertainty.estimates[path]),
-            fitted,
-            (value, ci95, identifiable),
-        )
-
-    stopped = told("K", 1e9, (1e8, 1e10), True)
-    assert "ran into a limit" in report_dict(stopped)["before"]["parameters"]["K"]["note"]
-    assert "AT BOUND" in report_text(report_dict(stopped))
-    assert "at bound" in write_page(tmp_path, stopped)
-    vague = told("alpha", 50.0, (-1910.0, 2010.0), False)
-    assert "largest measured twist" in report_dict(vague)["before"]["parameters"]["alpha"]["note"]
-    assert "NOT IDENTIFIABLE" in report_text(report_dict(vague))
-    assert "largest measured twist" in write_page(tmp_path, vague)
-    feeding = told("B_sp", -0.1, (-0.11, -0.09), True)
+    sentence = "K ended at its bound"
+    stopped = with_limits(fitted, "account", bounds={"K": sentence})
+    told = report_dict(stopped)
+    assert told["before"]["parameters"]["K"]["at_bound"] and told["before"]["parameters"]["K"]["note"] == sentence
+    assert not told["before"]["parameters"]["B_sp"]["at_bound"]
+    assert told["identifiability"]["bounds"] == {"K": sentence}
+    assert "AT BOUND" in report_text(told) and sentence in report_text(told)
+    page = write_page(tmp_path, stopped)
+    assert "at bound" in page and sentence in page
+    vague = with_estimate(fitted, "account", "alpha", ci95=(-1910.0, 2010.0), identifiable=False)
+    vague = with_limits(vague, "account", reasons={"alpha": VAGUE})
+    assert report_dict(vague)["before"]["parameters"]["alpha"]["note"] == VAGUE
+    text = report_text(report_dict(vague))
+    assert "NOT IDENTIFIABLE" in text and text.count("alpha is not identifiable") == 1
+    assert VAGUE.replace("^-2", "⁻²") in write_page(tmp_path, vague)
+    feeding = with_estimate(fitted, "account", "B_sp", value=-0.1, ci95=(-0.11, -0.09))
     assert "negative" in report_dict(feeding)["before"]["parameters"]["B_sp"]["note"]
 
 
-@pytest.mark.parametrize(
-    ("value", "bounds", "start", "stopped"),
-    [
-        (7160.0, (0.0, 1e9), 7000.0, False),
-        (9.95e8, (0.0, 1e9), 7000.0, True),
-        (1e-5, (0.0, 1e9), 7000.0, True),
-        (1e-5, (0.0, 1e9), 2e-5, False),
-        (-0.3, (-math.inf, math.inf), 0.2, False),
-        (0.5, (0.5, 2.0), None, True),
-    ],
-)
-def test_bounds(value: float, bounds: tuple[float, float], start: float | None, stopped: bool):
-    assert at_bound(value, bounds, start) is stopped
+def test_what_a_log_cannot_tell(fitted: FitOnly, tmp_path: Path):
+    """The account's own sentences, all of them, in JSON, text and page."""
+    held = fitted.account.identifiability.held
+    assert [h.path for h in held] == ["J_m", "J_l"]
+    first, *others = fitted.account.identifiability.directions
+    weak = dataclasses.replace(first, sentence="The logs can't tell K and B_sp apart")
+    blind = with_limits(fitted, "account", directions=(weak, *others))
+    found = report_dict(blind)["identifiability"]
+    assert [h["sentence"] for h in found["held"]] == [h.sentence for h in held]
+    assert found["held"][0]["changes"] == held[0].changes
+    assert [d["std"] for d in found["directions"]] == [first.std, *(d.std for d in others)]
+    sentences = [weak.sentence, *(h.sentence for h in held)]
+    assert report_dict(blind)["cannot_tell"][: len(sentences)] == sentences
+    text = re.sub(r"\s+", " ", report_text(report_dict(blind)).split("[What this log can't tell]")[1])
+    page = write_page(tmp_path, blind).replace("&#39;", "'")
+    for sentence in sentences:
+        assert sentence in text and sentence in page
+
+
+def test_intervals_from_profiles_are_marked(fitted: FitOnly, tmp_path: Path):
+    assert {e["interval"] for e in report_dict(fitted)["before"]["parameters"].values()} == {"curvature"}
+    profiled = with_estimate(fitted, "account", "alpha", ci95=(-1910.0, math.inf), interval="profile")
+    found = report_dict(profiled)
+    assert found["before"]["parameters"]["alpha"]["interval"] == "profile"
+    assert found["before"]["parameters"]["alpha"]["ci95"] == [-1910.0, None]
+    (row,) = re.findall(r"^ +alpha .*$", report_text(found), re.MULTILINE)[:1]
+    assert "above -1910" in row and row.rstrip().endswith("interval from profile")
+    page = write_page(tmp_path, profiled)
+    assert page.count('<span class="soft">profile</span>') == 1 and "above −1" in page
+
+
+def test_sentences_have_the_units_of_a_reduced_log():
+    sentence = "alpha is at most 2 1/[x]^2, and gain 3 [x]/s^2/[u]"
+    assert formatting.in_log_words(sentence, response="V", forcing="N m") == (
+        "alpha is at most 2 1/V^2, and gain 3 V/s^2/(N m)"
+    )
+    assert formatting.superscripts("K^-2 and omega_0^-2.1") == "K⁻² and omega_0^-2.1"
+
+
+def test_share_of_held_out_samples_in_the_band(fitted: FitOnly, tmp_path: Path):
+    (band,) = fitted.bands
+    (run,) = fitted.account.validation
+    assert band.run is run
+    spread = np.sqrt(band.std_predicted**2 + float(fitted.noise[-1, -1]))
+    share = float(np.mean(np.abs(run.measured - run.predicted) <= stats.norm.ppf(0.975) * spread))
+    assert report_dict(fitted)["goodness"]["band_coverage"] == pytest.approx(share)
+    # The model lacks the motor's friction, which no band knows of.
+    assert share < 0.9
+    assert f"95 % band of the free runs: {formatting.percent(share)}" in report_text(report_dict(fitted))
+    assert f"it holds {formatting.percent(share)} of them" in write_page(tmp_path, fitted)
+    (picture,) = [p for p in fit_plots(fitted, units={}) if p.key == "prediction-0"]
+    edges = [t["y"] for t in picture.figure["data"] if t["name"] == "95 % band"]
+    assert len(edges) == 4 and all(np.all(np.array(a) <= b) for a, b in (edges[:2], edges[2:]))
+
+
+def drawn(fitted: FitOnly, **changes) -> FitOnly:
+    """The fit with draws that a random generator made up."""
+    paths = tuple(fitted.account.uncertainty.estimates)
+    values = np.random.default_rng(0).normal(size=(2, 50, 3)) + [7000.0, 100.0, 1.0]
+    options = {"r_hat": np.full(3, 1.001), "effective_samples": np.array([80.0, 90.0, 100.0]), "divergences": 0}
+    return dataclasses.replace(fitted, posterior=Posterior(paths, values, values, **options | changes))
+
+
+def test_draws_are_told_and_written(fitted: FitOnly, tmp_path: Path):
+    assert report_dict(fitted)["posterior"] is None and "[Posterior]" not in report_text(report_dict(fitted))
+    sampled = drawn(fitted)
+    page = write_page(tmp_path, sampled)
+    assert set(os.listdir(tmp_path)) == FILES | {"posterior.parquet"}
+    table = pl.read_parquet(tmp_path / "posterior.parquet")
+    assert table.columns == ["chain", "draw", "K", "alpha", "B_sp"] and len(table) == 100
+    one = table.filter((pl.col("chain") == 1) & (pl.col("draw") == 7))
+    assert sampled.posterior is not None
+    np.testing.assert_array_equal(one.to_numpy()[0, 2:], sampled.posterior.values[1, 7])
+    found = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["posterior"]
+    assert (found["chains"], found["draws"], found["divergences"], found["settled"]) == (2, 50, 0, True)
+    for level, value in found["parameters"]["K"]["quantiles"].items():
+        assert value == pytest.approx(np.quantile(table["K"].to_numpy(), float(level)))
+    assert found["parameters"]["alpha"]["r_hat"] == 1.001
+    assert found["parameters"]["alpha"]["effective_samples"] == 90.0
+    text = report_text(report_dict(sampled))
+    assert re.search(r"^    K +(\S+ +){5}1\.001 +80 +N m/rad$", text, re.MULTILINE) and "the chains agree" in text
+    assert "<h2>Posterior</h2>" in page and "posterior.parquet" in page
+
+
+@pytest.mark.parametrize("changes", [{"divergences": 3}, {"r_hat": np.array([1.0, 1.2, math.nan])}])
+def test_draws_that_have_not_settled_are_told_so(fitted: FitOnly, tmp_path: Path, changes: dict):
+    doubtful = drawn(fitted, **changes)
+    assert "NOT settled" in report_text(report_dict(doubtful)) and "NOT settled" in write_page(tmp_path, doubtful)
+    assert not report_dict(doubtful)["posterior"]["settled"]
 
 
 @pytest.mark.parametrize("kind", ["loop", "fit"])

@@ -16,6 +16,7 @@ from fitting.plots.plot import Plot
 from fitting.plots.prediction import predictions
 from fitting.plots.residual import autocorrelation, dependences, input_correlation, orders, spectrum
 from fitting.plots.rmse import rmse_bars
+from fitting.prediction_band import PredictionBand
 
 _MOST_LOGS = 4
 
@@ -43,7 +44,7 @@ def fit_plots(fitted: FitOnly, *, units: Mapping[str, str]) -> list[Plot]:
     """All pictures of a fit; arguments as in [`plots`][]."""
     unit = units.get("dynamic_error", "rad")
     step = 0.5 / float(fitted.residual.frequency[-1])
-    found = _predictions(fitted.account, None, unit)
+    found = _predictions(fitted.account, None, unit, fitted.bands)
     memory, *others = _residual_plots(fitted.account, fitted.residual, None, noise=_noise(fitted), unit=unit)
     found += [memory, *(input_correlation(c, step=step) for c in fitted.tests.inputs), *others]
     if fitted.frequency_response is not None:
@@ -56,12 +57,15 @@ def _noise(outcome: Loop | FitOnly) -> float:
     return float(np.sqrt(np.asarray(outcome.noise)[-1, -1]))
 
 
-def _predictions(before: Account, after: Account | None, unit: str) -> list[Plot]:
-    """The same held-out stretch before and after, of the first few logs."""
+def _predictions(before: Account, after: Account | None, unit: str, bands: Sequence[PredictionBand] = ()) -> list[Plot]:
+    """The same held-out stretch before and after, of the first few logs; with the bands of the model before."""
     later: Sequence[FreeRun | None] = [None] * len(before.validation) if after is None else after.validation
     omega_0 = float(before.model.drive.omega_0)
     pairs = list(zip(before.validation, later, strict=True))[:_MOST_LOGS]
-    return [predictions(runs, omega_0=omega_0, unit=unit, key=f"prediction-{i}") for i, runs in enumerate(pairs)]
+    return [
+        predictions(runs, omega_0=omega_0, unit=unit, key=f"prediction-{i}", band=bands[i] if bands else None)
+        for i, runs in enumerate(pairs)
+    ]
 
 
 def _residual_plots(

@@ -4,17 +4,26 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fitting.formatting import axis_label, scaled_unit
+from fitting.formatting import axis_label, percent, scaled_unit
 from fitting.free_run import FreeRun
 from fitting.plots.long_trace import long_trace
 from fitting.plots.look import MEASURED, axis, figure, names_and_colors
-from fitting.plots.plot import Plot
+from fitting.plots.plot import Figure, Plot
+from fitting.prediction_band import PredictionBand, coverage
 
 # Natural periods that a trace shows at first sight.
 _PERIODS = 15
+_BAND = "rgba(0,114,178,0.25)"
 
 
-def predictions(runs: tuple[FreeRun, FreeRun | None], *, omega_0: float, unit: str, key: str) -> Plot:
+def predictions(
+    runs: tuple[FreeRun, FreeRun | None],
+    *,
+    omega_0: float,
+    unit: str,
+    key: str,
+    band: PredictionBand | None = None,
+) -> Plot:
     """Measured and predicted dynamic error on held-out data, and the error of each prediction.
 
     Args:
@@ -22,6 +31,7 @@ def predictions(runs: tuple[FreeRun, FreeRun | None], *, omega_0: float, unit: s
         omega_0: natural frequency [rad/s], for the first view.
         unit: of the dynamic error.
         key: of the plot.
+        band: of the first run.
     """
     first = runs[0]
     window = _first_view(first, omega_0)
@@ -29,7 +39,8 @@ def predictions(runs: tuple[FreeRun, FreeRun | None], *, omega_0: float, unit: s
     factor, label = scaled_unit(float(np.max(np.abs(first.measured))), unit)
     errors = [r.measured - r.predicted for r in runs if r is not None]
     error_factor, error_label = scaled_unit(_rms(errors[0]), unit)
-    traces = [long_trace(first.time, factor * first.measured, window, name="measured", color=MEASURED, width=4.0)]
+    traces = [] if band is None else _band(band, window, factor, error_factor)
+    traces.append(long_trace(first.time, factor * first.measured, window, name="measured", color=MEASURED, width=4.0))
     for (name, color), run, error in zip(names_and_colors(runs[1] is not None), runs, errors, strict=False):
         assert run is not None
         traces.append(long_trace(run.time, factor * run.predicted, window, name=name, color=color))
@@ -53,8 +64,36 @@ def predictions(runs: tuple[FreeRun, FreeRun | None], *, omega_0: float, unit: s
         f"Held-out data of {first.name}: measured and predicted",
         "Free run from the first samples on; the model sees the torque only. Below: measured minus predicted. "
         f"The view starts where the {'base ' if runs[1] else ''}model errs most; "
-        "double-click for the whole stretch, drag to zoom.",
+        f"double-click for the whole stretch, drag to zoom.{_coverage(band)}",
         figure(traces, 460, **layout),
+    )
+
+
+def _band(band: PredictionBand, window: tuple[float, float], factor: float, error_factor: float) -> list[Figure]:
+    """Where measured samples are expected, and where their errors are; nothing where that is not known."""
+    low, high = band.band95
+    if not np.isfinite([low, high]).all():
+        return []
+    predicted, time = band.run.predicted, band.run.time
+    made = []
+    for curve, scale, place in ((low, factor, {}), (low - predicted, error_factor, {"yaxis": "y2"})):
+        # The upper edge is as far from the prediction as the lower one.
+        other = curve + (high - low)
+        edges = [long_trace(time, scale * c, window, name="95 % band", color=_BAND, width=0.0) for c in (curve, other)]
+        edges[1] |= {"fill": "tonexty", "fillcolor": _BAND}
+        # One entry in the legend stands for all.
+        made += [e | place | {"hoverinfo": "skip", "showlegend": bool(not place and "fill" in e)} for e in edges]
+    return made
+
+
+def _coverage(band: PredictionBand | None) -> str:
+    """How many samples the band holds."""
+    share = np.nan if band is None else coverage([band])
+    if not np.isfinite(share):
+        return ""
+    return (
+        f" The blue band is where 95 % of the samples are expected, from what is open of parameters, initial state and "
+        f"noise; it holds {percent(share)} of them. What the model lacks is not in it."
     )
 
 

@@ -14,9 +14,10 @@ from fitting.close_loop import Loop
 from fitting.free_run import FreeRun
 from fitting.report.alternatives import alternatives
 from fitting.report.fit_content import fit_dict, meaning
-from fitting.report.limits import largest_twist, limits, parameter_note
+from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
 from fitting.report.parameters import account_dict, effect_dict, no_account
+from fitting.report.posterior import posterior_dict
 from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
 
@@ -56,10 +57,12 @@ def report_dict(
         "noise": {"dynamic_error": noise},
         "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
+        "identifiability": identifiability_dict(outcome.after.identifiability, units),
         "alternatives": alternatives(outcome),
         "goodness": None,
         "residual_tests": [],
         "frequency_response": None,
+        "posterior": None,
         "meaning": [],
         "dropped": list(outcome.dropped),
         "unexplained": unexplained(outcome, noise),
@@ -74,11 +77,8 @@ def report_dict(
         "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
     }
     if not is_loop:
-        report |= fit_dict(outcome, noise)
+        report |= fit_dict(outcome, noise) | {"posterior": posterior_dict(outcome.posterior)}
     report = _finite(report)
-    for side in ("before", "after"):
-        for path, estimate in report[side]["parameters"].items():
-            estimate["note"] = parameter_note(path, estimate, x_max, units["dynamic_error"])
     report["summary"] = summary(report)
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)

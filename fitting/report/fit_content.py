@@ -12,6 +12,7 @@ from fitting.frequency_response import (
     resonance_seen,
     unexplained_band,
 )
+from fitting.prediction_band import coverage
 
 # Measured and modelled resonance that differ by less than this, or than the lines' distance, agree.
 _AGREES = 0.03
@@ -35,6 +36,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
                 "training": account.training_rmse / noise,
                 "validation": account.validation_rmse / noise,
             },
+            "band_coverage": coverage(fitted.bands),
             "error_over_noise": dict(g.error_over_noise),
             "reduced_chi_square": g.reduced_chi_square,
             "log_likelihood": g.log_likelihood,

@@ -5,7 +5,8 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fitting.formatting import p_value, plain
+from fitting.formatting import open_interval, p_value, percent, plain
+from fitting.report.posterior import QUANTILES
 
 _WIDTH = 100
 _INDENT = "    "
@@ -24,6 +25,8 @@ def fit_lines(report: Mapping[str, Any]) -> list[str]:
         *_section("Result", _prose([report["summary"], *report["meaning"]])),
         *_section("Parameters", _parameters(report["before"])),
         *_section("Derived", _table(_derived_rows(report["before"]["derived"]), left=(0, 5))),
+        *_section("Posterior", _posterior(report["posterior"], report["before"]["parameters"])),
+        *_section("What this log can't tell", _prose(report["cannot_tell"])),
         *_section("Correlations above 0.1", _correlations(report["before"]["correlations"])),
         *_section("Goodness", _goodness(report)),
         *_section("Residual", _tests(report["residual_tests"])),
@@ -42,13 +45,18 @@ def _prose(sentences: Sequence[str]) -> list[str]:
 
 
 def _parameters(account: Mapping[str, Any]) -> list[str]:
-    """The table, and a sentence for each parameter that needs one."""
     entries = account["parameters"]
     rows = [["", "value", "std error", "%", "95 % interval", "start", "unit", ""]]
     for path, e in entries.items():
-        flag = "AT BOUND" if e["at_bound"] else "" if e["identifiable"] else "NOT IDENTIFIABLE"
-        rows.append([path, *_figures(e), plain(e["start"], 5), e["unit"], flag])
-    return _table(rows, left=(0, 6, 7)) + _prose([e["note"] for e in entries.values() if e["note"]])
+        rows.append([path, *_figures(e), plain(e["start"], 5), e["unit"], _flags(e)])
+    return _table(rows, left=(0, 6, 7))
+
+
+def _flags(entry: Mapping[str, Any]) -> str:
+    flags = ["AT BOUND"] if entry["at_bound"] else [] if entry["identifiable"] else ["NOT IDENTIFIABLE"]
+    if entry["interval"] == "profile":
+        flags.append("interval from profile")
+    return ", ".join(flags)
 
 
 def _derived_rows(derived: Mapping[str, Any]) -> list[list[str]]:
@@ -58,8 +66,20 @@ def _derived_rows(derived: Mapping[str, Any]) -> list[list[str]]:
 
 def _figures(entry: Mapping[str, Any]) -> list[str]:
     """Value, standard error, percent and interval, to the digits that the standard error leaves."""
-    value, std, low, high = _rounded([entry["value"], entry["std"], *entry["ci95"]], entry["std"])
-    return [value, std, plain(entry["percent"], 2), f"{low} to {high}"]
+    ends = [e for e in entry["ci95"] if e is not None]
+    value, std, *known = _rounded([entry["value"], entry["std"], *ends], entry["std"])
+    return [value, std, plain(entry["percent"], 2), open_interval(entry["ci95"]).format(*known)]
+
+
+def _posterior(found: Mapping[str, Any] | None, parameters: Mapping[str, Any]) -> list[str]:
+    """Quantiles by parameter, and whether they may be relied on; nothing where none were drawn."""
+    if found is None:
+        return []
+    rows = [["", *(f"{100 * q:g} %" for q in QUANTILES), "R-hat", "effective", "unit"]]
+    for path, e in found["parameters"].items():
+        quantiles = _rounded(list(e["quantiles"].values()), parameters[path]["std"])
+        rows.append([path, *quantiles, plain(e["r_hat"]), plain(e["effective_samples"]), parameters[path]["unit"]])
+    return _table(rows, left=(0, len(rows[0]) - 1)) + _prose([found["says"]])
 
 
 def _rounded(values: Sequence[float | None], std: float | None) -> list[str]:
@@ -90,6 +110,7 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
     held_out = sum(log["held_out"] for log in report["logs"])
     return _table(rows, left=(0, 3)) + [
         f"measurement noise {plain(report['noise']['dynamic_error'])} {unit} rms",
+        f"held-out samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
         f"left over in short simulations, in units of the noise: {left}",
         f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
         f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
@@ -98,6 +119,10 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
         f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",
         "time: " + ", ".join(f"{stage} {seconds:.2g} s" for stage, seconds in report["seconds"].items()),
     ]
+
+
+def _share(value: float | None) -> str:
+    return "n/a" if value is None else percent(value)
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> list[str]:

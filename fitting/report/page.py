@@ -10,6 +10,7 @@ from plotly.offline import get_plotlyjs
 
 from fitting import formatting
 from fitting.plots import Plot
+from fitting.report.posterior import QUANTILES
 from fitting.report.separating import plain_family
 from fitting.report.summary import chance
 from fitting.report.tables import changes, parameter_rows
@@ -36,9 +37,11 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         "number": formatting.number,
         "percent": formatting.percent,
         "unit": formatting.pretty_unit,
+        "superscripts": formatting.superscripts,
         "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
         "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
         "interval_in_factor": lambda p, factor: formatting.interval_in_factor(p["ci95"], p["std"], factor),
+        "value_in_factor": formatting.value_in_factor,
         "interval": lambda p: formatting.interval(p["ci95"], p["std"], p["unit"]),
         "family": plain_family,
         "code": _code,
@@ -54,6 +57,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         chance=lambda effect: chance(effect, report),
         rows=parameter_rows(report, final),
         changes=changes(report),
+        quantiles=QUANTILES,
         sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found")},
         plotlyjs=Markup(get_plotlyjs()),
     )

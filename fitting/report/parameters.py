@@ -10,12 +10,12 @@ from fitting import formatting
 from fitting.close_loop import Finding
 from fitting.compare import Account
 from fitting.derived import Derived, derived, drive_figures
+from fitting.report.limits import in_words_of_log, parameter_note
 from fitting.report.outcome import Outcome
-from fitting.uncertainty import Estimate, Uncertainty
+from fitting.uncertainty import Uncertainty
 from hdjax import Model, ReducedModel
 from hdjax.effects import ActuatorEffect
 
-_NEAR, _VANISHED = 0.01, 1e-6
 _TOLD_CORRELATION = 0.1
 
 
@@ -30,11 +30,11 @@ def account_dict(
         x_max: the largest measured twist.
         start: the model that the fit started from, where that is known.
     """
-    estimates, model = account.uncertainty.estimates, account.model
     figures = derived(account, lambda m: drive_figures(m, x_max))
+    base = [path for path in account.uncertainty.estimates if "." not in path]
     return {
         "effects": [],
-        "parameters": {p: _estimate_dict(e, model, units, start) for p, e in estimates.items() if "." not in p},
+        "parameters": {path: _estimate_dict(path, account, units, start) for path in base},
         "derived": {name: _derived_dict(name, q) for name, q in figures.items()},
         "correlations": _correlations(account.uncertainty),
         "rmse": {"training": account.training_rmse, "validation": account.validation_rmse},
@@ -47,32 +47,23 @@ def no_account() -> dict[str, Any]:
     return empty | {"rmse": {"training": None, "validation": None}}
 
 
-def _estimate_dict(
-    estimate: Estimate, model: Model, units: Mapping[str, str], start: Model | None = None
-) -> dict[str, Any]:
-    info = model.parameters()[estimate.path][1]
-    first = None if start is None else float(start.get(estimate.path))
+def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start: Model | None = None) -> dict[str, Any]:
+    estimate = account.uncertainty.estimates[path]
+    note = parameter_note(estimate, account.identifiability)
     return {
         "value": estimate.value,
         "std": estimate.std,
         "ci95": list(estimate.ci95),
-        "unit": _unit_in_log(estimate.unit, estimate.path, model, units),
+        "interval": estimate.interval,
+        "unit": _unit_in_log(estimate.unit, path, account.model, units),
         "identifiable": estimate.identifiable,
         "std_classical": estimate.std_classical,
-        "description": info.doc,
+        "description": account.model.parameters()[path][1].doc,
         "percent": _percent(estimate.value, estimate.std),
-        "start": first,
-        "at_bound": at_bound(estimate.value, info.bounds, first),
-        "note": None,
+        "start": None if start is None else float(start.get(path)),
+        "at_bound": path in account.identifiability.bounds,
+        "note": None if note is None else in_words_of_log(note, units),
     }
-
-
-def at_bound(value: float, bounds: tuple[float, float], start: float | None) -> bool:
-    """Whether a fit ran into a limit: within 1 % of a bound, or of the start by a factor of a million towards zero."""
-    low, high = bounds
-    small = low == 0.0 and start is not None and value < _VANISHED * start
-    near = any(math.isfinite(b) and b != 0.0 and abs(value - b) <= _NEAR * abs(b) for b in bounds)
-    return bool(small or near or not low <= value <= high)
 
 
 def _percent(value: float, std: float) -> float:
@@ -113,9 +104,7 @@ def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) ->
     prefix = f"{finding.name}."
     entry["equation"] = (type(finding.effect).__doc__ or finding.name).splitlines()[0]
     entry["parameters"] = {
-        path: _estimate_dict(estimate, account.model, units)
-        for path, estimate in account.uncertainty.estimates.items()
-        if path.startswith(prefix)
+        path: _estimate_dict(path, account, units) for path in account.uncertainty.estimates if path.startswith(prefix)
     }
     for name, quantity in derived(account, lambda m: m.effect(finding.name).derived(m.drive)).items():
         unit = _unit_in_log(quantity.unit, prefix + name, account.model, units)

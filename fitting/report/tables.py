@@ -26,13 +26,14 @@ def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[
         before = report["before"][kind][key]
         rows.append(
             {
+                "path": key,
                 "symbol": symbol,
                 "derived": kind == "derived",
                 "meaning": meaning,
                 "unit": unit,
                 "factor": factor,
                 "before": before,
-                "final": {"note": None} | estimate,
+                "final": estimate,
                 "flagged": kind == "parameters" and (estimate["at_bound"] or not estimate["identifiable"]),
             }
         )

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
-from fitting.formatting import plain
+from fitting.formatting import open_interval, plain
 from fitting.report.fit_text import fit_lines
 from fitting.report.summary import chance
 
@@ -51,8 +51,9 @@ def _parameter_lines(parameters: Mapping[str, Any]) -> list[str]:
 
 def _parameter_line(estimate: Mapping[str, Any]) -> str:
     value, std = estimate["value"], estimate["std"]
-    low, high = estimate["ci95"]
+    ends = [plain(e, 6) for e in estimate["ci95"] if e is not None]
+    span = f"[{', '.join(ends)}]" if len(ends) == 2 else open_interval(estimate["ci95"]).format(*ends)
     share = f" ({100 * std / abs(value):.2g} %)" if value and std is not None else ""
     flag = "" if estimate["identifiable"] else "  NOT IDENTIFIABLE"
     unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"
-    return f"{plain(value, 6)} +/- {plain(std, 2)}{share}{unit}  [{plain(low, 6)}, {plain(high, 6)}]{flag}"
+    return f"{plain(value, 6)} +/- {plain(std, 2)}{share}{unit}  {span}{flag}"

@@ -14,6 +14,7 @@ from fitting.plots import Plot, fit_plots, plots
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
+from fitting.report.posterior import DRAWS_FILE, draws_table
 from fitting.report.text import report_text
 from fitting.rig import Rig
 
@@ -27,7 +28,8 @@ def write_report(
     health: Sequence[tuple[str, findings.Finding]] = (),
     name: str = "drive",
 ) -> dict[str, Path]:
-    """Write `report.html`, `report.json` and `model.json`: all of them, whole, or none.
+    """Write `report.html`, `report.json` and `model.json`, and `posterior.parquet` where draws were made: all of them,
+    whole, or none.
 
     Args:
         out_dir: folder; made where absent.
@@ -41,13 +43,15 @@ def write_report(
         The files' paths, by name.
     """
     report = report_dict(outcome, units=units, health=health, name=name)
-    texts = {
+    contents: dict[str, str | bytes] = {
         "report.html": report_page(report, _pictures(outcome, report)),
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "model.json": model_json,
     }
-    paths = {file: Path(out_dir) / file for file in texts}
-    write_whole({paths[file]: text for file, text in texts.items()})
+    if isinstance(outcome, FitOnly) and outcome.posterior is not None:
+        contents[DRAWS_FILE] = draws_table(outcome.posterior)
+    paths = {file: Path(out_dir) / file for file in contents}
+    write_whole({paths[file]: content for file, content in contents.items()})
     return paths
 
 

@@ -1,0 +1,58 @@
+"""Draws from the posterior: their quantiles and diagnostics for the report, and the draws themselves as a table."""
+
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fitting.posterior import Posterior
+
+QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+"""Levels that a report lists."""
+
+DRAWS_FILE = "posterior.parquet"
+"""Holds the draws, beside the report."""
+
+
+def posterior_dict(found: Posterior | None) -> dict[str, Any] | None:
+    """Quantiles of each parameter and how far the draws may be relied on; None where none were made."""
+    if found is None:
+        return None
+    chains, draws, _ = found.values.shape
+    quantiles = found.quantiles(*QUANTILES)
+    parameters = {
+        path: {
+            "quantiles": dict(zip(map(str, QUANTILES), quantiles[path].tolist(), strict=True)),
+            "r_hat": float(found.r_hat[i]),
+            "effective_samples": float(found.effective_samples[i]),
+        }
+        for i, path in enumerate(found.paths)
+    }
+    return {
+        "chains": chains,
+        "draws": draws,
+        "divergences": found.divergences,
+        "settled": found.settled,
+        "says": _says(found),
+        "file": DRAWS_FILE,
+        "parameters": parameters,
+    }
+
+
+def _says(found: Posterior) -> str:
+    chains, draws, _ = found.values.shape
+    made = f"{draws} draws from each of {chains} chains, {found.divergences} divergent transitions"
+    if found.settled:
+        return f"{made}: the chains agree."
+    return f"{made}: the chains have NOT settled (R-hat above 1.01 or divergences); don't rely on these quantiles."
+
+
+def draws_table(found: Posterior) -> bytes:
+    """The draws as a Parquet file: `chain`, `draw`, and each parameter in the unit of the report."""
+    chains, draws, _ = found.values.shape
+    columns = {"chain": np.repeat(np.arange(chains), draws), "draw": np.tile(np.arange(draws), chains)}
+    columns |= {path: found.values[:, :, i].ravel() for i, path in enumerate(found.paths)}
+    buffer = BytesIO()
+    pl.DataFrame(columns).write_parquet(buffer)
+    return buffer.getvalue()
