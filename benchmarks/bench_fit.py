@@ -12,16 +12,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numba
 import numpy as np
 from scipy.optimize import least_squares
 
+from fitting.arrow import normal_equations
 from fitting.estimate import Fit, fit, natural_frequency, short_horizon, suggested_substeps
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
+from fitting.residual import linearise, residual
 from fitting.starting_values import starting_models
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
+from hdjax.lanes import jit_lanes
 
 GOAL = 5.0
 AGREEMENT = 1e-6
@@ -287,6 +292,37 @@ def verdict(text: str, held: bool) -> None:
     print(f"  {'met   ' if held else 'MISSED'}  {text}")
 
 
+def show_profile(row: Row, repeats: int) -> None:
+    """Where the time of one fit goes: compiled parts, timed apart, times how often they run."""
+    found: Fit = row.result
+    problem, unknowns = found.problem, found.unknowns
+    at_solution = linearise(problem, unknowns)
+    system = _system(at_solution, problem.segments.joined)
+    parts = {
+        "simulation with sensitivities": lambda: linearise(problem, unknowns),
+        "normal equations": lambda: _system(at_solution, problem.segments.joined),
+        "step": lambda: _step(system),
+    }
+    print(f"\nwhere the time of '{row.name}' goes ({found.steps} iterations, least of {repeats}):")
+    known = 0.0
+    for name, call in parts.items():
+        each = timed(name, lambda c=call: jax.block_until_ready(c()), repeats).least
+        known += each * found.steps
+        print(f"  {name:<32}{1e3 * each:7.2f} ms each {1e3 * each * found.steps:8.1f} ms together")
+    rest = "rest: host, first covariance"
+    print(f"  {rest:<32}{'':15} {1e3 * (row.least - known):8.1f} ms")
+    print(f"  simulation alone, without sensitivities: {1e3 * timed('', _residual(found), repeats).least:.2f} ms")
+
+
+_system = eqx.filter_jit(normal_equations)
+_step = eqx.filter_jit(lambda system: system.step(jnp.zeros(())))
+_simulated = jit_lanes(residual)
+
+
+def _residual(found: Fit) -> Callable[[], Any]:
+    return lambda: jax.block_until_ready(_simulated(found.problem, found.unknowns))
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -340,6 +376,7 @@ def main() -> None:
     show_table(rows, peer, args.samples)
     print(f"first: with compilation, where something had to be compiled. peer/this: against {peer.name}.")
 
+    show_profile(ours["x", "peer_start"], args.repeats)
     print()
     for key, row in peers.items():
         found = row.result[1]
