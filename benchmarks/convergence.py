@@ -265,7 +265,7 @@ def fit_from(truth: Model, found: Fit) -> Fit:
         found.stretches,
         base_paths(truth),
         horizon=found.horizon,
-        substeps=found.problem.substeps,
+        substeps=found.substeps,
         count=found.error.shape[0],
     )
 
@@ -313,7 +313,7 @@ def judge(drawn: Draw, seed: int) -> dict:
         "excess": excess,
         "seconds": spent,
         "horizon": found.horizon,
-        "substeps": found.problem.substeps,
+        "substeps": found.substeps,
         "converged": found.converged,
         "steps": found.steps,
         "left_out": left_out(found.stretches),

@@ -8,6 +8,7 @@ it has found.
 import dataclasses
 from collections.abc import Sequence
 
+import equinox as eqx
 import numpy as np
 from scipy.stats import chi2
 
@@ -30,7 +31,7 @@ _FALSE_ALARM = 1e-3
 
 
 def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
-    """Fit a drive without effects, from starting values that the data supply.
+    """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -41,7 +42,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: where the data supply no starting values.
     """
     training = without_glitches(training)
-    best = _coarse_fit(starting_models(model, training), training, halo)
+    best, start = _coarse_fit(starting_models(model, training), training, halo)
     horizon = short_horizon(best.model, training)
     if not best.horizon <= 2 * horizon <= 4 * best.horizon:
         segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
@@ -64,23 +65,23 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
             base_paths(best.model),
             horizon=best.horizon,
             halo=halo,
-            substeps=best.problem.substeps,
+            substeps=best.substeps,
             states=best.unknowns.states,
         )
-    return best
+    return eqx.tree_at(lambda f: f.problem.model, best, start)
 
 
-def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> Fit:
-    """The best of the fits from each start, over horizons that suit the fastest of them."""
+def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
+    """The best of the fits from each start, over horizons that suit the fastest of them; and where it started."""
     # Judged on equally short segments, a start with the wrong frequency can't hide.
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
 
-    def fitted(start: Model, *, max_steps: int = 60, hold_parameters: bool = False) -> Fit:
+    def fitted(model: Model, *, max_steps: int = 60, hold_parameters: bool = False) -> Fit:
         return fit(
-            start,
+            model,
             training,
-            base_paths(start),
+            base_paths(model),
             horizon=horizon,
             halo=halo,
             substeps=substeps,
@@ -88,15 +89,18 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
             hold_parameters=hold_parameters,
         )
 
-    held = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
-    best = fitted(held[0])
+    if len(starts) > 1:
+        starts = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
+    best, begun = fitted(starts[0]), starts[0]
     if len(starts) == 1 or leaves_white_noise(best):
-        return best
-    trials = sorted((fitted(s, max_steps=_TRIAL_STEPS) for s in held[1:]), key=lambda f: f.objective)
-    for trial in trials:
+        return best, begun
+    trials = [(fitted(s, max_steps=_TRIAL_STEPS), s) for s in starts[1:]]
+    for trial, start in sorted(trials, key=lambda pair: pair[0].objective):
         if trial.objective < best.objective + _HOPELESS:
-            best = min(best, fitted(trial.model), key=lambda f: f.objective)
-    return best
+            other = fitted(trial.model)
+            if other.objective < best.objective:
+                best, begun = other, start
+    return best, begun
 
 
 def leaves_white_noise(found: Fit) -> bool:

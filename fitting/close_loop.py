@@ -1,6 +1,5 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -20,6 +19,7 @@ from fitting.attribution import (
     look,
 )
 from fitting.base_fit import base_fit
+from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.estimate import (
@@ -37,6 +37,9 @@ from hdjax.effects import CATALOGUE, Effect
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
 _LONG_STEPS = 20
+# By how many standard errors the steps of the final fit may move its parameters, and how many steps a sample may take.
+_SHIFT = 0.2
+_MOST_SUBSTEPS = 32
 # What the long fit may cost on short segments, in the objective: 2 % of the error.
 _LONG_LOSS = 0.02
 # A residual this much larger than the measurement noise is not noise.
@@ -132,7 +135,7 @@ def close_loop(
     """
     if jnp.zeros(0).dtype != jnp.float64:
         raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
-    clock = _Clock()
+    clock = Clock()
     data: Data = {h: split(e) for h, e in experiments.items()}
     progress("finding starting values")
     base, setting, hold, data = _base_trial(model, data, hold)
@@ -147,10 +150,10 @@ def close_loop(
     final = _long_fit(current, training, setting)
     clock.lap("final fit")
     progress("free runs on held-out data")
-    before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
-    after = before
+    after = account(final, training, validation, noise=noise, halo=setting.halo)
+    before = after
     if current is not base:
-        after = account(final, training, validation, noise=noise, halo=setting.halo)
+        before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
     findings = _findings(base, current, rounds, data, setting, before, after, noise)
     clock.lap("free runs")
     return Loop(
@@ -165,23 +168,10 @@ def close_loop(
         residual_after=diagnose(current.training),
         hold=current.hold,
         setting=setting,
-        after_substeps=current.training.problem.substeps,
+        after_substeps=final.substeps,
         stretches=(training, validation),
         seconds=clock.laps,
     )
-
-
-class _Clock:
-    """Seconds by stage."""
-
-    def __init__(self):
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now
 
 
 def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Hold, Data]:
@@ -193,7 +183,7 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     best = base_fit(model, training, halo=halo)
     data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
     count = segment_count(training, segment_length(best.horizon))
-    setting = Setting(best.horizon, halo, best.problem.substeps, count)
+    setting = Setting(best.horizon, halo, best.substeps, count)
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
@@ -250,6 +240,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
     """
     start = current.training
     longest = max(len(s) for s in training)
+    substeps = needed_substeps(start, shift=_SHIFT, most=_MOST_SUBSTEPS)
     long = fit(
         current.model,
         training,
@@ -257,7 +248,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         horizon=longest,
         length=segment_length(setting.horizon),
         halo=setting.halo,
-        substeps=start.problem.substeps,
+        substeps=substeps,
         covariance=start.covariance,
         count=setting.count,
         states=start.unknowns.states,
@@ -269,7 +260,7 @@ def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> 
         start.free.paths,
         horizon=setting.horizon,
         halo=setting.halo,
-        substeps=start.problem.substeps,
+        substeps=substeps,
         count=setting.count,
         covariance=start.covariance,
         hold_parameters=True,

@@ -2,6 +2,7 @@
 
 # ruff: noqa: E402
 
+import contextlib
 import os
 
 # XLA reads this once, when jax loads. With a warm cache it would warn at length that the processor lacks
@@ -18,33 +19,39 @@ import jax
 import numpy as np
 from cyclopts import Parameter
 from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
 
-from fitting.close_loop import base_fit, close_loop
-from fitting.compare import account
+from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
-from fitting.diagnostics import diagnose
-from fitting.drive_file import read_drive_file
+from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.estimate import measurement_noise
-from fitting.experiment import Stretch, split
+from fitting.experiment import Stretch
 from fitting.files import write_whole
+from fitting.fit_only import fit_only
+from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
-from fitting.logs import read_log
+from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.quasi_static import content as quasi_static_content
+from fitting.quasi_static import report as quasi_static_report
+from fitting.quasi_static.fit import fit_quasi_static
+from fitting.quasi_static.preparation import prepare
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import Rig, experiment, read_rig
+from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
 from hdjax import (
     PRESETS,
     Chirp,
     Harmonic,
-    Hold,
     SimulationError,
     TwoInertiaModel,
     random_phase_multisine,
     sampled,
     simulate,
 )
+
+# A log of usual length has too few lanes for more.
+_MOST_DEVICES = 8
 
 app = cyclopts.App(
     name="hdjax",
@@ -54,7 +61,9 @@ app.command(amplitudes)
 app.command(seed_tables)
 app.command(speeds)
 
-Logs = Annotated[list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5 or Parquet.", negative="")]
+Logs = Annotated[
+    list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
+]
 DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
 
 
@@ -62,27 +71,64 @@ DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias
 def fit(logs: Logs, /, *, drive: DriveOption, out: Path) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
+    Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
+    run that was cut off goes on where it stopped. Quasi-static logs (twist and joint torque) give stiffness, knees,
+    hysteresis and lost motion instead.
+
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json.
+        Folder for report.html, report.json and, but for quasi-static logs, model.json; of a folder of logs for
+        fleet.parquet.
     """
-    rig = read_rig(logs, drive)
+    if any(path.is_dir() for path in logs):
+        _fit_fleet(logs, drive, out)
+        return
+    drive_file = read_drive_file(drive)
+    read = ready_logs(logs, drive_file)
+    if read[0].kind == "quasi-static":
+        _fit_quasi_static(read, drive_file, out)
+    else:
+        _fit_drive(rig_of(read, drive_file), out)
+
+
+def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
     with _progress() as progress:
-        progress("fitting the base model")
-        holds: list[Hold] = list(rig.experiments) if rig.hold is None else [rig.hold]
-        fits = {h: base_fit(rig.model, split(rig.experiments[h])[0]) for h in holds}
-        hold = min(holds, key=lambda h: fits[h].objective)
-        found, (training, validation) = fits[hold], split(rig.experiments[hold])
-        progress("free runs on held-out data")
-        noise = measurement_noise(found)
-        result = account(found, training, validation, noise=noise, halo=0)
-    stored = StoredModel(result.model, hold, found.problem.substeps, 0, noise)
-    paths = write_fit_report(
-        out, result, rig=rig, noise=noise, hold=hold, model_json=to_json(stored), residual=diagnose(found)
-    )
-    print(fit_text(result, rig=rig, noise=noise))
+        progress("fitting torque-twist curves")
+        data = prepare(logs, drive_file)
+        found = fit_quasi_static(
+            data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion
+        )
+        report = quasi_static_content.report_dict(data, found)
+    paths = quasi_static_report.write_report(out, report, found)
+    print(quasi_static_report.report_text(report))
     print(f"Report: {paths['report.html']}")
+
+
+def _fit_drive(rig: Rig, out: Path) -> None:
+    with _progress() as progress:
+        fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, progress=progress)
+    stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
+    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
+    print(fit_text(fitted, rig=rig))
+    print(f"Report: {paths['report.html']}")
+
+
+def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
+    if len(folders) > 1:
+        raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
+    read_drive_file(drive)
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("logs", total=None)
+        table = fit_fleet(
+            folders[0], drive, out, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    print(fleet_text(table))
+    print(f"Table: {out / 'fleet.parquet'}")
+    if not (table["state"] == "fitted").any():
+        raise DataError(f"{folders[0]}: none of its {len(table)} logs could be fitted; the reasons stand above")
 
 
 @app.command(name="close-loop")
@@ -131,12 +177,14 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     """
     stored = read_model(model)
     drive_file = read_drive_file(drive)
-    read = read_log(log, drive_file, outputs_until=WINDOW)
+    read = ready_log(log, drive_file, outputs_until=WINDOW)
+    if read.kind == "quasi-static":
+        raise InputError(f"{log}: {WHY_NOT_QUASI_STATIC}")
     if (read.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
             f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"
         )
-    ready = experiment(read, drive_file, stored.hold)
+    (ready,) = experiments(read, drive_file, stored.hold)
     (run,) = free_run(
         stored.model,
         [Stretch(ready, 0, len(ready))],
@@ -146,7 +194,11 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
     )
     if not np.isfinite(run.predicted).all():
         raise DataError(f"{log}: the model's free run leaves the numbers; check the torque column's unit and sign")
-    _write_table(out, {"time": run.time, "dynamic_error": run.predicted})
+    rows = slice(None) if ready.rows is None else ready.rows
+    _write_table(out, {"time": run.time[rows], "dynamic_error": run.predicted[rows] + read.zero})
+    for finding in read.findings:
+        if finding.severity == "warning":
+            print(f"hdjax: {log}: {finding}", file=sys.stderr)
     print(f"Prediction: {out}")
 
 
@@ -273,8 +325,10 @@ class _progress:
 
 
 def _set_up_jax() -> None:
-    """Double precision, and compiled programs kept between runs."""
+    """Double precision, a device for each core, and compiled programs kept between runs."""
     jax.config.update("jax_enable_x64", True)
+    with contextlib.suppress(RuntimeError):  # JAX has started: this is not the process' first command
+        jax.config.update("jax_num_cpu_devices", min(os.cpu_count() or 1, _MOST_DEVICES))
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdjax"
     try:
         cache.mkdir(parents=True, exist_ok=True)

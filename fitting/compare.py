@@ -81,7 +81,7 @@ def _runs(
         [*training, *validation],
         covariance=noise,
         halo=halo,
-        substeps=fit.problem.substeps,
+        substeps=fit.substeps,
         like=fit,
     )
     return together[: len(training)], together[len(training) :]

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import welch
 
+from fitting.autocorrelation import autocorrelation, left_over
 from fitting.estimate import Fit
 from hdjax import TwoInertiaModel
 
@@ -54,7 +55,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     """Diagnostics of a fit's residual."""
     segments = fit.problem.segments
     weight = np.asarray(segments.weight) > 0
-    residual = np.asarray(fit.error)[..., -1][weight]
+    residual = left_over(fit)
     simulated = (np.asarray(segments.measured) - np.asarray(fit.error))[weight]
     step = fit.stretches[0].experiment.time_step
     frequency, density = welch(residual, 1.0 / step, nperseg=min(2048, residual.size))
@@ -75,7 +76,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         spectral_density=density,
         order=order,
         order_amplitude=amplitude,
-        autocorrelation=_autocorrelation(residual, min(200, residual.size // 4)),
+        autocorrelation=autocorrelation(fit, min(200, residual.size // 4)),
         white_limit=1.96 / np.sqrt(residual.size),
         dependence={name: _dependence(residual, q) for name, q in quantities.items()},
         rms=float(np.sqrt(np.mean(residual**2))),
@@ -89,13 +90,6 @@ def _order_amplitude(residual: np.ndarray, theta_m: np.ndarray) -> np.ndarray:
         basis = np.stack([np.cos(order * theta_m), np.sin(order * theta_m)], axis=1)
         amplitude[i] = np.hypot(*np.linalg.lstsq(basis, residual, rcond=None)[0])
     return amplitude
-
-
-def _autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    centred = residual - residual.mean()
-    spectrum = np.abs(np.fft.rfft(centred, 2 * centred.size)) ** 2
-    correlation = np.fft.irfft(spectrum)[: lags + 1]
-    return correlation / correlation[0] if correlation[0] > 0 else correlation
 
 
 def _dependence(residual: np.ndarray, quantity: np.ndarray) -> Dependence:

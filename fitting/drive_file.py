@@ -23,8 +23,11 @@ SIGNALS = (
     "dynamic_error",
     "forcing",
     "motor_velocity",
+    "load_velocity",
+    "twist",
+    "joint_torque",
 )
-_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2"}
+_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2", "rated_torque": "N m"}
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
     "signals": ("torque_hold", "sample_rate"),
@@ -38,13 +41,17 @@ class ColumnMap:
 
     Attributes:
         column: Name of the column; in HDF5 the path of the dataset.
-        unit: Unit of the column's numbers, or None for SI.
+        unit: Unit of the column's numbers, or None for the file's own, or else SI.
         sign: +1.0 or -1.0, multiplies the column.
+        offset: What is subtracted before, in the column's own numbers.
+        time: Name of the column with this channel's own stamps, in the unit of [columns] time, or None.
     """
 
     column: str
     unit: str | None
     sign: float
+    offset: float = 0.0
+    time: str | None = None
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,7 @@ class DriveFile:
         torque_hold: What the torque does between samples, one of `HOLDS`, or None.
         sample_rate: Samples per second [Hz] of a log without time column, or None.
         columns: Signal name to its place in the log, only where the drive file states it.
+        rated_torque: At the output [N m], or None; lost motion is defined by it.
     """
 
     path: Path
@@ -70,6 +78,7 @@ class DriveFile:
     torque_hold: Hold | None
     sample_rate: float | None
     columns: dict[str, ColumnMap]
+    rated_torque: float | None = None
 
     def column_of(self, signal: str) -> ColumnMap:
         """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""
@@ -147,8 +156,17 @@ def _refuse_unknown(path: Path, kind: str, given: Iterable[str], known: Iterable
 
 def _text(path: Path, where: str, value: object) -> str:
     if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{path}: {where} must be a non-empty string, but is {value!r}")
+        raise InputError(f"{path}: {where} must be a non-empty string, but is {_short(value)}")
     return value
+
+
+def _short(value: object) -> str:
+    try:
+        shown = repr(value)
+    except ValueError:
+        # Python refuses to write out an integer of thousands of digits.
+        shown = "a number of thousands of digits"
+    return shown if len(shown) <= 60 else f"{shown[:57]}..."
 
 
 def _positive(path: Path, table: str, key: str, value: object, unit: str) -> float | None:
@@ -160,15 +178,15 @@ def _positive(path: Path, table: str, key: str, value: object, unit: str) -> flo
         try:
             value = parse_number(value, unit)
         except UnitError as error:
-            raise InputError(f"{path}: {wanted}, but is {value!r} ({error})") from error
+            raise InputError(f"{path}: {wanted}, but is {_short(value)} ({error})") from error
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{path}: {wanted}, but is {value!r}")
+        raise InputError(f"{path}: {wanted}, but is {_short(value)}")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{path}: {wanted}, but is {value!r}")
+        raise InputError(f"{path}: {wanted}, but is {_short(value)}")
     return number
 
 
@@ -179,7 +197,7 @@ def _hold(path: Path, value: object) -> Hold | None:
         if value == hold:
             return hold
     hint = did_you_mean(value, HOLDS) if isinstance(value, str) else ""
-    raise InputError(f"{path}: [signals] torque_hold must be one of {', '.join(HOLDS)}, but is {value!r}{hint}")
+    raise InputError(f"{path}: [signals] torque_hold must be one of {', '.join(HOLDS)}, but is {_short(value)}{hint}")
 
 
 def _column_map(path: Path, signal: str, entry: object) -> ColumnMap:
@@ -189,15 +207,23 @@ def _column_map(path: Path, signal: str, entry: object) -> ColumnMap:
     if not isinstance(entry, dict):
         raise InputError(
             f"{path}: {where} must be a column name or a table such as "
-            f'{{ column = "name", unit = "deg", sign = 1 }}, but is {entry!r}'
+            f'{{ column = "name", unit = "deg", sign = 1 }}, but is {_short(entry)}'
         )
-    _refuse_unknown(path, f"key in {where}", entry, ("column", "unit", "sign"))
+    _refuse_unknown(path, f"key in {where}", entry, ("column", "unit", "sign", "offset", "time"))
     sign = entry.get("sign", 1)
     if isinstance(sign, bool) or not isinstance(sign, int | float) or sign not in (1, -1):
-        raise InputError(f"{path}: sign in {where} must be 1 or -1, but is {sign!r}")
-    unit = entry.get("unit")
+        raise InputError(f"{path}: sign in {where} must be 1 or -1, but is {_short(sign)}")
+    offset = entry.get("offset", 0)
+    # An integer of a thousand digits is valid TOML, and no float.
+    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) < 1e30:
+        raise InputError(
+            f"{path}: offset in {where} must be a number in the column's own unit, but is {_short(offset)}"
+        )
+    unit, time = entry.get("unit"), entry.get("time")
     return ColumnMap(
         column=_text(path, f"column in {where}", entry.get("column", signal)),
         unit=None if unit is None else _text(path, f"unit in {where}", unit),
         sign=float(sign),
+        offset=float(offset),
+        time=None if time is None else _text(path, f"time in {where}", time),
     )

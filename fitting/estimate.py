@@ -10,16 +10,18 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
+from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, project
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import FreeParameters, free_parameters
 from fitting.residual import (
     Problem,
     Unknowns,
+    linearise,
     residual,
     residual_with_blocks,
 )
 from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.lanes import jit_lanes, spread
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -35,8 +37,8 @@ _RETRY_STEPS = 12
 # So many samples tell the noise to 1 %.
 _NOISE_SAMPLES = 5000
 _NOISE_STEPS = 30
-# A Runge-Kutta step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6.
-_STEP_ANGLE = 0.15
+STEP_ANGLE = 0.15
+"""A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
 
 
 class Fit(eqx.Module):
@@ -70,6 +72,11 @@ class Fit(eqx.Module):
     def free(self) -> FreeParameters:
         """What was free."""
         return self.problem.free
+
+    @property
+    def substeps(self) -> int:
+        """Solver steps in a sample interval."""
+        return int(self.problem.substeps)
 
     @property
     def dynamic_error_std(self) -> float:
@@ -135,6 +142,7 @@ def fit(
     motion = scales(stretches)
     outputs = segments.measured.shape[-1]
     problem = Problem(model, free, segments, jnp.eye(outputs), active, jnp.ones(states.shape[1]), substeps=substeps)
+    problem, unknowns = spread((problem, unknowns), states.shape[0])
     if covariance is None:
         _, covariance, _ = _evaluate(problem, unknowns)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
@@ -153,8 +161,10 @@ def fit(
         if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
             break
     assert error is not None
+    # By way of the host: what is computed with the model alone need not run on every device.
+    values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
-        model=free.unpack(model, unknowns.parameters),
+        model=free.unpack(model, values),
         problem=_weighed(problem, covariance, motion.x) if reweigh else problem,
         unknowns=unknowns,
         error=error,
@@ -180,7 +190,7 @@ def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float):
     return _compiled_solve(problem, start, jnp.asarray(max_steps), jnp.asarray(damping))
 
 
-@eqx.filter_jit
+@jit_lanes
 def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
     descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
     solution = optx.least_squares(
@@ -203,7 +213,7 @@ def _error_of_rows(problem: Problem, rows: Array) -> Array:
     return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
 
 
-@eqx.filter_jit
+@jit_lanes
 def _evaluate(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array, Array]:
     """The output error, its covariance, and each segment's sum of squares."""
     rows, _ = residual(problem, unknowns)
@@ -326,10 +336,16 @@ def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
     return float(drive.omega_0) * float(np.sqrt(1.0 + stiffening))
 
 
-def suggested_substeps(model: Model, stretches: Sequence[Stretch]) -> int:
-    """Solver steps in a sample interval that resolve the fastest oscillation."""
+def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle: float = STEP_ANGLE) -> int:
+    """Solver steps in a sample interval that resolve the fastest oscillation.
+
+    Args:
+        model: supplies the natural frequency.
+        stretches: supply the sample interval, and the twist that hardens the spring.
+        step_angle: by which a step may turn the oscillation [rad].
+    """
     angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
-    return int(np.clip(np.ceil(angle / _STEP_ANGLE), 1, 16))
+    return int(np.clip(np.ceil(angle / step_angle), 1, 16))
 
 
 def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:
@@ -372,23 +388,37 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
     return total / samples * (rows / (rows - len(found.model.motion_states)))
 
 
-def needed_substeps(found: Fit, *, tolerance: float = 0.05, most: int = 8) -> int:
+def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:
     """Solver steps in a sample interval that keep the step error below a fraction of the residual.
 
     Args:
         found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
         tolerance: largest rms difference in units of the residual's standard deviation.
+        shift: by how many standard errors the difference may move the parameters. An error too small to be seen in a
+            sample adds up over all of them.
         most: where to stop.
     """
     problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
-    substeps = problem.substeps
+    substeps = found.substeps
+    columns = project(linearise(problem, found.unknowns), problem.segments.joined) if np.isfinite(shift) else None
     error, _, _ = _evaluate(problem, found.unknowns)
     while substeps < most:
-        finer = dataclasses.replace(problem, substeps=2 * substeps)
-        better, _, _ = _evaluate(finer, found.unknowns)
-        white = np.asarray(better - error) @ np.asarray(problem.whitening).T
-        mean_square = (white**2).sum(axis=(0, 1)) / float(problem.segments.count)
-        if np.sqrt(mean_square.max()) < tolerance:
+        better, _, _ = _evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns)
+        white = (better - error) @ problem.whitening.T
+        mean_square = float(jnp.max(jnp.sum(white**2, axis=(0, 1)) / problem.segments.count))
+        moved = 0.0 if columns is None else _standard_errors_moved(columns, white)
+        if np.sqrt(mean_square) < tolerance and moved < shift:
             break
         substeps, error = 2 * substeps, better
     return substeps
+
+
+def _standard_errors_moved(columns: Array, white: Array) -> float:
+    """How far a whitened output error would move the parameters, in standard errors of their joint estimate."""
+    rows = white.reshape(white.shape[0], -1)
+    columns = columns[:, : rows.shape[1]]
+    gradient = np.asarray(jnp.einsum("srp,sr->p", columns, rows))
+    information = np.asarray(jnp.einsum("srp,srq->pq", columns, columns))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    return float(np.sqrt(max(0.0, (scale * gradient) @ inverse @ (scale * gradient))))

@@ -1,15 +1,23 @@
 """A log made ready for simulation: torque between samples, measured outputs, and the stretches they are cut into."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from math import comb
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fitting.errors import DataError
 from fitting.logs import Log
+from fitting.pieces import bridged
 from hdjax import Hold, PiecewisePolynomial, sampled
 from hdjax.effects import Scales
+
+# Both assumed: a Runge-Kutta step this much longer than the others is cut; so many samples may be put in per row.
+_LONGEST_STEP = 1.5
+_MOST_PUT_IN = 10
 
 
 class Experiment(eqx.Module):
@@ -24,6 +32,7 @@ class Experiment(eqx.Module):
         motor_angle: measured motor angle [rad], or None in a reduced log.
         weight: 1 for a sample whose outputs count, 0 for one that was put in or is not believed; None where all count.
             The outputs of a sample without weight are something finite in between.
+        rows: which samples are rows of the log, the others having been put in; None where all are.
     """
 
     name: str = eqx.field(static=True)
@@ -33,6 +42,7 @@ class Experiment(eqx.Module):
     measured: Float[np.ndarray, "n outputs"]
     motor_angle: Float[np.ndarray, " n"] | None
     weight: Float[np.ndarray, " n"] | None = None
+    rows: Bool[np.ndarray, " n"] | None = None
 
     def __len__(self) -> int:
         return self.time.size
@@ -57,6 +67,19 @@ class Stretch(eqx.Module):
     def name(self) -> str:
         """The log's name."""
         return self.experiment.name
+
+    @property
+    def weight(self) -> Float[np.ndarray, " n"]:
+        """1 for a sample whose outputs count, 0 for the others."""
+        weight = self.experiment.weight
+        return np.ones(len(self)) if weight is None else weight[self.start : self.stop]
+
+    def beginning(self, count: int) -> "Stretch":
+        """The shortest part from the start on that has `count` samples with weight, or all of them."""
+        enough = np.flatnonzero(np.cumsum(self.weight) >= count)
+        known = np.flatnonzero(self.weight)
+        last = enough[0] if len(enough) else known[-1] if len(known) else len(self) - 1
+        return replace(self, stop=self.start + int(last) + 1)
 
 
 class Segments(eqx.Module):
@@ -88,33 +111,118 @@ class Segments(eqx.Module):
         return jnp.sum(self.weight)
 
 
+def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tuple[Experiment, ...]:
+    """The stretches of a log between its gaps, each an experiment of its own; arguments as in
+    [`experiment_from_log`][]."""
+    if log.pieces is None:
+        return (experiment_from_log(log, hold=hold, N=N),)
+    several = len(log.pieces) > 1
+    return tuple(
+        experiment_from_log(
+            _piece(log, start, stop, f"{log.name}, part {i + 1}" if several else log.name), hold=hold, N=N
+        )
+        for i, (start, stop) in enumerate(log.pieces)
+    )
+
+
+def _piece(log: Log, start: int, stop: int, name: str) -> Log:
+    """Rows `start` to `stop` of a log."""
+    columns = {key: value[start:stop] for key, value in vars(log).items() if isinstance(value, np.ndarray)}
+    return replace(log, name=name, pieces=None, **columns)
+
+
 def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Experiment:
-    """Turn a log into an experiment.
+    """Turn a log without wide gaps into an experiment.
+
+    Where the log lacks samples, the torque's are bridged and the simulation gets steps of the usual length; the outputs
+    put in there have no weight.
 
     Args:
         log: what was measured.
         hold: what the torque does between samples.
         N: reduction ratio of a drive log.
+
+    Raises:
+        DataError: for a log that is mostly a gap.
     """
     drive_log = log.kind == "drive"
     input_samples = log.motor_torque if drive_log else log.forcing
     assert input_samples is not None
-    torque = sampled(log.time, input_samples, hold=hold)
+    lasts = (log.time[-1] - log.time[0]) / np.median(np.diff(log.time))
+    if lasts > _MOST_PUT_IN * len(log):
+        raise DataError(
+            f"{log.path}: the log is mostly gaps, since its {len(log)} samples are spread over {lasts:.3g} sampling "
+            "intervals; cut it into logs without gaps"
+        )
+    known = np.ones(len(log), dtype=bool) if log.input_known is None else log.input_known.copy()
+    known[[0, -1]] = True
+    stamps, samples = bridged(log.time[known], input_samples[known])
+    time, rows = _grid(log, stamps)
+    torque = _on_grid(sampled(stamps, samples, hold=hold), time)
     load_torque = None
     if drive_log and log.load_torque is not None:
-        load_torque = sampled(log.time, log.load_torque, hold="linear")
+        load_torque = _on_grid(sampled(log.time, log.load_torque, hold="linear"), time)
     columns = [log.dynamic_error]
     if drive_log:
         assert log.motor_angle is not None and N is not None
         columns.insert(0, log.motor_angle / N)
+    weight = rows.astype(float)
+    if log.trusted is not None:
+        weight[rows] = log.trusted
+    if log.outputs_until is not None:
+        weight[np.cumsum(rows) > log.outputs_until] = 0.0
+    measured = np.stack([_filled(log, column, time, rows) for column in columns], axis=1)
     return Experiment(
         name=log.name,
-        time=log.time,
+        time=time,
         torque=torque,
         load_torque=load_torque,
-        measured=np.stack(columns, axis=1),
-        motor_angle=log.motor_angle if drive_log else None,
+        measured=measured,
+        motor_angle=_filled(log, log.motor_angle, time, rows) if drive_log and log.motor_angle is not None else None,
+        weight=None if weight.all() else weight,
+        rows=None if rows.all() else rows,
     )
+
+
+def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The log's stamps with those of the torque and others where a step would be long, and which are the log's."""
+    time = np.union1d(log.time, stamps)
+    step = np.diff(time)
+    usual = max(float(np.median(step)), float(np.median(np.diff(log.time))))
+    lacking = np.where(step > _LONGEST_STEP * usual, np.rint(step / usual) - 1, 0.0)
+    if lacking.any():
+        count = lacking.astype(int)
+        part = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in count if n])
+        where = np.repeat(np.arange(len(step)), count)
+        time = np.insert(time, where + 1, time[where] + part * step[where])
+    return time, np.isin(time, log.time)
+
+
+def _on_grid(signal: PiecewisePolynomial, time: np.ndarray) -> PiecewisePolynomial:
+    """The same signal with more knots."""
+    knots, coefficients = np.asarray(signal.knots), np.asarray(signal.coefficients)
+    if time.size == knots.size - 1 and (time == knots[:-1]).all():
+        return signal
+    piece = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, coefficients.shape[0] - 1)
+    late = (time - knots[piece])[:, None]
+    own, powers = coefficients[piece], np.arange(coefficients.shape[1])
+    # A polynomial about a later point (Taylor).
+    shifted = [
+        sum((comb(k, i) * own[:, [k]] * late ** (k - i) for k in powers[i:]), np.zeros_like(late)) for i in powers
+    ]
+    return PiecewisePolynomial(
+        jnp.asarray(np.append(time, max(knots[-1], time[-1] + np.median(np.diff(time))))),
+        jnp.asarray(np.concatenate(shifted, axis=1)),
+    )
+
+
+def _filled(log: Log, values: np.ndarray, time: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """An output on the grid; where it was not measured or is not believed, a straight line."""
+    if log.trusted is None and log.outputs_until is None and rows.all():
+        return values
+    known = np.ones(len(log), dtype=bool) if log.trusted is None else log.trusted
+    known = known & (np.arange(len(log)) < (log.outputs_until or len(log)))
+    return np.interp(time, log.time[known], values[known])
 
 
 def split(
@@ -123,10 +231,18 @@ def split(
     """The training part of each log and the stretch at its end that the fit never sees."""
     training, validation = [], []
     for experiment in experiments:
-        border = round(len(experiment) * (1.0 - held_out))
+        border = _border(experiment, held_out)
         training.append(Stretch(experiment, 0, border))
         validation.append(Stretch(experiment, border, len(experiment)))
     return tuple(training), tuple(validation)
+
+
+def _border(experiment: Experiment, held_out: float) -> int:
+    """The sample that parts the experiment so that each side has its share of the samples with weight."""
+    if experiment.weight is None:
+        return round(len(experiment) * (1.0 - held_out))
+    total = np.cumsum(experiment.weight)
+    return int(np.clip(np.searchsorted(total, total[-1] * (1.0 - held_out)) + 1, 1, len(experiment) - 1))
 
 
 def segment_count(stretches: Sequence[Stretch], length: int) -> int:

@@ -11,6 +11,7 @@ Ends = Sequence[float | None]
 
 _MINUS, _NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
 _SUPERSCRIPT = str.maketrans("0123456789-n", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ⁿ")
+_LEAST_CHANCE = 1e-9
 # A prefix is put before these only; `m(N m/rad)` would be a puzzle.
 _PREFIXED = ("rad", "rad/s", "s", "m", "m/s", "V", "V/s", "A", "N", "N m", "Hz")
 _PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n", -12: "p"}
@@ -54,6 +55,11 @@ def number(value: float | None, digits: int = 3) -> str:
     if -4 < power < 6:
         return _fixed(value, digits - 1 - power)
     return f"{_fixed(value / 10.0**power, digits - 1)} × 10{_superscript(power)}"
+
+
+def plain(value: float | None, digits: int = 4) -> str:
+    """A number in plain characters, as programs write it; n/a where there is none."""
+    return "n/a" if value is None else f"{value:.{digits}g}"
 
 
 def quantity(value: float | None, unit: str, *, digits: int = 3, like: float | None = None) -> str:
@@ -112,6 +118,13 @@ def percent(share: float | None) -> str:
         value = math.floor(value * 10**decimals) / 10**decimals
         return f"{_fixed(value, decimals)} %"
     return f"{number(value, 2) if abs(value) < 99.5 else number(value, 3)} %"
+
+
+def p_value(chance: float | None) -> str:
+    """A p-value; below a billionth only that."""
+    if chance is not None and chance < _LEAST_CHANCE:
+        return "< 1e-9"
+    return plain(chance, 2)
 
 
 def words(names: list[str]) -> str:

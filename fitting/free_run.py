@@ -12,6 +12,7 @@ from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
 from fitting.residual import Problem, Unknowns, linearise, simulate_segments
 from hdjax import Model, TwoInertiaModel
+from hdjax.lanes import jit_lanes
 
 WINDOW = 50
 """Samples from which the initial state is taken."""
@@ -29,6 +30,7 @@ class FreeRun(eqx.Module):
         predicted: dynamic error [rad].
         measured: likewise.
         motor_angle: predicted motor angle [rad], or None for a reduced model.
+        weight: 1 for a sample whose measurement counts, 0 for the others; None where all count.
     """
 
     name: str = eqx.field(static=True)
@@ -36,6 +38,13 @@ class FreeRun(eqx.Module):
     predicted: Float[np.ndarray, " n"]
     measured: Float[np.ndarray, " n"]
     motor_angle: Float[np.ndarray, " n"] | None
+    weight: Float[np.ndarray, " n"] | None = None
+
+    @property
+    def squared_error(self) -> Float[np.ndarray, " counted"]:
+        """Squares of measured minus predicted [rad^2], of the samples that count."""
+        square = (self.measured - self.predicted) ** 2
+        return square if self.weight is None else square[self.weight > 0]
 
     @property
     def rmse(self) -> float:
@@ -45,7 +54,7 @@ class FreeRun(eqx.Module):
 
 def rms_error(runs: Sequence[FreeRun]) -> float:
     """Rms of measured minus predicted over several runs [rad]; infinite where a run left the numbers."""
-    square = np.concatenate([(r.measured - r.predicted) ** 2 for r in runs])
+    square = np.concatenate([r.squared_error for r in runs])
     return float(np.sqrt(np.mean(square))) if np.isfinite(square).all() else np.inf
 
 
@@ -72,9 +81,9 @@ def free_run(
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    windows = [Stretch(s.experiment, s.start, min(s.start + window, s.stop)) for s in stretches]
-    paths, length, count = (), window, len(stretches)
-    if like is not None and _holds(like, count, window):
+    windows = [s.beginning(window) for s in stretches]
+    paths, length, count = (), max(window, *(len(w) for w in windows)), len(stretches)
+    if like is not None and _holds(like, count, length):
         paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
     starts = fit(
         model,
@@ -114,12 +123,13 @@ def free_run(
                 predicted=output[:n, -1],
                 measured=stretch.experiment.measured[part, -1],
                 motor_angle=motor,
+                weight=stretch.weight,
             )
         )
     return tuple(runs)
 
 
-@eqx.filter_jit
+@jit_lanes
 def _simulate(problem: Problem, unknowns: Unknowns) -> Array:
     return simulate_segments(problem, unknowns)[0]
 

@@ -4,17 +4,22 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
+from hdjax.lanes import jit_lanes
 from hdjax.simulate import march
 from hdjax.where import where
 
 # A simulation that runs away, or leaves the numbers, is this many standard deviations off: a rejected step. (Its own
 # size would overflow where it is squared.)
 _LOST = 1e8
+
+
+def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
+    return jnp.asarray(value, dtype=int)
 
 
 class Problem(eqx.Module):
@@ -29,7 +34,7 @@ class Problem(eqx.Module):
         gap_weight: what a unit of each state counts where a joined segment does not yet start where the one before
             it ends.
         solver: explicit Runge-Kutta solver of diffrax.
-        substeps: its steps in each sample interval.
+        substeps: its steps in each sample interval; data, so that finer steps need no other program.
         unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
     """
 
@@ -40,7 +45,7 @@ class Problem(eqx.Module):
     active: Float[Array, " parameters"]
     gap_weight: Float[Array, " states"]
     solver: dfx.AbstractERK = dfx.Tsit5()
-    substeps: int = eqx.field(static=True, default=1)
+    substeps: Int[Array, ""] = eqx.field(converter=_as_integer, default=1)
     unroll: bool = eqx.field(static=True, default=True)
 
 
@@ -72,6 +77,7 @@ class Blocks(eqx.Module):
     before_by_state: Float[Array, "segments states states"]
 
 
+@eqx.filter_jit
 def simulate_segments(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
@@ -170,7 +176,7 @@ def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, j
     )
 
 
-linearise = eqx.filter_jit(blocks)
+linearise = jit_lanes(blocks)
 """[`blocks`][], compiled once for all who look at a solution."""
 
 

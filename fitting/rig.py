@@ -1,17 +1,25 @@
 """A drive file and its logs made ready: the base model, and the logs under each assumption about the torque."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
 
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import InputError
-from fitting.experiment import Experiment, experiment_from_log
+from fitting.experiment import Experiment, experiments_from_log
 from fitting.findings import Finding
 from fitting.health import examine, refuse_unfit
 from fitting.logs import Log, read_log
+from fitting.masks import masked
+from fitting.zero import zeroed
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
+
+WHY_NOT_QUASI_STATIC = (
+    "a quasi-static log holds nothing of the resonance, so that there is no motion to simulate; `hdjax fit` finds its "
+    "stiffness and hysteresis, and for the rest record a drive log with motor torque"
+)
 
 
 class Rig(eqx.Module):
@@ -21,7 +29,7 @@ class Rig(eqx.Module):
         name: of the drive.
         model: base model; its stiffness and damping are placeholders until they are fitted.
         hold: what the drive file says of the torque between samples, or None.
-        experiments: the logs under each hold.
+        experiments: the logs' stretches between gaps, under each hold.
         logs: as read.
         findings: what the health gate saw, by log.
         error_unit: unit of the dynamic error.
@@ -44,12 +52,13 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
         DataError: for logs that can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
-    logs = tuple(read_log(path, drive_file) for path in log_paths)
-    kinds = {log.kind for log in logs}
-    if len(kinds) > 1:
-        raise InputError(
-            f"{log_paths[0]} and the other logs: drive logs and reduced logs can't be fitted together; run them apart"
-        )
+    return rig_of(ready_logs(log_paths, drive_file), drive_file)
+
+
+def rig_of(logs: tuple[Log, ...], drive_file: DriveFile) -> Rig:
+    """[`read_rig`][] for logs that have been read."""
+    if logs[0].kind == "quasi-static":
+        raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
     findings = {}
     for log in logs:
         findings[log.name] = examine(log, drive_file)
@@ -58,11 +67,33 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
         name=drive_file.name,
         model=base_model(drive_file, logs[0]),
         hold=drive_file.torque_hold,
-        experiments={h: tuple(experiment(log, drive_file, h) for log in logs) for h in HOLDS},
+        experiments={h: tuple(e for log in logs for e in experiments(log, drive_file, h)) for h in HOLDS},
         logs=logs,
         findings=findings,
         error_unit=logs[0].units.get("dynamic_error", "rad"),
     )
+
+
+def ready_logs(paths: Sequence[Path], drive_file: DriveFile) -> tuple[Log, ...]:
+    """Logs of one kind, each with a name of its own.
+
+    Raises:
+        InputError: They are of several kinds.
+    """
+    logs = _with_own_names([ready_log(path, drive_file) for path in paths])
+    kinds = sorted({log.kind for log in logs})
+    if len(kinds) > 1:
+        raise InputError(
+            f"{paths[0]} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
+        )
+    return logs
+
+
+def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
+    """A log that was read, its wrong samples masked, and its dynamic error zeroed; arguments as in
+    [`fitting.logs.read_log`][]. The fit of a quasi-static log finds its zero itself."""
+    log = read_log(path, drive_file, outputs_until=outputs_until)
+    return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file)
 
 
 def base_model(drive_file: DriveFile, log: Log) -> Model:
@@ -74,7 +105,18 @@ def base_model(drive_file: DriveFile, log: Log) -> Model:
     )
 
 
-def experiment(log: Log, drive_file: DriveFile, hold: Hold) -> Experiment:
-    """The log on its sample grid under one hold."""
+def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment, ...]:
+    """The stretches of the log between its gaps, on their sample grids, under one hold."""
     ratio = drive_file.reduction_ratio if log.kind == "drive" else None
-    return experiment_from_log(log, hold=hold, N=ratio)
+    return experiments_from_log(log, hold=hold, N=ratio)
+
+
+def _with_own_names(logs: Sequence[Log]) -> tuple[Log, ...]:
+    """Logs of the same name in several folders are told apart by their folder, and then by their number."""
+    named: list[Log] = []
+    for log in logs:
+        alike = sum(log.path.stem == other.path.stem for other in logs) > 1
+        name = f"{log.path.absolute().parent.name}/{log.name}" if alike else log.name
+        before = sum(other.name.split(" (")[0] == name for other in named)
+        named.append(replace(log, name=f"{name} ({before + 1})" if before else name))
+    return tuple(named)

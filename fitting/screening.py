@@ -15,12 +15,13 @@ from jaxtyping import Array, Float
 from scipy.fft import prev_fast_len
 
 from fitting.arrow import project
-from fitting.estimate import Fit, suggested_substeps
+from fitting.estimate import STEP_ANGLE, Fit, suggested_substeps
 from fitting.experiment import scales
 from fitting.free import FreeParameters, base_paths, effect_paths, strength_paths
 from fitting.residual import Problem, Unknowns, blocks
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
+from hdjax.lanes import jit_lanes
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -140,8 +141,8 @@ def _score(everything: Model, fit: Fit, surrogates: Array) -> tuple[tuple[str, .
         fit.problem.whitening,
         jnp.ones(len(paths)),
         jnp.ones(len(everything.state_names)),
-        # Sensitivities need no more steps than the drive's own oscillation; the residual is the fit's own.
-        substeps=suggested_substeps(everything, fit.stretches),
+        # A first-order look needs no finer sensitivities; the residual is the fit's own.
+        substeps=suggested_substeps(everything, fit.stretches, step_angle=2 * STEP_ANGLE),
         unroll=False,
     )
     unknowns = Unknowns(vector, _states(everything, fit))
@@ -161,7 +162,7 @@ def _states(everything: Model, fit: Fit) -> Array:
     return jnp.stack(columns, axis=1)
 
 
-@eqx.filter_jit
+@jit_lanes
 def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogates: Array):
     found = blocks(problem, unknowns)
     columns = project(found, problem.segments.joined)

@@ -1,18 +1,13 @@
 """How well the data determine each parameter, also where the model is not quite right."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+from scipy.stats import t as student
 
-from fitting.arrow import project
-from fitting.estimate import Fit, short_horizon
-from fitting.residual import Blocks, Problem, linearise
+from fitting.estimate import Fit
+from fitting.sandwich import Covariance, Linearised, covariance, linearised
 from hdjax.parameters import ParameterInfo
-
-_NORMAL_95 = 1.959963984540054
-# Eigenvalues of the scaled information below this are directions that the data do not see at all.
-_BLIND = 1e-12
 
 
 class Estimate(eqx.Module):
@@ -23,10 +18,11 @@ class Estimate(eqx.Module):
         value: in SI units.
         std: standard error, robust against coloured residuals (sandwich).
         std_classical: standard error from J^T J alone, which takes the residual for white noise.
-        ci95: 95 % interval.
+        ci95: 95 % interval; wider than 1.96 standard errors where those rest on few data.
         unit: SI unit.
         identifiable: whether the data tell the parameter from zero; of a positive parameter, whether they know it
             to better than a factor of about two.
+        degrees_of_freedom: of Student's t behind the interval.
     """
 
     path: str = eqx.field(static=True)
@@ -36,6 +32,7 @@ class Estimate(eqx.Module):
     ci95: tuple[float, float]
     unit: str = eqx.field(static=True)
     identifiable: bool
+    degrees_of_freedom: float = np.inf
 
 
 class Uncertainty(eqx.Module):
@@ -44,95 +41,62 @@ class Uncertainty(eqx.Module):
     Attributes:
         estimates: by dotted path.
         correlation: of the free parameters, in the order of `estimates`.
+        covariance: robust, of the free vector (logarithms, or units of the parameters' scales).
+        unit_covariance: the same for white noise of the variance that weighs the outputs, (J^T J)^-1.
     """
 
     estimates: dict[str, Estimate]
     correlation: Float[np.ndarray, "parameters parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    unit_covariance: Float[np.ndarray, "parameters parameters"]
 
 
-def uncertainty(fit: Fit) -> Uncertainty:
+def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertainty:
     """Standard errors and intervals of a fit.
 
-    The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated. The robust one is the
-    sandwich (J^T J)^-1 M (J^T J)^-1, with M summed over chunks of a few natural periods within which residuals may be
-    correlated in any way (White 1980; Liang and Zeger 1986).
+    The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
+    The robust one holds whatever the colour of the residual, see [`fitting.sandwich`][]. Its own uncertainty enters
+    the intervals as Student's t.
+
+    Args:
+        fit: the fit.
+        regression: the fit as a linear regression, where it is at hand.
     """
     free = fit.free
     if not free.paths:
-        return Uncertainty({}, np.zeros((0, 0)))
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
-    chunk = min(short_horizon(fit.model, fit.stretches), fit.error.shape[1])
-    information, meat = (np.asarray(a) for a in _information(problem, linearise(problem, fit.unknowns), chunk))
-    classical = _inverse(information)
-    robust = classical @ meat @ classical
+        empty = np.zeros((0, 0))
+        return Uncertainty({}, empty, empty, empty)
+    found = covariance(linearised(fit) if regression is None else regression)
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
-    estimates = {}
-    for i, path in enumerate(free.paths):
-        value, info = known[path]
-        # Clusters under-estimate where they are few; the larger of the two is the honest one.
-        error = float(np.sqrt(max(robust[i, i], classical[i, i])))
-        estimates[path] = _estimate(
-            path,
-            float(value),
-            info,
-            error,
-            float(np.sqrt(classical[i, i])),
-            float(slopes[i]),
-            free.logarithmic[i],
-        )
-    spread = np.sqrt(np.diag(classical))
-    return Uncertainty(estimates, classical / np.outer(spread, spread))
+    estimates = {
+        path: _estimate(path, float(known[path][0]), known[path][1], found, i, float(slopes[i]), free.logarithmic[i])
+        for i, path in enumerate(free.paths)
+    }
+    spread = np.sqrt(np.diag(found.robust))
+    return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
 
 
 def _estimate(
-    path: str,
-    value: float,
-    info: ParameterInfo,
-    error: float,
-    classical: float,
-    slope: float,
-    logarithmic: bool,
+    path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
 ) -> Estimate:
+    freedom = float(found.degrees_of_freedom[i])
+    error = float(np.sqrt(found.robust[i, i]))
+    reach = float(student.ppf(0.975, freedom)) * error
     if logarithmic:
-        factor = float(np.exp(min(_NORMAL_95 * error, 700.0)))
+        factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)
-        identifiable = error < 0.5
+        identifiable = reach < 1.0
     else:
-        interval = (value - _NORMAL_95 * slope * error, value + _NORMAL_95 * slope * error)
+        interval = (value - slope * reach, value + slope * reach)
         identifiable = not interval[0] <= 0.0 <= interval[1]
     return Estimate(
         path=path,
         value=value,
         std=slope * error,
-        std_classical=slope * classical,
+        std_classical=slope * float(np.sqrt(found.classical[i, i])),
         ci95=interval,
         unit=info.unit,
         identifiable=bool(identifiable),
+        degrees_of_freedom=freedom,
     )
-
-
-@eqx.filter_jit
-def _information(problem: Problem, found: Blocks, chunk: int) -> tuple[Array, Array]:
-    projected = project(found, problem.segments.joined)
-    information = jnp.einsum("srp,srq->pq", projected, projected)
-    outputs = problem.segments.measured.shape[-1]
-    samples = problem.segments.measured.shape[1]
-    scores = projected * found.residual[:, :, None]
-    segments, _, parameters = scores.shape
-    scores = scores[:, : samples * outputs].reshape(segments, samples, outputs, parameters).sum(2)
-    padding = -samples % chunk
-    scores = jnp.pad(scores, ((0, 0), (0, padding), (0, 0)))
-    clusters = scores.reshape(segments, -1, chunk, parameters).sum(2)
-    meat = jnp.einsum("scp,scq->pq", clusters, clusters)
-    return information, meat
-
-
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """Inverse after scaling to unit diagonal; directions that the data do not see get a huge variance."""
-    diagonal = np.diag(information)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scaled = information * np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(scaled)
-    values = np.maximum(values, _BLIND)
-    return (vectors / values) @ vectors.T * np.outer(scale, scale)

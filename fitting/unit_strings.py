@@ -9,6 +9,24 @@ import pint
 
 # Coherent SI units by which a base unit is shown, where pint would spell kg m^2/(A s^3).
 _SHOWN = ("V", "N", "N m", "Pa", "W", "ohm", "T", "C")
+# What loggers write and pint does not know, or takes for something else.
+_SPELLINGS = {
+    "-": "1",
+    "sec": "s",
+    "secs": "s",
+    "msec": "ms",
+    "usec": "us",
+    "nsec": "ns",
+    "deg.": "deg",
+    "1/min": "rpm",
+    "min-1": "rpm",
+    "min^-1": "rpm",
+    "U/min": "rpm",
+    "r/min": "rpm",
+    "rev/min": "rpm",
+}
+_LONGEST = 80
+_RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
 class UnitError(ValueError):
@@ -24,8 +42,13 @@ def _registry() -> Any:
 
 def _parse(text: str) -> Any:
     """The pint quantity of one unit, e.g. 1/16777216 revolution."""
+    spelled = _SPELLINGS.get(text.strip(), text.strip())
+    spelled = re.sub(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda m: "^" + m[0].translate(_RAISED), spelled)
+    if len(text) > _LONGEST or _is_tower(spelled):
+        raise UnitError(f"unit {text[:_LONGEST]!r} is not understood")
+    spelled = re.sub(r"°(?![CFK])", "deg", spelled)
     # pint reads "Nm" as the textile unit number_meter; nobody who logs a torque means that.
-    spelled = re.sub(r"\b([nµumkM]?)Nm\b", r"\1N m", text.strip()) or "1"
+    spelled = re.sub(r"\b([nµμumkM]?)N(?:\s?[-.·⋅]\s?)?m\b", r"\1N m", spelled) or "1"
     try:
         quantity = _registry().Quantity(spelled)
         finite = bool(np.isfinite(float(quantity.magnitude)))
@@ -35,6 +58,19 @@ def _parse(text: str) -> Any:
     if not finite or quantity.magnitude == 0:
         raise UnitError(f"unit {text!r} is not a finite number other than zero")
     return quantity
+
+
+def _is_tower(text: str) -> bool:
+    """Whether a text holds powers that no unit has, such as 9**9**9, which pint would work out."""
+    powers = re.findall(r"(?:\*\*|\^)", text)
+    # 2**24 counts a revolution; other powers have one digit.
+    plain = re.sub(
+        r"\b[0-9]{1,2}\s*(?:\*\*|\^)\s*[0-9]{1,2}(?![0-9.])|(?:\*\*|\^)\s*\(?[-+]?[0-9](?:\.[0-9]{1,2})?(?![0-9.])",
+        " ",
+        text,
+    )
+    chained = re.search(r"(?:\*\*|\^)[\s(+-]*[0-9.]+[\s)]*(?:\*\*|\^)", text)
+    return len(powers) > 4 or bool(re.search(r"\*\*|\^", plain)) or bool(chained)
 
 
 def _base_powers(quantity: Any) -> dict[str, float]:
@@ -64,7 +100,7 @@ def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
     try:
         scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
         return np.asarray(_registry().Quantity(scaled, quantity.units).m_as(wanted.units))
-    except pint.PintError as error:
+    except (pint.PintError, ArithmeticError) as error:
         raise UnitError(f"unit {unit!r} does not convert to {target!r}") from error
 
 
@@ -87,7 +123,7 @@ def to_base(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
     try:
         converted = np.asarray(registry.Quantity(scaled, quantity.units).m_as(base))
-    except pint.PintError as error:
+    except (pint.PintError, ArithmeticError) as error:
         raise UnitError(f"unit {unit!r} does not convert to SI base units") from error
     for shown in _SHOWN:
         if registry.get_base_units(registry.Unit(shown))[1] == base:

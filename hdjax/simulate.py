@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hdjax.dynamics import Model, State
 from hdjax.effects import ActuatorEffect
@@ -193,7 +193,7 @@ def march(
     initial_state: State,
     *,
     solver: dfx.AbstractERK,
-    substeps: int,
+    substeps: int | Int[Array, ""],
     unroll: bool = True,
 ) -> tuple[Float[Array, "n states"], State]:
     """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
@@ -208,7 +208,7 @@ def march(
         load_torque: likewise on the load; zero where None.
         initial_state: state at the first knot.
         solver: an explicit Runge-Kutta solver of diffrax; its tableau is used.
-        substeps: steps in each sample interval.
+        substeps: steps in each sample interval. An array is data, so that one compiled program serves any number.
         unroll: whether a step's stages are written out. A loop over them compiles several times faster for a large
             model, and runs slower for a small one.
 
@@ -225,8 +225,10 @@ def march(
 
     def interval(state, inputs):
         coefficients, load_coefficients, width = inputs
-        h = width / substeps
+        h = width / jnp.asarray(substeps, dtype=width.dtype)
 
+        # Compiled once and called by every stage: it would be traced again for each.
+        @jax.jit
         def rates(y, s):
             load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
             return model.component_rates(y, polynomial(coefficients, s), load)
@@ -251,10 +253,8 @@ def march(
                 slopes.append(rates(_advanced(y, h, row, slopes), start + float(node) * h))
             return _advanced(y, h, weights, slopes)
 
-        if substeps == 1:
-            return step(state, jnp.zeros_like(width)), state
         # A loop rather than unrolled steps: the program, and its compile time, stay the same size.
-        end, _ = jax.lax.scan(lambda y, j: (step(y, j * h), None), state, jnp.arange(substeps, dtype=h.dtype))
+        end = jax.lax.fori_loop(0, substeps, lambda j, y: step(y, jnp.asarray(j, dtype=h.dtype) * h), state)
         return end, state
 
     load_coefficients = None if load_torque is None else load_torque.coefficients

@@ -58,7 +58,7 @@ def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
         whole(clean),
         base_paths(PLACEHOLDER),
         horizon=found.horizon,
-        substeps=found.problem.substeps,
+        substeps=found.substeps,
         hold_parameters=True,
     )
     assert not leaves_white_noise(off)

@@ -8,7 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rig
-from fitting.experiment import Experiment, Stretch, cut, experiment_from_log, scales, segment_count, split
+from fitting.errors import DataError
+from fitting.experiment import (
+    Experiment,
+    Stretch,
+    cut,
+    experiment_from_log,
+    experiments_from_log,
+    scales,
+    segment_count,
+    split,
+)
 
 COUNT = 47
 LOAD_TORQUE = np.linspace(3.0, -2.0, COUNT)
@@ -169,3 +179,72 @@ def test_scales_look_at_their_own_stretch_only():
     clean = scales([Stretch(source, 0, 100)])
     blind = scales([Stretch(replace(source, measured=spoiled), 0, 100)])
     assert blind == clean
+
+
+def gapped(kept: np.ndarray, count: int = 1000, **changes):
+    """A log of smooth motion and torque without some of its rows."""
+    logged = replace(log(count), motor_torque=np.sin(0.05 * np.arange(count)))
+    columns = {k: v[kept] for k, v in vars(logged).items() if isinstance(v, np.ndarray)}
+    return replace(logged, **columns, **changes), logged
+
+
+def test_missing_samples_are_put_in_without_weight():
+    kept = np.delete(np.arange(1000), [300, 301, 700])
+    short, whole = gapped(kept)
+    found = experiment_from_log(short, hold="zero-order", N=rig.N)
+    np.testing.assert_allclose(found.time, whole.time, atol=1e-12)
+    np.testing.assert_array_equal(np.flatnonzero(found.weight == 0), [300, 301, 700])
+    np.testing.assert_array_equal(found.rows, found.weight > 0)
+    np.testing.assert_array_equal(found.measured[kept, 0], whole.motor_angle[kept] / rig.N)
+    # A cubic through samples 1.5 to 2.5 steps away errs by some (0.05 * 2.5)^4 / 24.
+    np.testing.assert_allclose(np.asarray(found.torque.coefficients)[:, 0], whole.motor_torque, atol=2e-5)
+    segments = cut([Stretch(found, 0, 1000)], 100)
+    assert float(segments.count) == 997
+    assert np.isfinite(np.asarray(segments.measured)).all()
+
+
+def test_a_log_without_gaps_is_the_same_with_and_without_the_machinery():
+    plain = experiment()
+    assert plain.weight is None and plain.rows is None
+    np.testing.assert_array_equal(plain.time, log().time)
+
+
+def test_pieces_become_experiments_that_do_not_know_each_other():
+    short, _ = gapped(np.delete(np.arange(1000), np.arange(400, 500)), pieces=((0, 400), (400, 900)))
+    first, second = experiments_from_log(short, hold="cubic", N=rig.N)
+    assert (first.name, second.name) == ("log, part 1", "log, part 2")
+    assert (len(first), len(second)) == (400, 500)
+    alone = experiment_from_log(gapped(np.arange(500, 1000))[0], hold="cubic", N=rig.N)
+    np.testing.assert_array_equal(second.torque.coefficients, alone.torque.coefficients)
+    np.testing.assert_array_equal(second.measured, alone.measured)
+
+
+def test_samples_that_are_not_believed_have_no_weight_and_no_say():
+    trusted = np.ones(1000, dtype=bool)
+    trusted[[5, 6, 990]] = False
+    logged, whole = gapped(np.arange(1000), trusted=trusted)
+    wild = np.where(trusted, logged.dynamic_error, 1e3)
+    found = experiment_from_log(replace(logged, dynamic_error=wild), hold="zero-order", N=rig.N)
+    np.testing.assert_array_equal(np.flatnonzero(found.weight == 0), [5, 6, 990])
+    assert np.max(np.abs(found.measured[:, 1])) <= np.max(np.abs(whole.dynamic_error))
+    training, validation = split([found])
+    assert training[0].weight.sum() + validation[0].weight.sum() == 997
+    assert training[0].weight.sum() == pytest.approx(0.8 * 997, abs=1)
+    assert len(training[0].beginning(10)) == 12
+    assert len(Stretch(found, 0, 8).beginning(10)) == 8
+
+
+def test_only_known_outputs_of_a_prediction_have_weight():
+    logged, _ = gapped(np.arange(1000), outputs_until=50)
+    found = experiment_from_log(logged, hold="zero-order", N=rig.N)
+    np.testing.assert_array_equal(np.flatnonzero(found.weight), np.arange(50))
+    whole = Stretch(found, 0, 1000)
+    assert len(whole.beginning(50)) == 50 and len(whole.beginning(80)) == 50
+    assert np.ptp(found.measured[50:, 1]) == 0
+
+
+def test_a_log_that_is_mostly_a_gap_is_refused():
+    short, _ = gapped(np.arange(1000))
+    late = short.time + 10.0 * (np.arange(1000) > 500)
+    with pytest.raises(DataError, match="mostly gaps"):
+        experiment_from_log(replace(short, time=late), hold="zero-order", N=rig.N)

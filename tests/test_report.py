@@ -18,17 +18,19 @@ from fitting import formatting
 from fitting.attribution import Verdict
 from fitting.close_loop import Loop, close_loop
 from fitting.diagnostics import Dependence
-from fitting.experiment import Experiment
+from fitting.experiment import Experiment, split
 from fitting.findings import Finding
-from fitting.plots import decimated, plots
+from fitting.fit_only import FitOnly, fit_only
+from fitting.plots import decimated, fit_plots, plots
 from fitting.report import (
-    FitOnly,
     explained_share,
     report_dict,
     report_text,
     separating_experiment,
     write_report,
 )
+from fitting.report.parameters import at_bound
+from fitting.starting_values import starting_models
 from hdjax import Hold
 from hdjax.effects import FAMILIES
 from hdjax.effects.actuation import TorqueBias
@@ -53,8 +55,10 @@ def loop() -> Loop:
 
 
 @pytest.fixture(scope="module")
-def fitted(loop: Loop) -> FitOnly:
-    return FitOnly(account=loop.before, noise=loop.noise, hold=HOLD, residual=loop.residual_before)
+def fitted() -> FitOnly:
+    """A fit of the same log, which has a hostile name."""
+    log = rig.drive_experiment(3000, motor_friction=(T_C, 0.05), name=HOSTILE)
+    return fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (log,)}, hold=HOLD)
 
 
 @pytest.fixture
@@ -191,6 +195,12 @@ def test_hostile_names_stay_text(page: str):
     assert page.count("<script>") == 1 and page.count("</script>") == 2
 
 
+def test_hostile_names_stay_text_in_a_fit(fitted: FitOnly, tmp_path: Path):
+    page = write_page(tmp_path, fitted)
+    assert HOSTILE not in page and "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert page.count("<script>") == 1 and page.count("</script>") == 2
+
+
 def test_the_page_tells_the_story_in_order(page: str):
     heads = re.findall(r"<h2>(.*?)</h2>", page)
     assert heads == [
@@ -213,10 +223,130 @@ def test_a_fit_alone_has_a_report_too(fitted: FitOnly, tmp_path: Path):
     assert found["decision"] == "fit_only"
     assert found["after"]["parameters"] == {} and found["after"]["rmse"] == {"training": None, "validation": None}
     assert found["before"]["parameters"]["K"]["value"] == pytest.approx(rig.K, rel=0.05)
+    heads = re.findall(r"<h2>(.*?)</h2>", page)
+    assert heads[:4] == ["Parameters", "Goodness", "What was left over", "Frequency response"]
+    assert not re.search(r"\bNaN\b|\bInfinity\b|\bnan\b|\bNone\b", page)
 
 
-def test_plotly_knows_every_property_of_every_figure(loop: Loop):
-    pictures = plots(loop, units={"dynamic_error": "rad"})
+def test_a_fit_tells_all_that_fitters_expect(fitted: FitOnly):
+    found = report_dict(fitted, name=HOSTILE)
+    before, good = found["before"], found["goodness"]
+    for path, entry in before["parameters"].items():
+        assert set(entry) >= ESTIMATE_KEYS | {"start", "percent", "at_bound", "note"}
+        assert entry["percent"] == pytest.approx(100 * entry["std"] / abs(entry["value"]))
+        # A start is from the weak form, and no answer.
+        assert entry["start"] != entry["value"], path
+        assert not entry["at_bound"]
+    experiment = rig.drive_experiment(3000, motor_friction=(T_C, 0.05), name=HOSTILE)
+    starts = starting_models(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), split([experiment])[0])
+    assert before["parameters"]["K"]["start"] in [float(s.drive.K) for s in starts]
+    (run,) = fitted.account.validation
+    error = run.measured - run.predicted
+    assert good["fit_percent"]["validation"] == pytest.approx(
+        100 * (1 - np.linalg.norm(error) / np.linalg.norm(run.measured - run.measured.mean()))
+    )
+    assert good["rmse_over_noise"]["validation"] == pytest.approx(
+        np.sqrt(np.mean(error**2)) / found["noise"]["dynamic_error"]
+    )
+    assert good["data"] == 2 * 2400 and good["parameters"] == 3 and good["converged"]
+    (K_alpha,) = [c for c in before["correlations"] if c["between"] == ["K", "alpha"]]
+    assert K_alpha["value"] == pytest.approx(float(fitted.account.uncertainty.correlation[0, 1]))
+    assert all(abs(c["value"]) > 0.1 for c in before["correlations"])
+    # The motor's friction is missing: the tests see it, and the report says what to do.
+    verdicts = {t["name"]: t["verdict"] for t in found["residual_tests"]}
+    assert verdicts["whiteness"] == "failed"
+    assert any("close-loop" in sentence for sentence in found["meaning"])
+    assert found["frequency_response"]["excited"] and found["seconds"]["fit"] > 0
+
+
+def test_a_perfect_model_is_told_so():
+    log = rig.drive_experiment(3000)
+    good = report_dict(fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (log,)}, hold=HOLD))
+    assert {t["verdict"] for t in good["residual_tests"]} == {"passed"}
+    assert good["meaning"] == ["The model explains these logs down to the measurement noise."]
+    assert good["goodness"]["reduced_chi_square"] == pytest.approx(1.0, abs=0.1)
+    assert good["before"]["rmse"]["validation"] < 1.2 * good["noise"]["dynamic_error"]
+
+
+def test_a_diverged_fit_has_a_report_too(fitted: FitOnly, tmp_path: Path):
+    broken = eqx.tree_at(lambda f: f.account.validation[0].predicted, fitted, replace_fn=lambda p: p * np.inf)
+    broken = eqx.tree_at(lambda f: f.goodness.fit_percent["validation"], broken, -math.inf)
+    found = report_dict(broken)
+    assert found["goodness"]["fit_percent"]["validation"] is None
+    assert any("diverges" in sentence for sentence in found["meaning"])
+    assert "n/a" in report_text(found)
+    assert "diverged" in write_page(tmp_path, broken)
+
+
+def test_text_of_a_fit_is_aligned(fitted: FitOnly):
+    found = report_dict(fitted, health=HEALTH)
+    text = report_text(found)
+    assert text.isascii() or set(text) - set(map(chr, range(128))) <= set("µ²⁻¹ωα×")
+    heads = re.findall(r"^\[(.*)\]$", text, re.MULTILINE)
+    assert heads == [
+        "Result",
+        "Parameters",
+        "Derived",
+        "Correlations above 0.1",
+        "Goodness",
+        "Residual",
+        "Frequency response",
+        "Log health",
+    ]
+    rows = re.findall(r"^    (K|alpha|B_sp) +(\S+) +(\S+) +(\S+) +(\S+) to (\S+) +(\S+)  (\S+)", text, re.MULTILINE)
+    assert [r[0] for r in rows] == ["K", "alpha", "B_sp"]
+    for path, value, std, percent, low, high, start, _ in rows:
+        entry = found["before"]["parameters"][path]
+        # Two digits of the standard error, and as many decimals for the rest.
+        assert float(std) == pytest.approx(entry["std"], rel=0.06)
+        assert float(value) == pytest.approx(entry["value"], abs=0.06 * entry["std"])
+        assert [float(low), float(high)] == pytest.approx(entry["ci95"], abs=0.06 * entry["std"])
+        assert float(percent) == pytest.approx(entry["percent"], rel=0.06)
+        assert float(start) == pytest.approx(entry["start"], rel=1e-4)
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_flags_have_a_sentence(fitted: FitOnly, tmp_path: Path):
+    """A parameter that stopped at its bound, one that the data do not know, and a damping that feeds energy."""
+
+    def told(path: str, value: float, ci95: tuple[float, float], identifiable: bool) -> FitOnly:
+        return eqx.tree_at(
+            lambda f: (lambda e: (e.value, e.ci95, e.identifiable))(f.account.uncertainty.estimates[path]),
+            fitted,
+            (value, ci95, identifiable),
+        )
+
+    stopped = told("K", 1e9, (1e8, 1e10), True)
+    assert "ran into a limit" in report_dict(stopped)["before"]["parameters"]["K"]["note"]
+    assert "AT BOUND" in report_text(report_dict(stopped))
+    assert "at bound" in write_page(tmp_path, stopped)
+    vague = told("alpha", 50.0, (-1910.0, 2010.0), False)
+    assert "largest measured twist" in report_dict(vague)["before"]["parameters"]["alpha"]["note"]
+    assert "NOT IDENTIFIABLE" in report_text(report_dict(vague))
+    assert "largest measured twist" in write_page(tmp_path, vague)
+    feeding = told("B_sp", -0.1, (-0.11, -0.09), True)
+    assert "negative" in report_dict(feeding)["before"]["parameters"]["B_sp"]["note"]
+
+
+@pytest.mark.parametrize(
+    ("value", "bounds", "start", "stopped"),
+    [
+        (7160.0, (0.0, 1e9), 7000.0, False),
+        (9.95e8, (0.0, 1e9), 7000.0, True),
+        (1e-5, (0.0, 1e9), 7000.0, True),
+        (1e-5, (0.0, 1e9), 2e-5, False),
+        (-0.3, (-math.inf, math.inf), 0.2, False),
+        (0.5, (0.5, 2.0), None, True),
+    ],
+)
+def test_bounds(value: float, bounds: tuple[float, float], start: float | None, stopped: bool):
+    assert at_bound(value, bounds, start) is stopped
+
+
+@pytest.mark.parametrize("kind", ["loop", "fit"])
+def test_plotly_knows_every_property_of_every_figure(kind: str, loop: Loop, fitted: FitOnly):
+    units = {"dynamic_error": "rad"}
+    pictures = plots(loop, units=units) if kind == "loop" else fit_plots(fitted, units=units)
     assert len({p.key for p in pictures}) == len(pictures)
     for picture in pictures:
         go.Figure(picture.figure)

@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import binom, chi2, t
 
 import rig
 from fitting.estimate import Fit, fit
@@ -57,12 +57,17 @@ def z_scores(found: list[Uncertainty], error: str) -> np.ndarray:
     )
 
 
-def assert_chi_squared(z: np.ndarray):
-    """Second moments about the truth, in the 99.9 % band that all parameters together hold (Bonferroni)."""
+def assert_chi_squared(z: np.ndarray, slack: float = 1.0):
+    """Second moments about the truth, in the 99.9 % band that all parameters together hold (Bonferroni).
+
+    Args:
+        z: deviations in standard errors.
+        slack: what the scatter of the standard errors themselves adds.
+    """
     draws = z.shape[0]
     low, high = chi2.ppf([0.0005 / len(PATHS), 1 - 0.0005 / len(PATHS)], draws) / draws
     moment = np.mean(z**2, axis=0)
-    assert (moment > low).all() and (moment < high).all(), (low, moment, high)
+    assert (moment > low / slack).all() and (moment < high * slack).all(), (low, moment, high)
 
 
 def coverage(found: list[Uncertainty]) -> np.ndarray:
@@ -79,15 +84,20 @@ def white_draws(clean: Experiment) -> list[Uncertainty]:
     return repeated(clean, white, DRAWS)
 
 
+def assert_covered(found: list[Uncertainty]):
+    """Between 93 % and 97 %, up to what so many draws know (99.9 % band)."""
+    draws, covered = len(found), coverage(found)
+    assert (covered >= binom.ppf(0.0005, draws, 0.93)).all(), covered
+    assert covered.mean() <= binom.ppf(0.9995, draws, 0.97), covered
+
+
 def test_white_noise(white_draws: list[Uncertainty]):
-    z = z_scores(white_draws, "std_classical")
-    assert_chi_squared(z)
+    for error in ("std_classical", "std"):
+        assert_chi_squared(z_scores(white_draws, error), slack=1.0 if error == "std_classical" else 1.15)
     # No bias: the mean of so many is a standard normal over their root.
+    z = z_scores(white_draws, "std_classical")
     assert np.max(np.abs(z.mean(axis=0))) * np.sqrt(DRAWS) < 4.0
-    covered = coverage(white_draws)
-    # Robust errors are the larger of the two, so that they may cover more than 95 %.
-    assert (covered >= binom.ppf(0.0005, DRAWS, 0.95)).all(), covered
-    assert np.mean([u.estimates["omega_0"].std / u.estimates["omega_0"].std_classical for u in white_draws]) < 1.3
+    assert_covered(white_draws)
 
 
 def test_the_check_itself_sees_a_wrong_factor(white_draws: list[Uncertainty]):
@@ -100,14 +110,12 @@ def test_the_check_itself_sees_a_wrong_factor(white_draws: list[Uncertainty]):
 def test_coloured_noise(clean: Experiment):
     draws = 40
     found = repeated(clean, coloured, draws)
-    classical, robust = (np.mean(z_scores(found, e) ** 2, axis=0) for e in ("std_classical", "std"))
+    classical = np.mean(z_scores(found, "std_classical") ** 2, axis=0)
     # Noise with more power below the resonance than white: classical errors promise too much, of every parameter.
     high = chi2.ppf(0.9995, draws) / draws
     assert (classical > high).all(), (classical, high)
-    # Eight clusters for four parameters are few, so that the robust errors are still too small, but less so.
-    assert (robust <= classical).all()
-    assert robust.mean() < 0.8 * classical.mean(), (robust, classical)
-    assert coverage(found).sum() > binom.ppf(0.5, draws * len(PATHS), 0.7)
+    assert_chi_squared(z_scores(found, "std"), slack=1.15)
+    assert_covered(found)
 
 
 def test_correlations(white_draws: list[Uncertainty]):
@@ -126,11 +134,12 @@ def test_intervals_and_units(white_draws: list[Uncertainty]):
     for path, estimate in estimates.items():
         assert estimate.path == path
         assert estimate.identifiable
-        assert estimate.std >= estimate.std_classical > 0
+        assert 0.3 < estimate.std / estimate.std_classical < 3.0
         assert estimate.ci95[0] < estimate.value < estimate.ci95[1]
         width = estimate.ci95[1] - estimate.ci95[0]
         # A positive parameter's interval is one of its logarithm: a little longer above.
-        assert width == pytest.approx(2 * 1.959964 * estimate.std, rel=0.01)
+        assert width == pytest.approx(2 * t.ppf(0.975, estimate.degrees_of_freedom) * estimate.std, rel=0.01)
+        assert 1.959964 < 0.5 * width / estimate.std < 3.0
     assert estimates["mu"].unit == "1/s"
     assert estimates["omega_0"].ci95[0] > 0
 

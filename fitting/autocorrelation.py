@@ -1,0 +1,82 @@
+"""How long the dynamic error that a fit leaves over remembers itself, freed of what the fitting has put into it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.arrow import chains
+from fitting.estimate import Fit
+from fitting.residual import Problem, Unknowns, blocks
+
+# Directions of a chain's first state that its samples hardly see.
+_BLIND = 1e-12
+
+
+def left_over(fit: Fit) -> Float[np.ndarray, " samples"]:
+    """Measured minus simulated dynamic error of all samples, in order."""
+    return np.asarray(fit.error)[..., -1][np.asarray(fit.problem.segments.weight) > 0]
+
+
+def autocovariance(values: Float[np.ndarray, "*rows n"], lags: int) -> Float[np.ndarray, "*rows lags"]:
+    """Sum over samples of `values[t] * values[t + k]`, for k from 0 to `lags`."""
+    length = values.shape[-1] + lags
+    transform = np.fft.rfft(values, length)
+    return np.fft.irfft(np.abs(transform) ** 2, length)[..., : lags + 1]
+
+
+def autocorrelation(fit: Fit, lags: int) -> Float[np.ndarray, " lags"]:
+    """Autocorrelation of the dynamic error that a fit leaves over, at lags from 0 to `lags` samples.
+
+    Each simulation that starts anew has had its initial state fitted, which takes something out of white noise and
+    leaves a memory behind: with P the projection on what the initial states can do, the noise e becomes (1 - P) e,
+    whose autocovariance is known. It is taken off, so that white noise is seen as white also where segments are short.
+    """
+    residual = left_over(fit)
+    found = autocovariance(residual - residual.mean(), lags)
+    if found[0] <= 0:
+        return found
+    taken = _taken_by_states(fit, lags)
+    # What is left of the variance is less than there was, by what was taken.
+    share = min(taken[0] / found[0], 0.9)
+    corrected = found + taken / (1.0 - share)
+    return corrected / corrected[0]
+
+
+def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
+    """Autocovariance that the fitted initial states take out of white noise as large as the residual."""
+    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    slopes, first = (np.asarray(a) for a in _by_first_state(problem, fit.unknowns))
+    weight = np.asarray(problem.segments.weight) > 0
+    segments, samples = weight.shape
+    chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
+    basis = _orthonormal(slopes, chain)
+    white = basis[:, : samples * first.shape[0]].reshape(segments, samples, first.shape[0], -1)
+    # From whitened outputs back to the dynamic error.
+    error = np.einsum("o,snok->snk", first, white)[weight]
+    owner = np.repeat(chain, samples).reshape(segments, samples)[weight]
+    place = np.arange(owner.size) - np.searchsorted(owner, owner)
+    apart = np.zeros((int(owner[-1]) + 1, error.shape[1], int(place.max()) + 1))
+    apart[owner, :, place] = error
+    return autocovariance(apart, lags).sum(axis=(0, 1))
+
+
+@eqx.filter_jit
+def _by_first_state(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array]:
+    """Derivative of each segment's rows by its chain's first state; and the dynamic error by whitened outputs."""
+    found = blocks(problem, unknowns)
+    path = chains(found, problem.segments.joined)
+    slopes = jnp.einsum("srq,sqk->srk", found.by_state, path.by_first)
+    return slopes, jnp.linalg.inv(problem.whitening)[-1]
+
+
+def _orthonormal(slopes: np.ndarray, chain: np.ndarray) -> np.ndarray:
+    """Columns that span the same as those of each chain, orthonormal over its rows."""
+    count = int(chain[-1]) + 1
+    square = np.zeros((count, *slopes.shape[2:] * 2))
+    np.add.at(square, chain, np.einsum("srp,srq->spq", slopes, slopes))
+    size = np.sqrt(np.einsum("cpp->cp", square))
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    values, vectors = np.linalg.eigh(square * scale[:, :, None] * scale[:, None, :])
+    root = np.divide(1.0, np.sqrt(np.maximum(values, _BLIND)), out=np.zeros_like(values), where=values > _BLIND)
+    return np.einsum("srp,spq->srq", slopes, (scale[:, :, None] * vectors * root[:, None, :])[chain])

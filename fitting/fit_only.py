@@ -1,0 +1,114 @@
+"""A fit without a search for effects, with all that can be said of it."""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.attribution import Round
+from fitting.base_fit import base_fit
+from fitting.clock import Clock
+from fitting.close_loop import Finding
+from fitting.compare import Account, account
+from fitting.diagnostics import ResidualDiagnostics, diagnose
+from fitting.estimate import measurement_noise
+from fitting.experiment import Experiment, split
+from fitting.frequency_response import FrequencyResponse, frequency_response
+from fitting.goodness import Goodness, goodness
+from fitting.residual_tests import ResidualTests, residual_tests
+from hdjax import Hold, Model
+
+
+class FitOnly(eqx.Module):
+    """A fitted drive; stands in for a [`Loop`][] in reports.
+
+    Attributes:
+        account: the fitted model's.
+        start: the model that the fit started from.
+        noise: covariance of the measurement noise of the outputs.
+        hold: what the torque does between samples, as used.
+        residual: diagnostics of what the model leaves over.
+        tests: of the same.
+        goodness: figures of merit.
+        frequency_response: of the logs and of the model; None where the logs are too short for it.
+        seconds: where the time went.
+    """
+
+    account: Account
+    start: Model
+    noise: Float[Array, "outputs outputs"]
+    hold: Hold = eqx.field(static=True)
+    residual: ResidualDiagnostics
+    tests: ResidualTests
+    goodness: Goodness
+    frequency_response: FrequencyResponse | None
+    seconds: dict[str, float]
+    decision: ClassVar[str] = "fit_only"
+    findings: ClassVar[tuple[Finding, ...]] = ()
+    rounds: ClassVar[tuple[Round, ...]] = ()
+    dropped: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def before(self) -> Account:
+        """The one account that there is."""
+        return self.account
+
+    @property
+    def after(self) -> Account:
+        """Likewise."""
+        return self.account
+
+
+def _silent(message: str) -> None:
+    pass
+
+
+def fit_only(
+    model: Model,
+    experiments: dict[Hold, tuple[Experiment, ...]],
+    *,
+    hold: Hold | None = None,
+    progress: Callable[[str], None] = _silent,
+) -> FitOnly:
+    """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.close_loop`][].
+
+    Args:
+        model: the base model; its stiffness and damping are only placeholders.
+        experiments: the same logs under each assumption about the torque between samples.
+        hold: the assumption that the user states; where None, the one that suits the model best.
+        progress: told what is being done.
+
+    Raises:
+        DataError: where no oscillator fits the data.
+    """
+    clock = Clock()
+    progress("fitting the base model")
+    holds: list[Hold] = list(experiments) if hold is None else [hold]
+    fits = {h: base_fit(model, split(experiments[h])[0]) for h in holds}
+    hold = min(holds, key=lambda h: fits[h].objective)
+    found, (training, validation) = fits[hold], split(experiments[hold])
+    clock.lap("fit")
+    noise = measurement_noise(found)
+    clock.lap("measurement noise")
+    progress("free runs on held-out data")
+    result = account(found, training, validation, noise=noise, halo=0)
+    clock.lap("free runs and standard errors")
+    residual = diagnose(found)
+    tests = residual_tests(found, residual)
+    response = frequency_response(
+        found.model, experiments[hold], hold=hold, noise=float(np.sqrt(np.asarray(noise)[-1, -1]))
+    )
+    clock.lap("diagnostics")
+    return FitOnly(
+        account=result,
+        start=found.problem.model,
+        noise=noise,
+        hold=hold,
+        residual=residual,
+        tests=tests,
+        goodness=goodness(found, result, noise),
+        frequency_response=response,
+        seconds=clock.laps,
+    )

@@ -1,0 +1,301 @@
+"""What a log can't tell, and why: directions it does not see, parameters too small for it, values taken for granted."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.stats import t as student
+
+from fitting.arrow import project
+from fitting.estimate import Fit
+from fitting.experiment import scales
+from fitting.residual import Blocks, Problem, linearise
+from fitting.sandwich import directions
+from fitting.uncertainty import Estimate, Uncertainty
+from hdjax import TwoInertiaModel
+
+# Two standard errors along a direction that are more than 40 % leave it open.
+_WEAK = 0.2
+# Parameters with less than this share of a direction are no part of it.
+_SHARE = 0.2
+# What a drive file states and no log of angles and torque can check: 1 % of it is the unit of its error.
+_HELD = ("J_m", "J_l")
+_PERCENT = 0.01
+# Relative step of the central differences by what is held; their error is its square.
+_STEP = 1e-4
+# A positive parameter below this share of its start has run to zero.
+_VANISHED = 1e-3
+# Next to a bound: within this share of it.
+_AT_BOUND = 1e-3
+
+
+class Direction(eqx.Module):
+    """A combination of the free parameters that the logs know independently of all others.
+
+    Attributes:
+        weights: entries of a unit vector by path. A positive parameter counts by its logarithm, any other in `units`.
+        units: what one is of each parameter: 1 for a logarithm, else in SI units.
+        std: standard error along the direction.
+        sentence: what is not determined; None where the direction is.
+    """
+
+    weights: dict[str, float]
+    units: dict[str, float]
+    std: float
+    sentence: str | None
+
+
+class Held(eqx.Module):
+    """A value that the drive file states, and what an error of it does.
+
+    Attributes:
+        path: dotted path.
+        value: in SI units.
+        changes: relative change of each free parameter for a value that is 1 % larger, at the fit's weights.
+        std_if_free: relative standard error of each free parameter if this value were fitted as well.
+        sentence: the same in words.
+    """
+
+    path: str = eqx.field(static=True)
+    value: float
+    changes: dict[str, float]
+    std_if_free: dict[str, float]
+    sentence: str
+
+
+class Identifiability(eqx.Module):
+    """What the logs of a fit can't tell.
+
+    Attributes:
+        reasons: by path of each parameter that is not identifiable, a sentence that says why and what would help.
+        directions: of the free parameters, the least determined first.
+        held: what was taken from the drive file.
+        bounds: sentences about parameters that ended at a bound.
+    """
+
+    reasons: dict[str, str]
+    directions: tuple[Direction, ...]
+    held: tuple[Held, ...]
+    bounds: tuple[str, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """All that there is to say, in order of importance."""
+        weak = tuple(d.sentence for d in self.directions if d.sentence is not None)
+        return (*self.reasons.values(), *weak, *self.bounds, *(h.sentence for h in self.held))
+
+
+def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
+    """Look for what the logs of a fit can't tell.
+
+    Args:
+        fit: the fit.
+        found: its uncertainty.
+    """
+    if not fit.free.paths:
+        return Identifiability({}, (), (), ())
+    estimates = found.estimates
+    x_max = scales(fit.stretches).x_max
+    return Identifiability(
+        reasons={p: reason(e, x_max=x_max) for p, e in estimates.items() if not e.identifiable},
+        directions=_directions(fit, found),
+        held=_held(fit, found),
+        bounds=tuple(s for s in (_at_bound(fit, p) for p in estimates) if s is not None),
+    )
+
+
+def needed_twist(alpha: Estimate, size: float, *, x_max: float) -> float:
+    """Largest twist that a log of the same kind needs to tell an alpha of a given size from zero.
+
+    The cubic torque grows with the third power of the twist, and the standard error of alpha falls with it.
+
+    Args:
+        alpha: its estimate.
+        size: of the alpha to be seen, in the estimate's unit.
+        x_max: largest twist in the fitted logs.
+    """
+    return x_max * np.cbrt(_reach(alpha) / abs(size)) if size else np.inf
+
+
+def needed_samples(estimate: Estimate, size: float) -> float:
+    """How many times the samples would tell a parameter of a given size from zero."""
+    return (_reach(estimate) / abs(size)) ** 2 if size else np.inf
+
+
+def reason(estimate: Estimate, *, x_max: float) -> str:
+    """Why a parameter is not identifiable, and what would help.
+
+    Args:
+        estimate: of the parameter.
+        x_max: largest twist in the fitted logs.
+    """
+    path, unit = estimate.path, estimate.unit
+    low, high = estimate.ci95
+    largest = max(abs(low), abs(high))
+    opening = f"{path} is not identifiable from these logs"
+    if not np.isfinite(largest) or low * high > 0:
+        return f"{opening}: they leave it open between {low:.2g} and {high:.2g} {unit}."
+    if path != "alpha":
+        more = needed_samples(estimate, estimate.value)
+        return (
+            f"{opening}: it may be anything up to {largest:.2g} {unit} either way; "
+            f"to tell {estimate.value:.2g} {unit} from zero would need {more:.2g} times the samples."
+        )
+    twist = needed_twist(estimate, estimate.value, x_max=x_max)
+    more = needed_samples(estimate, estimate.value)
+    return (
+        f"{opening}: |alpha| is at most {largest:.2g} {unit}, so that alpha x^2 is at most {largest * x_max**2:.2g} at "
+        f"their largest twist of {x_max:.2g}. To tell {estimate.value:.2g} {unit} from zero they would need a "
+        f"twist above {twist:.2g}, or {more:.2g} times the samples."
+    )
+
+
+def _reach(estimate: Estimate) -> float:
+    """Half the length of a parameter's interval."""
+    return float(student.ppf(0.975, estimate.degrees_of_freedom)) * estimate.std
+
+
+def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:
+    """Principal axes of the free vector's covariance, whose entries are of order one."""
+    free = fit.free
+    units = {
+        p: 1.0 if logarithmic else float(s)
+        for p, logarithmic, s in zip(free.paths, free.logarithmic, np.asarray(free.scale), strict=True)
+    }
+    made = []
+    for std, vector in directions(found.covariance):
+        weights = dict(zip(free.paths, vector.tolist(), strict=True))
+        sentence = _not_determined(fit, weights, units) if std > _WEAK else None
+        made.append(Direction(weights, units, std, sentence))
+    return tuple(made)
+
+
+def _not_determined(fit: Fit, weights: Mapping[str, float], units: Mapping[str, float]) -> str | None:
+    """A weak direction as a sentence; None where it is that of a single parameter."""
+    largest = max(abs(w) for w in weights.values())
+    part = {p: w / largest for p, w in weights.items() if abs(w) >= _SHARE * largest}
+    if len(part) == 1:
+        return None
+    logarithmic = dict(zip(fit.free.paths, fit.free.logarithmic, strict=True))
+    values = {p: float(fit.model.get(p)) for p in part}
+    # Relative changes are what an engineer thinks in; near zero there are none.
+    relative = {
+        p: w if logarithmic[p] else w * units[p] / values[p]
+        for p, w in part.items()
+        if logarithmic[p] or abs(values[p]) > 0.1 * units[p]
+    }
+    moves = [
+        f"{p} by {10 * relative[p]:+.2g} %" if p in relative else f"{p} by {0.1 * w * units[p]:+.2g}"
+        for p, w in part.items()
+    ]
+    names = list(part)
+    sentence = f"The logs can't tell {_words(names)} apart: {_words(moves)} together hardly change the simulation"
+    if len(relative) < len(part):
+        return f"{sentence}."
+    # The gentlest mover makes the others' products with its powers stand still.
+    still = min(relative, key=lambda p: abs(relative[p]))
+    known = [f"{p} {_power(still, -relative[p] / relative[still])}" for p in names if p != still]
+    return f"{sentence}. They determine {_words(known)}, but no factor alone."
+
+
+def _power(path: str, exponent: float) -> str:
+    return path if np.isclose(exponent, 1.0) else f"{path}^{exponent:.2g}"
+
+
+def _words(items: list[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
+
+
+def _at_bound(fit: Fit, path: str) -> str | None:
+    """A sentence about a parameter that ended at a bound of its domain."""
+    value, info = fit.model.parameters()[path]
+    start, now = float(fit.problem.model.get(path)), float(value)
+    low, high = info.bounds
+    if info.positive and now < _VANISHED * start:
+        return f"{path} ran from {start:.2g} to {now:.2g} {info.unit}, towards its bound at zero: the logs want none."
+    for bound in (low, high):
+        if bound and np.isfinite(bound) and abs(now - bound) <= _AT_BOUND * abs(bound):
+            return f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense."
+    return None
+
+
+def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
+    """What the drive file states and the fit takes for granted."""
+    if not isinstance(fit.model, TwoInertiaModel):
+        return ()
+    held = tuple(p for p in _HELD if p not in fit.free.paths)
+    if not held:
+        return ()
+    products = np.asarray(_products(fit, held))
+    count = len(fit.free.paths)
+    information, coupling = products[:count, :count], products[:count, count:]
+    # The optimum follows where the gradient stays zero: (J^T J) dp + J^T dr/dJ dJ = 0.
+    response = -np.linalg.lstsq(information, coupling, rcond=None)[0]
+    values = np.array([e.value for e in found.estimates.values()])
+    relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
+    classical = np.linalg.pinv(information, hermitian=True)
+    robust = np.diag(found.covariance) / np.maximum(np.diag(classical), 1e-300)
+    made = []
+    for i, path in enumerate(held):
+        own = products[count + i, count + i] - coupling[:, i] @ classical @ coupling[:, i]
+        if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
+        change = _PERCENT * response[:, i] * np.sign(values) * relative
+        made.append(
+            _held_one(
+                fit,
+                path,
+                dict(zip(found.estimates, change.tolist(), strict=True)),
+                dict(zip(found.estimates, (relative * np.sqrt(robust * if_free)).tolist(), strict=True)),
+            )
+        )
+    return tuple(made)
+
+
+def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[str, float]) -> Held:
+    told = [f"{p} by {100 * c:+.2g} %" for p, c in changes.items() if "." not in p and p != "alpha"]
+    sentence = (
+        f"{path} is taken from the drive file, since a log of angles and torque knows inertia and stiffness only in "
+        f"proportion to the torque: if it is 1 % too large there, that moves {_words(told)}."
+        if told
+        else f"{path} is taken from the drive file."
+    )
+    return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)
+
+
+def _products(fit: Fit, held: tuple[str, ...]) -> Float[Array, "all all"]:
+    """J^T J of the free parameters and the logarithms of what is held, without the initial states.
+
+    By central differences through the program that the fit runs anyway.
+    """
+    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    found = linearise(problem, fit.unknowns)
+    rows, gaps = [], []
+    for path in held:
+        value = float(fit.model.get(path))
+        up, down = (
+            linearise(_with_held(problem, path, value * (1.0 + sign * _STEP)), fit.unknowns) for sign in (1, -1)
+        )
+        rows.append((up.residual - down.residual) / (2 * _STEP))
+        gaps.append((up.gap - down.gap) / (2 * _STEP))
+    return _wider(problem, found, jnp.stack(rows, axis=-1), jnp.stack(gaps, axis=-1))
+
+
+def _with_held(problem: Problem, path: str, value: float) -> Problem:
+    return eqx.tree_at(lambda p: p.model, problem, problem.model.replace({path: value}))
+
+
+@eqx.filter_jit
+def _wider(problem: Problem, found: Blocks, rows: Array, gaps: Array) -> Array:
+    """The products of the parameters' columns with further ones beside them."""
+    wider = eqx.tree_at(
+        lambda b: (b.by_parameter, b.before_by_parameter),
+        found,
+        (
+            jnp.concatenate([found.by_parameter, rows], axis=2),
+            jnp.concatenate([found.before_by_parameter, -gaps], axis=2),
+        ),
+    )
+    projected = project(wider, problem.segments.joined)
+    return jnp.einsum("srp,srq->pq", projected, projected)

@@ -1,0 +1,6 @@
+"""Pictures of a fit or a closed loop, as plotly figures in plain dictionaries. Statistics are computed elsewhere."""
+
+from fitting.plots.gallery import fit_plots as fit_plots
+from fitting.plots.gallery import plots as plots
+from fitting.plots.long_trace import decimated as decimated
+from fitting.plots.plot import Plot as Plot

@@ -1,0 +1,74 @@
+"""Which pictures a report has, in the order of the story."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from fitting.close_loop import Loop
+from fitting.compare import Account
+from fitting.diagnostics import ResidualDiagnostics
+from fitting.fit_only import FitOnly
+from fitting.free_run import FreeRun
+from fitting.plots.competition import competition
+from fitting.plots.correlations import correlations
+from fitting.plots.frequency_response import bode
+from fitting.plots.plot import Plot
+from fitting.plots.prediction import predictions
+from fitting.plots.residual import autocorrelation, dependences, input_correlation, orders, spectrum
+from fitting.plots.rmse import rmse_bars
+
+_MOST_LOGS = 4
+
+
+def plots(loop: Loop, *, units: Mapping[str, str]) -> list[Plot]:
+    """All pictures of a closed loop.
+
+    Args:
+        loop: the outcome.
+        units: of `dynamic_error`.
+    """
+    unit = units.get("dynamic_error", "rad")
+    after = None if loop.after is loop.before else loop.after
+    left = None if after is None else loop.residual_after
+    noise = _noise(loop)
+    found = _predictions(loop.before, after, unit)
+    found.append(rmse_bars(loop.before, after, noise=noise, unit=unit))
+    found += _residual_plots(loop.before, loop.residual_before, left, noise=noise, unit=unit)
+    if len(loop.after.uncertainty.estimates) > 1:
+        found.append(correlations(loop.after.uncertainty))
+    return found + [competition(this, turn + 1) for turn, this in enumerate(loop.rounds)]
+
+
+def fit_plots(fitted: FitOnly, *, units: Mapping[str, str]) -> list[Plot]:
+    """All pictures of a fit; arguments as in [`plots`][]."""
+    unit = units.get("dynamic_error", "rad")
+    step = 0.5 / float(fitted.residual.frequency[-1])
+    found = _predictions(fitted.account, None, unit)
+    memory, *others = _residual_plots(fitted.account, fitted.residual, None, noise=_noise(fitted), unit=unit)
+    found += [memory, *(input_correlation(c, step=step) for c in fitted.tests.inputs), *others]
+    if fitted.frequency_response is not None:
+        found.append(bode(fitted.frequency_response, units=units))
+    return found
+
+
+def _noise(outcome: Loop | FitOnly) -> float:
+    """Rms measurement noise of the dynamic error."""
+    return float(np.sqrt(np.asarray(outcome.noise)[-1, -1]))
+
+
+def _predictions(before: Account, after: Account | None, unit: str) -> list[Plot]:
+    """The same held-out stretch before and after, of the first few logs."""
+    later: Sequence[FreeRun | None] = [None] * len(before.validation) if after is None else after.validation
+    omega_0 = float(before.model.drive.omega_0)
+    pairs = list(zip(before.validation, later, strict=True))[:_MOST_LOGS]
+    return [predictions(runs, omega_0=omega_0, unit=unit, key=f"prediction-{i}") for i, runs in enumerate(pairs)]
+
+
+def _residual_plots(
+    account: Account, before: ResidualDiagnostics, after: ResidualDiagnostics | None, *, noise: float, unit: str
+) -> list[Plot]:
+    omega_0 = float(account.model.drive.omega_0)
+    found = [autocorrelation(before, after), spectrum(before, after, noise=noise, omega_0=omega_0, unit=unit)]
+    if before.order.size:
+        found.append(orders(before, after, unit=unit))
+    return [*found, dependences(before, after, unit=unit)]

@@ -1,0 +1,25 @@
+"""A figure with its place in the story."""
+
+from dataclasses import dataclass
+from typing import Any
+
+Figure = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure with its place in the story.
+
+    Attributes:
+        key: unique within a report; a word for an element's id.
+        section: "fit", "left_over", "look" or "found".
+        title: what it shows, as plain text.
+        caption: how to read it, as plain text.
+        figure: for plotly.js, finite numbers and nulls only.
+    """
+
+    key: str
+    section: str
+    title: str
+    caption: str
+    figure: Figure

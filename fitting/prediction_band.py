@@ -1,0 +1,149 @@
+"""How far a free run may be off: what parameters, initial state and encoder leave open."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimate import Fit, fit, whitening
+from fitting.experiment import Stretch, cut
+from fitting.free_run import WINDOW, FreeRun, free_run
+from fitting.residual import Problem, Unknowns, linearise
+from fitting.uncertainty import Uncertainty
+
+_NORMAL_95 = 1.959963984540054
+
+
+class PredictionBand(eqx.Module):
+    """A free run and how well it is known, to first order.
+
+    What the model lacks is not in it: where a fit leaves more than measurement noise, so will its predictions. A run
+    that is found to begin at rest is known better than this.
+
+    Attributes:
+        run: the free run.
+        std_parameters: what the parameters' covariance does to the predicted dynamic error [rad]. The initial state
+            follows the parameters, as it does in the window that it is taken from.
+        std_state: what the noise in that window does [rad].
+        std_noise: of the measured dynamic error [rad].
+    """
+
+    run: FreeRun
+    std_parameters: Float[np.ndarray, " n"]
+    std_state: Float[np.ndarray, " n"]
+    std_noise: float
+
+    @property
+    def std_predicted(self) -> Float[np.ndarray, " n"]:
+        """Standard error of the predicted dynamic error [rad]."""
+        return np.hypot(self.std_parameters, self.std_state)
+
+    @property
+    def std_measured(self) -> Float[np.ndarray, " n"]:
+        """Standard deviation of measured minus predicted [rad]."""
+        return np.hypot(self.std_predicted, self.std_noise)
+
+    @property
+    def band95(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Where 95 % of the measured samples are expected."""
+        reach = _NORMAL_95 * self.std_measured
+        return self.run.predicted - reach, self.run.predicted + reach
+
+
+def prediction_bands(
+    fitted: Fit,
+    found: Uncertainty,
+    stretches: Sequence[Stretch],
+    *,
+    noise: Float[Array, "outputs outputs"],
+    halo: int = 0,
+    window: int = WINDOW,
+) -> tuple[PredictionBand, ...]:
+    """Free runs along stretches, with their bands.
+
+    Args:
+        fitted: the fitted model.
+        found: its uncertainty.
+        stretches: where to run; no other logs than the fit's are needed, and outputs beyond the window are not used.
+        noise: covariance of the outputs' measurement noise.
+        halo: intervals of torque before the start, for delays.
+        window: samples for the initial state.
+    """
+    substeps = fitted.substeps
+    runs = free_run(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window)
+    windows = [Stretch(s.experiment, s.start, min(s.start + window, s.stop)) for s in stretches]
+    starts = fit(
+        fitted.model,
+        windows,
+        (),
+        horizon=window,
+        length=window,
+        halo=halo,
+        substeps=substeps,
+        covariance=noise,
+        reweigh=False,
+        hold_parameters=True,
+        count=len(stretches),
+    )
+    whole = _whole(fitted, stretches, halo, substeps)
+    states = starts.unknowns.states[: len(stretches)]
+    by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
+    white = np.asarray(whitening(noise))
+    return tuple(
+        _band(run, by_parameter[i, : len(s)], by_state[i, : len(s)], white, found.covariance, window)
+        for i, (run, s) in enumerate(zip(runs, stretches, strict=True))
+    )
+
+
+def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) -> Problem:
+    """Each stretch as one simulation, with unit weights."""
+    segments = cut(stretches, max(len(s) for s in stretches), halo=halo, count=len(stretches))
+    return Problem(
+        fitted.model,
+        fitted.free,
+        segments,
+        jnp.eye(segments.measured.shape[-1]),
+        jnp.ones(len(fitted.free.paths)),
+        jnp.ones(fitted.unknowns.states.shape[1]),
+        substeps=substeps,
+    )
+
+
+def _slopes(problem: Problem, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states."""
+    found = linearise(problem, unknowns)
+    count, samples, outputs = problem.segments.measured.shape
+    shape = (count, samples, outputs, -1)
+    by_parameter, by_state = (
+        np.asarray(a)[:, : samples * outputs].reshape(shape) for a in (found.by_parameter, found.by_state)
+    )
+    # The residual is measured minus simulated.
+    return -by_parameter, -by_state
+
+
+def _band(
+    run: FreeRun,
+    by_parameter: np.ndarray,
+    by_state: np.ndarray,
+    white: np.ndarray,
+    covariance: np.ndarray,
+    window: int,
+) -> PredictionBand:
+    """The band of one run, from the derivatives of its outputs."""
+    seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
+    moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
+    # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
+    size = np.linalg.norm(seen, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    inverse = np.linalg.pinv(seen / size, rcond=1e-10) / size[:, None]
+    total = by_parameter[:, -1] - by_state[:, -1] @ (inverse @ moved)
+    spread = by_state[:, -1] @ inverse
+    variance = np.linalg.inv(white)
+    return PredictionBand(
+        run=run,
+        std_parameters=np.sqrt(np.maximum(np.einsum("np,pq,nq->n", total, covariance, total), 0.0)),
+        std_state=np.linalg.norm(spread, axis=1),
+        std_noise=float(np.sqrt((variance @ variance.T)[-1, -1])),
+    )

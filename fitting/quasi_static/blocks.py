@@ -1,0 +1,140 @@
+"""Means over short runs of rows: less noise on both axes, and few enough points for a fit in milliseconds.
+
+The noise of either axis is measured in the log itself, from what third differences leave of a smooth course.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fitting.logs import Log
+from fitting.quasi_static.torque_twist import Blocks
+
+# Assumed: fine enough to place a knee to a few per cent, coarse enough to average noise away.
+BLOCKS_PER_CYCLE = 100
+MOST_BLOCKS = 1500
+# A swing back by less than this share of the torque's range leaves the branch as it is, nearly.
+_REVERSAL = 0.05
+# Blocks in a branch of which the two at its ends may be left out.
+_LONG_BRANCH = 6
+_MEDIAN_TO_STD = 1.4826
+_THIRD_DIFFERENCE = math.sqrt(20.0)
+
+
+def average(logs: Sequence[Log]) -> Blocks:
+    """Means over blocks so short that the torque is nearly straight, and so long that it outruns its noise.
+
+    No block crosses a reversal of the torque, and the extreme that the torque reached there is kept beside the blocks:
+    the hysteresis depends on it.
+    """
+    parts = [_average(log, MOST_BLOCKS // len(logs)) for log in logs]
+    sizes = [len(part["torque"]) for part in parts]
+    lengths = [len(part["path"]) for part in parts]
+    before = np.repeat(np.cumsum([0, *lengths[:-1]]), sizes)
+    whole = {key: np.concatenate([part[key] for part in parts]) for key in ("torque", "twist", "time", "path", "seat")}
+    torque_noise = float(np.mean([part["noise"][0] for part in parts]))
+    course = float(np.median(np.abs(np.diff(whole["torque"]))))
+    return Blocks(
+        torque=whole["torque"],
+        twist=whole["twist"],
+        time=whole["time"],
+        log=np.repeat(np.arange(len(logs)), sizes),
+        path=whole["path"],
+        path_log=np.repeat(np.arange(len(logs)), lengths),
+        seat=whole["seat"] + before,
+        names=tuple(log.name for log in logs),
+        torque_noise=torque_noise,
+        # Even exact numbers have rounding; without a floor their weights would be infinite.
+        twist_noise=max(float(np.mean([part["noise"][1] for part in parts])), 1e-7 * float(np.ptp(whole["twist"]))),
+        # The rows of a block are spread evenly over its course.
+        blur=math.hypot(torque_noise, course / math.sqrt(12.0)),
+        rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
+        reversals=tuple(int(part["reversals"]) for part in parts),
+    )
+
+
+def _average(log: Log, most: int) -> dict[str, np.ndarray]:
+    torque = log.joint_torque
+    assert torque is not None
+    cycles = max(1.0, len(turns(torque, max(1, len(torque) // 1000))) / 2)
+    most = min(most, round(BLOCKS_PER_CYCLE * cycles))
+    size = max(1, round(len(log) / most))
+    while len(log) / size > 0.4 * most and _moves_little(means(torque, size)):
+        size = math.ceil(1.2 * size)
+    branches = np.array([0, *turns(torque, size), len(log)])
+    counts = np.maximum(1, np.rint(np.diff(branches) / size)).astype(int)
+    edges = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(branches, branches[1:], counts, strict=False)]
+    edge = np.append(np.rint(np.concatenate(edges)), len(log)).astype(int)
+    columns = {"torque": torque, "twist": log.dynamic_error, "time": log.time}
+    found: dict[str, np.ndarray] = {key: np.add.reduceat(v, edge[:-1]) / np.diff(edge) for key, v in columns.items()}
+    # Blocks of one size, whose centres are evenly spaced as third differences want them.
+    found["noise"] = np.array([noise(means(values, size)) for values in (torque, log.dynamic_error)])
+    firsts = np.cumsum(counts)[:-1]
+    found["reversals"] = np.array(len(firsts))
+    extremes = [_extreme(found["torque"], int(first)) for first in firsts]
+    found["path"] = np.insert(found["torque"], firsts, extremes)
+    number = np.arange(len(edge) - 1)
+    found["seat"] = number + np.searchsorted(firsts, number, side="right")
+    # Beside a reversal the branch changes within a block, so that its mean is not on the curve.
+    beside = np.concatenate([firsts, firsts - 1])
+    kept = ~np.isin(number, beside) if np.min(counts) >= _LONG_BRANCH else np.full(len(number), True)
+    return found | {key: found[key][kept] for key in (*columns, "seat")}
+
+
+def _extreme(torque: np.ndarray, first: int) -> float:
+    """The torque at the edge between two blocks of which the later is `first`, from the courses on both sides."""
+    ends = [torque[max(first - 2, 0) : first], torque[first : first + 2][::-1]]
+    return float(np.mean([end[-1] + 0.5 * (end[-1] - end[0]) for end in ends]))
+
+
+def means(values: np.ndarray, size: int) -> np.ndarray:
+    """Means over runs of `size` values; a shorter rest at the end is left out."""
+    count = len(values) // size
+    return values[: count * size].reshape(count, size).mean(axis=1)
+
+
+def noise(values: np.ndarray) -> float:
+    """Standard deviation of the noise on a smooth course, robustly from third differences."""
+    differences = np.abs(np.diff(values, 3))
+    typical = float(np.median(differences)) * _MEDIAN_TO_STD
+    # More than half of the differences of a coarsely quantised channel may be zero.
+    return (typical or float(np.sqrt(np.mean(differences**2)))) / _THIRD_DIFFERENCE
+
+
+def _moves_little(torque: np.ndarray) -> bool:
+    return float(np.median(np.abs(np.diff(torque)))) < 3.0 * noise(torque)
+
+
+def turns(torque: np.ndarray, size: int) -> list[int]:
+    """Rows at which the torque turns back by more than its noise and a small share of its range.
+
+    Args:
+        torque: In order of time, (n,).
+        size: Rows over which it is averaged before one looks.
+    """
+    smooth = means(torque, size)
+    least = max(_REVERSAL * float(np.ptp(smooth)), 8.0 * noise(smooth))
+    values = smooth.tolist()
+    low = high = 0
+    direction, found = 0, []
+    for i, value in enumerate(values):
+        low, high = (i if value < values[low] else low), (i if value > values[high] else high)
+        if direction >= 0 and value < values[high] - least:
+            found += [high] if direction else []
+            direction, low = -1, i
+        elif direction <= 0 and value > values[low] + least:
+            found += [low] if direction else []
+            direction, high = 1, i
+    return [_refined(torque, size, i) for i in found]
+
+
+def _refined(torque: np.ndarray, size: int, i: int) -> int:
+    """The row of an extreme from the averages around the one that is most extreme."""
+    at = np.arange(max(0, (i - 1) * size), max(1, min(len(torque) - size, (i + 1) * size)) + 1)
+    running = np.concatenate([[0.0], np.cumsum(torque[at[0] : at[-1] + size])])
+    averages = running[size:] - running[:-size]
+    inner = torque[i * size : (i + 1) * size].mean()
+    outer = np.mean([torque[at[0] : at[0] + size].mean(), torque[at[-1] : at[-1] + size].mean()])
+    best = np.argmax(averages) if inner >= outer else np.argmin(averages)
+    return int(at[0] + best + size // 2)

@@ -1,0 +1,125 @@
+"""All curves fitted to quasi-static logs of one drive, and the one that held-out stretches ask for."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from fitting.logs import Log
+from fitting.quasi_static.blocks import average
+from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish
+from fitting.quasi_static.intervals import Known, figures
+from fitting.quasi_static.stretches import FOLDS, stretches
+from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape
+
+_CONTAINED: dict[Shape, Shape] = {"cubic": "linear", "two slopes": "linear", "three slopes": "two slopes"}
+
+
+@dataclass(frozen=True, eq=False)
+class QuasiStaticFit:
+    """The fits of all shapes, and which of them held-out stretches ask for.
+
+    Attributes:
+        blocks: What was fitted.
+        fits: By shape.
+        known: Figures with intervals, by shape.
+        held_out: Held-out misfit [rad] of each block, by shape.
+        stretch: Number of the stretch that each block was held out with, (n,).
+        chosen: The simplest shape that predicts held-out stretches about as well as the best one, among those whose own
+            figures the logs determine.
+    """
+
+    blocks: Blocks
+    fits: dict[Shape, CurveFit]
+    known: dict[Shape, dict[str, Known]]
+    held_out: dict[Shape, np.ndarray]
+    stretch: np.ndarray
+    chosen: Shape
+
+    @property
+    def best(self) -> CurveFit:
+        """The chosen shape's fit."""
+        return self.fits[self.chosen]
+
+    @property
+    def undetermined(self) -> Shape | None:
+        """A shape that predicts held-out stretches clearly better, but whose figures the logs do not determine."""
+        least = min(SHAPES, key=lambda shape: float(np.mean(self.held_out[shape] ** 2)))
+        return least if self.is_worse(self.chosen, least) else None
+
+    def is_worse(self, one: Shape, other: Shape) -> bool:
+        """Whether the first shape predicts held-out stretches clearly worse than the second."""
+        return worse(self.held_out[one], self.held_out[other], self.stretch, self.blocks.twist_noise)
+
+
+def fit_quasi_static(
+    logs: Sequence[Log], *, rated_torque: float | None = None, hysteresis: bool = True
+) -> QuasiStaticFit:
+    """Fit all shapes of torque-twist curve to quasi-static logs of one drive, and choose one.
+
+    Args:
+        logs: Of kind "quasi-static", checked by [`fitting.quasi_static.preparation.prepare`][]. All share the curve and
+            the torque bias; each has its own twist zero and drift.
+        rated_torque: [N m], or None; without it the figures that vendors define by it are unknown.
+        hysteresis: Whether the way there and back may differ; a joint that turns one way all the time shows no such
+            thing, since the direction of its friction follows the motion.
+
+    Returns:
+        The fits.
+    """
+    blocks = average(logs)
+    fits: dict[Shape, CurveFit] = {}
+    for shape in SHAPES:
+        forms = candidates(blocks, shape, hysteresis)
+        fits[shape] = best_of(blocks, forms, fits.get(_CONTAINED[shape]) if shape in _CONTAINED else None)
+    known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
+    stretch = stretches(fits["three slopes"].residual, blocks.log)
+    held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
+    return QuasiStaticFit(blocks, fits, known, held_out, stretch, _choice(known, held_out, stretch, blocks.twist_noise))
+
+
+def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
+    """Misfit [rad] of each block by the curve that was fitted without its stretch, (n,).
+
+    The torque of a stretch that is held out still moves the hysteresis, since it is an input; its twist is unseen.
+    """
+    count = int(stretch[-1]) + 1
+    # Drawn, since a regular comb could leave the same torque out at every pass.
+    fold = np.random.default_rng(0).permutation(np.arange(count) % FOLDS)[stretch]
+    misfit = np.empty_like(blocks.twist)
+    for i in range(FOLDS):
+        kept = polish(blocks, fit.curve, fit.parameters, fit.excess, (fold != i).astype(float), most=20)
+        misfit[fold == i] = kept.misfit[fold == i]
+    return misfit
+
+
+def _choice(
+    known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarray], stretch: np.ndarray, noise: float
+) -> Shape:
+    """The first shape whose held-out error is not clearly above the least, in the order from simple to flexible.
+
+    A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
+    """
+    able: list[Shape] = ["linear"]
+    for shape in SHAPES[1:]:
+        if all(one.identifiable for name, one in known[shape].items() if _is_of_shape(name)):
+            able.append(shape)
+    least = min(able, key=lambda shape: float(np.mean(held_out[shape] ** 2)))
+    return next(s for s in able if s == least or not worse(held_out[s], held_out[least], stretch, noise))
+
+
+def _is_of_shape(name: str) -> bool:
+    return name[0] in "KT" or name == "alpha"
+
+
+def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float) -> bool:
+    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %.
+
+    A difference of less than a hundredth of the noise's variance is none, or rounding would choose among exact fits.
+    """
+    excess = np.bincount(stretch, one**2 - other**2)
+    error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
+    clear = float(np.mean(excess)) > float(student.ppf(0.95, len(excess) - 1)) * error
+    return clear and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

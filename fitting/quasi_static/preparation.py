@@ -1,0 +1,159 @@
+"""Quasi-static logs made ready for their fit: how the joint moved, which rows count, and what is refused."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from fitting.drive_file import DriveFile
+from fitting.errors import DataError
+from fitting.findings import Finding
+from fitting.health import examine, refuse_unfit
+from fitting.logs import Log
+from fitting.mix_ups import FREE_MOTION
+from fitting.pieces import SHORTEST
+from fitting.quasi_static.blocks import means
+
+Motion = Literal["held", "one way", "both ways", "unknown"]
+
+# More than any gear bears: vendors' drives twist by less than 0.01 rad at their peak torque.
+LARGEST_TWIST = 0.1
+# Assumed: the part of the typical speed above which friction is that of steady motion.
+_STEADY = 0.7
+# Correlation of means over a hundredth of the log; even a wide loop stays above it.
+_UNRELATED = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class QuasiStaticData:
+    """Logs of one drive, ready to be fitted.
+
+    Attributes:
+        drive_file: The drive.
+        logs: Of the rows that count.
+        motion: How the joint moved in each log.
+        findings: By name of the log.
+    """
+
+    drive_file: DriveFile
+    logs: tuple[Log, ...]
+    motion: tuple[Motion, ...]
+    findings: dict[str, tuple[Finding, ...]]
+
+
+def prepare(logs: Sequence[Log], drive_file: DriveFile) -> QuasiStaticData:
+    """Check quasi-static logs and leave out the rows in which friction has no known sign.
+
+    Args:
+        logs: Of kind "quasi-static".
+        drive_file: The drive that they were read with.
+
+    Returns:
+        What can be fitted.
+
+    Raises:
+        DataError: A log can't be fitted; the sentence says why.
+    """
+    ready, motions, findings = [], [], {}
+    for log in logs:
+        seen = examine(log, drive_file)
+        refuse_unfit(seen, log)
+        _refuse_mix_ups(log)
+        kept, motion, more = _steady(_measured(log), drive_file)
+        ready.append(kept)
+        motions.append(motion)
+        findings[log.name] = (*seen, *more)
+    return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
+
+
+def _refuse_mix_ups(log: Log) -> None:
+    torque, twist = log.joint_torque, log.dynamic_error
+    assert torque is not None
+    span = float(np.ptp(twist))
+    if span > LARGEST_TWIST:
+        moved = log.motor_angle is not None
+        remedy = (
+            "correct reduction_ratio, or the units and signs of the two angles in [columns]"
+            if moved
+            else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, '
+            "lock the motor or log both angles"
+        )
+        raise DataError(
+            f"{log.path}: the twist spans {span:.3g} rad, which is more than the {LARGEST_TWIST} rad that any gear "
+            f"bears; {remedy}"
+        )
+    size = max(1, len(log) // 100)
+    with np.errstate(invalid="ignore"):
+        # Means that never change have no correlation.
+        likeness = float(np.nan_to_num(np.corrcoef(means(torque, size), means(twist, size))[0, 1]))
+    if abs(likeness) < _UNRELATED:
+        raise DataError(
+            f"{log.path}: the twist does not follow the joint torque (their correlation is {likeness:.2g}); check "
+            "which columns they are, or record larger torque cycles"
+        )
+    if likeness < 0:
+        raise DataError(
+            f"{log.path}: the twist falls where the joint torque rises; give one of the two sign = -1 in [columns]"
+        )
+
+
+def _speed(log: Log, drive_file: DriveFile) -> np.ndarray | None:
+    """Speed of the joint [rad/s], smoothed over a few rows; None where nothing tells it."""
+    rows = max(3, len(log) // 200)
+    if log.motor_angle is not None and drive_file.reduction_ratio is not None:
+        angle = log.motor_angle / drive_file.reduction_ratio
+        lag = np.minimum(np.arange(len(log)) + rows, len(log) - 1)
+        lead = np.maximum(np.arange(len(log)) - rows, 0)
+        return (angle[lag] - angle[lead]) / (log.time[lag] - log.time[lead])
+    if log.motor_velocity is not None:
+        return np.convolve(log.motor_velocity / (drive_file.reduction_ratio or 1.0), np.ones(rows) / rows, mode="same")
+    return None
+
+
+def _steady(log: Log, drive_file: DriveFile) -> tuple[Log, Motion, tuple[Finding, ...]]:
+    """The rows of steady motion where the joint moved; all rows where it was held.
+
+    While a joint moves, friction is a torque of known sign. At rest it takes any value up to sticking, so that rows at
+    rest don't belong to the same curve.
+    """
+    speed = _speed(log, drive_file)
+    if speed is None or not np.all(np.isfinite(speed)):
+        return log, "unknown", ()
+    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(log.time))])
+    if np.ptp(path) < FREE_MOTION:
+        return log, "held", ()
+    steady = np.abs(speed) > _STEADY * np.percentile(np.abs(speed), 90)
+    forwards, backwards = np.mean(speed[steady] > 0), np.mean(speed[steady] < 0)
+    motion: Motion = "both ways" if min(forwards, backwards) > 0.05 else "one way"
+    left_out = int(np.sum(~steady))
+    if left_out == 0:
+        return log, motion, ()
+    if len(log) - left_out < SHORTEST:
+        raise DataError(
+            f"{log.path}: the joint moves steadily in only {len(log) - left_out} rows, which is fewer than the "
+            f"{SHORTEST} that a fit needs; record a longer sweep at constant speed, or hold the joint"
+        )
+    told = Finding(
+        "note",
+        f"the joint moved by {np.ptp(path):.3g} rad, and in {left_out} rows it was at rest or slower than "
+        f"{100 * _STEADY:.0f} % of its usual speed",
+        "all columns",
+        "these rows were left out, since friction at rest has no known sign",
+    )
+    return _rows(log, steady), motion, (told,)
+
+
+def _measured(log: Log) -> Log:
+    """The rows in which torque and angles were measured; the findings of the reader tell of the others."""
+    kept = np.ones(len(log), dtype=bool)
+    for known in (log.trusted, log.input_known):
+        if known is not None:
+            kept &= known
+    return log if kept.all() else replace(_rows(log, kept), trusted=None, input_known=None)
+
+
+def _rows(log: Log, kept: np.ndarray) -> Log:
+    names = ("time", "motor_angle", "load_angle", "load_torque", "temperature", "dynamic_error", "motor_velocity")
+    held = {name: getattr(log, name) for name in (*names, "joint_torque")}
+    return replace(log, **{name: values[kept] for name, values in held.items() if values is not None})

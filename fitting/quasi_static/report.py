@@ -1,0 +1,111 @@
+"""The report of a quasi-static fit: text for the terminal, a page, and JSON."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from fitting import formatting
+from fitting.files import write_whole
+from fitting.quasi_static.content import PLAIN_SHAPE
+from fitting.quasi_static.fit import QuasiStaticFit
+from fitting.quasi_static.plots import Picture, pictures
+
+_ARCMIN = math.degrees(1.0) * 60.0
+
+
+def write_report(out: Path, report: Mapping[str, Any], fit: QuasiStaticFit) -> dict[str, Path]:
+    """Write `report.html` and `report.json`: both, whole, or none.
+
+    Args:
+        out: Folder; made where absent.
+        report: From [`fitting.quasi_static.content.report_dict`][].
+        fit: Its pictures.
+
+    Returns:
+        The files' paths, by name.
+    """
+    texts = {
+        "report.html": report_page(report, pictures(fit)),
+        "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
+    }
+    paths = {file: out / file for file in texts}
+    write_whole({paths[file]: text for file, text in texts.items()})
+    return paths
+
+
+def report_page(report: Mapping[str, Any], shown: Sequence[Picture]) -> str:
+    """The page: self-contained, reads without a network."""
+    environment = Environment(
+        loader=PackageLoader("fitting", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # `tojson` writes <, >, & and ' as escapes, so that no name can end the script.
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    environment.filters |= {
+        "quantity": formatting.quantity,
+        "number": formatting.number,
+        "unit": formatting.pretty_unit,
+        "value": _value,
+        "interval": _interval,
+        "shape": PLAIN_SHAPE.__getitem__,
+    }
+    page = environment.get_template("quasi_static.html.jinja")
+    return page.render(report=report, pictures=shown, plotlyjs=Markup(get_plotlyjs()))
+
+
+def _value(known: Mapping[str, Any]) -> str:
+    if known["value"] is None:
+        return "unknown"
+    return formatting.measured(known["value"], known["std"], known["unit"]) + _in_arcmin(known)
+
+
+def _interval(known: Mapping[str, Any]) -> str:
+    if None in known["ci95"]:
+        return "—"
+    return formatting.interval(known["ci95"], known["std"], known["unit"])
+
+
+def _in_arcmin(known: Mapping[str, Any]) -> str:
+    """The unit in which vendors state small angles."""
+    return f" ({formatting.number(_ARCMIN * known['value'])} arcmin)" if known["unit"] == "rad" else ""
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """A compact summary for the terminal."""
+    rmse = report["before"]["rmse"]
+    lines = ["[Fit of quasi-static logs]", f"    {report['summary']}", "[Rms error of the twist]"]
+    lines += [
+        f"    {name:10}{rmse[key]:12.4g} rad" for name, key in (("fitted", "training"), ("held out", "validation"))
+    ]
+    lines.append("[Parameters]")
+    known = report["before"]["parameters"]
+    width = max(map(len, known))
+    lines += [f"    {name:{width}}  {_line(one)}" for name, one in known.items()]
+    lines.append("[Shapes, by held-out error]")
+    for shape, account in sorted(report["shapes"].items(), key=lambda item: item[1]["rmse"]["validation"]):
+        mark = "  chosen" if shape == report["shape"] else ""
+        lines.append(f"    {PLAIN_SHAPE[shape]:14}{account['rmse']['validation']:12.4g} rad{mark}")
+    lines += [f"[Note] {note}" for note in report["cannot_tell"]]
+    lines += [f"[{f['severity']}] {f['log']}: {f['where']}: {f['what']}; {f['consequence']}" for f in report["health"]]
+    return "\n".join(lines)
+
+
+def _line(known: Mapping[str, Any]) -> str:
+    if known["value"] is None:
+        return "unknown"
+    low, high = known["ci95"]
+    ends = "" if low is None or high is None else f"  [{low:.4g}, {high:.4g}]"
+    share = (
+        f" ({100 * known['std'] / abs(known['value']):.2g} %)" if known["value"] and known["std"] is not None else ""
+    )
+    flag = "" if known["identifiable"] else "  NOT IDENTIFIABLE"
+    return f"{known['value']:.5g} +/- {known['std']:.2g}{share} {known['unit']}{ends}{flag}"

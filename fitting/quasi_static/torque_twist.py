@@ -1,0 +1,274 @@
+"""Torque-twist curves: what a gear twists by under a slowly changing torque, and how it remembers the way there.
+
+Plain NumPy in double precision: the curve is algebraic, so that a fit takes milliseconds and compiles nothing.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.special import ndtr
+
+Shape = Literal["linear", "cubic", "two slopes", "three slopes"]
+Memory = Literal["abrupt", "gradual"]
+SHAPES: tuple[Shape, ...] = get_args(Shape)
+MEMORIES: tuple[Memory, ...] = get_args(Memory)
+
+SHAPE_NAMES: dict[Shape, tuple[str, ...]] = {
+    "linear": ("log K1",),
+    "cubic": ("log K1", "alpha"),
+    "two slopes": ("log K1", "log K2", "log T1"),
+    "three slopes": ("log K1", "log K2", "log K3", "log T1", "log gap"),
+}
+
+
+def positive(logarithm: np.ndarray | float) -> np.ndarray:
+    """The positive number of that logarithm, finite wherever a search may wander."""
+    return np.asarray(np.exp(np.clip(logarithm, -80.0, 80.0)))
+
+
+def twist(
+    shape: Shape, coefficients: np.ndarray, torque: np.ndarray, *, blur: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """The elastic twist under a torque, and its slope; odd in the torque.
+
+    Two and three slopes are the vendors' straight lines through the origin: K1 up to T1, K2 from there to
+    T2 = T1 + gap, K3 beyond. The cubic is tau = K (x + alpha x^3), solved for x in closed form.
+
+    Args:
+        shape: Of the curve.
+        coefficients: As `SHAPE_NAMES` lists them; K in N m/rad, alpha in rad^-2, torques in N m.
+        torque: Less the torque at the centre of the curve [N m], (n,).
+        blur: Standard deviation of the true torque around the stated one [N m]. What is expected then turns its knees
+            in a curve; straight parts stay as they are.
+
+    Returns:
+        Twist [rad] and its derivative with respect to the torque [rad/(N m)], both (n,).
+    """
+    if shape == "linear":
+        compliance = positive(-coefficients[0])
+        return compliance * torque, np.full_like(torque, compliance)
+    if shape == "cubic":
+        return _cubic(float(positive(-coefficients[0])), coefficients[1], torque)
+    slopes = 2 if shape == "two slopes" else 3
+    signs = [-1.0] * slopes + [1.0] * (slopes - 1)
+    exponentials = np.exp(np.clip(signs * coefficients[: 2 * slopes - 1], -80.0, 80.0))
+    compliances, knees = exponentials[:slopes], np.cumsum(exponentials[slopes:])
+    x = compliances[0] * torque
+    slope = np.full_like(torque, compliances[0])
+    for knee, before, after in zip(knees, compliances[:-1], compliances[1:], strict=True):
+        beyond, share = _beyond(torque, knee, blur)
+        x = x + (after - before) * beyond
+        slope = slope + (after - before) * share
+    return x, slope
+
+
+def _beyond(torque: np.ndarray, knee: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far the torque is expected beyond a knee on either side, with its sign, and the chance that it is beyond."""
+    if blur <= 0.0:
+        beyond = torque - np.clip(torque, -knee, knee)
+        return beyond, (beyond != 0).astype(float)
+    above, below = (torque - knee) / blur, (-torque - knee) / blur
+    chance_above, chance_below = ndtr(above), ndtr(below)
+    density = (np.exp(-0.5 * above**2) - np.exp(-0.5 * below**2)) / np.sqrt(2.0 * np.pi)
+    return blur * (above * chance_above - below * chance_below + density), chance_above + chance_below
+
+
+def _cubic(compliance: float, alpha: float, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    y = compliance * torque
+    scale = np.sqrt(3.0 * abs(alpha))
+    if scale * np.max(np.abs(y), initial=0.0) < 1e-6:
+        # Below this the closed form loses digits that the series keeps.
+        x = y - alpha * y**3
+    elif alpha > 0:
+        x = 2.0 / scale * np.sinh(np.arcsinh(1.5 * scale * y) / 3.0)
+    else:
+        # A softening cubic bears no more than at its fold; just before it the slope is steep but finite.
+        x = 2.0 / scale * np.sin(np.arcsin(np.clip(1.5 * scale * y, -0.999, 0.999)) / 3.0)
+    return x, compliance / (1.0 + 3.0 * alpha * x**2)
+
+
+def remembered(memory: Memory, torque: np.ndarray, reach: float, start: float) -> np.ndarray:
+    """Which branch of the loop each sample is on: +1 loading, -1 unloading, between them after a reversal.
+
+    The abrupt law is a Jenkins element (play in series with the spring): the branch changes along a straight line while
+    the torque goes back by twice the reach. The gradual law is Dahl's: the distance to the new branch decays by e per
+    reach. Both depend on the torque's path only, not on time, and are exact where it is monotone between samples.
+
+    Args:
+        memory: The law.
+        torque: In order of time [N m], (n,).
+        reach: Torque over which the branch changes [N m].
+        start: Branch at the first sample, from -1 to 1.
+
+    Returns:
+        (n,).
+
+    References:
+        Dahl 1976, AIAA Journal 14(12); Visintin 1994, Differential Models of Hysteresis (play and stop).
+    """
+    steps = np.diff(torque) / reach
+    branch = float(start)
+    path = [branch]
+    if memory == "abrupt":
+        for step in steps.tolist():
+            branch += step
+            # Comparisons, since this loop is where a fit spends its time and min and max take twice as long.
+            branch = 1.0 if branch > 1.0 else -1.0 if branch < -1.0 else branch
+            path.append(branch)
+    else:
+        for towards, kept in zip(np.sign(steps).tolist(), np.exp(-np.abs(steps)).tolist(), strict=True):
+            branch = towards + (branch - towards) * kept
+            path.append(branch)
+    return np.array(path)
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Means over short runs of rows, of one log or of several.
+
+    Attributes:
+        torque: Joint torque [N m], (n,).
+        twist: [rad], (n,).
+        time: [s], (n,).
+        log: Number of the log that a block is from, (n,), rising.
+        path: Torque on the way [N m], the blocks' and, between them, the extremes at which it turned, (p,).
+        path_log: Number of the log of each point of the path, (p,).
+        seat: Where the blocks are on the path, (n,).
+        names: Of the logs.
+        torque_noise: Standard deviation of the noise of a block's torque [N m].
+        twist_noise: Likewise of its twist [rad].
+        blur: Standard deviation of the torque of a block's rows around its mean, noise and course together [N m].
+        rows: Rows in a block, by log, nearly.
+        reversals: Reversals of the torque, by log.
+    """
+
+    torque: np.ndarray
+    twist: np.ndarray
+    time: np.ndarray
+    log: np.ndarray
+    path: np.ndarray
+    path_log: np.ndarray
+    seat: np.ndarray
+    names: tuple[str, ...]
+    torque_noise: float
+    twist_noise: float
+    blur: float
+    rows: tuple[int, ...]
+    reversals: tuple[int, ...]
+
+    @cached_property
+    def centred_time(self) -> np.ndarray:
+        """Time from the middle of each block's log [s], (n,)."""
+        logs = range(len(self.names))
+        middle = np.array([0.5 * np.sum(self.time[self.log == i][[0, -1]]) for i in logs])
+        return self.time - middle[self.log]
+
+    @property
+    def amplitude(self) -> float:
+        """Half the range of the torque [N m]."""
+        return 0.5 * float(np.ptp(self.torque))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A form of torque-twist curve: which terms it has. Its parameters are a vector in the order of `names`.
+
+    Attributes:
+        shape: Of the elastic part.
+        memory: Law of the hysteresis, or None for no hysteresis.
+        biased: Whether the torque at the curve's centre is free; zero otherwise.
+        drifting: Whether the twist may drift with time.
+        logs: Number of logs; each has its own twist zero, initial branch and drift.
+    """
+
+    shape: Shape
+    memory: Memory | None
+    biased: bool
+    drifting: bool
+    logs: int
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        each = [f"offset {i}" for i in range(self.logs)]
+        each += [f"drift {i}" for i in range(self.logs) if self.drifting]
+        if self.memory is not None:
+            each += ["friction", "log reach", *(f"start {i}" for i in range(self.logs))]
+        return (*SHAPE_NAMES[self.shape], *(["torque_bias"] if self.biased else []), *each)
+
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Index of each parameter, by name."""
+        return {name: i for i, name in enumerate(self.names)}
+
+    def reach(self, parameters: np.ndarray) -> float:
+        """Torque over which the branch changes after a reversal [N m]."""
+        return float(positive(parameters[self.places["log reach"]]))
+
+    def elastic(
+        self, parameters: np.ndarray, torque: np.ndarray, *, blur: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Twist of the spring above the twist zero [rad], and its slope, at a torque as logged."""
+        bias = parameters[self.places["torque_bias"]] if self.biased else 0.0
+        return twist(self.shape, parameters, torque - bias, blur=blur)
+
+    def branch(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
+        """Which branch each block is on, from -1 to 1, (n,)."""
+        if self.memory is None:
+            return np.zeros_like(blocks.torque)
+        reach, start = self.reach(parameters), self.places["start 0"]
+        each = [
+            remembered(self.memory, blocks.path[blocks.path_log == i], reach, parameters[start + i])
+            for i in range(self.logs)
+        ]
+        return np.concatenate(each)[blocks.seat]
+
+    def predict(
+        self, parameters: np.ndarray, blocks: Blocks, branch: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Twist [rad] and the slope of the elastic part [rad/(N m)] at each block, both (n,).
+
+        Hysteresis is a friction torque beside the spring's, as `hdjax` has it: on loading it bears its full part of the
+        torque, on unloading it works against the spring.
+
+        Args:
+            parameters: As `names` lists them.
+            blocks: Where to look.
+            branch: From [`Curve.branch`][], where it is known already.
+        """
+        branch = self.branch(parameters, blocks) if branch is None else branch
+        friction = parameters[self.places["friction"]] if self.memory is not None else 0.0
+        x, slope = self.elastic(parameters, blocks.torque - friction * branch, blur=blocks.blur)
+        return x + self.zero(parameters, blocks), slope
+
+    def zero(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
+        """Twist zero and drift of each block's log [rad], (n,)."""
+        x = parameters[self.places["offset 0"] + blocks.log]
+        return x + parameters[self.places["drift 0"] + blocks.log] * blocks.centred_time if self.drifting else x
+
+
+def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int = 200) -> tuple[np.ndarray, ...]:
+    """The closed loop that the curve runs through under torque cycles around its centre.
+
+    Args:
+        curve: The form.
+        parameters: Its parameters.
+        amplitude: Of the torque cycles [N m].
+        steps: Points on each branch.
+
+    Returns:
+        Torque less its centre [N m], twist while it rises and twist while it falls [rad], each (steps + 1,).
+    """
+    torque = np.linspace(-amplitude, amplitude, steps + 1)
+    if curve.memory is None:
+        elastic, _ = twist(curve.shape, parameters, torque)
+        return torque, elastic, elastic
+    way = np.concatenate([torque, torque[-2::-1]])
+    # After two cycles the loop has closed, wherever it began.
+    path = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), curve.reach(parameters), -1.0)
+    closed = path[-2 * steps - 1 :]
+    friction = parameters[curve.places["friction"]]
+    x, _ = twist(curve.shape, parameters, way - friction * closed)
+    return torque, x[: steps + 1], x[: steps - 1 : -1]

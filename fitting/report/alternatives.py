@@ -1,0 +1,52 @@
+"""What else was refitted inside the equations."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fitting.attribution import Trial, Verdict
+from fitting.report.outcome import Outcome
+from fitting.report.separating import separating_experiment
+
+
+def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
+    """What else was refitted inside the equations: ties, and families that the data rule out."""
+    names = {f.name for f in outcome.findings}
+    families = {f.family for f in outcome.findings}
+    found: dict[str, dict[str, Any]] = {}
+    for this in outcome.rounds:
+        if not this.accepted or this.winner.name not in names:
+            continue
+        for verdict in this.verdicts:
+            if verdict.trial is None or verdict.name in names or (verdict.family in families and verdict.separable):
+                continue
+            entry = _alternative(verdict, verdict.trial, this.winner)
+            known = found.get(verdict.name)
+            if known is None or _closeness(entry) < _closeness(known):
+                found[verdict.name] = entry
+    return sorted(found.values(), key=_closeness)
+
+
+def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, Any]:
+    experiment = separating_experiment(winner.family, verdict.family)
+    if verdict.separable:
+        experiment = "None is needed: the held-out data tell the two apart."
+    return {
+        "family": verdict.family,
+        "name": verdict.name,
+        "validation_rmse": _held_out_rmse(trial),
+        "separable": verdict.separable,
+        "separating_experiment": experiment,
+        "instead_of": winner.name,
+        "validation_rmse_of_found": None if winner.trial is None else _held_out_rmse(winner.trial),
+    }
+
+
+def _held_out_rmse(trial: Trial) -> float:
+    """Rms of the dynamic error on held-out segments, whose initial states are fitted."""
+    return float(np.sqrt(np.asarray(trial.held_out.covariance)[-1, -1]))
+
+
+def _closeness(alternative: Mapping[str, Any]) -> tuple[bool, float]:
+    return alternative["separable"], alternative["validation_rmse"]

@@ -1,0 +1,112 @@
+"""The report as JSON has it."""
+
+import dataclasses
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from fitting import findings
+from fitting.close_loop import Loop
+from fitting.free_run import FreeRun
+from fitting.report.alternatives import alternatives
+from fitting.report.fit_content import fit_dict, meaning
+from fitting.report.limits import largest_twist, limits, parameter_note
+from fitting.report.outcome import Outcome
+from fitting.report.parameters import account_dict, effect_dict, no_account
+from fitting.report.summary import summary
+from fitting.report.unexplained import unexplained
+
+SCHEMA = "hdjax-report/1"
+
+_LIBRARIES = ("hdjax", "jax", "diffrax", "optimistix", "equinox", "numpy", "scipy")
+
+
+def report_dict(
+    outcome: Outcome,
+    *,
+    units: Mapping[str, str] | None = None,
+    health: Sequence[tuple[str, findings.Finding]] = (),
+    name: str = "drive",
+) -> dict[str, Any]:
+    """The report as JSON has it: finite numbers and nulls only.
+
+    Args:
+        outcome: of the loop or of a fit.
+        units: of `dynamic_error` and, in a reduced log, of `forcing`; SI where not given.
+        health: what the health gate said, each finding with its log's name.
+        name: the drive's.
+    """
+    units = {"dynamic_error": "rad", "forcing": "N m"} | dict(units or {})
+    noise = float(np.sqrt(np.asarray(outcome.noise)[-1, -1]))
+    x_max = largest_twist(outcome)
+    is_loop = isinstance(outcome, Loop)
+    start = None if is_loop else outcome.start
+    after = account_dict(outcome.after, units, x_max) if is_loop else no_account()
+    report = {
+        "schema": SCHEMA,
+        "version": version("hdjax"),
+        "name": name,
+        "decision": outcome.decision,
+        "summary": "",
+        "units": units,
+        "noise": {"dynamic_error": noise},
+        "before": account_dict(outcome.before, units, x_max, start=start),
+        "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
+        "alternatives": alternatives(outcome),
+        "goodness": None,
+        "residual_tests": [],
+        "frequency_response": None,
+        "meaning": [],
+        "dropped": list(outcome.dropped),
+        "unexplained": unexplained(outcome, noise),
+        "cannot_tell": [],
+        "hold": outcome.hold,
+        "setting": _setting(outcome),
+        "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
+        "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),
+        "seconds": dict(outcome.seconds),
+        "logs": [_log_dict(*runs) for runs in zip(outcome.before.training, outcome.before.validation, strict=True)],
+        "health": [{"log": log} | dataclasses.asdict(f) for log, f in health],
+        "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
+    }
+    if not is_loop:
+        report |= fit_dict(outcome, noise)
+    report = _finite(report)
+    for side in ("before", "after"):
+        for path, estimate in report[side]["parameters"].items():
+            estimate["note"] = parameter_note(path, estimate, x_max, units["dynamic_error"])
+    report["summary"] = summary(report)
+    report["meaning"] = [] if is_loop else meaning(report)
+    report["cannot_tell"] = limits(report)
+    return report
+
+
+def _log_dict(training: FreeRun, validation: FreeRun) -> dict[str, Any]:
+    return {
+        "name": training.name,
+        "samples": int(training.time.size + validation.time.size),
+        "held_out": int(validation.time.size),
+        "seconds": float(validation.time[-1] - training.time[0]),
+    }
+
+
+def _setting(outcome: Outcome) -> dict[str, int] | None:
+    """How the logs were cut, and the solver's steps in the end."""
+    if not isinstance(outcome, Loop):
+        return None
+    return dataclasses.asdict(outcome.setting) | {"substeps": outcome.after_substeps}
+
+
+def _finite(value: Any) -> Any:
+    """The same structure with null in place of what is no finite number."""
+    if isinstance(value, Mapping):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, bool) or not isinstance(value, float | np.floating):
+        return value
+    return float(value) if math.isfinite(value) else None

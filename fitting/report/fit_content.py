@@ -1,0 +1,150 @@
+"""What only the report of a fit has: goodness, residual tests, frequency response, and what all of it means."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fitting import formatting
+from fitting.fit_only import FitOnly
+from fitting.frequency_response import (
+    FrequencyResponse,
+    coherent_band,
+    excites_resonance,
+    resonance_seen,
+    unexplained_band,
+)
+
+# Measured and modelled resonance that differ by less than this, or than the lines' distance, agree.
+_AGREES = 0.03
+# Held-out error over training error, and error over noise, from which on it is worth a word.
+_DRIFTED = 1.5
+_NOTHING_BUT_NOISE = 1.1
+
+
+def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
+    """The entries of a fit's report.
+
+    Args:
+        fitted: the fit.
+        noise: rms measurement noise of the dynamic error.
+    """
+    g, account = fitted.goodness, fitted.account
+    return {
+        "goodness": {
+            "fit_percent": dict(g.fit_percent),
+            "rmse_over_noise": {
+                "training": account.training_rmse / noise,
+                "validation": account.validation_rmse / noise,
+            },
+            "error_over_noise": dict(g.error_over_noise),
+            "reduced_chi_square": g.reduced_chi_square,
+            "log_likelihood": g.log_likelihood,
+            "aic": g.aic,
+            "bic": g.bic,
+            "data": g.data,
+            "parameters": g.parameters,
+            "initial_states": g.states,
+            "iterations": g.iterations,
+            "converged": g.converged,
+            "substeps": g.substeps,
+        },
+        "residual_tests": [
+            {
+                "name": t.name,
+                "statistic": t.statistic,
+                "degrees": t.degrees,
+                "p_value": t.p_value,
+                "verdict": t.verdict,
+                "says": t.says,
+            }
+            for t in fitted.tests.tests
+        ],
+        "frequency_response": _response_dict(fitted.frequency_response),
+    }
+
+
+def meaning(report: Mapping[str, Any]) -> list[str]:
+    """What to make of a fit's report, most important first, a sentence or two each."""
+    verdicts = {t["name"].split(" of ")[0]: t["verdict"] for t in report["residual_tests"]}
+    rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"]["validation"]
+    notes = []
+    if not report["goodness"]["converged"]:
+        notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")
+    missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
+    if over_noise is None:
+        notes.append("The free run diverges on held-out data: the model doesn't stand for this drive.")
+    elif missing:
+        notes.append(
+            "The residual is not noise: the model lacks something. Its parameters absorb a part of it, so that the "
+            "truth may lie outside the intervals. `hdjax close-loop` looks for what is missing."
+        )
+        if over_noise < _DRIFTED:
+            notes.append("The estimate of the measurement noise holds a part of what is missing: don't lean on it.")
+    elif over_noise < _NOTHING_BUT_NOISE:
+        notes.append("The model explains these logs down to the measurement noise.")
+    if None not in rmse.values() and rmse["validation"] > _DRIFTED * rmse["training"]:
+        notes.append(
+            "The error is larger on held-out data than on the data that were fitted: the drive or its conditions "
+            "changed along the log, or the initial state is poorly known."
+        )
+    if verdicts.get("normality") == "failed" and not missing:
+        notes.append("The errors are not Gaussian: look for outliers, clipping or coarse quantisation in the plot.")
+    response = report["frequency_response"]
+    if response and not response["excited"]:
+        notes.append("The log does not excite the resonance: what it says of damping rests on little.")
+    return notes
+
+
+def _response_dict(found: FrequencyResponse | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "resonance": found.resonance,
+        "resonance_seen": resonance_seen(found),
+        "excited": excites_resonance(found),
+        "coherent_band": coherent_band(found),
+        "unexplained_band": unexplained_band(found),
+        "resolution": found.resolution,
+        "averages": found.averages,
+        "says": _response_sentences(found),
+    }
+
+
+def _response_sentences(found: FrequencyResponse) -> list[str]:
+    """What the frequency response shows."""
+    said = []
+    band = coherent_band(found)
+    if band:
+        said.append(
+            f"The dynamic error follows the {found.source} linearly from {_range(*band)} (coherence above 0.9)."
+        )
+    else:
+        said.append(f"Nowhere does the dynamic error follow the {found.source} linearly (coherence above 0.9).")
+    own, seen = _hertz(found.resonance), resonance_seen(found)
+    if not excites_resonance(found):
+        said.append(f"The log does not excite the model's resonance at {own}.")
+    elif seen is None:
+        said.append(f"The log reaches the model's resonance at {own}, but shows no clear peak there.")
+    elif abs(seen - found.resonance) <= max(_AGREES * found.resonance, found.resolution):
+        said.append(f"The resonance is seen at {_hertz(seen)}, where the model has it ({own}).")
+    else:
+        said.append(f"The resonance is seen at {_hertz(seen)}, but the model has it at {own}.")
+    lacking = unexplained_band(found)
+    if lacking:
+        said.append(
+            f"From {_range(*lacking)} the {found.source} is strong and noise is small, but the coherence is low: "
+            "nonlinearity, a disturbance, or an effect that the model lacks."
+        )
+    if found.width < 2 * found.resolution:
+        said.append(
+            f"The lines lie {_hertz(found.resolution)} apart, too far for a resonance {_hertz(found.width)} wide: its "
+            "peak looks lower than it is, and the coherence dips there."
+        )
+    return said
+
+
+def _range(low: float, high: float) -> str:
+    return f"{formatting.number(low, 3)} to {_hertz(high)}"
+
+
+def _hertz(value: float) -> str:
+    return f"{formatting.number(value, 3)} Hz"

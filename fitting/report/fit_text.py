@@ -1,0 +1,119 @@
+"""A fit's report on a terminal: plain text, in aligned columns."""
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fitting.formatting import p_value, plain
+
+_WIDTH = 100
+_INDENT = "    "
+# Beyond these a number reads better with a power of ten.
+_SMALLEST, _LARGEST = 1e-4, 1e8
+_VERDICTS = {"passed": "passed", "slight": "slight", "failed": "FAILED"}
+
+
+def fit_lines(report: Mapping[str, Any]) -> list[str]:
+    """The lines of the report.
+
+    Args:
+        report: from [`fitting.report.report_dict`][].
+    """
+    return [
+        *_section("Result", _prose([report["summary"], *report["meaning"]])),
+        *_section("Parameters", _parameters(report["before"])),
+        *_section("Derived", _table(_derived_rows(report["before"]["derived"]), left=(0, 5))),
+        *_section("Correlations above 0.1", _correlations(report["before"]["correlations"])),
+        *_section("Goodness", _goodness(report)),
+        *_section("Residual", _tests(report["residual_tests"])),
+        *_section("Frequency response", _prose((report["frequency_response"] or {"says": ()})["says"])),
+        *_section("Log health", _health(report["health"])),
+    ]
+
+
+def _section(head: str, lines: Sequence[str]) -> list[str]:
+    """A head and its lines; nothing where there are none."""
+    return [f"[{head}]", *(f"{_INDENT}{line}".rstrip() for line in lines)] if lines else []
+
+
+def _prose(sentences: Sequence[str]) -> list[str]:
+    return [line for s in sentences for line in textwrap.wrap(s, _WIDTH, subsequent_indent="  ")]
+
+
+def _parameters(account: Mapping[str, Any]) -> list[str]:
+    """The table, and a sentence for each parameter that needs one."""
+    entries = account["parameters"]
+    rows = [["", "value", "std error", "%", "95 % interval", "start", "unit", ""]]
+    for path, e in entries.items():
+        flag = "AT BOUND" if e["at_bound"] else "" if e["identifiable"] else "NOT IDENTIFIABLE"
+        rows.append([path, *_figures(e), plain(e["start"], 5), e["unit"], flag])
+    return _table(rows, left=(0, 6, 7)) + _prose([e["note"] for e in entries.values() if e["note"]])
+
+
+def _derived_rows(derived: Mapping[str, Any]) -> list[list[str]]:
+    rows = [["", "value", "std error", "%", "95 % interval", "unit"]]
+    return rows + [[name, *_figures(e), e["unit"]] for name, e in derived.items()]
+
+
+def _figures(entry: Mapping[str, Any]) -> list[str]:
+    """Value, standard error, percent and interval, to the digits that the standard error leaves."""
+    value, std, low, high = _rounded([entry["value"], entry["std"], *entry["ci95"]], entry["std"])
+    return [value, std, plain(entry["percent"], 2), f"{low} to {high}"]
+
+
+def _rounded(values: Sequence[float | None], std: float | None) -> list[str]:
+    """Numbers to the second digit of their standard error."""
+    largest = max((abs(v) for v in values if v is not None), default=0.0)
+    if not std or not _SMALLEST < largest < _LARGEST:
+        return [plain(v, 5) for v in values]
+    decimals = min(max(1 - math.floor(math.log10(std)), 0), 12)
+    return ["n/a" if v is None else f"{v:.{decimals}f}" for v in values]
+
+
+def _correlations(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
+    return _table([[", ".join(c["between"]), f"{c['value']:+.3f}"] for c in correlations], left=(0,))
+
+
+def _goodness(report: Mapping[str, Any]) -> list[str]:
+    g, rmse, unit = report["goodness"], report["before"]["rmse"], report["units"]["dynamic_error"]
+    sides = ("training", "validation")
+    rows = [
+        ["free run", "training", "held out", ""],
+        ["fit", *(plain(g["fit_percent"][s]) for s in sides), "%"],
+        ["rms error", *(plain(rmse[s]) for s in sides), unit],
+        ["rms error / noise", *(plain(g["rmse_over_noise"][s], 3) for s in sides), ""],
+    ]
+    met = "converged" if g["converged"] else "NOT CONVERGED"
+    samples = sum(log["samples"] for log in report["logs"])
+    left = ", ".join(f"{output} {plain(v, 3)}" for output, v in g["error_over_noise"].items())
+    held_out = sum(log["held_out"] for log in report["logs"])
+    return _table(rows, left=(0, 3)) + [
+        f"measurement noise {plain(report['noise']['dynamic_error'])} {unit} rms",
+        f"left over in short simulations, in units of the noise: {left}",
+        f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
+        f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
+        f"{len(report['logs'])} log(s), {samples} samples, {held_out} of them held out; {g['data']} numbers fitted by "
+        f"{g['parameters']} parameters and {g['initial_states']} initial states",
+        f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",
+        "time: " + ", ".join(f"{stage} {seconds:.2g} s" for stage, seconds in report["seconds"].items()),
+    ]
+
+
+def _tests(tests: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line each, and a sentence for what did not pass."""
+    rows = [["test", "verdict", "p"]] + [[t["name"], _VERDICTS[t["verdict"]], p_value(t["p_value"])] for t in tests]
+    return _table(rows, left=(0, 1, 2)) + _prose([t["says"] for t in tests if t["verdict"] != "passed"])
+
+
+def _health(health: Sequence[Mapping[str, Any]]) -> list[str]:
+    return _prose([f"{h['severity']}: {h['log']}, {h['where']}: {h['what']}; {h['consequence']}" for h in health])
+
+
+def _table(rows: Sequence[Sequence[str]], *, left: Sequence[int]) -> list[str]:
+    """Rows in aligned columns, flush right except those named."""
+    columns = []
+    for i, column in enumerate(zip(*rows, strict=True)):
+        width = max(map(len, column))
+        columns.append([cell.ljust(width) if i in left else cell.rjust(width) for cell in column])
+    return ["  ".join(row) for row in zip(*columns, strict=True)]

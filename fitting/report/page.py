@@ -1,0 +1,70 @@
+"""The report as a page that reads without a network."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+from plotly.offline import get_plotlyjs
+
+from fitting import formatting
+from fitting.plots import Plot
+from fitting.report.separating import plain_family
+from fitting.report.summary import chance
+from fitting.report.tables import changes, parameter_rows
+
+
+def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
+    """The page: self-contained, reads without a network.
+
+    Args:
+        report: from [`report_dict`][].
+        pictures: from [`fitting.plots.plots`][].
+    """
+    environment = Environment(
+        loader=PackageLoader("fitting", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # `tojson` writes <, >, & and ' as escapes, so that no name can end the script.
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    environment.filters |= {
+        "quantity": formatting.quantity,
+        "number": formatting.number,
+        "percent": formatting.percent,
+        "unit": formatting.pretty_unit,
+        "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
+        "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
+        "interval_in_factor": lambda p, factor: formatting.interval_in_factor(p["ci95"], p["std"], factor),
+        "interval": lambda p: formatting.interval(p["ci95"], p["std"], p["unit"]),
+        "family": plain_family,
+        "code": _code,
+        "p_value": formatting.p_value,
+        "symbol": _symbol,
+    }
+    final = report["after"] if report["after"]["parameters"] else report["before"]
+    template = "fit.html.jinja" if report["decision"] == "fit_only" else "loop.html.jinja"
+    return environment.get_template(template).render(
+        report=report,
+        noise=report["noise"]["dynamic_error"],
+        x_unit=report["units"]["dynamic_error"],
+        chance=lambda effect: chance(effect, report),
+        rows=parameter_rows(report, final),
+        changes=changes(report),
+        sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found")},
+        plotlyjs=Markup(get_plotlyjs()),
+    )
+
+
+def _code(text: str) -> Markup:
+    """Text with its `backticked` parts as code."""
+    parts = re.split(r"`([^`]*)`", text)
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else escape(p) for i, p in enumerate(parts))
+
+
+def _symbol(path: str) -> Markup:
+    """A parameter's path, breakable after its dot."""
+    return Markup("<code>{}</code>").format(Markup(".<wbr>").join(path.split(".")))

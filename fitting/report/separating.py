@@ -1,0 +1,111 @@
+"""Which experiment tells two families of effects apart."""
+
+_PLAIN_FAMILY = {"torque_sensor": "torque sensor error", "unknown": "unknown term"}
+
+
+# Which experiment separates two families; symmetric. Restates the look-alike column of EFFECTS.md.
+_SEPARATING = {
+    ("kinematic_error", "cogging"): "Run at two constant speeds: the force behind a geometric error grows with the "
+    "square of the speed, a cogging torque stays the same.",
+    ("kinematic_error", "encoder_eccentricity"): "Pass slowly through the speed at which the order meets the natural "
+    "frequency: a kinematic error is amplified there, an encoder's error is not.",
+    ("kinematic_error", "position_dependent_stiffness"): "Step the mean torque at one speed: a ripple of the stiffness "
+    "grows with it, a kinematic error does not.",
+    (
+        "kinematic_error",
+        "load_disturbance",
+    ): "Change the motor speed: an error of the gear moves with it, a disturbance stays at its frequency.",
+    ("cogging", "load_disturbance"): "Change the motor speed: cogging moves with it, a disturbance stays at its "
+    "frequency.",
+    ("cogging", "encoder_eccentricity"): "Lock the output and turn the motor slowly by hand: cogging takes torque, an "
+    "encoder's error does not.",
+    ("cogging", "position_dependent_friction"): "Run the same path in both directions: friction changes its sign, "
+    "cogging does not.",
+    ("stiffness_shape", "stiffness_shape"): "Drive to larger twists, past the knee of the stiffness, in both "
+    "directions.",
+    ("stiffness_shape", "backlash"): "Repeat with a preload: a dead zone disappears, a bent stiffness stays.",
+    ("stiffness_shape", "hysteresis"): "Cycle the torque slowly at several amplitudes: hysteresis opens a loop, a bent "
+    "stiffness retraces its curve.",
+    ("stiffness_shape", "nonlinear_damping"): "Cycle the torque slowly: damping vanishes with the rate, stiffness does "
+    "not.",
+    ("backlash", "hysteresis"): "Repeat with a preload: a dead zone disappears, hysteresis stays.",
+    ("backlash", "coulomb_friction"): "Repeat with a preload: a dead zone disappears, friction stays.",
+    ("hysteresis", "coulomb_friction"): "Cycle the torque as a slow triangle at three rates, with small loops inside "
+    "large ones: hysteresis has a slope before it slides and remembers its reversals.",
+    ("hysteresis", "nonlinear_damping"): "Repeat the same twist at three rates: the area of a hysteresis loop stays, "
+    "that of a damping loop grows with the rate.",
+    ("hysteresis", "motor_friction"): "Lock the output and cycle the torque slowly: what the motor's own friction "
+    "takes does not reach the twist, hysteresis shows in torque against twist.",
+    ("hysteresis", "creep"): "Stop under load and wait: creep goes on for minutes, hysteresis does not.",
+    ("coulomb_friction", "motor_friction"): "Turn the motor at constant speed, unloaded: its friction takes torque, "
+    "friction between the mesh's sides does not.",
+    ("coulomb_friction", "load_friction"): "Drive one side at a time, the other one locked.",
+    ("coulomb_friction", "nonlinear_damping"): "Excite at several levels: the loss per cycle grows more slowly than "
+    "the amplitude squared with Coulomb friction, and faster with nonlinear damping.",
+    ("motor_friction", "motor_friction"): "Reverse slowly and dwell near standstill, where the two laws differ.",
+    ("motor_friction", "load_friction"): "Drive one side at a time, the other one locked or uncoupled.",
+    ("motor_friction", "torque_sensor"): "Run the same path in both directions: friction changes its sign, a bias does "
+    "not.",
+    ("motor_friction", "nonlinear_damping"): "Turn at several constant speeds: motor friction takes torque, damping of "
+    "the mesh does not.",
+    ("motor_friction", "position_dependent_friction"): "Turn slowly over several revolutions: a ripple that repeats "
+    "with the angle belongs to the position.",
+    ("position_dependent_friction", "kinematic_error"): "Run the same path in both directions: friction changes its "
+    "sign, a kinematic error keeps its phase.",
+    ("gravity_load", "torque_sensor"): "Turn the mount, or add a known mass: gravity follows, a sensor's bias does "
+    "not.",
+    ("gravity_load", "encoder_eccentricity"): "Turn the mount: gravity keeps to the vertical, the encoder's error to "
+    "its disc.",
+    ("gravity_load", "load_disturbance"): "Rest in several poses: gravity depends on the pose, not on time.",
+    ("load_disturbance", "extra_resonance"): "Switch the excitation off, or change the load's inertia: a resonance "
+    "needs the one and moves with the other.",
+    ("temperature", "creep"): "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays "
+    "away.",
+    ("temperature", "hysteresis"): "Cool down and repeat: thermal drift goes back to where it was.",
+    ("torque_sensor", "torque_sensor"): "Rest without load, then apply a known torque: bias shows in the one, gain in "
+    "the other.",
+    ("input_delay", "nonlinear_damping"): "Excite up to several times the natural frequency: the phase of a delay "
+    "keeps growing, that of damping saturates.",
+    ("input_delay", "input_delay"): "Log the torque faster, or state its hold in the drive file.",
+}
+
+
+# Where the pair is not in the table: what brings out one family.
+_REVEALING = {
+    "kinematic_error": "repeat at two speeds and look for amplification at the natural frequency",
+    "stiffness_shape": "cycle the torque slowly to larger twists",
+    "backlash": "repeat with a preload, which removes a dead zone",
+    "hysteresis": "cycle the torque slowly at three rates, with small loops inside large ones",
+    "coulomb_friction": "let the drive ring down freely: the envelope falls along a straight line",
+    "motor_friction": "run the same path in both directions at several constant speeds",
+    "load_friction": "drive one side at a time, the other one locked",
+    "nonlinear_damping": "excite at the natural frequency at several levels",
+    "position_dependent_stiffness": "step the mean torque",
+    "position_dependent_friction": "run the same path in both directions",
+    "cogging": "turn slowly at two constant speeds",
+    "gravity_load": "turn the mount, or add a known mass",
+    "load_disturbance": "repeat at another motor speed and without excitation",
+    "extra_resonance": "change the load's inertia",
+    "temperature": "cool down and repeat",
+    "torque_sensor": "reverse the direction, and check the sensor with a known torque",
+    "input_delay": "excite up to several times the natural frequency",
+    "encoder_eccentricity": "pass slowly through the natural frequency",
+    "creep": "stop under load and wait for minutes",
+}
+
+
+def separating_experiment(one: str, other: str) -> str:
+    """The experiment that tells two families apart."""
+    known = _SEPARATING.get((one, other)) or _SEPARATING.get((other, one))
+    if known:
+        return known
+    hints = [f"for {plain_family(f)}, {_REVEALING[f]}" for f in dict.fromkeys((one, other)) if f in _REVEALING]
+    if not hints:
+        return "Repeat at another amplitude, speed and mean torque."
+    sentence = "; ".join(hints)
+    return f"{sentence[0].upper()}{sentence[1:]}."
+
+
+def plain_family(family: str) -> str:
+    """A family's name in prose."""
+    return _PLAIN_FAMILY.get(family, family.replace("_", " "))

@@ -1,0 +1,76 @@
+"""The decision in plain words."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fitting import formatting
+from fitting.report.separating import plain_family
+
+_COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
+
+
+def summary(report: Mapping[str, Any]) -> str:
+    """The decision in plain words."""
+    unit = report["units"]["dynamic_error"]
+    noise = report["noise"]["dynamic_error"]
+    before = report["before"]["rmse"]["validation"]
+    after = report["after"]["rmse"]["validation"]
+    families = list(dict.fromkeys(e["family"] for e in report["after"]["effects"]))
+    found = formatting.words([plain_family(f) for f in families]) if families else ""
+    decision = report["decision"]
+    if decision == "fit_only":
+        return f"The base model was fitted. On held-out data it errs by {_against_noise(before, noise, unit)}."
+    if decision == "model_sufficient":
+        return (
+            f"The model suffices: on held-out data it errs by {_against_noise(before, noise, unit)}, and none of the "
+            f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
+        )
+    if decision == "effect_found":
+        opening = (
+            "A missing effect was found"
+            if len(families) == 1
+            else f"{_count(len(families))} missing effects were found"
+        )
+        return (
+            f"{opening}: {found}. {'It removes' if len(families) == 1 else 'Together they remove'} "
+            f"{_removed(before, after)} of the held-out error, which falls from {_rmse(before, unit)} to "
+            f"{_against_noise(after, noise, unit, like=before)}."
+        )
+    left = report["unexplained"]
+    opening = "Something is missing that the catalogue does not explain."
+    if families:
+        opening = f"A part was found ({found}), but something else is missing that the catalogue does not explain."
+    return (
+        f"{opening} What is left over is {formatting.number(left['times_noise'])} times the measurement noise, and "
+        f"depends most on the {left['depends_on']} (which accounts for "
+        f"{formatting.percent(left['explained_share'])} of it)."
+    )
+
+
+def _count(number: int) -> str:
+    return _COUNTS[number] if number < len(_COUNTS) else str(number)
+
+
+def _rmse(value: float | None, unit: str, like: float | None = None) -> str:
+    return "a simulation that diverged" if value is None else formatting.quantity(value, unit, like=like)
+
+
+def _against_noise(value: float | None, noise: float, unit: str, like: float | None = None) -> str:
+    if value is None:
+        return _rmse(value, unit)
+    return f"{_rmse(value, unit, like)} rms ({formatting.number(value / noise)} times the measurement noise)"
+
+
+def _removed(before: float | None, after: float | None) -> str:
+    if before is None or after is None:
+        return "much"
+    return formatting.percent(1.0 - after / before)
+
+
+def chance(effect: Mapping[str, Any], report: Mapping[str, Any]) -> str:
+    """The p-value, with a sign where fewer draws than it would take were made."""
+    p = effect["p_value"]
+    smallest = 1.0 / (1 + report["surrogates"])
+    if p is None:
+        return "p unknown"
+    return f"p {'≤' if p <= 1.001 * smallest else '='} {p:.2g}"

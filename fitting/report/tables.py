@@ -1,0 +1,61 @@
+"""The rows of the page's tables."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fitting import formatting
+
+FIGURES = {
+    "omega_0": ("ω₀", "natural frequency at small twist"),
+    "natural_frequency": ("f₀", "natural frequency at small twist"),
+    "mu": ("μ", "damping of the twist"),
+    "zeta": ("ζ", "damping ratio, μ / (2 ω₀)"),
+    "nonlinear_share": ("α x²", "cubic share of the restoring torque at the largest measured twist"),
+    "stiffness_at_full_twist": ("K(1 + 3 α x²)", "stiffness at the largest measured twist"),
+}
+"""Symbol and meaning of what follows from a drive's parameters."""
+
+
+def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The drive's parameters and what follows from them, each with the unit in which its numbers read well."""
+    rows = []
+    entries = [(p, p, e["description"], "parameters", e) for p, e in final["parameters"].items()]
+    entries += [(k, *FIGURES[k], "derived", e) for k, e in final["derived"].items()]
+    for key, symbol, meaning, kind, estimate in entries:
+        factor, unit = formatting.scaled_unit(abs(estimate["value"] or 0.0), estimate["unit"])
+        before = report["before"][kind][key]
+        rows.append(
+            {
+                "symbol": symbol,
+                "derived": kind == "derived",
+                "meaning": meaning,
+                "unit": unit,
+                "factor": factor,
+                "before": before,
+                "final": {"note": None} | estimate,
+                "flagged": kind == "parameters" and (estimate["at_bound"] or not estimate["identifiable"]),
+            }
+        )
+    return rows
+
+
+def changes(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The drive's parameters without and with what was found."""
+    if not report["after"]["effects"]:
+        return []
+    rows = []
+    for path, with_it in report["after"]["parameters"].items():
+        without = report["before"]["parameters"].get(path)
+        if without is None or None in (without["value"], with_it["value"]):
+            continue
+        change = with_it["value"] - without["value"]
+        rows.append(
+            {
+                "path": path,
+                "without": without,
+                "with": with_it,
+                "relative": change / abs(without["value"]) if without["value"] else None,
+                "in_std": change / without["std"] if without["std"] else None,
+            }
+        )
+    return rows

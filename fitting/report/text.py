@@ -1,0 +1,58 @@
+"""The report on a terminal."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fitting import formatting
+from fitting.formatting import plain
+from fitting.report.fit_text import fit_lines
+from fitting.report.summary import chance
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """A compact summary for the terminal.
+
+    Args:
+        report: from [`report_dict`][].
+    """
+    return "\n".join(fit_lines(report) if report["decision"] == "fit_only" else _loop_lines(report))
+
+
+def _loop_lines(report: Mapping[str, Any]) -> list[str]:
+    unit = report["units"]["dynamic_error"]
+    final = report["after"] if report["after"]["parameters"] else report["before"]
+    lines = ["[Decision]", f"    {report['summary']}", "[Rms error of the free runs]"]
+    shown = [("model", report["before"])]
+    if report["after"]["effects"]:
+        shown = [("before", report["before"]), ("after", report["after"])]
+    lines.append("    " + " " * 12 + "".join(f"{n:>14}" for n, _ in shown))
+    for key, label in (("training", "training"), ("validation", "held out")):
+        values = "".join(f"{plain(a['rmse'][key]):>14}" for _, a in shown)
+        lines.append(f"    {label:12}{values} {unit}")
+    lines.append(f"    {'noise':12}{plain(report['noise']['dynamic_error']):>14} {unit}")
+    lines.append("[Parameters]")
+    lines += _parameter_lines(final["parameters"])
+    for effect in report["after"]["effects"]:
+        gain = formatting.percent(effect["validation_gain"])
+        lines.append(f"[Effect: {effect['name']}] {effect['family']}, gain {gain}, {chance(effect, report)}")
+        lines += _parameter_lines(effect["parameters"])
+    for other in report["alternatives"]:
+        kind = "ruled out" if other["separable"] else "TIE"
+        lines.append(f"[Alternative: {other['name']}] {kind}. {other['separating_experiment']}")
+    for note in report["cannot_tell"]:
+        lines.append(f"[Note] {note}")
+    return lines
+
+
+def _parameter_lines(parameters: Mapping[str, Any]) -> list[str]:
+    width = max((len(p) for p in parameters), default=0)
+    return [f"    {path:{width}}  {_parameter_line(estimate)}" for path, estimate in parameters.items()]
+
+
+def _parameter_line(estimate: Mapping[str, Any]) -> str:
+    value, std = estimate["value"], estimate["std"]
+    low, high = estimate["ci95"]
+    share = f" ({100 * std / abs(value):.2g} %)" if value and std is not None else ""
+    flag = "" if estimate["identifiable"] else "  NOT IDENTIFIABLE"
+    unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"
+    return f"{plain(value, 6)} +/- {plain(std, 2)}{share}{unit}  [{plain(low, 6)}, {plain(high, 6)}]{flag}"

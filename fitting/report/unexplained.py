@@ -1,0 +1,33 @@
+"""How much a model leaves over, and on what it depends most."""
+
+from typing import Any
+
+import numpy as np
+
+from fitting.close_loop import Loop
+from fitting.diagnostics import Dependence
+from fitting.report.outcome import Outcome
+
+
+def unexplained(outcome: Outcome, noise: float) -> dict[str, Any] | None:
+    """How much is left over, and on what it depends most; None where that is not the decision."""
+    if not isinstance(outcome, Loop) or outcome.decision != "unexplained":
+        return None
+    residual = outcome.residual_after
+    shares = {name: explained_share(d, residual.rms) for name, d in residual.dependence.items()}
+    most = max(shares, key=lambda name: shares[name])
+    words = {"x": "dynamic error", "v": "rate of the dynamic error"}
+    return {
+        "rms": residual.rms,
+        "times_noise": residual.rms / noise,
+        "depends_on": words.get(most, most),
+        "explained_share": shares[most],
+        "explained_shares": shares,
+    }
+
+
+def explained_share(dependence: Dependence, rms: float) -> float:
+    """Share of the residual's mean square that its mean over bins of a quantity accounts for."""
+    # Means of bins scatter even where nothing depends on anything; that is taken off.
+    square = np.mean(dependence.mean**2 - dependence.standard_error**2)
+    return float(np.clip(square / rms**2, 0.0, 1.0)) if rms > 0 else 0.0

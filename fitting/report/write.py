@@ -1,0 +1,92 @@
+"""Reports on disk: all files, whole, or none."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fitting import findings
+from fitting.close_loop import Loop
+from fitting.files import write_whole
+from fitting.fit_only import FitOnly
+from fitting.plots import Plot, fit_plots, plots
+from fitting.report.content import report_dict
+from fitting.report.outcome import Outcome
+from fitting.report.page import report_page
+from fitting.report.text import report_text
+from fitting.rig import Rig
+
+
+def write_report(
+    out_dir: str | os.PathLike[str],
+    outcome: Outcome,
+    *,
+    model_json: str,
+    units: Mapping[str, str] | None = None,
+    health: Sequence[tuple[str, findings.Finding]] = (),
+    name: str = "drive",
+) -> dict[str, Path]:
+    """Write `report.html`, `report.json` and `model.json`: all of them, whole, or none.
+
+    Args:
+        out_dir: folder; made where absent.
+        outcome: of the loop or of a fit.
+        model_json: the fitted model, as `hdjax predict` reads it.
+        units: see [`report_dict`][].
+        health: see [`report_dict`][].
+        name: the drive's.
+
+    Returns:
+        The files' paths, by name.
+    """
+    report = report_dict(outcome, units=units, health=health, name=name)
+    texts = {
+        "report.html": report_page(report, _pictures(outcome, report)),
+        "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
+        "model.json": model_json,
+    }
+    paths = {file: Path(out_dir) / file for file in texts}
+    write_whole({paths[file]: text for file, text in texts.items()})
+    return paths
+
+
+def write_loop_report(out_dir: str | os.PathLike[str], loop: Loop, *, rig: Rig, model_json: str) -> dict[str, Path]:
+    """[`write_report`][] of a loop on a rig's logs."""
+    return write_report(out_dir, loop, model_json=model_json, **_of_rig(rig))
+
+
+def write_fit_report(
+    out_dir: str | os.PathLike[str],
+    fitted: FitOnly,
+    *,
+    rig: Rig,
+    model_json: str,
+) -> dict[str, Path]:
+    """[`write_report`][] of a fit of a rig's logs."""
+    return write_report(out_dir, fitted, model_json=model_json, **_of_rig(rig))
+
+
+def loop_text(loop: Loop, *, rig: Rig) -> str:
+    """[`report_text`][] of a loop on a rig's logs."""
+    return report_text(report_dict(loop, **_of_rig(rig)))
+
+
+def fit_text(fitted: FitOnly, *, rig: Rig) -> str:
+    """[`report_text`][] of a fit of a rig's logs."""
+    return report_text(report_dict(fitted, **_of_rig(rig)))
+
+
+def _of_rig(rig: Rig) -> dict[str, Any]:
+    """What a report says of the drive and its logs."""
+    return {
+        "name": rig.name,
+        "units": rig.logs[0].units,
+        "health": [(log, finding) for log, found in rig.findings.items() for finding in found],
+    }
+
+
+def _pictures(outcome: Outcome, report: Mapping[str, Any]) -> list[Plot]:
+    if isinstance(outcome, Loop):
+        return plots(outcome, units=report["units"])
+    return fit_plots(outcome, units=report["units"])

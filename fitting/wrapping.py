@@ -1,0 +1,92 @@
+"""Channels that wrap: angles that start anew at each revolution, counters and integers that overflow."""
+
+import numpy as np
+
+_BITS = (8, 10, 12, 13, 14, 16, 17, 18, 19, 20, 21, 22, 23, 24, 31, 32)
+_OVERFLOWS = (12, 16, 32)
+_FINEST = 1e-9
+
+
+def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, float, np.ndarray]:
+    """An angle without its jumps.
+
+    Args:
+        values: as logged, NaN where unknown, (n,).
+        revolution: in the same unit.
+
+    Returns:
+        The angle that runs on, the span of a jump (0 where there is none), and the rows that jump.
+    """
+    spans = [revolution]
+    if _whole(values, 1.0):
+        spans += [2.0**bits for bits in _BITS]
+    for span in sorted(spans):
+        jumps = _jumps(values, span)
+        if jumps is None:
+            continue
+        step = _step(values)
+        folded = step - span * np.rint(step / span)
+        change = np.abs(np.diff(folded))
+        # A shaft's speed does not jump by an eighth of a revolution from one sample to the next.
+        if np.max(np.abs(folded)) < span / 4 and np.quantile(change, 0.999) < span / 8:
+            return _without(values, jumps, span), span, np.flatnonzero(jumps) + 1
+    return values, 0.0, np.zeros(0, dtype=int)
+
+
+def unwrapped_overflow(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """A slow signal whose integers overflowed; arguments and returns as in [`unwrapped_angle`][]."""
+    grid = _grid(values)
+    for bits in _OVERFLOWS if grid > 0 else ():
+        span = grid * 2.0**bits
+        jumps = _jumps(values, span)
+        if jumps is None:
+            continue
+        step = np.abs(_step(values))
+        folded = np.abs(step - span)[jumps]
+        usual = np.quantile(step[~jumps], 0.99)
+        # A switched input jumps as far, but neither lands on the other end nor is smooth elsewhere.
+        if usual < span / 20 and folded.max() <= 3 * usual + grid:
+            return _without(values, jumps, span), span, np.flatnonzero(jumps) + 1
+    return values, 0.0, np.zeros(0, dtype=int)
+
+
+def _step(values: np.ndarray) -> np.ndarray:
+    """Differences of the known values, those across unknown ones at the row that follows."""
+    known = np.flatnonzero(np.isfinite(values))
+    step = np.zeros(len(values) - 1)
+    step[known[1:] - 1] = np.diff(values[known])
+    return step
+
+
+def _jumps(values: np.ndarray, span: float) -> np.ndarray | None:
+    """Which steps are longer than half a span, where the values fit into one; None where there are none."""
+    known = values[np.isfinite(values)]
+    if len(known) < 3 or not 0.5 * span < np.ptp(known) <= span * (1 + _FINEST):
+        return None
+    jumps = np.abs(_step(values)) > 0.5 * span
+    return jumps if jumps.any() else None
+
+
+def _without(values: np.ndarray, jumps: np.ndarray, span: float) -> np.ndarray:
+    turns = np.where(jumps, np.rint(_step(values) / span), 0.0)
+    return values - span * np.concatenate(([0.0], np.cumsum(turns)))
+
+
+def _whole(values: np.ndarray, grid: float) -> bool:
+    known = values[np.isfinite(values)] / grid
+    return len(known) > 0 and bool(
+        np.all(np.abs(known - np.rint(known)) < 1e-6 * np.maximum(1.0, np.abs(known) * 1e-6))
+    )
+
+
+def _grid(values: np.ndarray) -> float:
+    """The step between the levels of a channel that came from integers, or 0."""
+    levels = np.unique(values[np.isfinite(values)])
+    if len(levels) < 16:
+        return 0.0
+    gaps = np.diff(levels)
+    grid = float(gaps[gaps > _FINEST * np.ptp(levels)].min(initial=np.inf))
+    if not np.isfinite(grid):
+        return 0.0
+    counts = levels / grid
+    return grid if np.mean(np.abs(counts - np.rint(counts)) < 0.05) > 0.99 else 0.0

@@ -1,0 +1,46 @@
+"""Programs of many lanes: compiled for wide vectors, and shared among the devices of this machine."""
+
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+_Tree = TypeVar("_Tree")
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+# A Runge-Kutta step's stages then fit into the registers of a processor that has such: twice as fast.
+_WIDE: Any = {"compiler_options": {"xla_cpu_prefer_vector_width": 512}}
+# With fewer lanes to each device, what the devices tell each other would take longer than what they save.
+_LEAST_LANES = 8
+
+
+def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """`eqx.filter_jit` for programs whose lanes [`hdjax.simulate.march`][] moves. None can be called inside another."""
+    return eqx.filter_jit(function, **_WIDE)
+
+
+def spread(tree: _Tree, lanes: int) -> _Tree:
+    """Share the lanes of arrays among the devices of this process; every other array is on each of them.
+
+    Compiled programs follow where their arrays are. Everything stays where it is on one device, where the lanes are
+    few or can't be shared evenly, and where `jax.default_device` names a device.
+
+    Args:
+        tree: arrays whose first axis is `lanes` long carry one lane a row.
+        lanes: how many there are.
+    """
+    if jax.config.jax_default_device is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return tree
+    devices = jax.local_devices()
+    while len(devices) > 1 and (lanes % len(devices) or lanes // len(devices) < _LEAST_LANES):
+        devices = devices[:-1]
+    if len(devices) == 1:
+        return tree
+    mesh = Mesh(np.array(devices), ("lanes",), axis_types=(AxisType.Auto,))
+    shared, everywhere = NamedSharding(mesh, PartitionSpec("lanes")), NamedSharding(mesh, PartitionSpec())
+    arrays, rest = eqx.partition(tree, eqx.is_array)
+    places = jax.tree.map(lambda a: shared if a.ndim and a.shape[0] == lanes else everywhere, arrays)
+    return eqx.combine(jax.device_put(arrays, places), rest)

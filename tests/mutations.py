@@ -1,0 +1,322 @@
+"""Logs and drive files spoilt in every way that a seed picks: bytes, columns, units, types, sizes, shapes."""
+
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import polars as pl
+import scipy.io
+
+import rig
+
+Table = dict[str, np.ndarray]
+Random = np.random.Generator
+
+ROWS = 600
+DRIVE = {
+    "drive": {"name": '"rig"', "reduction_ratio": "50", "motor_inertia": "5.26e-4", "load_inertia": "5.0e-2"},
+    "signals": {"torque_hold": '"zero-order"'},
+    "columns": {},
+}
+
+
+def healthy(seed: int) -> Table:
+    """Columns of a drive log or, now and then, a reduced one."""
+    if seed % 5 == 4:
+        forcing = rig.reduced_forcing(ROWS, seed=seed)
+        log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0], forcing, noise=1e-3, seed=seed)
+        return {"time": log.time.copy(), "dynamic_error": log.dynamic_error, "forcing": forcing}
+    torque = rig.drive_torque(ROWS, seed=seed)
+    log = rig.drive_log(rig.drive_motion(torque), torque, seed=seed)
+    return {
+        "time": log.time.copy(),
+        "motor_angle": log.motor_angle.copy(),
+        "load_angle": log.load_angle.copy(),
+        "motor_torque": torque,
+    }
+
+
+def _some(random: Random, table: Table) -> str:
+    return str(random.choice(list(table)))
+
+
+def _places(random: Random, table: Table) -> np.ndarray:
+    return random.integers(0, ROWS, int(random.choice([1, 5, 60, 300])))
+
+
+def _put(random: Random, table: Table) -> None:
+    value = random.choice([np.nan, np.inf, -np.inf, 0.0, 1e300, -1e300, 1e-300, 1e12, -1.0, 9.96920996838687e36])
+    table[_some(random, table)][_places(random, table)] = value
+
+
+def _scale(random: Random, table: Table) -> None:
+    factors = [0.0, -1.0, 1e3, 1e-3, 57.3, 1e9, 1e-9, 1e200, 1e-200, 1e308, np.inf, np.nan, 50.0]
+    table[_some(random, table)] *= random.choice(factors)
+
+
+def _shift(random: Random, table: Table) -> None:
+    table[_some(random, table)] += random.choice([1.0, -0.03, 1e6, 1.7e9, 1.7e18, 1e300])
+
+
+def _constant(random: Random, table: Table) -> None:
+    table[_some(random, table)][:] = random.choice([0.0, 1.0, np.nan, 1e300])
+
+
+def _swap(random: Random, table: Table) -> None:
+    a, b = _some(random, table), _some(random, table)
+    table[a], table[b] = table[b], table[a]
+
+
+def _drop_column(random: Random, table: Table) -> None:
+    del table[_some(random, table)]
+
+
+def _rename(random: Random, table: Table) -> None:
+    odd = ["", " ", "a,b", "a\nb", '"', "tïme", "x" * 500, "1", "nan", "time", "motor_angle [deg]", "\x1b[31m", "a/b"]
+    name = _some(random, table)
+    table[str(random.choice(odd))] = table.pop(name)
+
+
+def _wrap(random: Random, table: Table) -> None:
+    name, span = _some(random, table), random.choice([2 * np.pi, 1.0, 360.0, 0.01])
+    table[name] = np.mod(table[name], span)
+
+
+def _round(random: Random, table: Table) -> None:
+    name = _some(random, table)
+    step = random.choice([1e-3, 1e-6, 1.0, 1e-2]) * max(float(np.ptp(table[name])), 1e-300)
+    table[name] = np.rint(table[name] / step) * step
+
+
+def _clip(random: Random, table: Table) -> None:
+    name = _some(random, table)
+    table[name] = np.clip(table[name], *np.sort(random.choice(table[name], 2)))
+
+
+def _rows(random: Random, table: Table) -> None:
+    """Rows lost, doubled, shuffled, reversed, or nearly all of them gone."""
+    count = len(next(iter(table.values()), np.zeros(0)))
+    order = np.arange(count)
+    how = int(random.integers(7))
+    if how == 0:
+        order = np.delete(order, random.integers(0, max(1, count), 9) % max(1, count)) if count else order
+    elif how == 1:
+        order = np.sort(np.concatenate([order, order[::7]]))
+    elif how == 2:
+        order = random.permutation(order)
+    elif how == 3:
+        order = order[::-1]
+    elif how == 4:
+        order = order[: int(random.choice([0, 1, 2, 199, 201]))]
+    elif how == 5:
+        order = np.concatenate([order, order])
+    else:
+        order = np.delete(order, slice(count // 3, count // 2))
+    for name in table:
+        table[name] = table[name][order[order < len(table[name])]]
+
+
+def _jitter(random: Random, table: Table) -> None:
+    if "time" in table:
+        step = np.median(np.abs(np.diff(table["time"]))) if len(table["time"]) > 1 else 1.0
+        table["time"] = table["time"] + step * random.choice([0.1, 0.6, 3.0, 100.0]) * random.normal(
+            size=len(table["time"])
+        )
+
+
+def _clock(random: Random, table: Table) -> None:
+    if "time" in table:
+        ticks = table["time"] * random.choice([1.0, 1e3, 1e6]) + random.choice([0.0, 65536 - 100, 2.0**32 - 1e5])
+        table["time"] = np.mod(ticks, random.choice([65536.0, 2.0**32, 2.0**16 * 1e-3]))
+
+
+def _single(random: Random, table: Table) -> None:
+    with np.errstate(all="ignore"):
+        name = _some(random, table)
+        table[name] = table[name].astype(random.choice(["f4", "i4", "i2", "?", "u8"])).astype(float)
+
+
+COLUMNS: tuple[Callable[[Random, Table], None], ...] = (
+    _put,
+    _scale,
+    _shift,
+    _constant,
+    _swap,
+    _drop_column,
+    _rename,
+    _wrap,
+    _round,
+    _clip,
+    _rows,
+    _jitter,
+    _clock,
+    _single,
+)
+
+
+def _text(random: Random, table: Table) -> bytes:
+    delimiter = str(random.choice([",", ";", "\t", "|", " "]))
+    comma = delimiter != "," and random.random() < 0.4
+    count = max((len(c) for c in table.values()), default=0)
+    lines = [delimiter.join(table)]
+    if random.random() < 0.2:
+        lines.append(delimiter.join(str(random.choice(["s", "rad", "deg", "N m", "?", "1"])) for _ in table))
+    for i in range(count):
+        cells = [f"{c[i]:.9g}" if i < len(c) else "" for c in table.values()]
+        lines.append(delimiter.join(c.replace(".", ",") if comma else c for c in cells))
+    for _ in range(int(random.choice([0, 0, 1, 5, 50]))):
+        odd = ["", "#", ",,,,,,", "overload", '"', "\x00", "1;2;3", "1" * 400, "é", "12:00:00", "'", "\t" * 50]
+        lines.insert(int(random.integers(0, len(lines) + 1)), str(random.choice(odd)))
+    ending = str(random.choice(["\n", "\r\n", "\r", delimiter + "\n"]))
+    return (ending.join(lines) + ending).encode(
+        str(random.choice(["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])), errors="replace"
+    )
+
+
+def _shape(random: Random, values: np.ndarray) -> object:
+    kind = int(random.integers(12))
+    shapes: dict[int, object] = {
+        0: values[None, :],
+        1: values[:, None],
+        2: np.stack([values, values], axis=1),
+        3: values.astype(complex),
+        4: values.astype("f4"),
+        5: "text",
+        6: {"a": {"b": values}},
+        7: values[: len(values) // 2],
+        8: np.zeros((0, 3)),
+    }
+    return shapes.get(kind, values)
+
+
+def _mat(random: Random, table: Table, path: Path) -> None:
+    held = {
+        k if k.isascii() and k.isidentifier() and not k.startswith("_") else f"v{i}": v
+        for i, (k, v) in enumerate(table.items())
+    }
+    content: dict[str, object] = {k[:31]: _shape(random, v) if random.random() < 0.2 else v for k, v in held.items()}
+    if random.random() < 0.3:
+        for _ in range(int(random.choice([1, 3, 20]))):
+            content = {"nest": content}
+    scipy.io.savemat(path, content | {"fs": float(random.choice([2000.0, 0.0, np.nan, 1e300]))})
+
+
+def _hdf5(random: Random, table: Table, path: Path) -> None:
+    group = "/".join(["g"] * int(random.choice([0, 0, 1, 40])))
+    with h5py.File(path, "w") as file:
+        for i, (name, values) in enumerate(table.items()):
+            value = _shape(random, values) if random.random() < 0.2 else values
+            plain = "".join(c for c in name if c.isalnum() or c == "_") or f"v{i}"
+            place = f"{group}/{plain[:60]}" if group else plain[:60]
+            if not isinstance(value, dict) and place not in file:
+                file[place] = value
+                file[place].attrs["unit"] = str(random.choice(["", "", "", "", "rad", "bogus", "9**9**9"]))
+
+
+def write(random: Random, table: Table, folder: Path) -> Path:
+    """A log file of any format."""
+    kind = str(random.choice(["csv", "csv", "csv", "tsv", "txt", "csv.gz", "mat", "h5", "parquet"]))
+    path = folder / f"log.{kind}"
+    if kind == "mat":
+        _mat(random, table, path)
+    elif kind == "h5":
+        _hdf5(random, table, path)
+    elif kind == "parquet":
+        count = min((len(c) for c in table.values()), default=0)
+        pl.DataFrame({k: v[:count] for k, v in table.items()}).write_parquet(path)
+    else:
+        raw = _text(random, table)
+        path.write_bytes(gzip.compress(raw) if kind.endswith("gz") else raw)
+    return path
+
+
+def damage(random: Random, path: Path) -> Path:
+    """Bytes flipped, cut, put in, or the suffix changed."""
+    raw = bytearray(path.read_bytes())
+    how = int(random.integers(6))
+    if how == 0 and raw:
+        for place in random.integers(0, len(raw), int(random.choice([1, 10, 200]))):
+            raw[place] = int(random.integers(256))
+    elif how == 1:
+        raw = raw[: int(random.integers(0, len(raw) + 1))]
+    elif how == 2:
+        place = int(random.integers(0, len(raw) + 1))
+        raw[place:place] = random.bytes(int(random.choice([1, 100, 5000])))
+    elif how == 3:
+        raw = raw[int(random.integers(0, len(raw) + 1)) :]
+    elif how == 4:
+        raw = bytearray(random.bytes(int(random.choice([0, 1, 2000]))))
+    path.write_bytes(bytes(raw))
+    if how == 5:
+        path = path.rename(
+            path.with_name(f"log{random.choice(['.csv', '.mat', '.h5', '.parquet', '.gz', '.xyz', ''])}")
+        )
+    return path
+
+
+def drive_text(random: Random, spoilt: bool) -> bytes:
+    """A drive file, with whatever nonsense in it."""
+    content = {table: dict(keys) for table, keys in DRIVE.items()}
+    odd = [
+        "1e400",
+        "-1",
+        "0",
+        "nan",
+        "inf",
+        "true",
+        '""',
+        '"a\\nb"',
+        "[1, 2]",
+        "{ a = 1 }",
+        "0x" + "f" * 6000,
+        "1979-05-27",
+        '"5 kg m^2"',
+        '"9**9**9"',
+        '"rev / 16777216"',
+        '{ column = "time", unit = "deg" }',
+        '{ unit = "9^9^9^9" }',
+        '{ column = "", sign = -1 }',
+        '{ column = "motor_angle", unit = "1e-300 rad" }',
+        "{ offset = 1e300 }",
+        '{ column = "motor_torque", unit = "mN m", sign = -1, offset = 3 }',
+        '{ time = "time" }',
+        '"time"',
+        '{ unit = "ms" }',
+    ]
+    keys = ["reduction_ratio", "motor_inertia", "load_inertia", "name", "torque_hold", "sample_rate", "nonsense"]
+    keys += ["time", "motor_angle", "load_angle", "motor_torque", "temperature", "motor_velocity", "forcing"]
+    for _ in range(int(random.choice([1, 1, 3])) if spoilt else 0):
+        key = str(random.choice(keys))
+        table = "columns" if keys.index(key) > 6 else "signals" if keys.index(key) in (4, 5) else "drive"
+        table = str(random.choice(list(content))) if random.random() < 0.1 else table
+        content[table][key] = str(random.choice(odd))
+    lines = []
+    for table, entries in content.items():
+        lines += [f"[{table}]", *(f"{k} = {v}" for k, v in entries.items())]
+    raw = bytearray("\n".join(lines).encode())
+    if spoilt and random.random() < 0.2:
+        for place in random.integers(0, len(raw), 3):
+            raw[place] = int(random.integers(256))
+    if spoilt and random.random() < 0.03:
+        raw += b"\nx = " + b"[" * 5000
+    return bytes(raw)
+
+
+def spoilt_case(seed: int, folder: Path) -> tuple[Path, Path]:
+    """A log and a drive file, at least one of them spoilt."""
+    random = np.random.default_rng(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    table = healthy(int(random.integers(20)))
+    with np.errstate(all="ignore"):
+        for _ in range(int(random.choice([0, 1, 1, 2, 4]))):
+            change = COLUMNS[int(random.integers(len(COLUMNS)))]
+            if table and all(len(c) == ROWS for c in table.values()):
+                change(random, table)
+        log = write(random, table, folder)
+    if random.random() < 0.2:
+        log = damage(random, log)
+    drive = folder / "drive.toml"
+    drive.write_bytes(drive_text(random, random.random() < 0.25))
+    return log, drive

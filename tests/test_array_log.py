@@ -1,0 +1,170 @@
+"""Structs, groups and matrices in MATLAB files and HDF5; packed and misnamed files; MDF where it is installed."""
+
+import gzip
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import polars as pl
+import pytest
+import scipy.io
+
+from fitting.errors import InputError
+from fitting.log_table import read_table
+
+A = np.arange(300.0)
+B = A**2
+
+
+def mat(folder: Path, **content) -> Path:
+    scipy.io.savemat(folder / "log.mat", content)
+    return folder / "log.mat"
+
+
+def hdf5(folder: Path, content: dict) -> Path:
+    with h5py.File(folder / "log.h5", "w") as file:
+        for name, values in content.items():
+            file[name] = values
+    return folder / "log.h5"
+
+
+def values(path: Path, *names: str) -> list[np.ndarray]:
+    found = read_table(path, names)
+    return [found.columns[name].values for name in names]
+
+
+@pytest.mark.parametrize("names", [("run.x.a", "run.b"), ("run/x/a", "run/b"), ("a", "b")])
+def test_nested_structs(tmp_path: Path, names: tuple[str, str]):
+    path = mat(tmp_path, run={"x": {"a": A}, "b": B[:, None]}, other=np.ones((2, 2)))
+    found = values(path, *names)
+    np.testing.assert_array_equal(found, [A, B])
+    assert set(read_table(path, ()).names) == {"run.x.a", "run.b", "other"}
+
+
+def test_struct_arrays_are_counted_from_one(tmp_path: Path):
+    signals = np.array([({"values": A},), ({"values": B},)], dtype=[("signals", object)])["signals"]
+    path = mat(tmp_path, out={"time": A, "signals": signals})
+    np.testing.assert_array_equal(values(path, "out.signals(2).values", "out.time"), [B, A])
+    with pytest.raises(InputError, match="several datasets"):
+        values(path, "values")
+
+
+@pytest.mark.parametrize("make", [lambda f, m: mat(f, data=m), lambda f, m: hdf5(f, {"data": m})], ids=["mat", "hdf5"])
+@pytest.mark.parametrize("transposed", [False, True])
+def test_columns_of_a_matrix(tmp_path: Path, make, transposed: bool):
+    matrix = np.stack([A, B], axis=1)
+    path = make(tmp_path, matrix.T if transposed else matrix)
+    np.testing.assert_array_equal(values(path, "data(:,1)", "data(:, 2)"), [A, B])
+    for name, word in (("data(:,3)", "number"), ("data(:,0)", "number"), ("data", "data(:,1)")):
+        with pytest.raises(InputError, match="vector") as error:
+            values(path, name)
+        assert word in str(error.value)
+
+
+def test_a_struct_is_not_a_column(tmp_path: Path):
+    with pytest.raises(InputError, match=r"struct or group.*'run\.a'"):
+        values(mat(tmp_path, run={"a": A}), "run")
+
+
+def test_a_cell_is_not_a_column(tmp_path: Path):
+    cells = np.empty(2, dtype=object)
+    cells[:] = [A, "text"]
+    with pytest.raises(InputError, match="MATLAB's own"):
+        values(mat(tmp_path, a=cells), "a")
+
+
+def test_the_fields_of_an_hdf5_table(tmp_path: Path):
+    table = np.zeros(300, dtype=[("time", "f8"), ("count", "i4")])
+    table["time"], table["count"] = A, B
+    path = hdf5(tmp_path, {"rig/log": table})
+    np.testing.assert_array_equal(values(path, "rig/log/time", "count"), [A, B])
+
+
+def test_units_of_datasets(tmp_path: Path):
+    path = hdf5(tmp_path, {"a": A, "b": B, "c": B})
+    with h5py.File(path, "a") as file:
+        file["a"].attrs["unit"] = "deg"
+        file["b"].attrs["Units"] = np.bytes_(b"N m")
+        file["c"].attrs["unit"] = 3
+    found = read_table(path, ("a", "b", "c")).columns
+    assert [found[name].unit for name in "abc"] == ["deg", "N m", None]
+
+
+@pytest.mark.parametrize(("name", "value", "rate"), [("fs", 2000.0, 2000.0), ("Ts", 5e-4, 2000.0), ("fs", -1.0, None)])
+def test_a_sample_rate_or_step_beside_the_data(tmp_path: Path, name: str, value: float, rate: float | None):
+    for path in (mat(tmp_path, run={"a": A}, **{name: value}), hdf5(tmp_path, {"run/a": A, f"run/{name}": value})):
+        assert read_table(path, ("a",)).sample_rate == (None if rate is None else pytest.approx(rate))
+
+
+@pytest.mark.parametrize("kind", ["csv", "mat", "h5", "parquet"])
+def test_packed_and_misnamed_files(tmp_path: Path, kind: str):
+    frame = pl.DataFrame({"a": A, "b": B})
+    plain = tmp_path / f"log.{kind}"
+    if kind == "csv":
+        frame.write_csv(plain)
+    elif kind == "parquet":
+        frame.write_parquet(plain)
+    else:
+        (mat if kind == "mat" else lambda folder, **c: hdf5(folder, c))(tmp_path, a=A, b=B)
+    packed = tmp_path / f"other.{kind}.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    np.testing.assert_array_equal(values(packed, "a", "b"), [A, B])
+    if kind != "csv":
+        # The first bytes say what it is.
+        odd = Path(shutil.copy(plain, tmp_path / "log.dat"))
+        np.testing.assert_array_equal(values(odd, "a", "b"), [A, B])
+    packed.write_bytes(packed.read_bytes()[:-20])
+    with pytest.raises(InputError, match="too early|cannot be read"):
+        values(packed, "a")
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [(b"PK\x03\x04", "zip archive"), (b"\x89MCAP0\r\n", "MCAP"), (b"\x1f\x8b", "cannot be read")],
+)
+def test_what_other_formats_are_told(tmp_path: Path, head: bytes, words: str):
+    path = tmp_path / ("log.csv.gz" if head == b"\x1f\x8b" else "log.csv")
+    path.write_bytes(head + bytes(100))
+    with pytest.raises(InputError, match=words):
+        values(path, "a")
+
+
+def test_parquet_types(tmp_path: Path):
+    path = tmp_path / "log.parquet"
+    frame = pl.DataFrame({"a": A, "s": [f"{v:.1f}" for v in A], "n": [[1.0]] * 300, "on": A > 5})
+    frame.with_columns(
+        t=(pl.col("a") * 1e6).cast(pl.Duration("us")), c=pl.col("s").cast(pl.Categorical), w=pl.time(12, 0, 1)
+    ).write_parquet(path)
+    a, s, on, t, c, w = values(path, "a", "s", "on", "t", "c", "w")
+    for found in (s, t, c):
+        np.testing.assert_array_equal(found, a)
+    assert on.sum() == 294 and (w == 43201).all()
+    with pytest.raises(InputError, match="of type List"):
+        values(path, "n")
+
+
+def test_mdf_without_the_extra(tmp_path: Path):
+    try:
+        import asammdf  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        path = tmp_path / "log.mf4"
+        path.write_bytes(b"MDF     4.10    " + bytes(100))
+        with pytest.raises(InputError, match=r'pip install "hdjax\[mdf\]"'):
+            values(path, "a")
+
+
+def test_mdf_channels_bring_their_own_clocks(tmp_path: Path):
+    asammdf = pytest.importorskip("asammdf", reason="needs the extra mdf")
+    path = tmp_path / "log.mf4"
+    with asammdf.MDF(version="4.10") as file:
+        file.append([asammdf.Signal(A, A * 1e-3, name="angle", unit="deg")])
+        file.append([asammdf.Signal(B[::2].astype("i4"), A[::2] * 1e-3, name="torque", unit="Nm")])
+        file.append([asammdf.Signal(B, A * 1e-3, name="twice"), asammdf.Signal(A, A * 1e-3, name="twice")])
+        file.save(path)
+    found = read_table(path, ("angle", "torque", "time")).columns
+    assert set(found) == {"angle", "torque"} and found["torque"].unit == "Nm"
+    np.testing.assert_array_equal(found["angle"].values, A)
+    np.testing.assert_allclose(found["torque"].time, A[::2] * 1e-3)
+    with pytest.raises(InputError, match="several channels"):
+        values(path, "twice")

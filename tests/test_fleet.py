@@ -1,0 +1,156 @@
+"""Many logs in one table: a bad one stops nobody, and what is finished is not done twice."""
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+import fitting.fleet
+import rig
+from fitting.errors import DataError, InputError
+from fitting.fleet import find_logs, fit_fleet, fleet_text
+
+COUNT = 1200
+DRIVE = '[drive]\nname = "cells"\n[signals]\ntorque_hold = "zero-order"\n'
+
+
+def write_log(path: Path, *, seed: int = 0, omega_0: float = rig.OMEGA_0) -> Path:
+    forcing = rig.reduced_forcing(COUNT, seed=seed)
+    motion = rig.reduced_motion(forcing, omega_0=omega_0)
+    log = rig.reduced_log(motion[:, 0], forcing, noise=1e-3, seed=seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = np.stack([log.time, log.dynamic_error, forcing], axis=1)
+    np.savetxt(path, rows, delimiter=",", header="time,dynamic_error,forcing", comments="", fmt="%.12g")
+    return path
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    path = tmp_path / "all.toml"
+    path.write_text(DRIVE, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The logs that were read for a fit, each of which then can't be fitted."""
+    seen: list[Path] = []
+
+    def refuse(logs: list[Path], drive: Path):
+        seen.extend(logs)
+        raise DataError(f"{logs[0]}: no")
+
+    monkeypatch.setattr(fitting.fleet, "read_rig", refuse)
+    return seen
+
+
+def test_each_log_is_fitted_on_its_own(tmp_path: Path, drive: Path):
+    frequencies = {"a.csv": 80.0, "deeper/b.csv": 100.0}
+    for seed, (name, omega_0) in enumerate(frequencies.items()):
+        write_log(tmp_path / "logs" / name, seed=seed, omega_0=omega_0)
+    (tmp_path / "logs" / "bad.csv").write_text("time,dynamic_error\n0,1\n", encoding="utf-8")
+    table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    rows = {row["log"]: row for row in table.iter_rows(named=True)}
+    assert list(rows) == ["a.csv", "bad.csv", "deeper/b.csv"]
+    for name, omega_0 in frequencies.items():
+        row = rows[name]
+        assert (row["state"], row["message"]) == ("fitted", "")
+        assert abs(row["omega_0"] - omega_0) < 5 * row["omega_0_std"]
+        assert row["omega_0_low"] < row["omega_0"] < row["omega_0_high"]
+        assert row["omega_0_identifiable"]
+        assert row["samples"] == COUNT
+    assert rows["bad.csv"]["state"] == "refused"
+    assert "bad.csv" in rows["bad.csv"]["message"]
+    assert rows["bad.csv"]["omega_0"] is None
+    assert pl.read_parquet(tmp_path / "out" / "fleet.parquet").equals(table)
+    assert "3 logs: 2 fitted, 1 refused" in fleet_text(table)
+
+
+def test_finished_logs_are_not_fitted_again(tmp_path: Path, drive: Path, counted: list[Path]):
+    logs = [write_log(tmp_path / "logs" / f"{i}.csv", seed=i) for i in range(3)]
+    first = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    assert sorted(counted) == logs
+    counted.clear()
+    assert fit_fleet(tmp_path / "logs", drive, tmp_path / "out").equals(first)
+    assert not counted
+    write_log(logs[1], seed=7)
+    fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    assert counted == [logs[1]]
+    counted.clear()
+    drive.write_text(DRIVE + "# another file\n", encoding="utf-8")
+    fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    assert sorted(counted) == logs
+
+
+def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+    logs = [write_log(tmp_path / "logs" / f"{i}.csv", seed=i) for i in range(4)]
+    seen: list[Path] = []
+    limit = 2
+
+    def read(paths: list[Path], drive: Path):
+        if len(seen) == limit:
+            raise KeyboardInterrupt
+        seen.extend(paths)
+        raise DataError(f"{paths[0]}: no")
+
+    monkeypatch.setattr(fitting.fleet, "read_rig", read)
+    with pytest.raises(KeyboardInterrupt):
+        fit_fleet(tmp_path / "logs", drive, tmp_path / "out", workers=1)
+    assert not (tmp_path / "out" / "fleet.parquet").exists()
+    limit = len(logs)
+    table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out", workers=1)
+    assert seen == logs
+    assert len(table) == 4
+
+
+def test_a_bug_in_one_fit_stops_nobody(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+    for i in range(2):
+        write_log(tmp_path / "logs" / f"{i}.csv", seed=i)
+
+    def broken(logs: list[Path], drive: Path):
+        if logs[0].name == "0.csv":
+            raise ZeroDivisionError("oops")
+        raise DataError(f"{logs[0]}: no")
+
+    monkeypatch.setattr(fitting.fleet, "read_rig", broken)
+    table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    assert table["state"].to_list() == ["failed", "refused"]
+    assert "ZeroDivisionError: oops" in table["message"][0]
+
+
+def test_a_drive_file_beside_a_log_goes_first(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+    write_log(tmp_path / "logs" / "one" / "log.csv")
+    own = tmp_path / "logs" / "one" / "drive.toml"
+    own.write_text(DRIVE, encoding="utf-8")
+    write_log(tmp_path / "logs" / "two" / "log.csv", seed=1)
+    used: dict[str, Path] = {}
+
+    def note(logs: list[Path], drive: Path):
+        used[logs[0].parent.name] = drive
+        raise DataError("no")
+
+    monkeypatch.setattr(fitting.fleet, "read_rig", note)
+    fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    assert used == {"one": own, "two": drive}
+
+
+def test_a_spoilt_record_is_made_again(tmp_path: Path, drive: Path, counted: list[Path]):
+    write_log(tmp_path / "logs" / "0.csv")
+    fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    (record,) = (tmp_path / "out" / "finished").iterdir()
+    record.write_text("{", encoding="utf-8")
+    counted.clear()
+    fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
+    assert len(counted) == 1
+
+
+def test_which_files_are_logs(tmp_path: Path):
+    for name in ("b.CSV", "a.parquet", "notes.md", ".hidden.csv", ".cache/c.csv", "out/old.csv"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    assert [p.name for p in find_logs(tmp_path, apart_from=tmp_path / "out")] == ["a.parquet", "b.CSV"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no log files"):
+        find_logs(tmp_path / "empty")

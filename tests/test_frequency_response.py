@@ -1,0 +1,196 @@
+"""The frequency response agrees with the closed form, and says what a log shows and what it does not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import rig
+from fitting.experiment import Experiment, experiment_from_log
+from fitting.frequency_response import (
+    FrequencyResponse,
+    coherent_band,
+    excites_resonance,
+    frequency_response,
+    resonance_seen,
+    unexplained_band,
+)
+from hdjax import Hold
+
+MU, OMEGA_0, GAIN, STEP = 12.0, 200.0, 50.0, 1e-3
+F_0 = OMEGA_0 / (2 * np.pi)
+COUNT = 40_000
+
+
+def stepped(hold: Hold) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Exact update `y' = A y + b u + c u_next` of `x'' + mu x' + omega_0^2 x = gain u`, by one matrix exponential of
+    oscillator and input (Van Loan)."""
+    matrix = np.zeros((4, 4))
+    matrix[:2, :2] = [[0.0, 1.0], [-(OMEGA_0**2), -MU]]
+    matrix[1, 2] = GAIN
+    matrix[2, 3] = 1.0 / STEP if hold == "linear" else 0.0
+    whole = expm(matrix * STEP)
+    return whole[:2, :2], whole[:2, 2] - whole[:2, 3], whole[:2, 3]
+
+
+def exact_response(frequency: np.ndarray, hold: Hold) -> np.ndarray:
+    """From input samples to samples of x."""
+    A, b, c = stepped(hold)
+    z = np.exp(2j * np.pi * frequency * STEP)
+    return np.array([np.linalg.solve(k * np.eye(2) - A, b + k * c)[0] for k in z])
+
+
+def simulated(u: np.ndarray, *, alpha: float = 0.0, noise: float = 0.0) -> Experiment:
+    """A log of the linear oscillator, exact from sample to sample; or of the cubic one, by the rig's Runge-Kutta."""
+    if alpha:
+        x = rig.reduced_motion(u, mu=MU, omega_0=OMEGA_0, alpha=alpha, gain=GAIN, step=STEP, substeps=2)[:, 0]
+    else:
+        A, b, _ = stepped("zero-order")
+        states = np.zeros((u.size, 2))
+        for k in range(u.size - 1):
+            states[k + 1] = A @ states[k] + b * u[k]
+        x = states[:, 0]
+    return experiment_from_log(rig.reduced_log(x, u, noise=noise, step=STEP), hold="zero-order")
+
+
+def look(experiment: Experiment, *, alpha: float = 0.0, hold: Hold = "zero-order", noise: float = 0.0):
+    model = rig.reduced_model(mu=MU, omega_0=OMEGA_0, alpha=alpha, gain=GAIN)
+    return frequency_response(model, [experiment], hold=hold, noise=noise)
+
+
+@pytest.fixture(scope="module")
+def white() -> np.ndarray:
+    return np.random.default_rng(0).normal(size=COUNT)
+
+
+@pytest.fixture(scope="module")
+def linear(white: np.ndarray) -> FrequencyResponse:
+    found = look(simulated(white))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("hold", ["zero-order", "linear"])
+def test_model_is_the_closed_form(white: np.ndarray, hold: Hold):
+    found = look(simulated(white), hold=hold)
+    assert found is not None
+    # Far above the resonance the transfer function is a small difference of large terms.
+    np.testing.assert_allclose(found.model, exact_response(found.frequency, hold), rtol=1e-9, atol=1e-13)
+
+
+def test_smooth_input_has_the_response_of_continuous_time(white: np.ndarray):
+    found = look(simulated(white), hold="band-limited")
+    assert found is not None
+    s = 2j * np.pi * found.frequency
+    np.testing.assert_allclose(found.model, GAIN / (s**2 + MU * s + OMEGA_0**2), rtol=1e-12)
+
+
+def test_a_linear_log_shows_the_closed_form(linear: FrequencyResponse):
+    truth = exact_response(linear.frequency, "zero-order")
+    error = np.abs(linear.measured / truth - 1)
+    coherent = linear.coherence > 0.99
+    assert np.mean(coherent[linear.frequency < 3 * F_0]) > 0.9
+    # Random error of a line: sqrt((1 - coherence) / (2 averages coherence)), below 1 % here; leakage adds at the peak.
+    assert np.median(error[coherent]) < 0.01 and np.max(error[coherent]) < 0.1
+    assert linear.width == pytest.approx(MU / (2 * np.pi))
+    assert linear.averages >= 8
+
+
+def test_a_linear_log_shows_its_resonance(linear: FrequencyResponse):
+    assert excites_resonance(linear)
+    assert resonance_seen(linear) == pytest.approx(F_0, abs=2 * linear.resolution)
+    band = coherent_band(linear)
+    assert band is not None and band[0] < 2.0 < 3 * F_0 < band[1]
+    assert unexplained_band(linear) is None
+
+
+def test_coherence_falls_as_noise_says(white: np.ndarray):
+    """With noise on the response only, coherence is 1 - noise power / response power."""
+    noise = 2e-4
+    found = look(simulated(white, noise=noise), noise=noise)
+    assert found is not None
+    # One-sided densities of white noise; input of unit variance.
+    response = np.abs(exact_response(found.frequency, "zero-order")) ** 2 * 2 * STEP
+    truth = response / (response + 2 * STEP * noise**2)
+    assert truth[-1] < 0.1 and truth[0] > 0.9
+    # An estimate from few averages is too large by (1 - c)^2 / averages.
+    expected = truth + (1 - truth) ** 2 / found.averages
+    for part in np.array_split(np.arange(truth.size), 8):
+        assert np.mean(found.coherence[part]) == pytest.approx(np.mean(expected[part]), abs=0.02)
+    assert np.mean(np.abs(found.noise_coherence - truth)[truth > 0.5]) < 0.05
+    # Noise is no missing physics.
+    assert unexplained_band(found) is None
+
+
+def test_a_log_below_the_resonance_does_not_excite_it():
+    u = rig.multisine(COUNT, STEP, rms=1.0, low=0.5, high=6.0, seed=1)
+    # From rest the log would ring at first.
+    noise = 1e-5
+    found = look(simulated(u, noise=noise), noise=noise)
+    assert found is not None
+    tail = look(_cut(simulated(u, noise=noise), 4000), noise=noise)
+    assert tail is not None and not excites_resonance(tail) and resonance_seen(tail) is None
+
+
+def test_lines_beyond_the_excited_ones_hide_no_peak():
+    """Where neither torque nor twist has power their ratio is anything."""
+    u = rig.multisine(COUNT, STEP, rms=1.0, low=1.0, high=1.3 * F_0, seed=6)
+    found = look(simulated(u, noise=1e-7), noise=1e-7)
+    assert found is not None
+    assert resonance_seen(found) == pytest.approx(F_0, abs=2 * found.resolution)
+
+
+def _cut(experiment: Experiment, start: int) -> Experiment:
+    part = rig.reduced_log(
+        experiment.measured[start:, -1], np.asarray(experiment.torque.coefficients)[start:, 0], step=STEP
+    )
+    return experiment_from_log(part, hold="zero-order")
+
+
+def test_a_bent_stiffness_lowers_the_coherence():
+    u = 4e3 * np.random.default_rng(2).normal(size=20_000)
+    experiment = simulated(u, alpha=0.3)
+    found = look(experiment, alpha=0.3)
+    assert found is not None
+    x = experiment.measured[:, -1]
+    assert 3 * 0.3 * np.mean(x**2) > 0.5
+    # The mean slope of the restoring force, as for a Gaussian twist.
+    assert found.resonance == pytest.approx(F_0 * np.sqrt(1 + 0.9 * np.mean(x**2)))
+    assert unexplained_band(found) is not None
+
+
+def test_irregular_stamps_are_interpolated(white: np.ndarray, linear: FrequencyResponse):
+    """Stamps that jitter by a fifth of the step make no difference to slow motion."""
+    smooth = rig.multisine(COUNT, STEP, rms=1.0, low=2.0, high=60.0, seed=3)
+    even = simulated(smooth)
+    time = even.time + STEP * np.random.default_rng(4).uniform(-0.2, 0.2, COUNT)
+    x, u = (np.interp(time, even.time, v) for v in (even.measured[:, -1], smooth))
+    log = dataclasses.replace(rig.reduced_log(x, u, step=STEP), time=time)
+    irregular, regular = look(experiment_from_log(log, hold="zero-order")), look(even)
+    assert irregular is not None and regular is not None
+    # The median step is that of the grid to a few parts in ten thousand.
+    lines = np.flatnonzero((regular.frequency > 3) & (regular.frequency < 50) & (regular.coherence > 0.99))
+    found = np.interp(regular.frequency[lines], irregular.frequency, np.abs(irregular.measured))
+    np.testing.assert_allclose(found, np.abs(regular.measured[lines]), rtol=0.08)
+
+
+@pytest.mark.parametrize(("count", "amplitude"), [(300, 1.0), (4000, 0.0)])
+def test_nothing_to_see(count: int, amplitude: float):
+    """A log that is too short, or a torque that does not move."""
+    u = 1.0 + amplitude * np.random.default_rng(5).normal(size=count)
+    assert look(simulated(u)) is None
+
+
+def test_a_drive_is_excited_by_its_motor_torque():
+    """The two-inertia drive's twist obeys the reduced equation, with gain 1 / (N J_m)."""
+    experiment = rig.drive_experiment(8000, noise=0.0)
+    model = rig.drive_model(alpha=0.0)
+    found = frequency_response(model, [experiment], hold="zero-order", noise=1e-9)
+    assert found is not None and found.source == "torque"
+    c = 1 / (rig.N**2 * rig.J_M) + 1 / rig.J_L
+    assert found.resonance == pytest.approx(np.sqrt(c * rig.K) / (2 * np.pi))
+    omega = 2 * np.pi * found.frequency[0]
+    truth = 1 / (rig.N * rig.J_M) / (c * rig.K - omega**2)
+    # The hold and the damping matter by (omega step)^2 and by zeta^2.
+    assert abs(found.model[0]) == pytest.approx(truth, rel=1e-4)

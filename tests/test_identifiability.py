@@ -1,0 +1,135 @@
+"""What a log can't tell: against logs that can, refits with other values, and structure known on paper."""
+
+import re
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import Experiment, Stretch, experiment_from_log
+from fitting.identifiability import identifiability, needed_samples, needed_twist, reason
+from fitting.uncertainty import Estimate, uncertainty
+
+COUNT, HORIZON, NOISE = 1000, 128, 2e-3
+DRIVE_COUNT, DRIVE_HORIZON = 2000, 256
+
+
+def reduced_fit(experiment: Experiment, paths=("mu", "omega_0", "alpha", "gain"), **start) -> Fit:
+    stretches = [Stretch(experiment, 0, len(experiment))]
+    return fit(rig.reduced_model(**start), stretches, paths, horizon=HORIZON, substeps=2, count=8)
+
+
+def drive_fit(model, paths=("K", "alpha", "B_sp"), **options) -> Fit:
+    stretches = [Stretch(rig.drive_experiment(DRIVE_COUNT), 0, DRIVE_COUNT)]
+    return fit(model, stretches, paths, horizon=DRIVE_HORIZON, substeps=1, count=8, **options)
+
+
+@pytest.fixture(scope="module")
+def faint() -> tuple[Fit, Estimate]:
+    """A log whose twist is too small for its alpha."""
+    found = reduced_fit(rig.reduced_experiment(COUNT, noise=NOISE, rms=0.5), alpha=0.0)
+    return found, uncertainty(found).estimates["alpha"]
+
+
+def test_alpha_needs_the_twist_that_it_is_said_to_need(faint: tuple[Fit, Estimate]):
+    _, alpha = faint
+    assert not alpha.identifiable
+    x_max = 0.5 / 10.0 * np.max(np.abs(rig.reduced_experiment(COUNT).measured))
+    # At the true alpha's needed twist its interval would just touch zero: well below and well above are clear cases.
+    factor = needed_twist(alpha, rig.REDUCED_ALPHA, x_max=1.0)
+    seen = {}
+    for share in (0.6, 1.7):
+        experiment = rig.reduced_experiment(COUNT, noise=NOISE, rms=0.5 * share * factor)
+        seen[share] = uncertainty(reduced_fit(experiment, alpha=0.0)).estimates["alpha"]
+    assert not seen[0.6].identifiable and seen[1.7].identifiable
+    # The cube of the twist, as long as the motion is nearly linear; the two know their noise to some 20 %.
+    assert seen[0.6].std_classical / seen[1.7].std_classical == pytest.approx((1.7 / 0.6) ** 3, rel=0.2)
+    assert f"{max(map(abs, alpha.ci95)) * x_max**2:.2g}" in reason(alpha, x_max=x_max)
+
+
+def test_samples_add_up_as_their_square_root(faint: tuple[Fit, Estimate]):
+    _, alpha = faint
+    assert needed_samples(alpha, 0.5 * alpha.std) == pytest.approx(4 * needed_samples(alpha, alpha.std))
+    assert needed_samples(alpha, 0.0) == np.inf == needed_twist(alpha, 0.0, x_max=1.0)
+
+
+def test_sentences_of_a_faint_log(faint: tuple[Fit, Estimate]):
+    found, _ = faint
+    result = identifiability(found, uncertainty(found))
+    assert set(result.reasons) == {"alpha"}
+    assert result.reasons["alpha"].startswith("alpha is not identifiable from these logs: |alpha| is at most")
+    assert "they would need a twist above" in result.reasons["alpha"]
+    assert result.sentences == tuple(result.reasons.values())
+    # One direction is weak, and it is that of alpha.
+    weakest = result.directions[0]
+    assert abs(weakest.weights["alpha"]) > 0.99
+    assert [d.std for d in result.directions] == sorted((d.std for d in result.directions), reverse=True)
+
+
+def test_a_slow_log_knows_ratios_only():
+    """Far below its resonance the oscillator follows `gain u / omega_0^2`, late by `mu / omega_0^2`."""
+    time = np.arange(COUNT) * rig.REDUCED_STEP
+    forcing, omega = 300.0 * np.sin(2 * np.pi * 0.25 * time), 2 * np.pi * 0.25
+    start = (0.0, 300.0 * rig.GAIN / rig.OMEGA_0**2 * omega)
+    motion = rig.reduced_motion(forcing, mu=30.0, state=start)
+    experiment = experiment_from_log(rig.reduced_log(motion[:, 0], forcing, noise=5e-3), hold="zero-order")
+    found = reduced_fit(experiment, mu=30.0)
+    (weak,) = [d for d in identifiability(found, uncertainty(found)).directions if d.sentence is not None]
+    # Twice the logarithm of omega_0 goes with one of the gain and of mu; the damping alone is seen in the delay.
+    for path in ("gain", "mu"):
+        relative = weak.weights[path] * weak.units[path] / float(found.model.get(path))
+        assert relative / weak.weights["omega_0"] == pytest.approx(2.0, rel=0.05), path
+    assert weak.sentence is not None
+    assert "can't tell mu, omega_0 and gain apart" in weak.sentence
+    assert re.search(r"They determine mu omega_0\^-2(\.1)? and gain omega_0\^-2, but no factor alone", weak.sentence)
+
+
+@pytest.fixture(scope="module")
+def drive() -> Fit:
+    return drive_fit(rig.drive_model(K=0.9 * rig.K, alpha=0.0))
+
+
+def test_what_an_error_of_an_inertia_does(drive: Fit):
+    found = uncertainty(drive)
+    result = identifiability(drive, found)
+    assert [h.path for h in result.held] == ["J_m", "J_l"]
+    for held in result.held:
+        # A step small enough to be linear, at the same weights.
+        wrong = drive_fit(
+            drive.model.replace({held.path: (1 + 1e-4) * held.value}), covariance=drive.covariance, reweigh=False
+        )
+        for path in ("K", "alpha", "B_sp"):
+            value = found.estimates[path].value
+            change = float(wrong.model.get(path)) / value - 1.0
+            # The iteration stops at a thousandth of a standard error or so.
+            tolerance = 0.05 * abs(change) + 0.02 * found.estimates[path].std / abs(value)
+            assert 0.01 * held.changes[path] == pytest.approx(change, abs=tolerance), (held.path, path)
+            assert held.path != "J_l" or path != "K" or abs(change) > 10 * tolerance
+        assert f"if it is 1 % too large there, that moves K by {100 * held.changes['K']:+.2g} %" in held.sentence
+
+
+@pytest.mark.slow
+def test_stiffness_where_an_inertia_is_fitted_too(drive: Fit):
+    result = identifiability(drive, uncertainty(drive))
+    wider = uncertainty(drive_fit(drive.model, ("K", "alpha", "B_sp", "J_l"))).estimates
+    held = uncertainty(drive).estimates
+    told = result.held[1].std_if_free
+    for path in ("K", "B_sp"):
+        # By how much the classical errors grow; the robust ones know themselves to some 20 %.
+        growth = wider[path].std_classical / held[path].std_classical
+        assert told[path] * held[path].value / held[path].std == pytest.approx(growth, rel=0.35), path
+    assert told["K"] > held["K"].std / held["K"].value
+
+
+def test_a_parameter_that_ran_to_zero(drive: Fit):
+    gone = eqx.tree_at(lambda f: f.model, drive, drive.model.replace({"K": 1e-5 * rig.K}))
+    (sentence,) = identifiability(gone, uncertainty(drive)).bounds
+    assert sentence.startswith("K ran from") and "towards its bound at zero" in sentence
+    assert identifiability(drive, uncertainty(drive)).bounds == ()
+
+
+def test_a_reduced_log_holds_nothing(faint: tuple[Fit, Estimate]):
+    found, _ = faint
+    assert identifiability(found, uncertainty(found)).held == ()

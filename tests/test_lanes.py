@@ -1,0 +1,48 @@
+"""Lanes shared among devices: the same fit, on two devices and on one. The number of devices is set when JAX starts,
+so another process does it."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import sys, json, jax
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, sys.argv[2])
+import rig
+from fitting.estimate import fit
+from fitting.experiment import Stretch
+from fitting.free import base_paths
+
+experiment = rig.reduced_experiment(2048, noise=1e-5)
+model = rig.reduced_model()
+start = model.replace({"omega_0": 1.02 * model.drive.omega_0})
+found = fit(start, [Stretch(experiment, 0, 2048)], base_paths(model), horizon=128)
+devices = len(found.problem.segments.measured.sharding.device_set)
+print(json.dumps([devices, found.unknowns.parameters.tolist(), float(found.dynamic_error_std)]))
+"""
+
+
+@pytest.fixture(scope="module")
+def fits(request):
+    folder = str(request.path.parent)
+
+    def fitted(devices: int):
+        command = [sys.executable, "-c", SCRIPT, str(devices), folder]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+        return json.loads(done.stdout)
+
+    return {n: fitted(n) for n in (1, 2)}
+
+
+def test_lanes_are_shared(fits):
+    assert (fits[1][0], fits[2][0]) == (1, 2)
+
+
+def test_the_fit_does_not_depend_on_the_devices(fits):
+    # Sums in another order; the iteration ends within a small part of a standard error, which is 1e-5 or so.
+    assert fits[2][1] == pytest.approx(fits[1][1], rel=1e-8)
+    assert fits[2][2] == pytest.approx(fits[1][2], rel=1e-8)

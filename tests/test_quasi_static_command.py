@@ -1,0 +1,240 @@
+"""`hdjax fit` on quasi-static logs: the files it writes, and one sentence where it can't."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from torque_cycles import K1, cycles, line
+
+from fitting.command_line import main
+from fitting.drive_file import read_drive_file
+from fitting.logs import read_log
+from fitting.model_file import StoredModel, to_json
+from fitting.quasi_static.fit import fit_quasi_static
+from fitting.quasi_static.preparation import prepare
+from hdjax import TwoInertiaModel, hdc_40_050
+
+DRIVE = "[drive]\nrated_torque = 54.0\n"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Compiled programs go to the test's folder, and JAX's settings are put back."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def run(*arguments: object) -> int:
+    try:
+        main([str(a) for a in arguments])
+    except SystemExit as end:
+        return 0 if end.code is None else int(end.code)
+    return 0
+
+
+def table(**options) -> dict[str, np.ndarray]:
+    log = cycles(line, **({"rows": 400, "largest": 1e-3} | options))
+    assert log.joint_torque is not None
+    return {"time": log.time, "twist": log.dynamic_error - 0.4, "joint_torque": log.joint_torque}
+
+
+def write(folder: Path, columns: dict[str, np.ndarray], drive: str = DRIVE) -> tuple[Path, Path]:
+    log, file = folder / "log.csv", folder / "drive.toml"
+    np.savetxt(
+        log, np.stack(list(columns.values()), 1), delimiter=",", header=",".join(columns), comments="", fmt="%.12g"
+    )
+    file.write_text(drive, encoding="utf-8")
+    return log, file
+
+
+def no_constant(name: str) -> float:
+    raise AssertionError(f"{name} in JSON")
+
+
+def test_fit_writes_page_and_json_and_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table())
+    assert run("fit", log, "--drive", drive, "--out", tmp_path / "out") == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.html", "report.json"]
+    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=no_constant)
+    assert report["schema"] == "hdjax-report/1" and report["kind"] == "quasi-static"
+    assert report["decision"] == "fit_only"
+    parameters = report["before"]["parameters"]
+    assert set(parameters["K"]) >= {"value", "std", "ci95", "unit", "identifiable"}
+    assert parameters["K"]["ci95"][0] < K1 < parameters["K"]["ci95"][1]
+    assert parameters["K"]["unit"] == "N m/rad"
+    assert parameters["lost_motion"]["value"] == pytest.approx(2 * 0.04 * 54 / K1, rel=0.02)
+    # The cycles reach some 34 N m, so that figures of rated torque and of knees are told to be unknown.
+    for name in ("K2", "K3", "hysteresis_loss"):
+        assert parameters[name]["value"] is None and not parameters[name]["identifiable"]
+        assert any(name in note for note in report["cannot_tell"])
+    assert report["before"]["rmse"]["validation"] > 0
+    page = (tmp_path / "out/report.html").read_text()
+    assert "Plotly.newPlot" in page and "<script src" not in page and "http-equiv" in page
+    text = capsys.readouterr().out
+    assert "straight line" in text and "hysteresis_width" in text and "Report:" in text
+
+
+def test_without_rated_torque_its_figures_are_unknown(tmp_path: Path) -> None:
+    log, drive = write(tmp_path, table(), "")
+    assert run("fit", log, "--drive", drive, "--out", tmp_path / "out") == 0
+    parameters = json.loads((tmp_path / "out/report.json").read_text())["before"]["parameters"]
+    assert parameters["lost_motion"]["value"] is None and "rated_torque" in parameters["lost_motion"]["reason"]
+
+
+ANGLES = '[drive]\nreduction_ratio = 100\n[columns]\njoint_torque = "torque"\n'
+
+
+def angles(turn: float = 0.0) -> dict[str, np.ndarray]:
+    """Both angles of a joint that turns by `turn` [rad] at constant speed beside its twist."""
+    columns = table()
+    joint = turn * np.linspace(0.0, 1.0, 400)
+    return {
+        "time": columns["time"],
+        "motor_angle": 100.0 * (joint + columns["twist"]),
+        "load_angle": joint,
+        "torque": columns["joint_torque"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("columns", "drive"),
+    [
+        (table(), ""),
+        ({("dynamic_error" if k == "twist" else k): v for k, v in table().items()}, ""),
+        (angles(), ANGLES),
+        ({k: v for k, v in table().items() if k != "time"}, ""),
+        (
+            {"time": table()["time"], "load_angle": -table()["twist"], "tau": table()["joint_torque"]},
+            '[columns]\njoint_torque = "tau"\n',
+        ),
+        (
+            table() | {"twist": np.rad2deg(table()["twist"]) * 60, "joint_torque": -1e3 * table()["joint_torque"]},
+            '[columns]\ntwist = { unit = "arcmin" }\njoint_torque = { unit = "mN m", sign = -1 }\n',
+        ),
+    ],
+    ids=["twist", "dynamic error", "both angles", "no time", "locked motor", "other units"],
+)
+def test_every_spelling_is_the_same_log(tmp_path: Path, columns: dict[str, np.ndarray], drive: str) -> None:
+    path, file = write(tmp_path, columns, drive)
+    log = read_log(path, read_drive_file(file))
+    assert log.kind == "quasi-static"
+    np.testing.assert_allclose(log.dynamic_error, table()["twist"], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(log.joint_torque, table()["joint_torque"], rtol=1e-10)
+
+
+def test_rows_at_rest_of_a_moving_joint_are_left_out_and_told(tmp_path: Path) -> None:
+    columns = angles()
+    joint = np.interp(np.arange(400), [0, 80, 399], [0.0, 0.0, 2.0])
+    columns |= {"motor_angle": columns["motor_angle"] + 100 * joint, "load_angle": columns["load_angle"] + joint}
+    path, file = write(tmp_path, columns, ANGLES)
+    drive = read_drive_file(file)
+    data = prepare([read_log(path, drive)], drive)
+    assert data.motion == ("one way",)
+    # The speed is smoothed over a few rows.
+    assert 310 <= len(data.logs[0]) <= 325
+    assert any("left out" in finding.consequence for finding in data.findings["log"])
+
+
+def turned_round() -> dict[str, np.ndarray]:
+    return table() | {"twist": -table()["twist"]}
+
+
+@pytest.mark.parametrize(
+    ("columns", "drive", "code", "words"),
+    [
+        (turned_round(), "", 1, "sign = -1"),
+        (table() | {"twist": 180 / np.pi * table()["twist"] * 60}, "", 1, "arcmin"),
+        (angles(turn=2.0), ANGLES.replace("100", "90"), 1, "reduction_ratio"),
+        (angles(), ANGLES.replace("reduction_ratio = 100", ""), 2, "reduction_ratio"),
+        (table() | {"joint_torque": np.full(400, 3.0)}, "", 1, "joint_torque"),
+        (table() | {"joint_torque": np.random.default_rng(1).normal(size=400)}, "", 1, "does not follow"),
+        (table() | {"twist": np.full(400, 1e-3)}, "", 1, "dynamic_error"),
+        (table(), '[columns]\njoint_torque = { unit = "rad" }\n', 2, "joint_torque"),
+        (table(), '[columns]\njoint_torque = "torqe"\n', 2, "torqe"),
+        (table(), "[drive]\nrated_torque = -5\n", 2, "rated_torque"),
+        (table() | {"twist": np.where(np.arange(400) == 7, np.nan, table()["twist"])}, "", 2, "data row 8"),
+        ({"time": table()["time"], "joint_torque": table()["joint_torque"]}, "", 2, "motor_angle"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture, columns: dict[str, np.ndarray], drive: str, code: int, words: str
+) -> None:
+    log, file = write(tmp_path, columns, drive)
+    assert run("fit", log, "--drive", file, "--out", tmp_path / "out") == code
+    message = capsys.readouterr().err
+    assert words in message and message.count("\n") == 1 and "Traceback" not in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_close_loop_says_what_to_do_instead(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table())
+    assert run("close-loop", log, "--drive", drive, "--out", tmp_path / "out") == 2
+    message = capsys.readouterr().err
+    assert "hdjax fit" in message and "drive log" in message and message.count("\n") == 1
+
+
+def test_predict_says_what_to_do_instead(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table())
+    model = tmp_path / "model.json"
+    stored = StoredModel(TwoInertiaModel(hdc_40_050()), "zero-order", 2, 4, jnp.diag(jnp.asarray([4e-14, 1e-12])))
+    model.write_text(to_json(stored), encoding="utf-8")
+    assert run("predict", model, log, "--drive", drive, "--out", tmp_path / "prediction.csv") == 2
+    message = capsys.readouterr().err
+    assert "hdjax fit" in message and message.count("\n") == 1
+    assert not (tmp_path / "prediction.csv").exists()
+
+
+def test_logs_of_two_kinds_are_not_mixed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table())
+    other = tmp_path / "reduced.csv"
+    values = table()
+    np.savetxt(
+        other,
+        np.stack([values["time"], values["twist"], values["joint_torque"]], 1),
+        delimiter=",",
+        header="time,dynamic_error,forcing",
+        comments="",
+    )
+    assert run("fit", log, other, "--drive", drive, "--out", tmp_path / "out") == 2
+    assert "quasi-static and reduced" in capsys.readouterr().err
+
+
+def lara_drive(joint: int, ratio: int, sign: int) -> str:
+    return f"""
+[drive]
+reduction_ratio = {ratio}
+[columns]
+time = "Timestamp"
+motor_angle = {{ column = "encoder_motorinc_{joint}", unit = "rev / 16777216" }}
+load_angle = {{ column = "encoder_loadinc_{joint}", unit = "rev / 16777216" }}
+joint_torque = {{ column = "joint_torque_current_{joint}", sign = {sign} }}
+"""
+
+
+# Measured drives: the intervals must hold what a ruler on the torque-twist plot gives, and for joint 3 the mean
+# stiffness of the curve that the authors of the data use, over the same torques (48 100 N m/rad).
+@pytest.mark.parametrize(
+    ("joint", "ratio", "sign", "motion", "ruler"),
+    [(2, 121, -1, "held", 108e3), (3, 101, 1, "one way", 48.1e3), (5, 101, 1, "held", 12e3)],
+)
+def test_measured_joints(
+    shared: Path, tmp_path: Path, joint: int, ratio: int, sign: int, motion: str, ruler: float
+) -> None:
+    file = tmp_path / "drive.toml"
+    file.write_text(lara_drive(joint, ratio, sign), encoding="utf-8")
+    drive = read_drive_file(file)
+    data = prepare([read_log(shared / "data/lara8/ML1_validate.csv", drive)], drive)
+    assert data.motion == (motion,)
+    fit = fit_quasi_static(data.logs, hysteresis=motion == "held")
+    low, high = fit.known["linear"]["K"].ci95 or (0.0, 0.0)
+    assert low < ruler < high and high < 3 * low
+    # One cycle of coloured residuals: no bend is determined.
+    assert fit.chosen == "linear"

@@ -1,0 +1,42 @@
+"""Logs of one drive, each under a name of its own."""
+
+from pathlib import Path
+
+import mutations
+import pytest
+
+from fitting.errors import InputError
+from fitting.rig import read_rig
+
+
+def write(folder: Path, name: str, seed: int) -> Path:
+    folder.mkdir(exist_ok=True)
+    table = mutations.healthy(seed)
+    lines = [",".join(table), *(",".join(f"{v:.12g}" for v in row) for row in zip(*table.values(), strict=True))]
+    (folder / name).write_text("\n".join(lines), encoding="utf-8")
+    return folder / name
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    path = tmp_path / "drive.toml"
+    path.write_bytes(mutations.drive_text(None, spoilt=False))
+    return path
+
+
+def test_logs_of_one_name_are_told_apart(tmp_path: Path, drive: Path):
+    paths = [
+        write(tmp_path / "a", "run.csv", 0),
+        write(tmp_path / "b", "run.csv", 1),
+        write(tmp_path / "b", "other.csv", 2),
+    ]
+    found = read_rig([*paths, paths[1]], drive)
+    names = ["a/run", "b/run", "other", "b/run (2)"]
+    assert [log.name for log in found.logs] == names
+    assert list(found.findings) == names
+    assert [e.name for e in found.experiments["linear"]] == names
+
+
+def test_logs_of_two_kinds_do_not_mix(tmp_path: Path, drive: Path):
+    with pytest.raises(InputError, match="can't be fitted together"):
+        read_rig([write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 4)], drive)

@@ -1,0 +1,172 @@
+"""The same numbers in every dialect of text."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fitting.errors import InputError
+from fitting.raw_table import RawTable, split_unit
+from fitting.text_log import read_text
+
+TIME = [0.0, 0.5, 1.0, 1.5]
+A = [1.5, -2.25, 3.0, 1e-3]
+
+
+def read(text: str | bytes, encoding: str = "utf-8", wanted: tuple[str, ...] = ("time", "a")) -> RawTable:
+    return read_text(Path("log.csv"), text if isinstance(text, bytes) else text.encode(encoding), wanted)
+
+
+def table(
+    delimiter: str, *, decimal: str = ".", quote: str = "", end: str = "\n", head: str = "", tail: str = ""
+) -> str:
+    rows = [("time", "a", "b"), *((repr(t), repr(a), "7") for t, a in zip(TIME, A, strict=True))]
+    cells = [[quote + (c.replace(".", decimal) if i else c) + quote for c in row] for i, row in enumerate(rows)]
+    return head + end.join(delimiter.join(row) + tail for row in cells) + end
+
+
+DIALECTS: dict[str, str | bytes] = {
+    "comma": table(","),
+    "semicolon": table(";"),
+    "tab": table("\t"),
+    "pipe": table("|"),
+    "blanks": table("   "),
+    "decimal comma": table(";", decimal=","),
+    "decimal comma and tabs": table("\t", decimal=","),
+    "decimal comma and blanks": table(" ", decimal=","),
+    "quoted": table(",", quote='"'),
+    "quoted decimal comma": table(",", quote='"', decimal=","),
+    "trailing delimiter": table(",", tail=","),
+    "trailing semicolon": table(";", decimal=",", tail=";"),
+    "blank after delimiter": table(", "),
+    "Windows": table(",", end="\r\n"),
+    "old Mac": table(",", end="\r"),
+    "blank lines": table(",", end="\n\n"),
+    "BOM": table(",").encode("utf-8-sig"),
+    "UTF-16": table(";", decimal=",").encode("utf-16"),
+    "UTF-16 without BOM": table(",").encode("utf-16-le"),
+    "Latin-1": table(",", head="# Prüfstand, 20 °C\n").encode("latin-1"),
+    "comments": table(",", head="# rig\n# second line, with comma\n\n"),
+    "preamble": table(";", head="Export of rig 7\nDate;21.11.2026 10:00\nOperator: N. N.\n\nRate;2 kHz\n"),
+    "preamble with numbers": table(",", head="Serial 4711\nGain,5\nrig, no. 3\n"),
+    "unit row": table(",").replace("b\n", "b\ns,N m,rad\n", 1),
+    "bracketed unit row": table(";").replace("b\n", "b\n[s];[N m];[rad]\n", 1),
+    "units in the header": table(",").replace("time,a", "time [s],a (N m)"),
+    "commented header": "# " + table(","),
+    "MATLAB's comment": "% " + table(","),
+    "comment inside": table(",").replace("1.0,", "# paused\n1.0,", 1),
+    "zeros behind the end": table(",").encode() + bytes(200),
+    "stray quote": table(",").replace(",7\n", ',"\n', 1),
+    "plus and exponents": "time,a\n+0,1.5E0\n5D-1,-2.25\n1.0e+00,3\n1.5,1d-3\n",
+    "typeset": "time;a\n0,0;1,5\n0,5;\u22122,25\n1,0;3,0\n1,5;0,001\n",
+}
+
+
+@pytest.mark.parametrize("text", DIALECTS.values(), ids=DIALECTS.keys())
+def test_every_dialect_gives_the_same_columns(text: str | bytes):
+    found = read(text)
+    np.testing.assert_array_equal(found.columns["time"].values, TIME)
+    np.testing.assert_array_equal(found.columns["a"].values, A)
+    assert len(found.columns["a"].text_rows) == 0
+
+
+@pytest.mark.parametrize("name", ["unit row", "bracketed unit row", "units in the header"])
+def test_units_are_read(name: str):
+    found = read(DIALECTS[name])
+    assert (found.columns["time"].unit, found.columns["a"].unit) == ("s", "N m")
+
+
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        (["1.234,5", "12,25"], [1234.5, 12.25]),
+        (["1,234.5", "12.25"], [1234.5, 12.25]),
+        (["1.234.567", "2.000"], [1234567, 2000]),
+        (["1'234.5", "12.25"], [1234.5, 12.25]),
+        (["1 234,5", "12,25"], [1234.5, 12.25]),
+        # One comma with three digits behind it is a decimal comma, where semicolons part the cells.
+        (["1,234", "12,345"], [1.234, 12.345]),
+    ],
+)
+def test_thousands(cells: list[str], expected: list[float]):
+    found = read("time;a\n" + "".join(f"{i};{c}\n" for i, c in enumerate(cells)))
+    np.testing.assert_allclose(found.columns["a"].values, expected, rtol=1e-15)
+
+
+def test_quoted_thousands():
+    found = read('time,a\n0,"1,234"\n1,"12,345,678"\n')
+    np.testing.assert_array_equal(found.columns["a"].values, [1234, 12345678])
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("2026-11-21T23:59:59.750", "2026-11-22T00:00:00.250"),
+        ("2026-11-21 23:59:59.75Z", "2026-11-22 00:00:00.25Z"),
+        ("2026-11-21T23:59:59,75+01:00", "2026-11-22T00:00:00,25+01:00"),
+        ("21.11.2026 23:59:59.75", "22.11.2026 00:00:00.25"),
+        ("23:59:59.75", "00:00:00.25"),
+        ("20261121_23:59:59.75", "20261122_00:00:00.25"),
+    ],
+)
+def test_dates_and_times_of_day_become_seconds(first: str, second: str):
+    column = read(f"time;a\n{first};1,5\n{second};2,5\n").columns["time"]
+    assert column.unit == "s"
+    # 2026 is 1.8e9 s from 1970, where doubles lie 0.24 us apart.
+    np.testing.assert_allclose(np.diff(column.values), 0.5, atol=1e-6)
+
+
+def test_a_date_that_may_be_read_two_ways_is_text():
+    column = read("time;a\n09/10/2026 10:00:00;1\n09/10/2026 10:00:01;2\n").columns["time"]
+    assert len(column.text_rows) == 2
+
+
+def test_blanks_and_text_are_told_apart():
+    column = read("time,a\n0,1\n1,\n2,NaN\n3,n/a\n4,OVLD\n5,-\n6,2\n").columns["a"]
+    np.testing.assert_array_equal(np.isnan(column.values), [False, True, True, True, True, True, False])
+    np.testing.assert_array_equal(column.text_rows, [4])
+    assert column.text == "OVLD"
+
+
+def test_short_and_long_rows():
+    found = read("time,a,b\n0,1,2\n1\n2,3,4,5,6\n3,4,5\n")
+    np.testing.assert_array_equal(found.columns["time"].values, [0, 1, 2, 3])
+    np.testing.assert_array_equal(found.columns["a"].values, [1, np.nan, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0,1\n1,2\n", ["no header line"]),
+        ("time,a\n0,0,1,5\n0,5,2,5\n1,0,3,0\n", ["no header line", "semicolons"]),
+        ("", ["empty"]),
+        ("\n \n", ["empty"]),
+        (b"time,a\n\x00\x01\x02,3\n", ["not text"]),
+        ("time,a,a\n0,1,2\n1,2,3\n", ["'a'", "twice"]),
+    ],
+)
+def test_what_is_no_table_is_refused(text: str | bytes, words: list[str]):
+    with pytest.raises(InputError) as error:
+        read(text)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_a_header_alone_names_the_columns():
+    found = read("time;a;b\n")
+    assert found.names == ("time", "a", "b") and found.columns == {}
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("torque [N m]", ("torque", "N m")),
+        ("time (ms)", ("time", "ms")),
+        ("phi [°]", ("phi", "°")),
+        ("joint(2)", ("joint(2)", None)),
+        ("data(:,3)", ("data(:,3)", None)),
+        ("x", ("x", None)),
+    ],
+)
+def test_units_in_headers(header: str, expected: tuple[str, str | None]):
+    assert split_unit(header) == expected

@@ -1,0 +1,154 @@
+"""Whatever a logger did to its stamps, the clock behind them is found, or it is said that there is none."""
+
+import numpy as np
+import pytest
+
+from fitting.errors import InputError
+from fitting.time_stamps import TimeBase, time_base
+
+COUNT, STEP = 4000, 5e-4
+CLOCK = np.arange(COUNT) * STEP
+SAMPLES = np.random.default_rng(0).normal(size=(COUNT, 2))
+
+
+def base(stamps: np.ndarray, samples: np.ndarray = SAMPLES, second: float = 1.0) -> TimeBase:
+    found = time_base(stamps, samples, path="log.csv", name="t", second=second, first_row=0)
+    assert (np.diff(found.time) > 0).all()
+    assert len(found.time) == len(found.rows)
+    return found
+
+
+def told(found: TimeBase, severity: str, *words: str):
+    (finding,) = found.findings
+    assert finding.severity == severity
+    for word in words:
+        assert word in str(finding)
+
+
+def changed(**places: float) -> np.ndarray:
+    stamps = CLOCK.copy()
+    for row, value in places.items():
+        stamps[int(row[1:])] = value
+    return stamps
+
+
+@pytest.mark.parametrize("stamps", [CLOCK, CLOCK + 1.7e9, CLOCK * 1e-3, np.sort(CLOCK + 2e-4 * SAMPLES[:, 0])])
+def test_good_stamps_stay(stamps: np.ndarray):
+    found = base(stamps)
+    np.testing.assert_array_equal(found.time, stamps)
+    assert found.findings == () and len(found.restarts) == 0
+
+
+COARSE = {
+    "milliseconds, cut": (STEP, lambda t: np.floor(t * 1e3) / 1e3, 1e-3),
+    "milliseconds, rounded": (STEP, lambda t: np.round(t, 3), 1e-3),
+    "milliseconds of 250.3 Hz": (1 / 250.3, lambda t: np.round(t, 3), 1e-3),
+    "tenths of milliseconds of 2048 Hz": (1 / 2048, lambda t: np.round(t, 4), 1e-4),
+    "a tick of 3 kHz": (STEP, lambda t: np.floor(t * 3e3) / 3e3, 1 / 3e3),
+    "single precision after an hour": (STEP, lambda t: (t + 5000).astype("f4").astype(float) - 5000, 2.0**-11),
+    "single precision after a day": (STEP, lambda t: (t + 90000).astype("f4").astype(float) - 90000, 2.0**-7),
+}
+
+
+@pytest.mark.parametrize(("step", "rounded", "quantum"), COARSE.values(), ids=COARSE.keys())
+def test_coarse_stamps_of_a_steady_clock(step: float, rounded, quantum: float):
+    clock = np.arange(COUNT) * step
+    found = base(rounded(clock))
+    told(found, "note", "rounded", "steady sampling")
+    assert len(found.time) == COUNT
+    np.testing.assert_allclose(np.diff(found.time), step, rtol=quantum / step / COUNT)
+    # Whether stamps were cut or rounded can't be told: half a quantum of shift.
+    np.testing.assert_allclose(found.time, clock, atol=0.6 * quantum)
+
+
+def test_coarse_stamps_with_a_pause_and_a_few_samples_missing():
+    stamps = np.round(CLOCK + np.where(np.arange(COUNT) > 1999, 0.25, 0.0), 3)
+    kept = np.delete(np.arange(COUNT), [100, 101, 102, 103])
+    found = base(stamps[kept], SAMPLES[kept])
+    usual = np.delete(np.diff(found.time), [99, 1995])
+    np.testing.assert_allclose(usual, STEP, rtol=1e-3)
+    assert np.diff(found.time)[1995] == pytest.approx(0.25 + STEP, abs=2e-3)
+
+
+def test_missing_samples_of_an_exact_clock_are_no_rounding():
+    kept = np.delete(np.arange(COUNT), [100, 101, 700, 1500, 2000, 2900, 3100])
+    found = base(CLOCK[kept], SAMPLES[kept])
+    np.testing.assert_array_equal(found.time, CLOCK[kept])
+    assert found.findings == ()
+
+
+@pytest.mark.parametrize(
+    ("span", "second"), [(2.0**32, 1e6), (2.0**32 * 1e-6, 1.0), (2.0**16, 1e3), (86400.0, 1.0), (2.0**31, 1e6)]
+)
+def test_a_counter_that_wraps(span: float, second: float):
+    # Every clock wraps in the middle of the log; that of milliseconds twice more.
+    step = 1.0 / second if span == 2.0**16 else STEP
+    ticks = np.rint((np.arange(COUNT) - COUNT / 2) * step * second * (15 if span == 2.0**16 else 1) * 1e6) / 1e6
+    found = base(np.mod(ticks, span) / second, second=second)
+    told(found, "note", "wraps")
+    np.testing.assert_allclose(np.diff(found.time), np.diff(ticks) / second, atol=1e-9 * span / second)
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, 1e9, -5.0, 1e300])
+def test_a_wild_stamp_is_put_between_its_neighbours(value: float):
+    found = base(changed(r100=value))
+    told(found, "warning", "1 stamps are blank or fit nowhere", "row 101")
+    np.testing.assert_allclose(found.time, CLOCK, atol=1e-12)
+
+
+def test_a_wild_stamp_of_unsteady_sampling_costs_its_row():
+    stamps = np.cumsum(np.random.default_rng(1).uniform(0.2, 3.0, COUNT)) * STEP
+    found = base(np.where(np.arange(COUNT) == 100, np.nan, stamps))
+    kept = np.arange(COUNT) != 100
+    if len(found.rows) < COUNT:
+        np.testing.assert_array_equal(found.time, stamps[kept])
+    else:
+        np.testing.assert_array_equal(found.time[kept], stamps[kept])
+
+
+@pytest.mark.parametrize("order", [[*range(100), 101, 100, *range(102, COUNT)], [*range(2000, COUNT), *range(2000)]])
+def test_late_rows_are_sorted_in(order: list[int]):
+    found = base(CLOCK[order], SAMPLES[order])
+    told(found, "warning", "a row comes late")
+    np.testing.assert_array_equal(found.time, CLOCK)
+    np.testing.assert_array_equal(np.asarray(order)[found.rows], np.arange(COUNT))
+
+
+def test_a_log_written_backwards():
+    np.testing.assert_array_equal(base(CLOCK[::-1], SAMPLES[::-1]).time, CLOCK)
+
+
+def test_a_buffer_written_twice():
+    order = [*range(200), *range(150, COUNT)]
+    found = base(CLOCK[order], SAMPLES[order])
+    told(found, "warning", "50 times", "row 201")
+    np.testing.assert_array_equal(found.time, CLOCK)
+    np.testing.assert_array_equal(np.asarray(order)[found.rows], np.arange(COUNT))
+
+
+def test_a_clock_that_starts_anew():
+    stamps = np.concatenate([CLOCK[:2500], CLOCK[:1500]])
+    found = base(stamps)
+    told(found, "warning", "starts anew", "row 2501")
+    np.testing.assert_array_equal(found.restarts, [2500])
+    np.testing.assert_array_equal(found.time[:2500], CLOCK[:2500])
+    np.testing.assert_allclose(np.diff(found.time[2500:]), STEP)
+
+
+def test_rows_that_repeat_a_stamp_with_other_numbers():
+    stamps = np.cumsum(np.random.default_rng(1).uniform(0.9, 1.1, COUNT)) * STEP
+    stamps[[70, 900]] = stamps[[69, 899]]
+    found = base(stamps)
+    told(found, "warning", "2 rows repeat", "row 71")
+    np.testing.assert_array_equal(found.rows, np.delete(np.arange(COUNT), [70, 900]))
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [np.ones(COUNT), np.full(COUNT, np.nan), SAMPLES[:, 0], CLOCK * 1e300, np.where(CLOCK < 1.5, 0.0, CLOCK)],
+    ids=["stands", "blank", "noise", "huge", "stands for long"],
+)
+def test_what_is_no_clock_is_refused(stamps: np.ndarray):
+    with np.errstate(all="ignore"), pytest.raises(InputError, match="is no clock") as error:
+        base(stamps)
+    assert "log.csv" in str(error.value) and "'t'" in str(error.value) and "sample_rate" in str(error.value)

@@ -1,0 +1,141 @@
+"""Spoilt logs give a result or one clear sentence: no traceback, no hang, no NaN."""
+
+import json
+import time
+from pathlib import Path
+
+import mutations
+import numpy as np
+import pytest
+
+import rig
+from fitting.command_line import main
+from fitting.drive_file import read_drive_file
+from fitting.errors import DataError, InputError
+from fitting.health import examine, refuse_unfit
+from fitting.logs import Log
+from fitting.rig import ready_log
+
+# A log of 600 rows takes milliseconds; a loaded machine may take a hundred times as long.
+LONGEST = 20.0
+
+
+def outcome(log_path: Path, drive_path: Path) -> Log | ValueError:
+    """The log, ready to be fitted, or the refusal."""
+    try:
+        drive = read_drive_file(drive_path)
+        log = ready_log(log_path, drive)
+        findings = examine(log, drive)
+        for finding in findings:
+            assert "\n" not in str(finding)
+            assert not {"nan", "inf"} & set(finding.what.replace(",", " ").split()), str(finding)
+        refuse_unfit(findings, log)
+    except (InputError, DataError) as error:
+        return error
+    return log
+
+
+def assert_sound(found: Log | ValueError, log_path: Path, drive_path: Path) -> None:
+    """A log without a number that is none, or one sentence that names the file."""
+    if isinstance(found, ValueError):
+        message = str(found)
+        assert len(message.splitlines()) == 1 and message.isprintable(), message
+        assert str(log_path) in message or str(drive_path) in message, message
+        assert 30 < len(message) < 1200, message
+        return
+    columns = [value for key, value in vars(found).items() if isinstance(value, np.ndarray) and "velocity" not in key]
+    assert all(np.isfinite(column).all() for column in columns if column.dtype == float)
+    assert {column.shape for column in columns} == {(len(found),)}
+    assert (np.diff(found.time) > 0).all()
+    for start, stop in found.pieces or ():
+        assert 0 <= start < stop <= len(found)
+
+
+def fit(log_path: Path, drive_path: Path, out: Path) -> int:
+    """The exit code of a fit on the command line."""
+    try:
+        main(["fit", str(log_path), "--drive", str(drive_path), "--out", str(out)])
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+def check(seed: int, folder: Path) -> bool:
+    """Whether a spoilt log can be fitted all the same."""
+    log_path, drive_path = mutations.spoilt_case(seed, folder / str(seed))
+    begin = time.monotonic()
+    found = outcome(log_path, drive_path)
+    assert time.monotonic() - begin < LONGEST
+    assert_sound(found, log_path, drive_path)
+    return isinstance(found, Log)
+
+
+@pytest.mark.parametrize("block", range(6))
+def test_spoilt_logs_give_a_log_or_a_sentence(block: int, tmp_path: Path):
+    fitted = [check(seed, tmp_path) for seed in range(20 * block, 20 * block + 20)]
+    # Neither are all refused nor all let through: the mutations bite, and the gate is no wall.
+    assert 0 < sum(fitted) < len(fitted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", range(10))
+def test_a_thousand_spoilt_logs(block: int, tmp_path: Path):
+    for seed in range(1000 + 100 * block, 1100 + 100 * block):
+        check(seed, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_cache")
+def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """The fit itself, on spoilt logs that the gate lets through: a report without a NaN, or one sentence."""
+    fitted = 0
+    for seed in range(200, 300):
+        log_path, drive_path = mutations.spoilt_case(seed, tmp_path / str(seed))
+        if isinstance(outcome(log_path, drive_path), ValueError):
+            continue
+        out = tmp_path / str(seed) / "out"
+        capfd.readouterr()
+        code = fit(log_path, drive_path, out)
+        told = capfd.readouterr()
+        if code == 0:
+            text = (out / "report.json").read_text(encoding="utf-8")
+            # Python would read and write NaN and Infinity as if they were JSON.
+            json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in report.json"))
+            assert "nan" not in told.out.lower().split(), told.out
+        else:
+            assert code in (1, 2) and told.err.startswith("hdjax: ") and told.err.count("\n") == 1, (seed, told.err)
+            assert not out.exists()
+        fitted += 1
+        if fitted == 12:
+            return
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("own_cache")
+def test_an_ugly_log_gives_the_same_drive(tmp_path: Path):
+    """Latin-1, decimal commas, degrees, a gap, a dropped sample, blanks, spikes, encoders that were never zeroed."""
+    count, random = 6000, np.random.default_rng(0)
+    torque = rig.drive_torque(count)
+    log = rig.drive_log(rig.drive_motion(torque), torque)
+    assert log.motor_angle is not None and log.load_angle is not None
+    motor, load = np.rad2deg(log.motor_angle), np.rad2deg(log.load_angle - 0.7)
+    load[random.integers(100, count - 100, 12)] += 0.2 * random.normal(size=12)
+    motor[random.integers(0, count, 20)] = np.nan
+    kept = np.delete(np.arange(count), [*range(2000, 2300), 4000])
+    rows = [";".join("" if np.isnan(c[i]) else f"{c[i]:.12g}" for c in (log.time, motor, load, torque)) for i in kept]
+    text = "Prüfstand 3\ntime;motor_angle;load_angle;motor_torque\ns;°;°;Nm\n" + "\n".join(rows).replace(".", ",")
+    path, drive, out = tmp_path / "log.csv", tmp_path / "drive.toml", tmp_path / "out"
+    path.write_text(text, encoding="latin-1")
+    drive.write_bytes(mutations.drive_text(np.random.default_rng(0), spoilt=False))
+    assert fit(path, drive, out) == 0
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    found = report["before"]["parameters"]
+    for name, truth in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}.items():
+        # Four standard errors, and the bridged sample's share of one.
+        assert abs(found[name]["value"] - truth) < 5 * found[name]["std"], name
+    noise = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
+    assert report["before"]["rmse"]["validation"] < 1.1 * noise
+    assert [log["name"] for log in report["logs"]] == ["log, part 1", "log, part 2"]
+    told = " ".join(finding["what"] for finding in report["health"])
+    for words in ("20 rows", "1 gaps", "1 samples of motor_torque", "12 samples stand out", "off zero"):
+        assert words in told

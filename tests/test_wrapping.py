@@ -1,0 +1,82 @@
+"""Wrapped angles and overflowed integers run on; what only looks like them is left alone."""
+
+import numpy as np
+import pytest
+
+from fitting.wrapping import unwrapped_angle, unwrapped_overflow
+
+COUNT = 4000
+TIME = np.arange(COUNT) * 5e-4
+ANGLE = 15 * np.sin(3 * TIME) + 0.01 * np.random.default_rng(0).normal(size=COUNT)  # rad
+
+
+def counts(bits: int) -> np.ndarray:
+    return np.rint(ANGLE / (2 * np.pi) * 2.0**bits)
+
+
+CASES = {
+    "0 to 2 pi": (ANGLE, 2 * np.pi, 0.0, 2 * np.pi),
+    "-pi to pi": (ANGLE, 2 * np.pi, -np.pi, 2 * np.pi),
+    "degrees": (np.rad2deg(ANGLE), 360.0, 0.0, 360.0),
+    "revolutions": (ANGLE / (2 * np.pi), 1.0, 0.0, 1.0),
+    "single-turn counts": (counts(14), 2.0**14, 0.0, 2.0**14),
+    "16 bits of a finer encoder": (counts(17), 2.0**16, 0.0, 2.0**17),
+    "signed 16 bits": (counts(16), 2.0**16, -(2.0**15), 2.0**16),
+}
+
+
+@pytest.mark.parametrize(("running", "span", "low", "revolution"), CASES.values(), ids=CASES.keys())
+def test_wrapped_angles_run_on(running: np.ndarray, span: float, low: float, revolution: float):
+    wrapped = np.mod(running - low, span) + low
+    found, told, rows = unwrapped_angle(wrapped, revolution)
+    assert told == span
+    np.testing.assert_allclose(np.diff(found), np.diff(running), atol=1e-12 * span)
+    np.testing.assert_array_equal(rows, np.flatnonzero(np.abs(np.diff(wrapped)) > span / 2) + 1)
+
+
+def test_blanks_in_a_wrapped_angle():
+    wrapped = np.mod(ANGLE, 2 * np.pi)
+    wrapped[::7] = np.nan
+    found, _, rows = unwrapped_angle(wrapped, 2 * np.pi)
+    known = np.isfinite(found)
+    assert known.sum() == COUNT - len(wrapped[::7]) and len(rows)
+    np.testing.assert_allclose(np.diff(found[known]), np.diff(ANGLE[known]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [ANGLE, ANGLE / 20, np.random.default_rng(1).uniform(0, 2 * np.pi, COUNT), np.full(COUNT, np.nan), np.zeros(COUNT)],
+    ids=["running", "small", "noise", "blank", "still"],
+)
+def test_other_angles_stay(values: np.ndarray):
+    found, span, rows = unwrapped_angle(values, 2 * np.pi)
+    np.testing.assert_array_equal(found, values)
+    assert span == 0 and len(rows) == 0
+
+
+TORQUE = 40 * np.sin(40 * TIME) + 0.1 * np.random.default_rng(2).normal(size=COUNT)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0 / 1024])
+def test_an_overflowed_torque_runs_on(unit: float):
+    whole = np.rint(TORQUE / unit)
+    overflowed = np.mod(whole + 2**15, 2.0**16) - 2**15
+    found, span, rows = unwrapped_overflow(overflowed * unit)
+    assert span == pytest.approx(2**16 * unit, rel=1e-9) and len(rows)
+    np.testing.assert_allclose(found, whole * unit, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.rint(TORQUE * 1e3),
+        np.where(np.arange(COUNT) // 50 % 2, 3e4, -3e4),
+        np.rint(1e4 * np.random.default_rng(3).normal(size=COUNT)),
+        TORQUE,
+    ],
+    ids=["integers", "switched", "noise", "real numbers"],
+)
+def test_other_torques_stay(values: np.ndarray):
+    found, span, _ = unwrapped_overflow(values)
+    np.testing.assert_array_equal(found, values)
+    assert span == 0
