@@ -23,25 +23,18 @@ from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.estimate import (
-    Fit,
-    fit,
     measurement_noise,
     needed_substeps,
     segment_length,
 )
 from fitting.experiment import Experiment, Stretch, segment_count, split
+from fitting.long_fit import long_fit
 from fitting.outliers import with_weights
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
-_LONG_STEPS = 20
-# By how many standard errors the steps of the final fit may move its parameters, and how many steps a sample may take.
-_SHIFT = 0.2
-_MOST_SUBSTEPS = 32
-# What the long fit may cost on short segments, in the objective: 2 % of the error.
-_LONG_LOSS = 0.02
 # A residual this much larger than the measurement noise is not noise.
 _EXCESS = 1.5
 # Share of the unexplained variance that found effects must remove to be called the explanation.
@@ -147,7 +140,7 @@ def close_loop(
     progress("final fit over long horizons")
     training, validation = data[current.hold]
     noise = measurement_noise(current.training)
-    final = _long_fit(current, training, setting)
+    final = long_fit(current.training)
     clock.lap("final fit")
     progress("free runs on held-out data")
     after = account(final, training, validation, noise=noise, halo=setting.halo)
@@ -231,41 +224,6 @@ def _add_effects(
             dropped.append(name)
             current = without
     return current, tuple(rounds), tuple(dropped)
-
-
-def _long_fit(current: Trial, training: Sequence[Stretch], setting: Setting) -> Fit:
-    """The last fit, over simulations as long as the logs, where small errors of a parameter add up and show.
-
-    Where a long simulation has lost its way, short segments say so, and their own fit stays.
-    """
-    start = current.training
-    longest = max(len(s) for s in training)
-    substeps = needed_substeps(start, shift=_SHIFT, most=_MOST_SUBSTEPS)
-    long = fit(
-        current.model,
-        training,
-        start.free.paths,
-        horizon=longest,
-        length=segment_length(setting.horizon),
-        halo=setting.halo,
-        substeps=substeps,
-        covariance=start.covariance,
-        count=setting.count,
-        states=start.unknowns.states,
-        max_steps=_LONG_STEPS,
-    )
-    check = fit(
-        long.model,
-        training,
-        start.free.paths,
-        horizon=setting.horizon,
-        halo=setting.halo,
-        substeps=substeps,
-        count=setting.count,
-        covariance=start.covariance,
-        hold_parameters=True,
-    )
-    return long if check.objective < start.objective + _LONG_LOSS else start
 
 
 def _findings(

@@ -88,12 +88,12 @@ def fit_only(
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, split(experiments[h])[0]) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
-    found, (training, validation) = fits[hold], split(experiments[hold])
+    found, (_, validation) = fits[hold], split(experiments[hold])
     clock.lap("fit")
     noise = measurement_noise(found)
     clock.lap("measurement noise")
     progress("free runs on held-out data")
-    result = account(found, training, validation, noise=noise, halo=0)
+    result = account(found, found.stretches, validation, noise=noise, halo=0)
     clock.lap("free runs and standard errors")
     residual = diagnose(found)
     tests = residual_tests(found, residual)
