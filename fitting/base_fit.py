@@ -45,16 +45,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
     best, start = _coarse_fit(starting_models(model, training), training, halo)
     horizon = short_horizon(best.model, training)
     if not best.horizon <= 2 * horizon <= 4 * best.horizon:
-        segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
-        best = fit(
-            best.model,
-            training,
-            base_paths(best.model),
-            horizon=horizon,
-            halo=halo,
-            substeps=suggested_substeps(best.model, training),
-            states=initial_states(best.model, segments),
-        )
+        best = _refined(best, training, halo)
     for _ in range(_CLEANINGS):
         cleaned = without_lone_errors(best)
         if cleaned is None:
@@ -101,6 +92,36 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
             if other.objective < best.objective:
                 best, begun = other, start
     return best, begun
+
+
+def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
+    """The fit over horizons of six natural periods, from one over shorter ones."""
+    paths, length = base_paths(best.model), best.error.shape[1]
+    # The reach of a horizon is in inverse proportion to it, so that none may be skipped. Joined segments make a longer
+    # one by the same program.
+    while 4 * best.horizon <= short_horizon(best.model, training):
+        best = fit(
+            best.model,
+            training,
+            paths,
+            horizon=2 * best.horizon,
+            length=length,
+            halo=halo,
+            substeps=best.substeps,
+            count=best.error.shape[0],
+            states=best.unknowns.states,
+        )
+    horizon = short_horizon(best.model, training)
+    segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
+    return fit(
+        best.model,
+        training,
+        paths,
+        horizon=horizon,
+        halo=halo,
+        substeps=suggested_substeps(best.model, training),
+        states=initial_states(best.model, segments),
+    )
 
 
 def leaves_white_noise(found: Fit) -> bool:
