@@ -42,20 +42,10 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: where the data supply no starting values.
     """
     training = without_glitches(training)
-    best = _coarse_fit(starting_models(model, training), training, halo)
-    start = best.problem.model
+    best, start = _coarse_fit(starting_models(model, training), training, halo)
     horizon = short_horizon(best.model, training)
     if not best.horizon <= 2 * horizon <= 4 * best.horizon:
-        segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
-        best = fit(
-            best.model,
-            training,
-            base_paths(best.model),
-            horizon=horizon,
-            halo=halo,
-            substeps=suggested_substeps(best.model, training),
-            states=initial_states(best.model, segments),
-        )
+        best = _refined(best, training, halo)
     for _ in range(_CLEANINGS):
         cleaned = without_lone_errors(best)
         if cleaned is None:
@@ -72,17 +62,17 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
     return eqx.tree_at(lambda f: f.problem.model, best, start)
 
 
-def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> Fit:
-    """The best of the fits from each start, over horizons that suit the fastest of them."""
+def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
+    """The best of the fits from each start, over horizons that suit the fastest of them; and where it started."""
     # Judged on equally short segments, a start with the wrong frequency can't hide.
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
 
-    def fitted(start: Model, *, max_steps: int = 60, hold_parameters: bool = False) -> Fit:
+    def fitted(model: Model, *, max_steps: int = 60, hold_parameters: bool = False) -> Fit:
         return fit(
-            start,
+            model,
             training,
-            base_paths(start),
+            base_paths(model),
             horizon=horizon,
             halo=halo,
             substeps=substeps,
@@ -90,15 +80,48 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
             hold_parameters=hold_parameters,
         )
 
-    held = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
-    best = fitted(held[0])
+    if len(starts) > 1:
+        starts = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
+    best, begun = fitted(starts[0]), starts[0]
     if len(starts) == 1 or leaves_white_noise(best):
-        return best
-    trials = sorted((fitted(s, max_steps=_TRIAL_STEPS) for s in held[1:]), key=lambda f: f.objective)
-    for trial in trials:
+        return best, begun
+    trials = [(fitted(s, max_steps=_TRIAL_STEPS), s) for s in starts[1:]]
+    for trial, start in sorted(trials, key=lambda pair: pair[0].objective):
         if trial.objective < best.objective + _HOPELESS:
-            best = min(best, fitted(trial.model), key=lambda f: f.objective)
-    return best
+            other = fitted(trial.model)
+            if other.objective < best.objective:
+                best, begun = other, start
+    return best, begun
+
+
+def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
+    """The fit over horizons of six natural periods, from one over shorter ones."""
+    paths, length = base_paths(best.model), best.error.shape[1]
+    # The reach of a horizon is in inverse proportion to it, so that none may be skipped. Joined segments make a longer
+    # one by the same program.
+    while 4 * best.horizon <= short_horizon(best.model, training):
+        best = fit(
+            best.model,
+            training,
+            paths,
+            horizon=2 * best.horizon,
+            length=length,
+            halo=halo,
+            substeps=best.substeps,
+            count=best.error.shape[0],
+            states=best.unknowns.states,
+        )
+    horizon = short_horizon(best.model, training)
+    segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
+    return fit(
+        best.model,
+        training,
+        paths,
+        horizon=horizon,
+        halo=halo,
+        substeps=suggested_substeps(best.model, training),
+        states=initial_states(best.model, segments),
+    )
 
 
 def leaves_white_noise(found: Fit) -> bool:

@@ -25,6 +25,8 @@ from hdjax.lanes import jit_lanes, spread
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
+# An output that the model can't follow may take longer to lose its say.
+_MOST_REWEIGHTINGS = 12
 # Simulations longer than this many segments start from states that shorter ones have found already.
 _LONGEST_RETRY = 16
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
@@ -149,7 +151,7 @@ def fit(
     scale_matters = outputs > 1 or states.shape[1] > len(model.motion_states)
     objective, converged, steps = np.inf, False, 0
     error = None
-    for turn in range(_REWEIGHTINGS if reweigh and scale_matters else 1):
+    for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, motion.x)
         unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
@@ -236,7 +238,7 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
     if not suspect.any():
         return unknowns, False
     length = weight.shape[1]
-    for samples in (max(length // 8, min(length, 16)), length // 2, length):
+    for samples in _growing(problem, length):
         masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
         part = eqx.tree_at(
             lambda p: (p.segments.weight, p.segments.joined), held, (masked, jnp.zeros_like(held.segments.joined))
@@ -246,6 +248,14 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
     better = np.asarray(new < 0.99 * old) & suspect
     states = jnp.where(better[:, None], fresh.states, unknowns.states)
     return Unknowns(unknowns.parameters, states), bool(np.any(better))
+
+
+def _growing(problem: Problem, length: int) -> list[int]:
+    """From half a natural period, within which hardly a wrong state runs away, to the whole segment."""
+    knots = np.asarray(problem.segments.torque.knots)
+    half = np.pi / float(problem.model.drive.omega_0) / float(np.median(np.diff(knots)))
+    first = min(length, max(4, round(half)))
+    return [first * 2**k for k in range(20) if first * 2**k < length] + [length]
 
 
 def whitening(covariance: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
@@ -292,21 +302,28 @@ def _half_log_determinant(covariance: Array) -> float:
 
 
 def initial_states(model: Model, segments: Segments) -> Float[Array, "segments states"]:
-    """Each segment's first state from a local polynomial through its first samples; hidden states at rest.
+    """Each segment's first state from a local polynomial, through its first samples and, where the log goes on, the
+    last ones of the segment before; hidden states at rest.
 
     A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
     """
-    step = float(np.median(np.diff(np.asarray(segments.torque.knots))))
-    quarter = 0.5 * np.pi / float(model.drive.omega_0) / step
-    count = min(segments.measured.shape[1], int(np.clip(np.ceil(quarter), 5, _LONGEST_SEGMENT)))
-    measured = np.asarray(segments.measured[:, :count])
-    halo = segments.halo
-    t = np.asarray(segments.torque.knots[:, halo : halo + count])
-    t = t - t[:, :1]
-    scaled = t / t[:, -1:]
-    basis = scaled[:, :, None] ** np.arange(4)[None, None, :]
-    coefficients = np.linalg.pinv(basis) @ measured
-    value, rate = coefficients[:, 0], coefficients[:, 1] / t[:, -1:]
+    halo, length = segments.halo, segments.measured.shape[1]
+    measured, knots = np.asarray(segments.measured), np.asarray(segments.torque.knots)[:, halo:]
+    step = float(np.median(np.diff(knots)))
+    quarter = int(min(np.ceil(0.5 * np.pi / float(model.drive.omega_0) / step), _LONGEST_SEGMENT))
+    time = knots[:, :-1] - knots[:, :1]
+    ahead = slice(min(length, max(quarter, 5)))
+    value, rate = _value_and_rate(time[:, ahead], measured[:, ahead])
+    around = min(length - 1, max(quarter, 2))
+    if around >= 2:
+        before, previous = np.roll(knots, 1, axis=0), np.roll(measured, 1, axis=0)
+        earlier = before[:, -1 - around : -1] - knots[:, :1]
+        goes_on = np.abs(before[:, -1] - knots[:, 0]) < 0.5 * step
+        both = _value_and_rate(
+            np.hstack([earlier, time[:, : around + 1]]),
+            np.hstack([previous[:, -around:], measured[:, : around + 1]]),
+        )
+        value, rate = (np.where(goes_on[:, None], b, a) for a, b in zip((value, rate), both, strict=True))
     if isinstance(model, TwoInertiaModel):
         N = float(model.drive.N)
         columns = [N * value[:, 0], value[:, 0] - value[:, 1]]
@@ -316,6 +333,14 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
     motion = np.stack(columns, axis=1)
     hidden = np.asarray(model.rest())[len(model.motion_states) :]
     return jnp.asarray(np.hstack([motion, np.tile(hidden, (motion.shape[0], 1))]))
+
+
+def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value and slope at time zero of the cubic through samples of each segment."""
+    span = np.max(np.abs(time), axis=1, keepdims=True)
+    basis = (time / span)[:, :, None] ** np.arange(4)[None, None, :]
+    coefficients = np.linalg.pinv(basis) @ measured
+    return coefficients[:, 0], coefficients[:, 1] / span
 
 
 def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, float]:

@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
+from fitting.masks import glitches
 
 # Chance that the noise of a whole log has a sample left out.
 _FALSE_ALARM = 1e-3
@@ -23,20 +24,17 @@ _LONGEST = 3
 _BESIDE = 2
 # More than this share is the nature of the noise, not a fault.
 _MOST = 0.05
-# A sample that its neighbours do not foretell by this many standard deviations may be a glitch of the sensor ...
-_GROSS = 12.0
-# ... if it is missed by its neighbours' cubics in the pattern that a lone wrong sample leaves.
-_PATTERN = np.array([1 / 6, -2 / 3, -2 / 3, 1 / 6])
-_PATTERN_TOLERANCE = 0.13
 
 
 def without_glitches(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-    """The stretches without the samples that stand out from their neighbours far beyond noise and motion."""
+    """The stretches without gross spikes, which would spoil starting values and scales; of a log that was read from a
+    file they are known already."""
     found = []
     for stretch in stretches:
+        part = slice(stretch.start, stretch.stop)
         wrong = np.zeros(len(stretch), dtype=bool)
-        for column in stretch.experiment.measured[stretch.start : stretch.stop].T:
-            wrong |= _glitches(column)
+        for column in stretch.experiment.measured[part].T:
+            wrong[glitches(column, stretch.experiment.time[part])] = True
         found.append(_left_out(stretch, wrong))
     return tuple(found)
 
@@ -64,12 +62,12 @@ def without_lone_errors(found: Fit) -> tuple[Stretch, ...] | None:
 
 def with_weights(stretches: Sequence[Stretch], believed: Sequence[Stretch]) -> tuple[Stretch, ...]:
     """The same stretches under another assumption about the torque, with the outputs and weights of `believed`."""
-    return tuple(
-        dataclasses.replace(
-            s, experiment=dataclasses.replace(s.experiment, measured=b.experiment.measured, weight=b.experiment.weight)
-        )
-        for s, b in zip(stretches, believed, strict=True)
-    )
+
+    def one(stretch: Stretch, known: Stretch) -> Stretch:
+        fields = {name: getattr(known.experiment, name) for name in ("measured", "motor_angle", "weight")}
+        return dataclasses.replace(stretch, experiment=dataclasses.replace(stretch.experiment, **fields))
+
+    return tuple(one(s, b) for s, b in zip(stretches, believed, strict=True))
 
 
 def left_out(stretches: Sequence[Stretch]) -> int:
@@ -86,10 +84,17 @@ def _left_out(stretch: Stretch, wrong: np.ndarray) -> Stretch:
     weight = np.ones(len(experiment)) if experiment.weight is None else experiment.weight.copy()
     weight[stretch.start + np.flatnonzero(wrong)] = 0.0
     known = weight > 0
-    measured = np.stack(
-        [np.interp(experiment.time, experiment.time[known], column[known]) for column in experiment.measured.T], axis=1
+
+    def bridged(values: np.ndarray) -> np.ndarray:
+        return np.interp(experiment.time, experiment.time[known], values[known])
+
+    mended = dataclasses.replace(
+        experiment,
+        measured=np.stack([bridged(column) for column in experiment.measured.T], axis=1),
+        motor_angle=None if experiment.motor_angle is None else bridged(experiment.motor_angle),
+        weight=weight,
     )
-    return dataclasses.replace(stretch, experiment=dataclasses.replace(experiment, measured=measured, weight=weight))
+    return dataclasses.replace(stretch, experiment=mended)
 
 
 def _alone(size: np.ndarray, limit: float) -> np.ndarray:
@@ -100,21 +105,6 @@ def _alone(size: np.ndarray, limit: float) -> np.ndarray:
         beside = np.concatenate([size[max(0, start - _BESIDE) : start], size[stop : stop + _BESIDE]])
         if stop - start <= _LONGEST and (beside < _ORDINARY).all():
             found[start:stop] = True
-    return found
-
-
-def _glitches(values: np.ndarray) -> np.ndarray:
-    """Samples that a cubic through the two on either side does not foretell; an impact leaves another pattern."""
-    found = np.zeros(values.size, dtype=bool)
-    if values.size < 8:
-        return found
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, 2, mode="reflect", reflect_type="odd"), 5)
-    off = around @ np.array([1 / 6, -2 / 3, 1.0, -2 / 3, 1 / 6])
-    spread = _spread(off)
-    for k in np.flatnonzero(np.abs(off) > _GROSS * spread) if spread > 0 else ():
-        if 2 <= k < values.size - 2:
-            beside = off[[k - 2, k - 1, k + 1, k + 2]] / off[k]
-            found[k] = np.max(np.abs(beside - _PATTERN)) < _PATTERN_TOLERANCE
     return found
 
 

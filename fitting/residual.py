@@ -113,7 +113,9 @@ def residual(
     """Whitened output error of each segment by row, then its hidden initial states in units of their prior; and the
     gap before each joined segment."""
     outputs, end = simulate_segments(problem, unknowns)
-    error = (problem.segments.measured - outputs) * problem.segments.weight[:, :, None]
+    weight = problem.segments.weight[:, :, None]
+    # A simulation may run away where there are no data; infinity times zero is no zero.
+    error = where(weight > 0, (problem.segments.measured - outputs) * weight, 0.0)
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
     rows = white.reshape(white.shape[0], -1)
     rows = where(jnp.abs(rows) < _LOST, rows, _LOST)

@@ -187,6 +187,17 @@ def test_a_simulation_that_runs_away_can_be_squared(small):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(system))
 
 
+def test_a_simulation_may_run_away_where_there_are_no_data(small):
+    problem, start = small
+    softening = start.parameters.at[2].set(-5.0)
+    lost = Unknowns(softening, start.states.at[3].set(jnp.asarray([3.0, 0.0])))
+    empty = eqx.tree_at(lambda p: p.segments.weight, problem, problem.segments.weight.at[3].set(0.0))
+    found = eqx.filter_jit(blocks)(empty, lost)
+    np.testing.assert_array_equal(found.residual[3], 0.0)
+    np.testing.assert_array_equal(found.by_parameter[3], 0.0)
+    assert np.isfinite(np.asarray(found.residual)).all()
+
+
 def test_the_minimum_is_that_of_scipy(small):
     problem, start = small
     segments, states = start.states.shape

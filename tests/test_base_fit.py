@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.base_fit import base_fit, leaves_white_noise
+from fitting.base_fit import _refined, base_fit, leaves_white_noise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
 from fitting.free import base_paths
@@ -62,6 +62,18 @@ def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
         hold_parameters=True,
     )
     assert not leaves_white_noise(off)
+
+
+def test_horizons_grow_step_by_step(clean):
+    far = rig.reduced_model(omega_0=0.5 * rig.OMEGA_0, gain=0.25 * rig.GAIN, alpha=0.0)
+    paths = base_paths(far)
+    # At once over six periods, a frequency 50 % off ends in a wrong minimum.
+    direct = fit(far, whole(clean), paths, horizon=128, substeps=3)
+    assert abs(float(direct.model.get("omega_0")) / rig.OMEGA_0 - 1) > 0.1
+    coarse = fit(far, whole(clean), paths, horizon=32, substeps=3, hold_parameters=True)
+    refined = _refined(coarse, whole(clean), 0)
+    assert refined.horizon == 128
+    assert_recovered(refined, TRUTH)
 
 
 @pytest.mark.parametrize("size", [15 * NOISE, 20.0])
