@@ -103,7 +103,7 @@ def fit_only(
     noise = measurement_noise(base)
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    found = long_fit(base)
+    found = long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs on held-out data")
     result = account(found, found.stretches, validation, noise=noise, halo=0, profiles=True)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from fitting.compare import Account, excess
 from fitting.estimate import Fit
 from fitting.free_run import FreeRun
+from fitting.outliers import left_out
 
 
 class Goodness(eqx.Module):
@@ -18,6 +19,7 @@ class Goodness(eqx.Module):
     Attributes:
         fit_percent: `100 (1 - |y - yhat| / |y - mean(y)|)` of the free runs on training and on held-out stretches.
         data: measured numbers that were fitted (samples times outputs).
+        left_out: samples without weight: put in, not believed by the health gate, or wrong on their own.
         parameters: free parameters.
         states: fitted entries of initial states.
         error_over_noise: rms of what short simulations leave of each output, in units of its measurement noise.
@@ -33,6 +35,7 @@ class Goodness(eqx.Module):
 
     fit_percent: dict[str, float]
     data: int = eqx.field(static=True)
+    left_out: int = eqx.field(static=True)
     parameters: int = eqx.field(static=True)
     states: int = eqx.field(static=True)
     error_over_noise: dict[str, float]
@@ -69,6 +72,7 @@ def goodness(fit: Fit, account: Account, noise: Float[Array, "outputs outputs"])
     return Goodness(
         fit_percent={"training": fit_percent(account.training), "validation": fit_percent(account.validation)},
         data=samples * outputs,
+        left_out=left_out(fit.stretches),
         parameters=parameters,
         states=states,
         error_over_noise=dict(zip(names, excess(fit, noise).tolist(), strict=True)),

@@ -5,11 +5,14 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from fitting.estimate import Fit
 from fitting.sandwich import Covariance, Linearised, covariance, linearised
 from hdjax.parameters import ParameterInfo
+
+_DISSIPATIVE = ("B_sp", "mu")
 
 
 class Estimate(eqx.Module):
@@ -18,7 +21,7 @@ class Estimate(eqx.Module):
     Attributes:
         path: dotted path.
         value: in SI units.
-        std: standard error, robust against coloured residuals (sandwich).
+        std: standard error, robust against coloured residuals (sandwich), and no less than the classical one.
         std_classical: standard error from J^T J alone, which takes the residual for white noise.
         ci95: 95 % interval; wider than 1.96 standard errors where those rest on few data.
         unit: SI unit.
@@ -60,7 +63,7 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
 
     The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
     The robust one holds whatever the colour of the residual, see [`fitting.sandwich`][]. Its own uncertainty enters
-    the intervals as Student's t.
+    the intervals as Student's t. The larger of the two counts.
 
     Args:
         fit: the fit.
@@ -85,20 +88,23 @@ def _estimate(
     path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
 ) -> Estimate:
     freedom = float(found.degrees_of_freedom[i])
-    error = float(np.sqrt(found.robust[i, i]))
-    reach = float(student.ppf(0.975, freedom)) * error
+    robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
+    # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
+    error = max(robust, classical)
+    reach = max(float(student.ppf(0.975, freedom)) * robust, float(norm.ppf(0.975)) * classical)
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)
         identifiable = reach < 1.0
     else:
         interval = (value - slope * reach, value + slope * reach)
-        identifiable = not interval[0] <= 0.0 <= interval[1]
+        # Damping below zero would be energy from nowhere: that a log tells it from zero does not make it known.
+        identifiable = interval[0] > 0.0 if path in _DISSIPATIVE else not interval[0] <= 0.0 <= interval[1]
     return Estimate(
         path=path,
         value=value,
         std=slope * error,
-        std_classical=slope * float(np.sqrt(found.classical[i, i])),
+        std_classical=slope * classical,
         ci95=interval,
         unit=info.unit,
         identifiable=bool(identifiable),

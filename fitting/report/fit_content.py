@@ -43,6 +43,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
             "aic": g.aic,
             "bic": g.bic,
             "data": g.data,
+            "left_out": g.left_out,
             "parameters": g.parameters,
             "initial_states": g.states,
             "iterations": g.iterations,
@@ -90,6 +91,8 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
         )
     if verdicts.get("normality") == "failed" and not missing:
         notes.append("The errors are not Gaussian: look for outliers, clipping or coarse quantisation in the plot.")
+    if report["goodness"]["left_out"]:
+        notes.append(f"{report['goodness']['left_out']} samples were left out: missing, or wrong on their own.")
     response = report["frequency_response"]
     if response and not response["excited"]:
         notes.append("The log does not excite the resonance: what it says of damping rests on little.")
