@@ -89,6 +89,20 @@ def test_without_rated_torque_its_figures_are_unknown(tmp_path: Path) -> None:
     assert parameters["lost_motion"]["value"] is None and "rated_torque" in parameters["lost_motion"]["reason"]
 
 
+def test_rows_without_a_number_are_left_out_and_told(tmp_path: Path) -> None:
+    columns = table()
+    blank = np.arange(400) % 50 == 7
+    # Taken for a measurement, what is put in there would be far off the curve.
+    columns["joint_torque"] = np.where(blank, np.nan, columns["joint_torque"])
+    columns["twist"] = np.where(np.roll(blank, 1), np.nan, columns["twist"])
+    log, drive = write(tmp_path, columns)
+    assert run("fit", log, "--drive", drive, "--out", tmp_path / "out") == 0
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    low, high = report["before"]["parameters"]["K"]["ci95"]
+    assert low < K1 < high
+    assert any("8 rows" in finding["what"] for finding in report["health"])
+
+
 ANGLES = '[drive]\nreduction_ratio = 100\n[columns]\njoint_torque = "torque"\n'
 
 
@@ -160,7 +174,6 @@ def turned_round() -> dict[str, np.ndarray]:
         (table(), '[columns]\njoint_torque = { unit = "rad" }\n', 2, "joint_torque"),
         (table(), '[columns]\njoint_torque = "torqe"\n', 2, "torqe"),
         (table(), "[drive]\nrated_torque = -5\n", 2, "rated_torque"),
-        (table() | {"twist": np.where(np.arange(400) == 7, np.nan, table()["twist"])}, "", 2, "data row 8"),
         ({"time": table()["time"], "joint_torque": table()["joint_torque"]}, "", 2, "motor_angle"),
     ],
 )

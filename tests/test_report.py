@@ -278,7 +278,7 @@ def test_a_fit_tells_all_that_fitters_expect(fitted: FitOnly):
     verdicts = {t["name"]: t["verdict"] for t in found["residual_tests"]}
     assert verdicts["whiteness"] == "failed"
     assert any("close-loop" in sentence for sentence in found["meaning"])
-    assert found["frequency_response"]["excited"] and found["seconds"]["fit"] > 0
+    assert found["frequency_response"]["excited"] and found["seconds"]["final fit"] > 0
 
 
 def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
