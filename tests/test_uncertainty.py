@@ -137,9 +137,10 @@ def test_intervals_and_units(white_draws: list[Uncertainty]):
         assert 0.3 < estimate.std / estimate.std_classical < 3.0
         assert estimate.ci95[0] < estimate.value < estimate.ci95[1]
         width = estimate.ci95[1] - estimate.ci95[0]
-        # A positive parameter's interval is one of its logarithm: a little longer above.
-        assert width == pytest.approx(2 * t.ppf(0.975, estimate.degrees_of_freedom) * estimate.std, rel=0.01)
-        assert 1.959964 < 0.5 * width / estimate.std < 3.0
+        # The larger of the normal law's interval and Student's; of a positive parameter one of its logarithm, which is
+        # a little longer above.
+        student = t.ppf(0.975, estimate.degrees_of_freedom)
+        assert 0.99 * 1.959964 < 0.5 * width / estimate.std < 1.01 * student < 3.0
     assert estimates["mu"].unit == "1/s"
     assert estimates["omega_0"].ci95[0] > 0
 

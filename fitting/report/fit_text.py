@@ -108,17 +108,19 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
     samples = sum(log["samples"] for log in report["logs"])
     left = ", ".join(f"{output} {plain(v, 3)}" for output, v in g["error_over_noise"].items())
     held_out = sum(log["held_out"] for log in report["logs"])
-    return _table(rows, left=(0, 3)) + [
-        f"measurement noise {plain(report['noise']['dynamic_error'])} {unit} rms",
-        f"held-out samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
-        f"left over in short simulations, in units of the noise: {left}",
-        f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
-        f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
-        f"{len(report['logs'])} log(s), {samples} samples, {held_out} of them held out; {g['data']} numbers fitted by "
-        f"{g['parameters']} parameters and {g['initial_states']} initial states",
-        f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",
-        "time: " + ", ".join(f"{stage} {seconds:.2g} s" for stage, seconds in report["seconds"].items()),
-    ]
+    return _table(rows, left=(0, 3)) + _prose(
+        [
+            f"measurement noise {plain(report['noise']['dynamic_error'])} {unit} rms",
+            f"held-out samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
+            f"left over in short simulations, in units of the noise: {left}",
+            f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
+            f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
+            f"{len(report['logs'])} log(s), {samples} samples, {held_out} of them held out; {g['data']} numbers fitted by "
+            f"{g['parameters']} parameters and {g['initial_states']} initial states",
+            f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",
+            "time: " + ", ".join(f"{stage} {seconds:.2g} s" for stage, seconds in report["seconds"].items()),
+        ]
+    )
 
 
 def _share(value: float | None) -> str:
