@@ -115,7 +115,8 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
             f"left over in short simulations, in units of the noise: {left}",
             f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
             f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
-            f"{len(report['logs'])} log(s), {samples} samples, {held_out} of them held out; {g['data']} numbers fitted by "
+            f"{len(report['logs'])} log(s), {samples} samples, {held_out} of them held out; "
+            f"{g['data']} numbers fitted by "
             f"{g['parameters']} parameters and {g['initial_states']} initial states",
             f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",
             "time: " + ", ".join(f"{stage} {seconds:.2g} s" for stage, seconds in report["seconds"].items()),
