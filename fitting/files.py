@@ -1,9 +1,13 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and what may stand in them."""
 
+import math
 import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 
 def write_whole(contents: Mapping[Path, str | bytes]) -> None:
@@ -31,3 +35,14 @@ def write_whole(contents: Mapping[Path, str | bytes]) -> None:
     finally:
         for name, _ in waiting:
             os.unlink(name)
+
+
+def finite(value: Any) -> Any:
+    """The same structure with None, null in JSON, in place of what is no finite number."""
+    if isinstance(value, Mapping):
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    if isinstance(value, bool) or not isinstance(value, float | np.floating):
+        return value
+    return float(value) if math.isfinite(value) else None

@@ -1,10 +1,8 @@
 """`hdjax fit` on quasi-static logs: the files it writes, and one sentence where it can't."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,15 +19,7 @@ from hdjax import TwoInertiaModel, hdc_40_050
 DRIVE = "[drive]\nrated_torque = 54.0\n"
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Compiled programs go to the test's folder, and JAX's settings are put back."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-    before = {name: getattr(jax.config, name) for name in names}
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def run(*arguments: object) -> int:

@@ -1,7 +1,6 @@
 """What a quasi-static fit found, as `report.json` has it: figures, held-out errors, and what the logs can't tell."""
 
 import dataclasses
-import math
 import platform
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
+from fitting.files import finite
 from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.preparation import QuasiStaticData
@@ -69,7 +69,7 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         ],
         "versions": {"python": platform.python_version()} | {library: version(library) for library in _LIBRARIES},
     }
-    report = _finite(report)
+    report = finite(report)
     report["summary"] = summary(report)
     report["cannot_tell"] = _limits(report, data, fit)
     return report
@@ -299,14 +299,3 @@ def _about_axes(fit: QuasiStaticFit) -> list[str]:
         "The noise of both axes was measured and weighed; what exceeds it was ascribed to the twist. If it were an "
         f"error of the torque instead, the drive would be softer by up to {formatting.percent(share)}."
     ]
-
-
-def _finite(value: Any) -> Any:
-    """The same structure with null in place of what is no finite number."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, bool) or not isinstance(value, float | np.floating):
-        return value
-    return float(value) if math.isfinite(value) else None

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
@@ -15,6 +14,7 @@ from fitting.files import write_whole
 from fitting.quasi_static.content import PLAIN_SHAPE
 from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.plots import Picture, pictures
+from fitting.web_page import environment
 
 _ARCMIN = math.degrees(1.0) * 60.0
 
@@ -41,24 +41,12 @@ def write_report(out: Path, report: Mapping[str, Any], fit: QuasiStaticFit) -> d
 
 def report_page(report: Mapping[str, Any], shown: Sequence[Picture]) -> str:
     """The page: self-contained, reads without a network."""
-    environment = Environment(
-        loader=PackageLoader("fitting", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    # `tojson` writes <, >, & and ' as escapes, so that no name can end the script.
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    environment.filters |= {
-        "quantity": formatting.quantity,
-        "number": formatting.number,
-        "unit": formatting.pretty_unit,
+    filters = {
         "value": _value,
         "interval": _interval,
         "shape": PLAIN_SHAPE.__getitem__,
     }
-    page = environment.get_template("quasi_static.html.jinja")
+    page = environment(filters).get_template("quasi_static.html.jinja")
     return page.render(report=report, pictures=shown, plotlyjs=Markup(get_plotlyjs()))
 
 

@@ -1,7 +1,6 @@
 """The report as JSON has it."""
 
 import dataclasses
-import math
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -11,6 +10,7 @@ import numpy as np
 
 from fitting import findings
 from fitting.close_loop import Loop
+from fitting.files import finite
 from fitting.free_run import FreeRun
 from fitting.report.alternatives import alternatives
 from fitting.report.fit_content import fit_dict, meaning
@@ -78,7 +78,7 @@ def report_dict(
     }
     if not is_loop:
         report |= fit_dict(outcome, noise) | {"posterior": posterior_dict(outcome.posterior)}
-    report = _finite(report)
+    report = finite(report)
     report["summary"] = summary(report)
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)
@@ -99,14 +99,3 @@ def _setting(outcome: Outcome) -> dict[str, int] | None:
     if not isinstance(outcome, Loop):
         return None
     return dataclasses.asdict(outcome.setting) | {"substeps": outcome.after_substeps}
-
-
-def _finite(value: Any) -> Any:
-    """The same structure with null in place of what is no finite number."""
-    if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, bool) or not isinstance(value, float | np.floating):
-        return value
-    return float(value) if math.isfinite(value) else None

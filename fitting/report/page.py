@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
@@ -14,6 +13,7 @@ from fitting.report.posterior import QUANTILES
 from fitting.report.separating import plain_family
 from fitting.report.summary import chance
 from fitting.report.tables import changes, parameter_rows
+from fitting.web_page import environment
 
 
 def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
@@ -23,20 +23,8 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         report: from [`report_dict`][].
         pictures: from [`fitting.plots.plots`][].
     """
-    environment = Environment(
-        loader=PackageLoader("fitting", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    # `tojson` writes <, >, & and ' as escapes, so that no name can end the script.
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    environment.filters |= {
-        "quantity": formatting.quantity,
-        "number": formatting.number,
+    filters = {
         "percent": formatting.percent,
-        "unit": formatting.pretty_unit,
         "superscripts": formatting.superscripts,
         "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
         "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
@@ -50,16 +38,20 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
     }
     final = report["after"] if report["after"]["parameters"] else report["before"]
     template = "fit.html.jinja" if report["decision"] == "fit_only" else "loop.html.jinja"
-    return environment.get_template(template).render(
-        report=report,
-        noise=report["noise"]["dynamic_error"],
-        x_unit=report["units"]["dynamic_error"],
-        chance=lambda effect: chance(effect, report),
-        rows=parameter_rows(report, final),
-        changes=changes(report),
-        quantiles=QUANTILES,
-        sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found")},
-        plotlyjs=Markup(get_plotlyjs()),
+    return (
+        environment(filters)
+        .get_template(template)
+        .render(
+            report=report,
+            noise=report["noise"]["dynamic_error"],
+            x_unit=report["units"]["dynamic_error"],
+            chance=lambda effect: chance(effect, report),
+            rows=parameter_rows(report, final),
+            changes=changes(report),
+            quantiles=QUANTILES,
+            sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found")},
+            plotlyjs=Markup(get_plotlyjs()),
+        )
     )
 
 
