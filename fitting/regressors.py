@@ -18,6 +18,8 @@ from hdjax.where import where
 
 # Steps of an effect's own states in a sample interval, along a motion that is a straight line in between.
 _OWN_STEPS = 2
+# The nodes as parts of an interval.
+_PART = 0.5 * (NODES + 1.0)[None, None, :]
 
 
 class Regressors(eqx.Module):
@@ -47,7 +49,7 @@ def regressors(model: Model, proposals: Sequence[Effect], followed: Followed, se
         segments: the data that it belongs to.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *proposals)
-    return _regressors(model, stacked, followed, segments, continues(segments))
+    return _regressors(model, stacked, followed, segments, jnp.asarray(continues(segments)))
 
 
 def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
@@ -94,8 +96,8 @@ def _rates_and_reading(
     between, samples = followed.between, followed.states[:, :-1]
     if own is not None:
         start, end = own
-        part = 0.5 * (jnp.asarray(NODES) + 1.0)[None, None, :, None]
-        between = jnp.concatenate([between, start[:, :, None] * (1.0 - part) + end[:, :, None] * part], axis=-1)
+        start_to_end = start[:, :, None] * (1.0 - _PART[..., None]) + end[:, :, None] * _PART[..., None]
+        between = jnp.concatenate([between, start_to_end], axis=-1)
         samples = jnp.concatenate([samples, start], axis=-1)
     halo = segments.halo
     acting = jax.vmap(model.actuate)(segments.torque)
@@ -108,7 +110,7 @@ def _rates_and_reading(
 
 def _at_nodes(signal: PiecewisePolynomial) -> Float[Array, "segments samples nodes"]:
     width = jnp.diff(signal.knots)[..., None]
-    return polynomial(signal.coefficients[..., None, :], 0.5 * (jnp.asarray(NODES) + 1.0) * width)
+    return polynomial(signal.coefficients[..., None, :], jnp.asarray(_PART) * width)
 
 
 def _own_states(

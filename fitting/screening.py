@@ -25,6 +25,7 @@ from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks, linearise
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
+from hdjax.where import where
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -81,11 +82,7 @@ def screen(
     model = training.model
     motion = scales(training.stretches)
     present = {e.name for e in model.effects}
-    forms = [
-        f
-        for f in catalogue
-        if f.name not in present and not (f.needs_motor and isinstance(model, ReducedModel))
-    ]
+    forms = [f for f in catalogue if f.name not in present and not (f.needs_motor and isinstance(model, ReducedModel))]
     proposals = tuple(proposal for f in forms for proposal in f.proposals(motion))
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
@@ -138,26 +135,30 @@ def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[
     )
     followed: Followed = _on_host(follow(problem, fit.unknowns))
     found: Blocks = _on_host(linearise(problem, fit.unknowns))
-    slopes = np.asarray(fit.free.slopes(fit.model))
+    slopes = fit.free.slopes(fit.model)[None, None, :]
     found = replace(
         found,
         by_parameter=found.by_parameter / slopes,
         before_by_parameter=found.before_by_parameter / slopes,
     )
     segments: Segments = _on_host(problem.segments)
-    whitening = np.asarray(problem.whitening)
-    residual = np.asarray(fit.error) @ whitening.T
-    surrogates = _surrogates(fit, seed)
+    whitening = _on_host(problem.whitening)
+    residual = _on_host(fit.error) @ whitening.T
+    surrogates = jnp.asarray(_surrogates(fit, seed))
     rows = float(np.sum(segments.weight)) * residual.shape[-1]
     already = slopes.size
     for own, forces in _batches(fit.model, proposals, followed, segments):
         products = _inner_products(found, followed, segments, whitening, forces, residual, surrogates)
-        yield {i: [already + c for c in columns] for i, columns in own.items()}, _Score(*map(np.asarray, products), rows)
+        gram, gradient, against = (np.asarray(a) for a in products)
+        yield (
+            {i: [already + c for c in columns] for i, columns in own.items()},
+            _Score(gram, gradient, against, rows),
+        )
 
 
 def _on_host(tree):
     """Arrays by way of the host: what follows is not shared among devices."""
-    return jax.tree.map(lambda a: np.asarray(a) if eqx.is_array(a) else a, tree)
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)) if eqx.is_array(a) else a, tree)
 
 
 def _batches(
@@ -169,7 +170,7 @@ def _batches(
     taken, index = 0, 0
     for form in dict.fromkeys(type(p) for p in proposals):
         same = [p for p in proposals if type(p) is form]
-        found = _on_host(regressors(model, same, followed, segments))
+        found = jax.tree.map(np.asarray, regressors(model, same, followed, segments))
         strengths = len(strength_paths(same[0]))
         for i in range(len(same)):
             if waiting and taken + strengths > _COLUMNS:
@@ -185,9 +186,12 @@ def _batches(
 
 def _filled(parts: Sequence[Regressors]) -> Regressors:
     """The parts side by side, with columns of zeros up to the next size that has a program."""
-    joined = jax.tree.map(lambda *a: np.concatenate(a, axis=-1), *parts)
-    missing = -joined.reading.shape[-1] % _COLUMNS
-    return jax.tree.map(lambda a: np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)]), joined)
+    missing = -sum(part.reading.shape[-1] for part in parts) % _COLUMNS
+
+    def joined(*columns: np.ndarray) -> np.ndarray:
+        return np.concatenate([*columns, np.zeros((*columns[0].shape[:-1], missing))], axis=-1)
+
+    return jax.tree.map(joined, *parts)
 
 
 @eqx.filter_jit
@@ -207,7 +211,7 @@ def _inner_products(
     # Residuals are measured minus simulated. What follows a segment's rows of outputs is its states' prior.
     columns = -white.reshape(white.shape[0], rows, -1)
     columns = jnp.pad(columns, ((0, 0), (0, found.residual.shape[1] - rows), (0, 0)))
-    before = jnp.where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
+    before = where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
     extended = replace(
         found,
         by_parameter=jnp.concatenate([found.by_parameter, columns], axis=2),
