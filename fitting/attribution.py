@@ -240,7 +240,7 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
         # First-order changes may overshoot; a positive parameter stays positive.
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
-    typical = lead.effect.typical(scales(before.training.stretches))
+    typical = lead.effect.typical(scales(before.training.stretches, model))
     trials = [
         attempt(start, data, before.hold, setting, start=before, contains_start=True)
         for start in (first, *(model.with_effects(e) for e in typical))

@@ -9,6 +9,7 @@ surrogates of the residual gives the law of the best gain where there is nothing
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,8 +20,8 @@ from fitting.estimate import STEP_ANGLE, Fit, suggested_substeps
 from fitting.experiment import scales
 from fitting.free import FreeParameters, base_paths, effect_paths, strength_paths
 from fitting.residual import Problem, Unknowns, blocks
-from hdjax import Model, ReducedModel
-from hdjax.effects import CATALOGUE, Effect
+from hdjax import Model, TwoInertiaModel
+from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.lanes import jit_lanes
 
 DRAWS = 199
@@ -73,10 +74,9 @@ def screen(
         seed: of the surrogates.
     """
     model = training.model
-    motion = scales(training.stretches)
-    forms = [f for f in catalogue if not (f.needs_motor and isinstance(model, ReducedModel))]
+    found = applicable(catalogue, scales(training.stretches, model), has_motor=isinstance(model, TwoInertiaModel))
+    forms, proposals = tuple(found), {form.name: effects for form, effects in found.items()}
     present = {e.name for e in model.effects}
-    proposals = {f.name: f.proposals(motion) for f in forms}
     free_now = list(base_paths(model))
     for effect in model.effects:
         free_now += effect_paths(effect)
@@ -154,11 +154,10 @@ def _score(everything: Model, fit: Fit, surrogates: Array) -> tuple[tuple[str, .
 
 
 def _states(everything: Model, fit: Fit) -> Array:
-    """The fit's initial states, with those of the effects that it does not have at rest."""
+    """The fit's initial states, with those of the effects that it does not have as if it had long moved like this."""
     known = dict(zip(fit.model.state_names, fit.unknowns.states.T, strict=True))
-    rest = dict(zip(everything.state_names, everything.rest(), strict=True))
-    segments = fit.unknowns.states.shape[0]
-    columns = [known.get(n, jnp.full(segments, rest[n])) for n in everything.state_names]
+    settled = jax.vmap(everything.settled)(fit.unknowns.states[:, : len(everything.motion_states)])
+    columns = [known.get(n, column) for n, column in zip(everything.state_names, settled.T, strict=True)]
     return jnp.stack(columns, axis=1)
 
 

@@ -34,14 +34,21 @@ TORQUE = sampled(
     1.5 * np.cos(50 * TIME) + 0.8 * np.sin(330 * TIME) + 0.5 * np.sin(410 * TIME + 1.0),
     hold="linear",
 )
+# Ten kelvin up over the record; the base drive does not care.
+TEMPERATURE = sampled(TIME, 300.0 + 50.0 * TIME, hold="linear")
 START = jnp.asarray([0.3, 0.007, 5.0, 0.2])
 
 
 @eqx.filter_jit
 def outputs(model, torque, start, substeps=1):
     """What the encoders read. The drive's own states start at `start`, an effect's at rest."""
-    state = model.rest().at[: start.size].set(start)
-    states, _ = march(model, model.actuate(torque), None, state, solver=dfx.Tsit5(), substeps=substeps)
+    state = model.settled(start)
+    warmth = eqx.tree_at(lambda s: s.coefficients, torque, jnp.zeros((torque.knots.size - 1, 1)) + 300.0)
+    if torque.knots.size == TEMPERATURE.knots.size:
+        warmth = TEMPERATURE
+    states, _ = march(
+        model, model.actuate(torque), None, state, solver=dfx.Tsit5(), substeps=substeps, temperature=warmth
+    )
     return jax.vmap(model.outputs)(states)
 
 
@@ -84,6 +91,12 @@ def scales() -> Scales:
         omega_m=50 * rms(omega),
         omega_l=rms(omega - v),
         time_step=STEP,
+        duration=float(TIME[-1]),
+        reduction_ratio=50.0,
+        omega_0=386.0,
+        temperature=303.0,
+        temperature_change=3.0,
+        residual_frequencies=(120.0, 260.0),
     )
 
 
