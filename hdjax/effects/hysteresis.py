@@ -92,7 +92,7 @@ class Dahl(MeshTorqueEffect):
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(
-            cls(yield_twist=fraction * scales.x, settling=0.4 * scales.time_step) for fraction in (0.3, 1.0, 0.1)
+            cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.3, 1.0, 0.1)
         )
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
@@ -139,7 +139,7 @@ class MaxwellSlip(MeshTorqueEffect):
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(
-            cls(yield_twist=fraction * scales.x, settling=0.4 * scales.time_step) for fraction in (0.5, 1.5, 0.2)
+            cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.5, 1.5, 0.2)
         )
 
     @property
