@@ -91,9 +91,7 @@ class Dahl(MeshTorqueEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(
-            cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.3, 1.0, 0.1)
-        )
+        return tuple(cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.3, 1.0, 0.1))
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.k * state[0]
@@ -138,9 +136,7 @@ class MaxwellSlip(MeshTorqueEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(
-            cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.5, 1.5, 0.2)
-        )
+        return tuple(cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.5, 1.5, 0.2))
 
     @property
     def _yields(self) -> Float[Array, "3"]:

@@ -90,9 +90,7 @@ class LuGreMotorFriction(MotorSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(
-            cls(omega_s=0.2 * scales.omega_m, bend=bend, settling=scales.time_step) for bend in _bends(scales)
-        )
+        return tuple(cls(omega_s=0.2 * scales.omega_m, bend=bend, settling=scales.time_step) for bend in _bends(scales))
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
