@@ -305,12 +305,12 @@ def _size(verdict: Verdict) -> int:
     return len(verdict.trial.training.free.paths)
 
 
-def halo_for(training: Sequence[Stretch], *, longest_delay: float = 3e-3) -> int:
+def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int:
     """Intervals of torque before each segment.
 
     Args:
         training: training stretches.
-        longest_delay: how far back a delayed torque may reach [s].
+        longest_delay: how far back a delayed or lagging torque may reach [s].
     """
     step = training[0].experiment.time_step
     return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))
