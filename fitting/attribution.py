@@ -240,7 +240,7 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
         # First-order changes may overshoot; a positive parameter stays positive.
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
-    typical = lead.effect.typical(scales(before.training.stretches))
+    typical = lead.effect.typical(scales(before.training.stretches, model))
     trials = [
         attempt(start, data, before.hold, setting, start=before, contains_start=True)
         for start in (first, *(model.with_effects(e) for e in typical))
@@ -305,12 +305,12 @@ def _size(verdict: Verdict) -> int:
     return len(verdict.trial.training.free.paths)
 
 
-def halo_for(training: Sequence[Stretch], *, longest_delay: float = 3e-3) -> int:
+def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int:
     """Intervals of torque before each segment.
 
     Args:
         training: training stretches.
-        longest_delay: how far back a delayed torque may reach [s].
+        longest_delay: how far back a delayed or lagging torque may reach [s].
     """
     step = training[0].experiment.time_step
     return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))

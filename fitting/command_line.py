@@ -202,6 +202,12 @@ def predict(model: Path, log: Path, /, *, drive: DriveOption, out: Path) -> None
         raise InputError(
             f"{log}: a {read.kind} log, but {model} is a model of the other kind; give a log like those fitted"
         )
+    warm = [e.name for e in stored.model.effects if e.needs_temperature]
+    if warm and read.temperature is None:
+        raise InputError(
+            f"{log}: there is no temperature, on which {warm[0]} of {model} depends; add the column, or name it in "
+            f"[columns] temperature of {drive}"
+        )
     (ready,) = experiments(read, drive_file, stored.hold)
     (run,) = free_run(
         stored.model,

@@ -303,7 +303,7 @@ def _half_log_determinant(covariance: Array) -> float:
 
 def initial_states(model: Model, segments: Segments) -> Float[Array, "segments states"]:
     """Each segment's first state from a local polynomial, through its first samples and, where the log goes on, the
-    last ones of the segment before; hidden states at rest.
+    last ones of the segment before; hidden states as if it had long moved like this.
 
     A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
     """
@@ -330,9 +330,13 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
         columns += [N * rate[:, 0], rate[:, 0] - rate[:, 1]]
     else:
         columns = [value[:, 0], rate[:, 0]]
-    motion = np.stack(columns, axis=1)
-    hidden = np.asarray(model.rest())[len(model.motion_states) :]
-    return jnp.asarray(np.hstack([motion, np.tile(hidden, (motion.shape[0], 1))]))
+    motion = jnp.asarray(np.stack(columns, axis=1))
+    return _settled(model, motion) if any(e.states for e in model.effects) else motion
+
+
+@eqx.filter_jit
+def _settled(model: Model, motion: Array) -> Array:
+    return jax.vmap(model.settled)(motion)
 
 
 def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from fitting.errors import DataError
 from fitting.logs import Log
 from fitting.pieces import bridged
-from hdjax import Hold, PiecewisePolynomial, sampled
+from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
 from hdjax.effects import Scales
 
 # Both assumed: a Runge-Kutta step this much longer than the others is cut; so many samples may be put in per row.
@@ -33,6 +33,8 @@ class Experiment(eqx.Module):
         weight: 1 for a sample whose outputs count, 0 for one that was put in or is not believed; None where all count.
             The outputs of a sample without weight are something finite in between.
         rows: which samples are rows of the log, the others having been put in; None where all are.
+        temperature: of the drive [K], or None.
+        origin: when the log starts, on the clock of `time` [s].
     """
 
     name: str = eqx.field(static=True)
@@ -43,6 +45,8 @@ class Experiment(eqx.Module):
     motor_angle: Float[np.ndarray, " n"] | None
     weight: Float[np.ndarray, " n"] | None = None
     rows: Bool[np.ndarray, " n"] | None = None
+    temperature: PiecewisePolynomial | None = None
+    origin: float = eqx.field(static=True, default=0.0)
 
     def __len__(self) -> int:
         return self.time.size
@@ -90,12 +94,13 @@ class Segments(eqx.Module):
 
     Attributes:
         torque: logged torque of each segment; its first `halo` intervals lie before the segment, so that a delay
-            has something to reach back to.
+            has something to reach back to. Its knots count from the log's start.
         load_torque: coefficients of the load torque, or None.
         measured: outputs at the samples.
         weight: 1 for a sample whose outputs count, 0 for the others and for padding.
         joined: whether a segment starts where the one before it ends.
         halo: intervals before each segment's first sample.
+        temperature: likewise of the drive's temperature, or None where a log lacks it.
     """
 
     torque: PiecewisePolynomial
@@ -104,6 +109,7 @@ class Segments(eqx.Module):
     weight: Float[Array, "segments samples"]
     joined: Bool[Array, " segments"]
     halo: int = eqx.field(static=True)
+    temperature: PiecewisePolynomial | None = None
 
     @property
     def count(self) -> Array:
@@ -117,12 +123,13 @@ def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tup
     if log.pieces is None:
         return (experiment_from_log(log, hold=hold, N=N),)
     several = len(log.pieces) > 1
-    return tuple(
+    parts = (
         experiment_from_log(
             _piece(log, start, stop, f"{log.name}, part {i + 1}" if several else log.name), hold=hold, N=N
         )
         for i, (start, stop) in enumerate(log.pieces)
     )
+    return tuple(replace(part, origin=float(log.time[0])) for part in parts)
 
 
 def _piece(log: Log, start: int, stop: int, name: str) -> Log:
@@ -159,9 +166,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
     stamps, samples = bridged(log.time[known], input_samples[known])
     time, rows = _grid(log, stamps)
     torque = _on_grid(sampled(stamps, samples, hold=hold), time)
-    load_torque = None
-    if drive_log and log.load_torque is not None:
-        load_torque = _on_grid(sampled(log.time, log.load_torque, hold="linear"), time)
+    load_torque = _straight(log, log.load_torque, time) if drive_log else None
     columns = [log.dynamic_error]
     if drive_log:
         assert log.motor_angle is not None and N is not None
@@ -181,7 +186,14 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         motor_angle=_filled(log, log.motor_angle, time, rows) if drive_log and log.motor_angle is not None else None,
         weight=None if weight.all() else weight,
         rows=None if rows.all() else rows,
+        temperature=_straight(log, log.temperature, time),
+        origin=float(log.time[0]),
     )
+
+
+def _straight(log: Log, values: np.ndarray | None, time: np.ndarray) -> PiecewisePolynomial | None:
+    """A channel of the log on the grid, with straight lines between its samples; None where the log has none."""
+    return None if values is None else _on_grid(sampled(log.time, values, hold="linear"), time)
 
 
 def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -269,11 +281,12 @@ def cut(
     found = [np.concatenate(column) for column in zip(*parts, strict=True)]
     missing = max(0, (segment_count(stretches, length) if count is None else count) - found[0].shape[0])
     filled = [np.concatenate([column, np.repeat(column[-1:], missing, axis=0)]) for column in found]
-    knots, torque, load, measured, weight, joined = filled
+    knots, torque, load, warmth, measured, weight, joined = filled
     weight[weight.shape[0] - missing :] = 0.0
     joined[joined.shape[0] - missing :] = False
     own_knots = jnp.asarray(knots)
     loaded = any(s.experiment.load_torque is not None for s in stretches)
+    warm = all(s.experiment.temperature is not None for s in stretches)
     return Segments(
         torque=PiecewisePolynomial(own_knots, jnp.asarray(torque)),
         load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if loaded else None,
@@ -281,11 +294,13 @@ def cut(
         weight=jnp.asarray(weight),
         joined=jnp.asarray(joined),
         halo=halo,
+        temperature=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(warmth)) if warm else None,
     )
 
 
 def _cut_one(stretch: Stretch, length: int, pieces: int, halo: int) -> tuple[np.ndarray, ...]:
-    """Knots, torque, load torque, measured outputs, weight, and whether joined, of one stretch's segments by row."""
+    """Of one stretch's segments by row: knots, torque, load torque, temperature, measured outputs, weight, whether
+    joined."""
     experiment = stretch.experiment
     last = len(experiment) - 1
     begin = np.arange(stretch.start, stretch.stop, length)
@@ -298,12 +313,17 @@ def _cut_one(stretch: Stretch, length: int, pieces: int, halo: int) -> tuple[np.
     known = np.clip(outer, 0, last + 1)
     knots = np.asarray(experiment.torque.knots)[known] + (outer - known) * experiment.time_step
     own = index[:, halo:]
-    load = experiment.load_torque
-    coefficients = np.zeros((last + 1, 0)) if load is None else np.asarray(load.coefficients)
+    load, warmth = (
+        np.zeros((last + 1, 0)) if signal is None else np.asarray(signal.coefficients)
+        for signal in (experiment.load_torque, experiment.temperature)
+    )
+    own_row = np.clip(own, 0, last)
     return (
-        knots,
+        knots - experiment.origin,
         torque,
-        coefficients[np.clip(own, 0, last)],
+        load[own_row],
+        # Straight lines need no higher powers.
+        warmth[own_row, :2],
         experiment.measured[np.clip(own, 0, stretch.stop - 1)],
         _weight(experiment, own) * (own < stretch.stop),
         np.arange(begin.size) % pieces != 0,
@@ -316,8 +336,13 @@ def _weight(experiment: Experiment, index: np.ndarray) -> np.ndarray:
     return experiment.weight[np.clip(index, 0, len(experiment) - 1)]
 
 
-def scales(stretches: Sequence[Stretch]) -> Scales:
-    """Orders of magnitude of the measured motion."""
+def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
+    """Orders of magnitude of the measured motion.
+
+    Args:
+        stretches: the data.
+        model: supplies the natural frequency and the reduction ratio where it is given.
+    """
     x = np.concatenate([s.experiment.measured[s.start : s.stop, -1] for s in stretches])
     x = x - np.median(x)
     step = stretches[0].experiment.time_step
@@ -330,6 +355,7 @@ def scales(stretches: Sequence[Stretch]) -> Scales:
     angles = [s.experiment.motor_angle[s.start : s.stop] for s in stretches if s.experiment.motor_angle is not None]
     motor = float(np.sqrt(np.mean([rate(a) ** 2 for a in angles]))) if angles else 1.0
     output = [rate(s.experiment.measured[s.start : s.stop, 0]) for s in stretches]
+    temperature, change = _temperature(stretches)
     return Scales(
         x=float(np.std(x)),
         x_max=float(np.max(np.abs(x))),
@@ -337,4 +363,21 @@ def scales(stretches: Sequence[Stretch]) -> Scales:
         omega_m=motor,
         omega_l=float(np.sqrt(np.mean(np.square(output)))),
         time_step=step,
+        duration=max(float(np.ptp(s.experiment.time)) for s in stretches),
+        reduction_ratio=float(model.drive.N) if isinstance(model, TwoInertiaModel) else 1.0,
+        omega_0=None if model is None else float(model.drive.omega_0),
+        temperature=temperature,
+        temperature_change=change,
     )
+
+
+def _temperature(stretches: Sequence[Stretch]) -> tuple[float | None, float]:
+    """Mean temperature of the first log and the rms distance from it [K], where all logs have one."""
+    found = []
+    for stretch in stretches:
+        signal = stretch.experiment.temperature
+        if signal is None:
+            return None, 0.0
+        found.append(np.asarray(signal.coefficients)[stretch.start : stretch.stop, 0])
+    mean = float(np.mean(found[0]))
+    return mean, float(np.sqrt(np.mean((np.concatenate(found) - mean) ** 2)))

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from fitting.residual import Problem, Unknowns
 from hdjax import Drive, Model, PiecewisePolynomial, ReducedDrive
 from hdjax.dynamics import State
-from hdjax.effects import Effect, Motion
+from hdjax.effects import Conditions, Effect, Motion
 from hdjax.lanes import jit_lanes
 from hdjax.signals import polynomial
 from hdjax.simulate import march
@@ -58,12 +58,14 @@ class _Pushed(Model):
     effects: tuple[Effect, ...] = ()
     motion_states: ClassVar[tuple[str, ...]] = ()
 
-    def motion(self, state: State | Sequence[Array]) -> Motion:
-        return self.model.motion(state[:-1])
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
+        return self.model.motion(state[:-1], conditions)
 
-    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
         *own, passed = state
-        found = self.model.component_rates(own, torque, load_torque)
+        found = self.model.component_rates(own, torque, load_torque, conditions)
         pushed = [
             rate + start * (1.0 - passed) + end * passed
             for rate, start, end in zip(found, self.at_start, self.at_end, strict=True)
@@ -78,47 +80,53 @@ class _Pushed(Model):
 def follow(problem: Problem, unknowns: Unknowns) -> Followed:
     """Simulate the segments and linearise every sample interval along the way."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
-    halo = problem.segments.halo
+    segments = problem.segments
+    halo = segments.halo
 
-    def one(torque, load_torque, state):
+    def one(torque, load_torque, temperature, state):
         acting = model.actuate(torque)
         own = PiecewisePolynomial(acting.knots[halo:], acting.coefficients[halo:])
         options = {"solver": problem.solver, "substeps": problem.substeps, "unroll": problem.unroll}
-        states, end = march(model, own, load_torque, state, **options)
+        states, end = march(model, own, load_torque, state, temperature=temperature, **options)
         knots = jnp.concatenate([states, end[None]])
 
-        def through(start, at_start, at_end, coefficients, load, width):
+        def through(start, at_start, at_end, begin, width, coefficients, load, warmth):
             pushed = _Pushed(model=model, width=width, at_start=at_start, at_end=at_end, drive=model.drive)
-            interval = jnp.stack([jnp.zeros_like(width), width])
+            interval = jnp.stack([begin, begin + width])
             piece = PiecewisePolynomial(interval, coefficients[None])
-            on_load = None if load is None else PiecewisePolynomial(interval, load[None])
+            on_load, warm = (None if c is None else PiecewisePolynomial(interval, c[None]) for c in (load, warmth))
             initial = jnp.append(start, jnp.zeros_like(width))
-            return march(pushed, piece, on_load, initial, **options)[1][:-1]
+            return march(pushed, piece, on_load, initial, temperature=warm, **options)[1][:-1]
 
         none = jnp.zeros_like(state)
         linear = jax.jacfwd(through, argnums=(0, 1, 2))
-        load = None if load_torque is None else load_torque.coefficients
-        transition, from_start, from_end = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0))(
-            states, none, none, own.coefficients, load, jnp.diff(own.knots)
+        load, warmth = (None if s is None else s.coefficients for s in (load_torque, temperature))
+        transition, from_start, from_end = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0, 0, 0))(
+            states, none, none, own.knots[:-1], jnp.diff(own.knots), own.coefficients, load, warmth
         )
-        between = _between(model, knots, own, load)
+        between = _between(model, knots, own, load_torque, temperature)
         return knots, between, transition, from_start, from_end, jax.vmap(jax.jacfwd(model.outputs))(states)
 
-    found = jax.vmap(one)(problem.segments.torque, problem.segments.load_torque, unknowns.states)
+    found = jax.vmap(one)(segments.torque, segments.load_torque, segments.temperature, unknowns.states)
     knots, between, transition, from_start, from_end, readout = found
     return Followed(knots, between, transition, from_start, from_end, readout)
 
 
 def _between(
-    model: Model, knots: Float[Array, "knots states"], torque: PiecewisePolynomial, load: Array | None
+    model: Model,
+    knots: Float[Array, "knots states"],
+    torque: PiecewisePolynomial,
+    load_torque: PiecewisePolynomial | None,
+    temperature: PiecewisePolynomial | None,
 ) -> Float[Array, "samples nodes states"]:
     """States inside the intervals: cubics with the right values and rates at both ends (Hermite)."""
     width = jnp.diff(torque.knots)
-    on_load = jnp.zeros_like(torque.coefficients) if load is None else load
-    rates = jax.vmap(model.rates)
 
-    def rise_at(states: Array, at: Array) -> Array:
-        return width[:, None] * rates(states, polynomial(torque.coefficients, at), polynomial(on_load, at))
+    def rise_at(states: Array, late: Array) -> Array:
+        value = polynomial(torque.coefficients, late)
+        load = jnp.zeros_like(late) if load_torque is None else polynomial(load_torque.coefficients, late)
+        warmth = None if temperature is None else polynomial(temperature.coefficients, late)
+        return width[:, None] * jax.vmap(model.rates)(states, value, load, Conditions(torque.knots[:-1] + late, warmth))
 
     r0, r1 = rise_at(knots[:-1], jnp.zeros_like(width))[:, None], rise_at(knots[1:], width)[:, None]
     y0, y1 = knots[:-1, None], knots[1:, None]

@@ -1,6 +1,7 @@
 """What an effect of little strength would do along a motion: a force, or a change of what the encoders read."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -12,7 +13,15 @@ from fitting.experiment import Segments
 from fitting.followed import NODES, WEIGHTS, Followed
 from fitting.free import strength_paths
 from hdjax import Model, PiecewisePolynomial
-from hdjax.effects import Effect, Motion
+from hdjax.effects import (
+    Conditions,
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+)
 from hdjax.signals import polynomial
 from hdjax.where import where
 
@@ -49,6 +58,9 @@ def regressors(model: Model, proposals: Sequence[Effect], followed: Followed, se
         segments: the data that it belongs to.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *proposals)
+    if isinstance(stacked, MeshTorqueEffect | MotorSideEffect | LoadSideEffect):
+        # A torque is the same whatever other torques there are: one program for all models that the loop comes by.
+        model = replace(model, effects=tuple(e for e in model.effects if isinstance(e, MeshGeometryEffect)))
     return _regressors(model, stacked, followed, segments, jnp.asarray(continues(segments)))
 
 
@@ -64,16 +76,22 @@ def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
 def _regressors(
     model: Model, stacked: Effect, followed: Followed, segments: Segments, goes_on: Bool[Array, " segments"]
 ) -> Regressors:
+    kept = len(model.state_names)
+    others = followed.states.shape[-1] - kept
+    states, between = followed.states[..., :kept], followed.between[..., :kept]
+
     def of(effect: Effect) -> Regressors:
-        own = _own_states(model, effect, followed.states, segments, goes_on) if effect.states else None
+        own = _own_states(model, effect, states, segments, goes_on) if effect.states else None
         paths = strength_paths(effect)
         extended = model.with_effects(effect)
 
         def looked_at(strengths: Array):
             changed = extended.replace(dict(zip(paths, strengths, strict=True)))
-            return _rates_and_reading(changed, followed, own, segments)
+            return _rates_and_reading(changed, states, between, own, segments)
 
         rates, reading = jax.jacfwd(looked_at)(jnp.stack([extended.get(p) for p in paths]))
+        # Rates of states that the model was looked at without do not depend on the effect.
+        rates = jnp.pad(rates, ((0, 0), (0, 0), (0, 0), (0, others), (0, 0)))
         mean = 0.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS), rates)
         rise = 1.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS * NODES), rates)
         return Regressors(mean - rise, mean + rise, reading)
@@ -90,27 +108,33 @@ def _finite(values: Array) -> Array:
 
 
 def _rates_and_reading(
-    model: Model, followed: Followed, own: tuple[Array, Array] | None, segments: Segments
+    model: Model,
+    states: Float[Array, "segments knots states"],
+    between: Float[Array, "segments samples nodes states"],
+    own: tuple[Array, Array] | None,
+    segments: Segments,
 ) -> tuple[Array, Array]:
-    """Rates of the states that are followed, at the nodes of each interval, and the outputs at the samples."""
-    between, samples = followed.between, followed.states[:, :-1]
+    """Rates of the given states, at the nodes of each interval, and the outputs at the samples."""
+    kept, samples = states.shape[-1], states[:, :-1]
     if own is not None:
         start, end = own
-        start_to_end = start[:, :, None] * (1.0 - _PART[..., None]) + end[:, :, None] * _PART[..., None]
+        part = jnp.asarray(_PART)[..., None]
+        start_to_end = start[:, :, None] * (1.0 - part) + end[:, :, None] * part
         between = jnp.concatenate([between, start_to_end], axis=-1)
         samples = jnp.concatenate([samples, start], axis=-1)
     halo = segments.halo
     acting = jax.vmap(model.actuate)(segments.torque)
-    torque = _at_nodes(PiecewisePolynomial(acting.knots[:, halo:], acting.coefficients[:, halo:]))
-    load = segments.load_torque
-    on_load = jnp.zeros_like(torque) if load is None else _at_nodes(load)
-    rates = jax.vmap(jax.vmap(jax.vmap(model.rates)))(between, torque, on_load)
-    return rates[..., : followed.states.shape[-1]], jax.vmap(jax.vmap(model.outputs))(samples)
-
-
-def _at_nodes(signal: PiecewisePolynomial) -> Float[Array, "segments samples nodes"]:
-    width = jnp.diff(signal.knots)[..., None]
-    return polynomial(signal.coefficients[..., None, :], jnp.asarray(_PART) * width)
+    acting = PiecewisePolynomial(acting.knots[:, halo:], acting.coefficients[:, halo:])
+    late = jnp.asarray(_PART) * jnp.diff(acting.knots)[..., None]
+    torque = polynomial(acting.coefficients[..., None, :], late)
+    load, warmth = (
+        None if signal is None else polynomial(signal.coefficients[..., None, :], late)
+        for signal in (segments.load_torque, segments.temperature)
+    )
+    load = jnp.zeros_like(late) if load is None else load
+    conditions = Conditions(acting.knots[:, :-1, None] + late, warmth)
+    rates = jax.vmap(jax.vmap(jax.vmap(model.rates)))(between, torque, load, conditions)
+    return rates[..., :kept], jax.vmap(jax.vmap(model.outputs))(samples)
 
 
 def _own_states(
@@ -120,10 +144,10 @@ def _own_states(
     segments: Segments,
     goes_on: Bool[Array, " segments"],
 ) -> tuple[Array, Array]:
-    """An effect's own states at both ends of each interval, driven by the motion from rest at each log's start."""
-    motion = jax.vmap(jax.vmap(model.motion))(states)
-    rest = effect.initial_state()
-    width = jnp.diff(segments.torque.knots[:, segments.halo :])
+    """An effect's own states at both ends of each interval: settled at each log's start, then driven by the motion."""
+    time = segments.torque.knots[:, segments.halo :]
+    width = jnp.diff(time)
+    motion = jax.vmap(jax.vmap(model.motion))(states, Conditions(time, _at_knots(segments.temperature, width)))
 
     def rate(own: Array, before: Motion, after: Motion, passed: float) -> Array:
         between = jax.tree.map(lambda a, b: (1.0 - passed) * a + passed * b, before, after)
@@ -142,8 +166,17 @@ def _own_states(
 
     def segment(own: Array, inputs):
         motion, width, goes_on = inputs
-        own = where(goes_on, own, rest)
+        settled = effect.initial_state(jax.tree.map(lambda a: a[0], motion))
+        own = where(goes_on, own, settled)
         before, after = (jax.tree.map(lambda a, s=s: a[s], motion) for s in (slice(None, -1), slice(1, None)))
         return jax.lax.scan(interval, own, (before, after, width))
 
-    return jax.lax.scan(segment, rest, (motion, width, goes_on))[1]
+    return jax.lax.scan(segment, jnp.zeros_like(effect.initial_state()), (motion, width, goes_on))[1]
+
+
+def _at_knots(signal: PiecewisePolynomial | None, width: Float[Array, "segments samples"]) -> Array | None:
+    """A signal's values at the samples and at the end of the last interval."""
+    if signal is None:
+        return None
+    last = polynomial(signal.coefficients[:, -1], width[:, -1])
+    return jnp.concatenate([signal.coefficients[:, :, 0], last[:, None]], axis=1)

@@ -84,8 +84,9 @@ def simulate_segments(
     """The outputs that the model gives on each segment, and the state it ends in."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
     segments = problem.segments
+    temperature = segments.temperature if any(e.needs_temperature for e in model.effects) else None
 
-    def one(torque, load_torque, state):
+    def one(torque, load_torque, temperature, state):
         acting = model.actuate(torque)
         halo = segments.halo
         own = eqx.tree_at(
@@ -101,10 +102,11 @@ def simulate_segments(
             solver=problem.solver,
             substeps=problem.substeps,
             unroll=problem.unroll,
+            temperature=temperature,
         )
         return jax.vmap(model.outputs)(states), end
 
-    return jax.vmap(one)(segments.torque, segments.load_torque, unknowns.states)
+    return jax.vmap(one)(segments.torque, segments.load_torque, temperature, unknowns.states)
 
 
 def residual(
@@ -134,7 +136,8 @@ def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments
     hidden = unknowns.states[:, motion:]
     if not scale:
         return hidden
-    return hidden / jax.lax.stop_gradient(jnp.concatenate(scale))[None, :]
+    expected = jax.vmap(model.settled)(unknowns.states[:, :motion])[:, motion:]
+    return (hidden - expected) / jax.lax.stop_gradient(jnp.concatenate(scale))[None, :]
 
 
 def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:

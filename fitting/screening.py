@@ -23,8 +23,9 @@ from fitting.followed import Followed, follow, respond
 from fitting.free import strength_paths
 from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks, linearise
-from hdjax import Model, ReducedModel
-from hdjax.effects import CATALOGUE, Effect
+from fitting.spectral_lines import spectral_lines
+from hdjax import Model, TwoInertiaModel
+from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.where import where
 
 DRAWS = 199
@@ -80,10 +81,13 @@ def screen(
         seed: of the surrogates.
     """
     model = training.model
-    motion = scales(training.stretches)
     present = {e.name for e in model.effects}
-    forms = [f for f in catalogue if f.name not in present and not (f.needs_motor and isinstance(model, ReducedModel))]
-    proposals = tuple(proposal for f in forms for proposal in f.proposals(motion))
+    found = applicable(
+        [form for form in catalogue if form.name not in present],
+        replace(scales(training.stretches, model), residual_frequencies=spectral_lines(training)),
+        has_motor=isinstance(model, TwoInertiaModel),
+    )
+    proposals = tuple(effect for effects in found.values() for effect in effects)
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
     null_gains = np.full(DRAWS, -np.inf)

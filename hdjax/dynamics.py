@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects import (
     ActuatorEffect,
+    Conditions,
     Effect,
     LoadSideEffect,
     MeshGeometryEffect,
@@ -35,22 +36,28 @@ class Model(eqx.Module):
     motion_states: eqx.AbstractClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
-    def motion(self, state: State | Sequence[Array]) -> Motion:
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         """The motion that a state means, as the mesh sees it."""
 
     @abc.abstractmethod
-    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
         """[`rates`][] of a state that is kept as separate numbers, which is how a vectorised program is fastest."""
 
-    def rates(self, state: State, torque: Array, load_torque: Array) -> State:
+    def rates(self, state: State, torque: Array, load_torque: Array, conditions: Conditions = Conditions()) -> State:
         """Time derivative of the state.
 
         Args:
             state: see `state_names`.
             torque: motor torque [N m] that acts (or the forcing of a reduced drive).
             load_torque: torque on the load along +theta_l [N m]; ignored by a reduced drive.
+            conditions: time and temperature, for effects that ask for them.
+
+        Raises:
+            ValueError: where an effect asks for what `conditions` lack.
         """
-        return jnp.stack(self.component_rates(tuple(state), torque, load_torque))
+        return jnp.stack(self.component_rates(tuple(state), torque, load_torque, conditions))
 
     @abc.abstractmethod
     def outputs(self, state: State) -> Float[Array, " outputs"]:
@@ -64,9 +71,12 @@ class Model(eqx.Module):
 
     def rest(self) -> State:
         """The state of a drive at rest, unloaded, at angle zero."""
-        parts = [jnp.zeros(len(self.motion_states))]
-        parts += [e.initial_state() for e in self.effects if e.states]
-        return jnp.concatenate(parts)
+        return self.settled(jnp.zeros(len(self.motion_states)))
+
+    def settled(self, motion_state: Float[Array, " motion_states"]) -> State:
+        """The state of a drive that has long moved like this: the effects' own states have followed."""
+        motion = self.motion(motion_state)
+        return jnp.concatenate([motion_state, *(e.initial_state(motion) for e in self.effects if e.states)])
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         """The torque that acts, from the torque that was logged."""
@@ -149,18 +159,22 @@ class TwoInertiaModel(Model):
     effects: tuple[Effect, ...] = ()
     motion_states: ClassVar[tuple[str, ...]] = ("theta_m", "theta_l", "omega_m", "omega_l")
 
-    def motion(self, state: State | Sequence[Array]) -> Motion:
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         theta_m, theta_l, omega_m, omega_l = state[0], state[1], state[2], state[3]
         x = theta_m / self.drive.N - theta_l
         v = omega_m / self.drive.N - omega_l
         for effect in self._of(MeshGeometryEffect):
             x = x + effect.error(theta_m)
             v = v + effect.slope(theta_m) * omega_m
-        return Motion(x=x, v=v, theta_m=theta_m, omega_m=omega_m, theta_l=theta_l, omega_l=omega_l)
+        return Motion(
+            x, v, theta_m, omega_m, theta_l, omega_l, time=conditions.time, temperature=conditions.temperature
+        )
 
-    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
         drive = self.drive
-        motion = self.motion(state)
+        motion = self.motion(state, conditions)
         own = self._own_states(state)
         tau = self._mesh_torque(motion, own)
         transmission = 1.0 / drive.N
@@ -194,11 +208,13 @@ class ReducedModel(Model):
             if effect.needs_motor:
                 raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
 
-    def motion(self, state: State | Sequence[Array]) -> Motion:
-        return Motion(x=state[0], v=state[1])
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
+        return Motion(x=state[0], v=state[1], time=conditions.time, temperature=conditions.temperature)
 
-    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
-        motion = self.motion(state)
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
+        motion = self.motion(state, conditions)
         own = self._own_states(state)
         rates = [state[1], self.drive.gain * torque - self._mesh_torque(motion, own)]
         return self._with_own_rates(motion, rates, own)

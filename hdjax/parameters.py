@@ -26,6 +26,7 @@ class ParameterInfo:
         doc: one line that says what it is.
         source: paper, table or equation behind its law or magnitude; `"assumed"` where there is none.
         bounds: open interval of values that make physical sense.
+        plausible: magnitudes that real drives show, lowest and highest; evidence for a reader, no bound of a fit.
         role: `"base"` for the drive itself, `"strength"` for a parameter whose zero removes the effect,
             `"shape"` for one that only shapes an effect that is there.
     """
@@ -34,7 +35,12 @@ class ParameterInfo:
     doc: str
     source: str
     bounds: tuple[float, float]
+    plausible: tuple[float, float]
     role: Role
+
+    def implausibly_large(self, value: float) -> bool:
+        """Whether the value's magnitude is above what real drives show. (A small one only is weak.)"""
+        return abs(value) > self.plausible[1]
 
     @property
     def positive(self) -> bool:
@@ -54,6 +60,7 @@ def parameter(
     doc: str,
     source: str = "assumed",
     bounds: tuple[float, float] = (-math.inf, math.inf),
+    plausible: tuple[float, float] = (0.0, math.inf),
     role: Role = "base",
 ) -> Any:
     """Declare a field of an equinox module as a physical parameter.
@@ -69,7 +76,7 @@ def parameter(
     Returns:
         A dataclass field.
     """
-    info = ParameterInfo(unit=unit, doc=doc, source=source, bounds=bounds, role=role)
+    info = ParameterInfo(unit=unit, doc=doc, source=source, bounds=bounds, plausible=plausible, role=role)
     options: dict[str, Any] = {
         "converter": as_scalar,
         "metadata": {"parameter": info},

@@ -4,12 +4,15 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
 from scipy.signal import fftconvolve
 from scipy.signal.windows import kaiser
+
+from hdjax.where import where
 
 DEGREE = 5
 """Degree of the polynomial of an interval; 5 lets value, slope and curvature match at both of its ends."""
@@ -71,9 +74,58 @@ class PiecewisePolynomial(eqx.Module):
             total = total + moments(self.coefficients[piece], start - self.knots[piece], begin, end)
             begin = end
         legendre = total * jnp.asarray(_NORMS)[None, :] / width[:, None]
-        powers = jnp.einsum("kd,dj->kj", legendre, jnp.asarray(_LEGENDRE_TO_POWERS))
-        scaled = powers / width[:, None] ** jnp.arange(DEGREE + 1.0)[None, :]
-        return PiecewisePolynomial(self.knots, scaled)
+        return PiecewisePolynomial(self.knots, _powers(legendre, width))
+
+    def lagged(self, lag: Array) -> "PiecewisePolynomial":
+        """The signal y of `lag y' + y = self`, settled at the first knot, on the same knots.
+
+        On each interval y is a polynomial and a decaying exponential; for the latter stands the quintic with the
+        same moments, see [`delayed`][].
+
+        Args:
+            lag: time constant [s], above zero.
+        """
+        width = jnp.diff(self.knots)
+        # The polynomial part: self - lag self' + lag^2 self'' - ...
+        part = derivative = self.coefficients
+        for _ in range(DEGREE):
+            orders = jnp.arange(1.0, derivative.shape[1])
+            derivative = -lag * jnp.pad(derivative[:, 1:] * orders[None, :], ((0, 0), (0, 1)))
+            part = part + derivative
+        decay = jnp.exp(-width / lag)
+        end = polynomial(part, width)
+
+        def interval(y, inputs):
+            first, last, factor = inputs
+            away = y - first
+            return last + away * factor, away
+
+        _, away = jax.lax.scan(interval, part[0, 0], (part[:, 0], end, decay))
+        legendre = away[:, None] * _decay_moments(width / lag) * jnp.asarray(_NORMS)[None, :]
+        return PiecewisePolynomial(self.knots, part + _powers(legendre, width))
+
+
+def _powers(legendre: Array, width: Array) -> Array:
+    """Coefficients in powers of the time into each interval, from those of Legendre polynomials over it."""
+    powers = jnp.einsum("kd,dj->kj", legendre, jnp.asarray(_LEGENDRE_TO_POWERS))
+    return powers / width[:, None] ** jnp.arange(DEGREE + 1.0)[None, :]
+
+
+def _decay_moments(rate: Float[Array, " n"]) -> Float[Array, "n d"]:
+    """Integrals over u from 0 to 1 of exp(-rate u) times the Legendre polynomials there."""
+    slow = where(rate < _FAST, rate, 1.0)
+    u = 0.5 * (_FINE_NODES + 1.0)
+    weighted = jnp.asarray(0.5 * _FINE_WEIGHTS)[None, :] * jnp.exp(-slow[:, None] * jnp.asarray(u)[None, :])
+    by_quadrature = jnp.einsum("kn,nd->kd", weighted, _legendre(jnp.asarray(_FINE_NODES)))
+    # Modified spherical Bessel functions of half the rate, scaled; their recurrence is stable where it is large.
+    half = 0.5 * where(rate < _FAST, _FAST, rate)
+    tail = jnp.exp(-2.0 * half)
+    found = [0.5 * (1.0 - tail) / half, 0.5 * ((1.0 + tail) / half - (1.0 - tail) / half**2)]
+    for d in range(1, DEGREE):
+        found.append(found[d - 1] - (2 * d + 1) / half * found[d])
+    signs = (-1.0) ** np.arange(DEGREE + 1)
+    by_recurrence = jnp.stack(found, axis=-1) * jnp.asarray(signs)[None, :]
+    return where((rate < _FAST)[:, None], by_quadrature, by_recurrence)
 
 
 def polynomial(coefficients: Float[Array, "*a d"], s: Float[Array, "*b"]) -> Float[Array, "*c"]:
@@ -86,6 +138,9 @@ def polynomial(coefficients: Float[Array, "*a d"], s: Float[Array, "*b"]) -> Flo
 
 # Six Gauss-Legendre points integrate a quintic against a quintic exactly.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
+# Sixteen do so for an exponential that falls by this many e-folds in the interval.
+_FINE_NODES, _FINE_WEIGHTS = np.polynomial.legendre.leggauss(16)
+_FAST = 12.0
 _NORMS = 2.0 * np.arange(DEGREE + 1) + 1.0
 # An interval that a delay has moved can lie on two pieces, or on three where the stamps jitter (by up to a third).
 _PIECES = 3

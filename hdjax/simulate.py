@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from hdjax.dynamics import Model, State
-from hdjax.effects import ActuatorEffect
+from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.results import Ending, SimulationError
 from hdjax.signals import PiecewisePolynomial, polynomial
 
@@ -50,6 +50,7 @@ def simulate(
     initial_state: State | None = None,
     *,
     load_torque: Callable[[Array], Array] = no_torque,
+    temperature: Callable[[Array], Array] | None = None,
     solver: dfx.AbstractSolver | None = None,
     step_size: float | None = None,
     rtol: float = 1e-8,
@@ -74,6 +75,7 @@ def simulate(
 
     Args:
         load_torque: torque on the load along +theta_l [N m].
+        temperature: of the drive [K], for effects that depend on it.
         solver: any diffrax solver; Tsit5 where not given.
         step_size: a fixed step [s]; adaptive where not given.
         rtol: relative tolerance of adaptive steps.
@@ -100,6 +102,7 @@ def simulate(
         jnp.asarray(times, dtype=float),
         initial_state,
         load_torque,
+        temperature,
         dfx.Tsit5() if solver is None else solver,
         step_size,
         rtol,
@@ -136,6 +139,7 @@ def _simulate(
     times,
     initial_state,
     load_torque,
+    temperature,
     solver,
     step_size,
     rtol,
@@ -147,12 +151,15 @@ def _simulate(
     torque = model.actuate(forcing) if isinstance(forcing, PiecewisePolynomial) else forcing
 
     def field(t, state, args):
-        model, torque, load_torque = args
-        return model.rates(state, torque(t), load_torque(t))
+        model, torque, load_torque, temperature = args
+        conditions = Conditions(time=t, temperature=None if temperature is None else temperature(t))
+        return model.rates(state, torque(t), load_torque(t), conditions)
 
     if step_size is None:
         controller: Any = dfx.PIDController(rtol=rtol, atol=atol)
-        jumps = [signal.knots for signal in (torque, load_torque) if isinstance(signal, PiecewisePolynomial)]
+        jumps = [
+            signal.knots for signal in (torque, load_torque, temperature) if isinstance(signal, PiecewisePolynomial)
+        ]
         if jumps:
             controller = dfx.ClipStepSizeController(controller, jump_ts=jnp.sort(jnp.concatenate(jumps)))
     else:
@@ -164,7 +171,7 @@ def _simulate(
         times[-1],
         step_size,
         initial_state,
-        args=(model, torque, load_torque),
+        args=(model, torque, load_torque, temperature),
         saveat=dfx.SaveAt(ts=times),
         stepsize_controller=controller,
         adjoint=adjoint,
@@ -195,6 +202,7 @@ def march(
     solver: dfx.AbstractERK,
     substeps: int | Int[Array, ""],
     unroll: bool = True,
+    temperature: PiecewisePolynomial | None = None,
 ) -> tuple[Float[Array, "n states"], State]:
     """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
 
@@ -204,13 +212,14 @@ def march(
 
     Args:
         model: the equations.
-        torque: the torque that acts (after `Model.actuate`); its knots are the samples.
+        torque: the torque that acts (after `Model.actuate`); its knots are the samples, and tell effects the time.
         load_torque: likewise on the load; zero where None.
         initial_state: state at the first knot.
         solver: an explicit Runge-Kutta solver of diffrax; its tableau is used.
         substeps: steps in each sample interval. An array is data, so that one compiled program serves any number.
         unroll: whether a step's stages are written out. A loop over them compiles several times faster for a large
             model, and runs slower for a small one.
+        temperature: of the drive [K] on the same knots; None where no effect depends on it.
 
     Returns:
         States at each knot but the last, by row, and the state at the last.
@@ -224,14 +233,15 @@ def march(
     table = np.stack([np.pad(row, (0, len(nodes) - len(row))) for row in [np.zeros(0), *lower]])
 
     def interval(state, inputs):
-        coefficients, load_coefficients, width = inputs
+        coefficients, load_coefficients, warmth, knot, width = inputs
         h = width / jnp.asarray(substeps, dtype=width.dtype)
 
         # Compiled once and called by every stage: it would be traced again for each.
         @jax.jit
         def rates(y, s):
             load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
-            return model.component_rates(y, polynomial(coefficients, s), load)
+            conditions = Conditions(knot + s, None if warmth is None else polynomial(warmth, s))
+            return model.component_rates(y, polynomial(coefficients, s), load, conditions)
 
         def step_in_a_loop(y, start):
             def stage(slopes, inputs):
@@ -257,8 +267,8 @@ def march(
         end = jax.lax.fori_loop(0, substeps, lambda j, y: step(y, jnp.asarray(j, dtype=h.dtype) * h), state)
         return end, state
 
-    load_coefficients = None if load_torque is None else load_torque.coefficients
-    inputs = (torque.coefficients, load_coefficients, jnp.diff(torque.knots))
+    load_coefficients, warmth = (None if s is None else s.coefficients for s in (load_torque, temperature))
+    inputs = (torque.coefficients, load_coefficients, warmth, torque.knots[:-1], jnp.diff(torque.knots))
     # The state travels as separate numbers: under vmap each is one contiguous row of lanes.
     end, states = jax.lax.scan(interval, tuple(initial_state), inputs)
     return jnp.stack(states, axis=-1), jnp.stack(end)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hdjax.dynamics import Model, State
+from hdjax.effects import Conditions
 from hdjax.noise import Noise
 from hdjax.results import Ending
 from hdjax.signals import PiecewisePolynomial
@@ -155,7 +156,8 @@ def _drift(t, state, args):
     model, noise, torque, load_torque, _ = args
     own = state[len(model.state_names) :]
     motor, load = noise.torques(own)
-    motion = model.rates(state[: len(model.state_names)], torque(t) + motor, load_torque(t) + load)
+    torques = torque(t) + motor, load_torque(t) + load
+    motion = model.rates(state[: len(model.state_names)], *torques, Conditions(time=t))
     return jnp.concatenate([motion, noise.rates(own)])
 
 
@@ -170,7 +172,7 @@ def _simulate_noisy(
     torque = model.actuate(forcing) if isinstance(forcing, PiecewisePolynomial) else forcing
     start_key, path_key = jax.random.split(key)
     # Torque enters the accelerations linearly and whatever the state, so any state shows how.
-    acceleration = jax.jacfwd(lambda u: model.rates(model.rest(), u[0], u[1]))(jnp.zeros(2))
+    acceleration = jax.jacfwd(lambda u: model.rates(model.rest(), u[0], u[1], Conditions(time=times[0])))(jnp.zeros(2))
     fractions = jnp.arange(substeps, dtype=times.dtype) / substeps
     steps = times[:-1, None] + jnp.diff(times)[:, None] * fractions[None, :]
     steps = jnp.concatenate([jnp.ravel(steps), times[-1:]])

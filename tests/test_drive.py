@@ -16,7 +16,17 @@ from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.parameters import own_parameters
 
-SCALES = Scales(x=1e-3, x_max=3e-3, v=0.4, omega_m=20.0, omega_l=0.4, time_step=1e-3)
+SCALES = Scales(
+    x=1e-3,
+    x_max=3e-3,
+    v=0.4,
+    omega_m=20.0,
+    omega_l=0.4,
+    time_step=1e-3,
+    temperature=300.0,
+    temperature_change=2.0,
+    residual_frequencies=(90.0, 400.0),
+)
 
 # DESIGN 2.1 and the table of effects.
 KNOWN_FAMILIES = {

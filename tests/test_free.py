@@ -13,7 +13,17 @@ from hdjax.effects import BY_NAME, CATALOGUE, Effect, Scales
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.hysteresis import BoucWen
 
-SCALES = Scales(x=5e-4, x_max=2e-3, v=0.1, omega_m=40.0, omega_l=0.8, time_step=5e-4)
+SCALES = Scales(
+    x=5e-4,
+    x_max=2e-3,
+    v=0.1,
+    omega_m=40.0,
+    omega_l=0.8,
+    time_step=5e-4,
+    temperature=300.0,
+    temperature_change=2.0,
+    residual_frequencies=(90.0, 400.0),
+)
 PATHS = ("K", "alpha", "B_sp", "coulomb_friction.T_c", "coulomb_friction.v_0")
 SCALE = {"alpha": 2e4, "B_sp": 0.1}
 

@@ -15,7 +15,17 @@ from hdjax.effects import CATALOGUE, Effect, Scales
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.effects.stiffness import QuadraticStiffness
 
-SCALES = Scales(x=5e-4, x_max=2e-3, v=0.1, omega_m=40.0, omega_l=0.8, time_step=5e-4)
+SCALES = Scales(
+    x=5e-4,
+    x_max=2e-3,
+    v=0.1,
+    omega_m=40.0,
+    omega_l=0.8,
+    time_step=5e-4,
+    temperature=300.0,
+    temperature_change=2.0,
+    residual_frequencies=(90.0, 400.0),
+)
 
 
 def stored(model: Model, hold: str = "zero-order") -> StoredModel:

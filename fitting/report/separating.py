@@ -66,7 +66,53 @@ _SEPARATING = {
     "the other.",
     ("input_delay", "nonlinear_damping"): "Excite up to several times the natural frequency: the phase of a delay "
     "keeps growing, that of damping saturates.",
-    ("input_delay", "input_delay"): "Log the torque faster, or state its hold in the drive file.",
+    ("kinematic_error", "kinematic_error"): "Turn the output by several whole revolutions at constant speed: sidebands "
+    "come and go with the output's revolution.",
+    ("cogging", "cogging"): "Turn slowly at constant speed for many motor revolutions: the orders then part.",
+    ("cogging", "gravity_load"): "Turn the mount: gravity keeps to the vertical, cogging to the motor.",
+    ("hysteresis", "hysteresis"): "Cycle the torque slowly with small loops inside large ones, up to several times the "
+    "yield: the laws differ in how they leave a reversal and in whether small loops close.",
+    ("coulomb_friction", "coulomb_friction"): "Repeat under a preload: one friction grows with the torque that the "
+    "mesh passes on, the other stays.",
+    ("nonlinear_damping", "nonlinear_damping"): "Excite at the natural frequency at several levels, with and without "
+    "a preload: the powers of rate and twist then part.",
+    ("coulomb_friction", "position_dependent_friction"): "Turn slowly over several revolutions: a ripple that repeats "
+    "with the angle belongs to the position.",
+    ("position_dependent_friction", "position_dependent_friction"): "Turn the motor at constant speed, unloaded: "
+    "friction on the motor takes torque, friction between the mesh's sides does not.",
+    ("position_dependent_stiffness", "stiffness_shape"): "Cycle the torque slowly at several motor angles: a stiffness "
+    "that depends on the position differs between them.",
+    ("position_dependent_stiffness", "cogging"): "Step the mean torque at one speed: a ripple of the stiffness grows "
+    "with it, cogging does not.",
+    ("load_disturbance", "torque_sensor"): "Lock the motor: a torque on the load still twists the drive, a bias of the "
+    "motor's sensor does not.",
+    ("load_disturbance", "load_friction"): "Run the same path in both directions: friction changes its sign, a "
+    "constant torque does not.",
+    ("load_disturbance", "load_disturbance"): "Log longer: lines that are close together then part.",
+    ("load_disturbance", "encoder_eccentricity"): "Change the speed: an encoder's error moves with it, a disturbance "
+    "stays at its frequency.",
+    ("gravity_load", "load_friction"): "Hold several poses and approach each from both sides: friction depends on the "
+    "side, gravity on the pose.",
+    ("load_friction", "load_friction"): "Turn the load at several constant speeds in both directions.",
+    ("extra_resonance", "input_delay"): "Excite up to several times the natural frequency: a second resonance turns "
+    "the phase and back within a band, a delay ever more.",
+    ("extra_resonance", "nonlinear_damping"): "Repeat at another level: a second resonance stays where it is.",
+    ("extra_resonance", "stiffness_shape"): "Repeat at another level: a second resonance stays where it is, a bent "
+    "stiffness moves the natural frequency.",
+    ("extra_resonance", "creep"): "Stop under load and wait: creep goes on, a second resonance rings down.",
+    ("creep", "nonlinear_damping"): "Excite at the natural frequency at several levels, then stop under load and wait: "
+    "creep is linear in the level and slow, nonlinear damping neither.",
+    ("temperature", "motor_friction"): "Repeat the same path cold and warm: what depends on temperature changes, the "
+    "rest stays.",
+    ("temperature", "stiffness_shape"): "Repeat the same torque cycle cold and warm, with the same twists.",
+    ("temperature", "temperature"): "Ring the drive down freely, cold and warm, and turn the motor unloaded: the "
+    "frequency shows the stiffness, the decay the damping, the torque the friction.",
+    ("encoder_eccentricity", "encoder_eccentricity"): "Turn the output by more than one revolution: the load's encoder "
+    "repeats with it, the motor's with the motor.",
+    ("motor_friction", "gravity_load"): "Run the same path in both directions: friction changes its sign, gravity does "
+    "not.",
+    ("input_delay", "input_delay"): "Excite up to several times the natural frequency, log the torque faster, and "
+    "state its hold in the drive file: a lag also weakens fast torques, a delay does not.",
 }
 
 

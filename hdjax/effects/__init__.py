@@ -3,8 +3,12 @@
 from hdjax.effects.catalogue import BY_NAME as BY_NAME
 from hdjax.effects.catalogue import CATALOGUE as CATALOGUE
 from hdjax.effects.catalogue import FAMILIES as FAMILIES
+from hdjax.effects.catalogue import applicable as applicable
 from hdjax.effects.effect import (
     ActuatorEffect as ActuatorEffect,
+)
+from hdjax.effects.effect import (
+    Conditions as Conditions,
 )
 from hdjax.effects.effect import (
     Effect as Effect,

@@ -1,4 +1,4 @@
-"""What happens to the logged torque on its way to the drive: sensor gain and bias, delay."""
+"""What happens to the logged torque on its way to the drive: sensor gain and bias, delay, lag."""
 
 from typing import ClassVar
 
@@ -46,6 +46,7 @@ class TorqueGain(ActuatorEffect):
         unit="1",
         doc="relative error of the torque's scale",
         source="EFFECTS: within 10 %",
+        plausible=(0.0, 0.1),
         role="strength",
     )
 
@@ -69,6 +70,7 @@ class InputDelay(ActuatorEffect):
         doc="from the logged torque to the torque that acts",
         source="EFFECTS: 0.1 to 3 ms",
         bounds=(0.0, 0.1),
+        plausible=(1e-4, 3e-3),
         role="strength",
     )
 
@@ -79,3 +81,28 @@ class InputDelay(ActuatorEffect):
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
         return logged.delayed(self.delay)
+
+
+class InputLag(ActuatorEffect):
+    """The torque follows what was logged with a first-order lag: `lag T' + T = T_logged`, as a current loop does."""
+
+    family: ClassVar[str] = "input_delay"
+    name: ClassVar[str] = "input_lag"
+
+    lag: Scalar = parameter(
+        0.0,
+        unit="s",
+        doc="time constant",
+        source="EFFECTS: 0.1 to 3 ms",
+        bounds=(0.0, 0.1),
+        plausible=(1e-4, 3e-3),
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        # At exactly zero the exponential has no derivative.
+        return (cls(lag=1e-9 * scales.time_step),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        return logged.lagged(self.lag)

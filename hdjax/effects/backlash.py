@@ -22,6 +22,7 @@ class Backlash(MeshTorqueEffect):
         doc="half-width of the dead zone at the output",
         source="vendor catalogues: 6 to 60 arcsec",
         bounds=(0.0, 0.1),
+        plausible=(2.9e-5, 2.9e-4),
         role="strength",
     )
 

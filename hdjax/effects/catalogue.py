@@ -1,32 +1,93 @@
 """The catalogue: every form of every effect that the loop may find, one line each."""
 
-from hdjax.effects.actuation import InputDelay, TorqueBias, TorqueGain
+from collections.abc import Sequence
+
+from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
 from hdjax.effects.backlash import Backlash
-from hdjax.effects.damping import DisplacementDamping, QuadraticDamping
-from hdjax.effects.effect import Effect
-from hdjax.effects.friction import CoulombFriction, MotorFriction, StribeckMotorFriction
-from hdjax.effects.hysteresis import BoucWen
-from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.load import GravityLoad
-from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, ThreeSlopeStiffness
+from hdjax.effects.cogging import Cogging, SingleOrderCogging
+from hdjax.effects.creep import Creep
+from hdjax.effects.damping import CubicDamping, DisplacementDamping, QuadraticDamping
+from hdjax.effects.effect import Effect, Scales
+from hdjax.effects.friction import (
+    CoulombFriction,
+    LoadDependentFriction,
+    LoadFriction,
+    MotorFriction,
+    StribeckMotorFriction,
+)
+from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip
+from hdjax.effects.kinematic import KinematicError, KinematicSidebands
+from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
+from hdjax.effects.position import (
+    PositionDependentMeshFriction,
+    PositionDependentMotorFriction,
+    PositionDependentStiffness,
+)
+from hdjax.effects.presliding import DahlMotorFriction, LuGreMotorFriction
+from hdjax.effects.resonance import ExtraResonance
+from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
+from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
+from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
 CATALOGUE: tuple[type[Effect], ...] = (
     QuadraticStiffness,
     QuinticStiffness,
     ThreeSlopeStiffness,
+    SmoothKneeStiffness,
     QuadraticDamping,
+    CubicDamping,
     DisplacementDamping,
     CoulombFriction,
+    LoadDependentFriction,
     MotorFriction,
     StribeckMotorFriction,
+    DahlMotorFriction,
+    LuGreMotorFriction,
+    LoadFriction,
     KinematicError,
+    KinematicSidebands,
     TorqueBias,
     TorqueGain,
     InputDelay,
+    InputLag,
     GravityLoad,
+    ConstantLoad,
+    LoadDisturbance,
+    TwoLineDisturbance,
     Backlash,
     BoucWen,
+    Dahl,
+    MaxwellSlip,
+    Creep,
+    Cogging,
+    SingleOrderCogging,
+    PositionDependentStiffness,
+    PositionDependentMotorFriction,
+    PositionDependentMeshFriction,
+    ExtraResonance,
+    ThermalStiffness,
+    ThermalDamping,
+    ThermalMotorFriction,
+    MotorEncoderEccentricity,
+    LoadEncoderEccentricity,
 )
 
 BY_NAME: dict[str, type[Effect]] = {form.name: form for form in CATALOGUE}
 FAMILIES: tuple[str, ...] = tuple(dict.fromkeys(form.family for form in CATALOGUE))
+
+
+def applicable(
+    catalogue: Sequence[type[Effect]], scales: Scales, *, has_motor: bool
+) -> dict[type[Effect], tuple[Effect, ...]]:
+    """The forms that logs of these scales can show, each with its proposals.
+
+    Left out is what needs the motor's motion on a reduced drive, a temperature that changes where there is none, or a
+    line in the residual where there is none.
+
+    Args:
+        catalogue: forms to choose from.
+        scales: of the measured motion.
+        has_motor: whether the model has the motor's and load's own motion, a reduced one has not.
+    """
+    found = {form: form.proposals(scales) for form in catalogue if has_motor or not form.needs_motor}
+    return {form: proposals for form, proposals in found.items() if proposals}

@@ -26,6 +26,22 @@ class QuadraticDamping(MeshTorqueEffect):
         return self.c2 * motion.v * jnp.abs(motion.v)
 
 
+class CubicDamping(MeshTorqueEffect):
+    """Torque `c3 v^3`."""
+
+    family: ClassVar[str] = "nonlinear_damping"
+    name: ClassVar[str] = "cubic_damping"
+
+    c3: Scalar = parameter(0.0, unit="N m s^3/rad^3", doc="cubic damping", source="EFFECTS", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return self.c3 * motion.v**3
+
+
 class DisplacementDamping(MeshTorqueEffect):
     """Torque `c_x x^2 v`: damping that grows with the twist."""
 

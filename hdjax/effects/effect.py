@@ -22,6 +22,8 @@ class Motion(eqx.Module):
         omega_m: motor rate [rad/s].
         theta_l: load angle [rad].
         omega_l: load rate [rad/s].
+        time: since the log's start [s], or None where it is not known.
+        temperature: of the drive [K], or None where it is not known.
     """
 
     x: Array
@@ -30,6 +32,20 @@ class Motion(eqx.Module):
     omega_m: Array | None = None
     theta_l: Array | None = None
     omega_l: Array | None = None
+    time: Array | None = None
+    temperature: Array | None = None
+
+
+class Conditions(eqx.Module):
+    """What surrounds a drive and is no torque: it acts on the effects that ask for it.
+
+    Attributes:
+        time: since the log's start [s]; the clock of the torque's signal.
+        temperature: of the drive [K].
+    """
+
+    time: Array | None = None
+    temperature: Array | None = None
 
 
 class Scales(eqx.Module):
@@ -42,6 +58,12 @@ class Scales(eqx.Module):
         omega_m: rms motor rate [rad/s].
         omega_l: rms load rate [rad/s].
         time_step: median sampling interval [s].
+        duration: of the longest log [s].
+        reduction_ratio: of the drive.
+        omega_0: natural frequency of the dynamic error [rad/s]; from the motion where None.
+        temperature: mean temperature of the first log [K], or None where a log has no such channel.
+        temperature_change: rms distance from it over all logs [K].
+        residual_frequencies: strongest lines of what the current model leaves over [rad/s], strongest first.
     """
 
     x: float
@@ -50,6 +72,17 @@ class Scales(eqx.Module):
     omega_m: float
     omega_l: float
     time_step: float
+    duration: float = 1.0
+    reduction_ratio: float = 1.0
+    omega_0: float | None = None
+    temperature: float | None = None
+    temperature_change: float = 0.0
+    residual_frequencies: tuple[float, ...] = ()
+
+    @property
+    def natural_frequency(self) -> float:
+        """Natural frequency of the dynamic error [rad/s], at worst the mean frequency of its motion."""
+        return self.v / self.x if self.omega_0 is None else self.omega_0
 
 
 class Effect(eqx.Module):
@@ -60,19 +93,23 @@ class Effect(eqx.Module):
         name: the form's own name, prefix of its parameters' dotted paths.
         states: names of its internal states.
         needs_motor: whether it needs the motor's and load's own motion, which a reduced log lacks.
+        needs_time: whether it depends on the time since the log's start.
+        needs_temperature: whether it depends on the drive's temperature.
     """
 
     family: ClassVar[str]
     name: ClassVar[str]
     states: ClassVar[tuple[str, ...]] = ()
     needs_motor: ClassVar[bool] = False
+    needs_time: ClassVar[bool] = False
+    needs_temperature: ClassVar[bool] = False
 
     @classmethod
     @abc.abstractmethod
     def proposals(cls, scales: Scales) -> "tuple[Effect, ...]":
         """The effect at zero strength, with shape parameters that suit a motion of these scales.
 
-        Several proposals are starting points of the same form.
+        Several proposals are starting points of the same form; none where a log of these scales can't show it.
         """
 
     @classmethod
@@ -87,8 +124,8 @@ class Effect(eqx.Module):
         """Further quantities that a reader expects, as name -> (value, unit)."""
         return {}
 
-    def initial_state(self) -> Float[Array, " states"]:
-        """Internal states of a drive that has rested unloaded."""
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, " states"]:
+        """Internal states of a drive that has long moved like this; that has rested unloaded where None."""
         raise ValueError(f"`{self.name}` has no internal states")
 
     def state_rates(self, motion: Motion, state: Array) -> Array:
@@ -96,7 +133,7 @@ class Effect(eqx.Module):
         raise ValueError(f"`{self.name}` has no internal states")
 
     def state_scale(self) -> Array:
-        """How far each internal state can be from its value at rest: the prior of an unknown initial state."""
+        """How far each internal state can be from its initial value: the prior of an unknown initial state."""
         raise ValueError(f"`{self.name}` has no internal states")
 
 

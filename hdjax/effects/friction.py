@@ -1,12 +1,12 @@
-"""Friction with a sign: in the mesh and on the motor."""
+"""Friction that needs no state: in the mesh, on the motor, on the load."""
 
 from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.drive import Drive, ReducedDrive, restoring
+from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
 from hdjax.parameters import Scalar, parameter
 
 
@@ -22,16 +22,47 @@ class CoulombFriction(MeshTorqueEffect):
         doc="Coulomb torque at the output",
         source="EFFECTS: 0.1 to 5 N m",
         bounds=(0.0, 1e3),
+        plausible=(0.1, 5.0),
         role="strength",
     )
     v_0: Scalar = parameter(unit="rad/s", doc="transition rate", bounds=(0.0, 1e3), role="shape")
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(v_0=0.03 * scales.v),)
+        return tuple(cls(v_0=fraction * scales.v) for fraction in (0.03, 0.2))
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.T_c * smooth_sign(motion.v, self.v_0)
+
+
+class LoadDependentFriction(MeshTorqueEffect):
+    """Torque `(T_c + share |K f(x)|) sgn(v)`: friction that grows with the torque that the mesh passes on.
+
+    In the literature's `T_c (1 + k |tau|)` k is `share / T_c`.
+    """
+
+    family: ClassVar[str] = "coulomb_friction"
+    name: ClassVar[str] = "load_dependent_friction"
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="Coulomb torque at the output, unloaded",
+        source="EFFECTS: 0.1 to 5 N m",
+        bounds=(0.0, 1e3),
+        plausible=(0.1, 5.0),
+        role="strength",
+    )
+    share: Scalar = parameter(0.0, unit="1", doc="friction torque over transmitted torque", role="strength")
+    v_0: Scalar = parameter(unit="rad/s", doc="transition rate", bounds=(0.0, 1e3), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(v_0=fraction * scales.v) for fraction in (0.03, 0.2))
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        transmitted = jnp.abs(drive.stiffness * restoring(motion.x, drive.alpha))
+        return (self.T_c + self.share * transmitted) * smooth_sign(motion.v, self.v_0)
 
 
 class MotorFriction(MotorSideEffect):
@@ -56,7 +87,7 @@ class MotorFriction(MotorSideEffect):
         return (cls(transition=0.01 * scales.omega_m),)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        omega = _motor_rate(motion)
+        omega = motor_rate(motion)
         return -self.T_c * smooth_sign(omega, self.transition) - self.b * omega
 
 
@@ -90,12 +121,34 @@ class StribeckMotorFriction(MotorSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(transition=0.01 * scales.omega_m, omega_s=0.2 * scales.omega_m),)
+        fractions = (0.2, 0.05, 0.6)
+        return tuple(cls(transition=0.01 * scales.omega_m, omega_s=f * scales.omega_m) for f in fractions)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        omega = _motor_rate(motion)
+        omega = motor_rate(motion)
         level = self.T_c + self.T_excess * jnp.exp(-((omega / self.omega_s) ** 2))
         return -level * smooth_sign(omega, self.transition) - self.b * omega
+
+
+class LoadFriction(LoadSideEffect):
+    """Friction torque `T_c sgn(omega_l) + b omega_l` against the load, its sign smoothed over `transition`."""
+
+    family: ClassVar[str] = "load_friction"
+    name: ClassVar[str] = "load_friction"
+
+    T_c: Scalar = parameter(
+        0.0, unit="N m", doc="Coulomb torque at the load", source="EFFECTS", bounds=(0.0, 1e4), role="strength"
+    )
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e3), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(transition=0.01 * scales.omega_l),)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        assert motion.omega_l is not None
+        return -self.T_c * smooth_sign(motion.omega_l, self.transition) - self.b * motion.omega_l
 
 
 def smooth_sign(rate: Array, transition: Array) -> Array:
@@ -103,6 +156,7 @@ def smooth_sign(rate: Array, transition: Array) -> Array:
     return jnp.tanh(rate / transition)
 
 
-def _motor_rate(motion: Motion) -> Array:
+def motor_rate(motion: Motion) -> Array:
+    """The motor's own rate, which a reduced drive lacks."""
     assert motion.omega_m is not None
     return motion.omega_m

@@ -1,4 +1,4 @@
-"""Hysteresis with memory: Bouc-Wen."""
+"""Hysteresis with memory in the mesh: Bouc-Wen, Dahl, Maxwell slip."""
 
 from typing import ClassVar
 
@@ -6,10 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.bristle import SETTLING, bristle_rate, slip_rate
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Dhaouadi, Ghorbel, Gandhi 2003; Ruderman"
+SLIP = "Tjahjowidodo, Al-Bender, Van Brussel 2013: slip at 1e-4 to 1e-3 rad"
 
 
 class BoucWen(MeshTorqueEffect):
@@ -25,7 +27,14 @@ class BoucWen(MeshTorqueEffect):
     states: ClassVar[tuple[str, ...]] = ("z",)
 
     k: Scalar = parameter(0.0, unit="N m/rad", doc="stiffness of the hysteretic part", source=SOURCE, role="strength")
-    yield_twist: Scalar = parameter(unit="rad", doc="where z saturates", source=SOURCE, bounds=(0.0, 0.1), role="shape")
+    yield_twist: Scalar = parameter(
+        unit="rad",
+        doc="where z saturates",
+        source=SOURCE,
+        bounds=(0.0, 0.1),
+        plausible=(1e-4, 1e-3),
+        role="shape",
+    )
     share: Scalar = parameter(
         0.6, unit="1", doc="beta / (beta + gamma)", source=SOURCE, bounds=(0.0, 1e2), role="shape"
     )
@@ -33,12 +42,12 @@ class BoucWen(MeshTorqueEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(yield_twist=fraction * scales.x) for fraction in (0.3, 1.0))
+        return tuple(cls(yield_twist=fraction * scales.x) for fraction in (0.3, 1.0, 0.1))
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.k * state[0]
 
-    def initial_state(self) -> Float[Array, "1"]:
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
         return jnp.zeros_like(self.k)[None]
 
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
@@ -57,3 +66,92 @@ class BoucWen(MeshTorqueEffect):
             "beta": (self.share * total, "rad^-n"),
             "gamma": ((1.0 - self.share) * total, "rad^-n"),
         }
+
+
+class Dahl(MeshTorqueEffect):
+    """Torque `k z` with `z' = v (1 - sgn(v) z / yield_twist)`: z follows the twist and saturates.
+
+    Bouc-Wen with n = 1 and gamma = 0, in two parameters.
+    """
+
+    family: ClassVar[str] = "hysteresis"
+    name: ClassVar[str] = "dahl"
+    states: ClassVar[tuple[str, ...]] = ("z",)
+
+    k: Scalar = parameter(0.0, unit="N m/rad", doc="stiffness of the hysteretic part", source="Dahl", role="strength")
+    yield_twist: Scalar = parameter(
+        unit="rad",
+        doc="where z saturates",
+        source=SLIP,
+        bounds=(0.0, 0.1),
+        plausible=(1e-4, 1e-3),
+        role="shape",
+    )
+    settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.3, 1.0, 0.1))
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return self.k * state[0]
+
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
+        return jnp.zeros_like(self.k)[None]
+
+    def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
+        return bristle_rate(motion.v, state[0], self.yield_twist, self.settling)[None]
+
+    def state_scale(self) -> Float[Array, "1"]:
+        return self.yield_twist[None]
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {"T_c": (self.k * self.yield_twist, "N m")}
+
+
+class MaxwellSlip(MeshTorqueEffect):
+    """Torque `k_1 z_1 + k_2 z_2 + k_3 z_3`: springs that slip, each at its own twist.
+
+    Each z follows the twist until it is its yield twist away, and then slips. The three yield at `yield_twist` and at
+    half and a quarter of it, so that one shape parameter serves them all. The corners are rounded a little, see
+    [`slip_rate`][].
+    """
+
+    family: ClassVar[str] = "hysteresis"
+    name: ClassVar[str] = "maxwell_slip"
+    states: ClassVar[tuple[str, ...]] = ("z_1", "z_2", "z_3")
+
+    k_1: Scalar = parameter(0.0, unit="N m/rad", doc="spring that slips last", source=SLIP, role="strength")
+    k_2: Scalar = parameter(0.0, unit="N m/rad", doc="spring that slips at a half", source=SLIP, role="strength")
+    k_3: Scalar = parameter(0.0, unit="N m/rad", doc="spring that slips at a quarter", source=SLIP, role="strength")
+    yield_twist: Scalar = parameter(
+        unit="rad",
+        doc="where the last spring slips",
+        source=SLIP,
+        bounds=(0.0, 0.1),
+        plausible=(1e-4, 1e-3),
+        role="shape",
+    )
+    settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.5, 1.5, 0.2))
+
+    @property
+    def _yields(self) -> Float[Array, "3"]:
+        return jnp.stack([self.yield_twist, 0.5 * self.yield_twist, 0.25 * self.yield_twist])
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return self.k_1 * state[0] + self.k_2 * state[1] + self.k_3 * state[2]
+
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "3"]:
+        return jnp.zeros_like(self._yields)
+
+    def state_rates(self, motion: Motion, state: Array) -> Float[Array, "3"]:
+        # Element by element: each is one contiguous row of lanes.
+        rates = [slip_rate(motion.v, z, d, self.settling) for z, d in zip(state, self._yields, strict=True)]
+        return jnp.stack(rates)
+
+    def state_scale(self) -> Float[Array, "3"]:
+        return self._yields

@@ -7,9 +7,11 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, MeshGeometryEffect, Scales
+from hdjax.effects.ripple import amplitude_and_phase, ripple, ripple_slope
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Ghorbel, Gandhi, Alpeter 2001; vendors: 1.5e-4 to 5.8e-4 rad peak to peak"
+PLAUSIBLE = (0.0, 2.9e-4)
 
 
 class KinematicError(MeshGeometryEffect):
@@ -22,12 +24,18 @@ class KinematicError(MeshGeometryEffect):
     name: ClassVar[str] = "kinematic_error"
     orders: ClassVar[tuple[int, ...]] = (1, 2, 4)
 
-    cos_1: Scalar = parameter(0.0, unit="rad", doc="cosine, order 1", source=SOURCE, role="strength")
-    sin_1: Scalar = parameter(0.0, unit="rad", doc="sine, order 1", source=SOURCE, role="strength")
-    cos_2: Scalar = parameter(0.0, unit="rad", doc="cosine, order 2", source=SOURCE, role="strength")
-    sin_2: Scalar = parameter(0.0, unit="rad", doc="sine, order 2", source=SOURCE, role="strength")
-    cos_4: Scalar = parameter(0.0, unit="rad", doc="cosine, order 4", source=SOURCE, role="strength")
-    sin_4: Scalar = parameter(0.0, unit="rad", doc="sine, order 4", source=SOURCE, role="strength")
+    cos_1: Scalar = parameter(
+        0.0, unit="rad", doc="cosine, order 1", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    sin_1: Scalar = parameter(0.0, unit="rad", doc="sine, order 1", source=SOURCE, plausible=PLAUSIBLE, role="strength")
+    cos_2: Scalar = parameter(
+        0.0, unit="rad", doc="cosine, order 2", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    sin_2: Scalar = parameter(0.0, unit="rad", doc="sine, order 2", source=SOURCE, plausible=PLAUSIBLE, role="strength")
+    cos_4: Scalar = parameter(
+        0.0, unit="rad", doc="cosine, order 4", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    sin_4: Scalar = parameter(0.0, unit="rad", doc="sine, order 4", source=SOURCE, plausible=PLAUSIBLE, role="strength")
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
@@ -42,17 +50,51 @@ class KinematicError(MeshGeometryEffect):
         )
 
     def error(self, theta_m: Array) -> Array:
-        return sum(
-            (a * jnp.cos(n * theta_m) + b * jnp.sin(n * theta_m) for n, a, b in self._terms),
-            start=jnp.zeros_like(theta_m),
-        )
+        return sum((ripple(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
 
     def slope(self, theta_m: Array) -> Array:
-        return sum(
-            (n * (b * jnp.cos(n * theta_m) - a * jnp.sin(n * theta_m)) for n, a, b in self._terms),
-            start=jnp.zeros_like(theta_m),
-        )
+        return sum((ripple_slope(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        amplitudes = {f"amplitude_{n}": (jnp.hypot(a, b), "rad") for n, a, b in self._terms}
-        return amplitudes | {f"phase_{n}": (jnp.arctan2(-b, a), "rad") for n, a, b in self._terms}
+        return {k: v for n, a, b in self._terms for k, v in amplitude_and_phase(a, b, "rad", f"_{n}").items()}
+
+
+class KinematicSidebands(MeshGeometryEffect):
+    """Kinematic error of order n that comes and goes with the output's revolution: orders `n +- 1/ratio`.
+
+    `e = sum over both of cos cos(order theta_m) + sin sin(order theta_m)`: the circular spline's own error moves the
+    wave generator's by once an output revolution.
+    """
+
+    family: ClassVar[str] = "kinematic_error"
+    name: ClassVar[str] = "kinematic_sidebands"
+
+    cos_below: Scalar = parameter(
+        0.0, unit="rad", doc="cosine, lower sideband", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    sin_below: Scalar = parameter(
+        0.0, unit="rad", doc="sine, lower sideband", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    cos_above: Scalar = parameter(
+        0.0, unit="rad", doc="cosine, upper sideband", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    sin_above: Scalar = parameter(
+        0.0, unit="rad", doc="sine, upper sideband", source=SOURCE, plausible=PLAUSIBLE, role="strength"
+    )
+    n: Scalar = parameter(2.0, unit="1", doc="order between the sidebands", bounds=(0.0, 1e3))
+    ratio: Scalar = parameter(unit="1", doc="motor revolutions in an output revolution", bounds=(0.0, 1e4))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(n=n, ratio=scales.reduction_ratio) for n in (2.0, 1.0))
+
+    @property
+    def _terms(self) -> tuple[tuple[Array, Array, Array], ...]:
+        away = 1.0 / self.ratio
+        return (self.n - away, self.cos_below, self.sin_below), (self.n + away, self.cos_above, self.sin_above)
+
+    def error(self, theta_m: Array) -> Array:
+        return sum((ripple(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
+
+    def slope(self, theta_m: Array) -> Array:
+        return sum((ripple_slope(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))

@@ -1,4 +1,4 @@
-"""Stiffness shapes beyond the cubic: quadratic, quintic, three slopes."""
+"""Stiffness shapes beyond the cubic: quadratic, quintic, three slopes, one smooth knee."""
 
 from typing import ClassVar
 
@@ -52,7 +52,12 @@ class ThreeSlopeStiffness(MeshTorqueEffect):
     name: ClassVar[str] = "three_slope_stiffness"
 
     stiffening_2: Scalar = parameter(
-        0.0, unit="1", doc="(K2 - K1)/K1", source="vendor catalogues: 0.2 to 0.6", role="strength"
+        0.0,
+        unit="1",
+        doc="(K2 - K1)/K1",
+        source="vendor catalogues: 0.2 to 0.6",
+        plausible=(0.2, 0.6),
+        role="strength",
     )
     stiffening_3: Scalar = parameter(0.0, unit="1", doc="(K3 - K2)/K1", source="vendor catalogues", role="strength")
     x1: Scalar = parameter(unit="rad", doc="twist at the first knee", bounds=(0.0, 0.1), role="shape")
@@ -60,7 +65,7 @@ class ThreeSlopeStiffness(MeshTorqueEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        fractions = ((0.25, 0.35), (0.5, 0.25))
+        fractions = ((0.25, 0.35), (0.5, 0.25), (0.12, 0.25), (0.35, 0.3))
         return tuple(cls(x1=a * scales.x_max, gap=b * scales.x_max) for a, b in fractions)
 
     @classmethod
@@ -87,6 +92,43 @@ class ThreeSlopeStiffness(MeshTorqueEffect):
             "T1": (T1, "N m"),
             "T2": (T1 + K2 * self.gap, "N m"),
         }
+
+
+class SmoothKneeStiffness(MeshTorqueEffect):
+    """One knee that is round: the slope goes from K to `K (1 + stiffening)` around the twist `knee`, within `width`.
+
+    One parameter fewer than three slopes, and smooth. The torque is `stiffening K (h(x - knee) - h(-x - knee))` with
+    the hyperbola `h(u) = (u + sqrt(u^2 + width^2)) / 2`, which rises to u.
+    """
+
+    family: ClassVar[str] = "stiffness_shape"
+    name: ClassVar[str] = "smooth_knee_stiffness"
+
+    stiffening: Scalar = parameter(
+        0.0,
+        unit="1",
+        doc="relative rise of the slope",
+        source="vendor catalogues: 0.2 to 0.6",
+        plausible=(0.2, 0.6),
+        role="strength",
+    )
+    knee: Scalar = parameter(unit="rad", doc="twist at the knee", bounds=(0.0, 0.1), role="shape")
+    width: Scalar = parameter(unit="rad", doc="half-width of the knee", bounds=(0.0, 0.1), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(knee=f * scales.x_max, width=0.1 * scales.x_max) for f in (0.25, 0.5, 0.75))
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        x = motion.x
+        beyond = self._rise(x - self.knee) - self._rise(-x - self.knee)
+        return drive.stiffness * self.stiffening * beyond
+
+    def _rise(self, u: Array) -> Array:
+        return 0.5 * (u + jnp.sqrt(u * u + self.width**2))
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {"K2": (drive.stiffness * (1 + self.stiffening), "N m/rad")}
 
 
 def _beyond(x: Array, knee: Array) -> Array:

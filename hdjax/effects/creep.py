@@ -1,0 +1,54 @@
+"""Creep: a part of the stiffness that relaxes."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
+from hdjax.parameters import Scalar, parameter
+
+
+class Creep(MeshTorqueEffect):
+    """Torque `share K (x - z)` with `tau z' = x - z`: the standard linear solid.
+
+    K is the stiffness after a long time, `(1 + share) K` that at once. After a step of the torque the twist goes its
+    last `share / (1 + share)` with the time constant `tau (1 + share)`.
+    """
+
+    family: ClassVar[str] = "creep"
+    name: ClassVar[str] = "creep"
+    states: ClassVar[tuple[str, ...]] = ("z",)
+
+    share: Scalar = parameter(
+        0.0,
+        unit="1",
+        doc="stiffness that relaxes, over K",
+        source="EFFECTS: percent of the twist",
+        plausible=(1e-3, 1e-1),
+        role="strength",
+    )
+    tau: Scalar = parameter(
+        unit="s", doc="relaxation time", source="EFFECTS: minutes to hours", bounds=(0.0, 1e7), role="shape"
+    )
+    span: Scalar = parameter(unit="rad", doc="twist from which z may start away", bounds=(0.0, 1e9))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        # Faster than a few periods it would be damping, slower than a few logs a stiffness.
+        slowest, fastest = 3.0 * scales.duration, 10.0 / scales.natural_frequency
+        times = [slowest / 3.0**k for k in range(12)]
+        return tuple(cls(tau=t, span=scales.x) for k, t in enumerate(times) if k == 0 or t > fastest)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return self.share * drive.stiffness * (motion.x - state[0])
+
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
+        return (jnp.zeros_like(self.tau) if motion is None else motion.x)[None]
+
+    def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
+        return ((motion.x - state[0]) / self.tau)[None]
+
+    def state_scale(self) -> Float[Array, "1"]:
+        return self.span[None]

@@ -1,0 +1,124 @@
+"""Stiffness and friction that depend on where the motor stands."""
+
+from typing import ClassVar
+
+from jaxtyping import Array
+
+from hdjax.drive import Drive, ReducedDrive, restoring
+from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.effects.friction import motor_rate, smooth_sign
+from hdjax.effects.ripple import amplitude_and_phase, ripple
+from hdjax.parameters import Scalar, parameter
+
+_ORDERS = (1.0, 2.0, 4.0)
+
+
+class PositionDependentStiffness(MeshTorqueEffect):
+    """Torque `K f(x) (cosine cos(n theta_m) + sine sin(n theta_m))`: a stiffness that ripples with the motor angle.
+
+    The small torque `x^2 dK/dtheta_m / 2` that such a spring puts on the motor is left out, as in the literature: it
+    is `n N x / 2` of the ripple's own torque there, a few per cent.
+    """
+
+    family: ClassVar[str] = "position_dependent_stiffness"
+    name: ClassVar[str] = "position_dependent_stiffness"
+    needs_motor: ClassVar[bool] = True
+
+    cosine: Scalar = parameter(
+        0.0,
+        unit="1",
+        doc="relative stiffness ripple, cosine",
+        source="EFFECTS: 1e-3 to 1e-1",
+        plausible=(1e-3, 1e-1),
+        role="strength",
+    )
+    sine: Scalar = parameter(
+        0.0,
+        unit="1",
+        doc="relative stiffness ripple, sine",
+        source="EFFECTS: 1e-3 to 1e-1",
+        plausible=(1e-3, 1e-1),
+        role="strength",
+    )
+    n: Scalar = parameter(2.0, unit="1", doc="cycles in a motor revolution", bounds=(0.0, 1e3))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(n=n) for n in _ORDERS)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        assert motion.theta_m is not None
+        share = ripple(motion.theta_m, self.n, self.cosine, self.sine)
+        return drive.stiffness * restoring(motion.x, drive.alpha) * share
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return amplitude_and_phase(self.cosine, self.sine, "1")
+
+
+class PositionDependentMotorFriction(MotorSideEffect):
+    """Friction `(T_c + cosine cos(n theta_m) + sine sin(n theta_m)) sgn(omega_m)` against the motor.
+
+    The ripple changes its sign with the direction, unlike cogging. It dissipates where it is smaller than T_c.
+    """
+
+    family: ClassVar[str] = "position_dependent_friction"
+    name: ClassVar[str] = "position_dependent_motor_friction"
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="mean Coulomb torque at the motor",
+        source="Tuttle 1992",
+        bounds=(0.0, 1e3),
+        role="strength",
+    )
+    cosine: Scalar = parameter(0.0, unit="N m", doc="ripple, cosine", source="Tuttle 1992", role="strength")
+    sine: Scalar = parameter(0.0, unit="N m", doc="ripple, sine", source="Tuttle 1992", role="strength")
+    n: Scalar = parameter(2.0, unit="1", doc="cycles in a motor revolution", bounds=(0.0, 1e3))
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(n=n, transition=0.01 * scales.omega_m) for n in _ORDERS)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        assert motion.theta_m is not None
+        level = self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
+        return -level * smooth_sign(motor_rate(motion), self.transition)
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return amplitude_and_phase(self.cosine, self.sine, "N m")
+
+
+class PositionDependentMeshFriction(MeshTorqueEffect):
+    """Friction `(T_c + cosine cos(n theta_m) + sine sin(n theta_m)) sgn(v)` between the mesh's two sides."""
+
+    family: ClassVar[str] = "position_dependent_friction"
+    name: ClassVar[str] = "position_dependent_mesh_friction"
+    needs_motor: ClassVar[bool] = True
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="mean Coulomb torque at the output",
+        source="EFFECTS: 0.1 to 5 N m",
+        bounds=(0.0, 1e3),
+        plausible=(0.1, 5.0),
+        role="strength",
+    )
+    cosine: Scalar = parameter(0.0, unit="N m", doc="ripple, cosine", plausible=(0.0, 5.0), role="strength")
+    sine: Scalar = parameter(0.0, unit="N m", doc="ripple, sine", plausible=(0.0, 5.0), role="strength")
+    n: Scalar = parameter(2.0, unit="1", doc="cycles in a motor revolution", bounds=(0.0, 1e3))
+    v_0: Scalar = parameter(unit="rad/s", doc="transition rate", bounds=(0.0, 1e3), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(n=n, v_0=0.03 * scales.v) for n in _ORDERS)
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        assert motion.theta_m is not None
+        level = self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
+        return level * smooth_sign(motion.v, self.v_0)
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return amplitude_and_phase(self.cosine, self.sine, "N m")

@@ -1,0 +1,127 @@
+"""Motor friction with memory: bristles that bend before they slide."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.bristle import SETTLING, bristle_rate
+from hdjax.effects.effect import Effect, Motion, MotorSideEffect, Scales
+from hdjax.effects.friction import motor_rate
+from hdjax.parameters import Scalar, parameter
+
+SOURCE = "Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
+# Bristles of this share of a radian over the omega_m of a period: from well resolved to nearly Coulomb.
+_BENDS = (0.1, 0.02, 0.5)
+
+
+class DahlMotorFriction(MotorSideEffect):
+    """Friction `T_c z / bend + b omega_m` against the motor, with `z' = omega_m (1 - sgn(omega_m) z / bend)`.
+
+    A Coulomb torque that builds up over the angle `bend`. The stiffness sigma_0 is `T_c / bend`.
+    """
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "dahl_motor_friction"
+    states: ClassVar[tuple[str, ...]] = ("z",)
+
+    T_c: Scalar = parameter(
+        0.0, unit="N m", doc="Coulomb torque at the motor", source="Dahl", bounds=(0.0, 1e3), role="strength"
+    )
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+    bend: Scalar = parameter(unit="rad", doc="motor angle within which it slides", bounds=(0.0, 10.0), role="shape")
+    settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(bend=bend, settling=scales.time_step) for bend in _bends(scales))
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
+
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
+        return _bent(self.bend, motion)
+
+    def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
+        return bristle_rate(motor_rate(motion), state[0], self.bend, self.settling)[None]
+
+    def state_scale(self) -> Float[Array, "1"]:
+        return self.bend[None]
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {"sigma_0": (self.T_c / self.bend, "N m/rad")}
+
+
+class LuGreMotorFriction(MotorSideEffect):
+    """LuGre friction `sigma_0 z + b omega_m` against the motor, with `z' = omega_m - sigma_0 |omega_m| z / g`.
+
+    `g = T_c (1 + excess exp(-(omega_m / omega_s)^2))` and `sigma_0 = T_c / bend`, so that the bristles saturate at
+    `bend` times the Stribeck level whatever T_c is. The bristles' own damping sigma_1 is left out: it matters only
+    while they stick.
+    """
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "lugre_motor_friction"
+    states: ClassVar[tuple[str, ...]] = ("z",)
+
+    T_c: Scalar = parameter(
+        0.0, unit="N m", doc="Coulomb torque at the motor", source=SOURCE, bounds=(0.0, 1e3), role="strength"
+    )
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source=SOURCE, role="strength")
+    excess: Scalar = parameter(
+        0.5,
+        unit="1",
+        doc="static torque above Coulomb, over Coulomb",
+        source="EFFECTS: 0.2 to 1",
+        bounds=(0.0, 100.0),
+        plausible=(0.2, 1.0),
+        role="shape",
+    )
+    omega_s: Scalar = parameter(
+        unit="rad/s",
+        doc="Stribeck rate",
+        source="EFFECTS: 1e-3 to 0.1 rad/s at the output",
+        bounds=(0.0, 1e4),
+        role="shape",
+    )
+    bend: Scalar = parameter(unit="rad", doc="motor angle within which it slides", bounds=(0.0, 10.0), role="shape")
+    settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(omega_s=0.2 * scales.omega_m, bend=bend, settling=scales.time_step) for bend in _bends(scales))
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
+
+    def _level(self, motion: Motion) -> Array:
+        return 1.0 + self.excess * jnp.exp(-((motor_rate(motion) / self.omega_s) ** 2))
+
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
+        return _bent(self.bend, motion)
+
+    def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
+        limit = self.bend * self._level(motion)
+        return bristle_rate(motor_rate(motion), state[0], limit, self.settling)[None]
+
+    def state_scale(self) -> Float[Array, "1"]:
+        return self.bend[None]
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {
+            "sigma_0": (self.T_c / self.bend, "N m/rad"),
+            "T_s": (self.T_c * (1.0 + self.excess), "N m"),
+        }
+
+
+def _bends(scales: Scales) -> tuple[float, ...]:
+    """Motor angles, as shares of what the motor turns within a radian of the natural oscillation."""
+    angle = scales.omega_m / scales.natural_frequency
+    return tuple(share * angle for share in _BENDS)
+
+
+def _bent(bend: Array, motion: Motion | None) -> Float[Array, "1"]:
+    """A motor that has long turned has bent its bristles its way."""
+    omega = None if motion is None else motion.omega_m
+    return (jnp.zeros_like(bend) if omega is None else bend * jnp.sign(omega))[None]

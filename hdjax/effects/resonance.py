@@ -1,0 +1,79 @@
+"""A second resonance: something that swings on the load."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.effect import Effect, LoadSideEffect, Motion, Scales
+from hdjax.parameters import Scalar, parameter
+
+
+class ExtraResonance(LoadSideEffect):
+    """A third inertia J_3 on a spring K_3 and a damper B_3 at the load, a flexible link or fixture.
+
+        J_3 theta_3'' = -K_3 (theta_3 - theta_l) - B_3 (theta_3' - theta_l')
+
+    and the opposite torque on the load. Kept in the terms that a log determines well, and in which J_3 = 0 is the drive
+    alone: `J_3 = mass_ratio J_l`, `K_3 = J_3 omega_3^2`, `B_3 = 2 zeta omega_3 J_3`. The load's response has its zero
+    at omega_3. States: `theta_3 - theta_l`, which stays small on a load that turns, and `theta_3'`; both are driven by
+    the load's rate alone.
+    """
+
+    family: ClassVar[str] = "extra_resonance"
+    name: ClassVar[str] = "extra_resonance"
+    states: ClassVar[tuple[str, ...]] = ("twist", "omega")
+
+    mass_ratio: Scalar = parameter(0.0, unit="1", doc="J_3 / J_l", bounds=(0.0, 1e3), role="strength")
+    omega_3: Scalar = parameter(
+        unit="rad/s", doc="natural frequency on a load that stands still", bounds=(0.0, 1e6), role="shape"
+    )
+    zeta: Scalar = parameter(0.02, unit="1", doc="damping ratio", bounds=(0.0, 10.0), role="shape")
+    twist_span: Scalar = parameter(unit="rad", doc="twist that it may start with", bounds=(0.0, 1e9))
+    rate_span: Scalar = parameter(unit="rad/s", doc="rate against the load's that it may start with", bounds=(0.0, 1e9))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        base = scales.natural_frequency
+        grid = tuple(base * 1.15**k for k in range(-8, 9))
+        return tuple(cls._at(omega, scales) for omega in (*scales.residual_frequencies, *grid))
+
+    @classmethod
+    def typical(cls, scales: Scales) -> tuple[Effect, ...]:
+        # The fit of a drive alone lies between the two resonances, and a heavy third inertia has moved it far.
+        return tuple(cls._at(scales.natural_frequency * ratio, scales, mass_ratio=0.2) for ratio in (0.7, 1.0, 1.4))
+
+    @classmethod
+    def _at(cls, omega_3: float, scales: Scales, mass_ratio: float = 0.0) -> "ExtraResonance":
+        rate = scales.x * scales.natural_frequency
+        return cls(mass_ratio=mass_ratio, omega_3=omega_3, twist_span=rate / omega_3, rate_span=rate)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return self.mass_ratio * drive.J_l * self._pull(motion, state)
+
+    def _pull(self, motion: Motion, state: Array) -> Array:
+        """What accelerates the load, over the mass ratio [rad/s^2]."""
+        assert motion.omega_l is not None
+        return self.omega_3**2 * state[0] + 2 * self.zeta * self.omega_3 * (state[1] - motion.omega_l)
+
+    def initial_state(self, motion: Motion | None = None) -> Float[Array, "2"]:
+        nothing = jnp.zeros_like(self.omega_3)
+        return jnp.stack([nothing, nothing if motion is None or motion.omega_l is None else motion.omega_l])
+
+    def state_rates(self, motion: Motion, state: Array) -> Float[Array, "2"]:
+        assert motion.omega_l is not None
+        return jnp.stack([state[1] - motion.omega_l, -self._pull(motion, state)])
+
+    def state_scale(self) -> Float[Array, "2"]:
+        return jnp.stack([self.twist_span, self.rate_span])
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        assert isinstance(drive, Drive)
+        J_3 = self.mass_ratio * drive.J_l
+        return {
+            "J_3": (J_3, "kg m^2"),
+            "K_3": (J_3 * self.omega_3**2, "N m/rad"),
+            "B_3": (2 * self.zeta * self.omega_3 * J_3, "N m s/rad"),
+            "zero": (self.omega_3 / (2 * jnp.pi), "Hz"),
+        }

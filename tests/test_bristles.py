@@ -1,0 +1,174 @@
+"""Bristles and slipping springs against their closed forms and an own numpy implementation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hdjax import Drive
+from hdjax.effects import Effect, Motion
+from hdjax.effects.bristle import bristle_rate, slip_rate
+from hdjax.effects.hysteresis import Dahl, MaxwellSlip
+from hdjax.effects.presliding import DahlMotorFriction, LuGreMotorFriction
+
+DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0)
+NO_LIMIT = 1e-12  # s: bristles as fast as their law
+
+
+@eqx.filter_jit
+def followed(effect: Effect, x: jax.Array, rate: jax.Array, step: jax.Array) -> jax.Array:
+    """States along a motion whose rate is given at the start, middle and end of each step, by classical Runge-Kutta.
+
+    The twist and the motor's motion are the same here.
+    """
+
+    def at(rate, state):
+        return effect.state_rates(Motion(x=rate, v=rate, omega_m=rate), state)
+
+    def move(state, rates):
+        start, middle, end = rates
+        k1 = at(start, state)
+        k2 = at(middle, state + 0.5 * step * k1)
+        k3 = at(middle, state + 0.5 * step * k2)
+        k4 = at(end, state + step * k3)
+        state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return state, state
+
+    first = effect.initial_state()
+    return jnp.concatenate([first[None], jax.lax.scan(move, first, rate)[1]])
+
+
+def along_sine(effect: Effect, size: float, omega: float, cycles: int, samples: int = 2000):
+    """Twist and states over cycles of `size sin(omega t)`."""
+    step = 2 * np.pi / omega / samples
+    t = step * np.arange(cycles * samples + 1)
+    rate = size * omega * np.cos(omega * np.stack([t[:-1], t[:-1] + step / 2, t[1:]], axis=1))
+    x = size * np.sin(omega * t)
+    return x, np.asarray(followed(effect, jnp.asarray(x), jnp.asarray(rate), jnp.asarray(step)))
+
+
+def elastoplastic(x: np.ndarray, limit: float) -> np.ndarray:
+    """An ideal element: it follows the twist, cut at its limit."""
+    z = np.zeros(x.size)
+    for i in range(1, x.size):
+        z[i] = np.clip(z[i - 1] + x[i] - x[i - 1], -limit, limit)
+    return z
+
+
+SLIP = MaxwellSlip(k_1=3000.0, k_2=2000.0, k_3=1000.0, yield_twist=6e-4, settling=NO_LIMIT)
+
+
+def slip_torque(states: np.ndarray) -> np.ndarray:
+    motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()))
+    return np.asarray(jax.vmap(lambda s: SLIP.torque(motion, DRIVE, s))(jnp.asarray(states)))
+
+
+def test_maxwell_slip_is_a_sum_of_elastoplastic_elements():
+    """With minor loops. At its corner a rounded element is 0.14 of its limit short, and more only where it has crept
+    beyond an ideal one; over the whole path that is little."""
+    samples = 4000
+    t = np.linspace(0.0, 2 * np.pi, samples + 1)
+    x = 1.5e-3 * np.sin(t) + 5e-4 * np.sin(5 * t)
+    rate = lambda t: 1.5e-3 * np.cos(t) + 2.5e-3 * np.cos(5 * t)  # noqa: E731
+    step = t[1]
+    rates = np.stack([rate(t[:-1]), rate(t[:-1] + step / 2), rate(t[1:])], axis=1)
+    states = np.asarray(followed(SLIP, jnp.asarray(x), jnp.asarray(rates), jnp.asarray(step)))
+    torque = slip_torque(states)
+    ideal = 3000 * elastoplastic(x, 6e-4) + 2000 * elastoplastic(x, 3e-4) + 1000 * elastoplastic(x, 1.5e-4)
+    assert np.abs(ideal).max() == pytest.approx(3000 * 6e-4 + 2000 * 3e-4 + 1000 * 1.5e-4)
+    assert np.abs(torque - ideal).max() < 0.2 * np.abs(ideal).max()
+    assert np.sqrt(np.mean((torque - ideal) ** 2)) < 0.06 * np.sqrt(np.mean(ideal**2))
+    area, ideal_area = np.trapezoid(torque, x), np.trapezoid(ideal, x)
+    assert area == pytest.approx(ideal_area, rel=0.1)
+
+
+@pytest.mark.parametrize("omega", (0.5, 40.0))
+def test_the_area_of_a_slip_loop_does_not_depend_on_the_rate(omega):
+    """Close to the ideal 4 sum k_i d_i (X - d_i) at every rate."""
+    size = 2e-3
+    x, states = along_sine(SLIP, size, omega, cycles=2)
+    area = np.trapezoid(slip_torque(states)[-2001:], x[-2001:])
+    ideal = sum(4 * k * d * (size - d) for k, d in ((3000.0, 6e-4), (2000.0, 3e-4), (1000.0, 1.5e-4)))
+    assert area == pytest.approx(ideal, rel=0.05)
+    _, other = along_sine(SLIP, size, 1.0, cycles=2)
+    np.testing.assert_allclose(states, other, atol=1e-9 * 6e-4)
+
+
+def test_dahl_loads_exponentially_and_forgets_its_start():
+    """z = d (1 - exp(-x/d)) from rest; on the way back z = -d + (d + z_0) exp(-|dx|/d)."""
+    d, size = 4e-4, 1e-3
+    effect = Dahl(k=1000.0, yield_twist=d, settling=NO_LIMIT)
+    x, states = along_sine(effect, size, 3.0, cycles=1, samples=4000)
+    up, back = states[:1001, 0], states[1000:3001, 0]
+    np.testing.assert_allclose(up, d * (1 - np.exp(-x[:1001] / d)), atol=1e-9 * d)
+    np.testing.assert_allclose(back, -d + (d + up[-1]) * np.exp(-(size - x[1000:3001]) / d), atol=1e-9 * d)
+    assert float(effect.derived(DRIVE)["T_c"][0]) == pytest.approx(0.4)
+
+
+@settings(max_examples=40)
+@given(
+    rates=st.lists(st.floats(-1e4, 1e4), min_size=2, max_size=60),
+    limit=st.floats(1e-7, 1e-1),
+    start=st.floats(-1.0, 1.0),
+    steps=st.floats(0.05, 1.0),
+    law=st.sampled_from((bristle_rate, slip_rate)),
+)
+def test_no_rate_is_too_fast_for_a_step_of_the_settling_time(rates, limit, start, steps, law):
+    """However short the bristle and however fast the motion, it stays within its limit."""
+    settling = 1e-3
+    h = steps * settling
+    z = limit * start
+    f = lambda z, v: float(law(jnp.asarray(v), jnp.asarray(z), jnp.asarray(limit), jnp.asarray(settling)))  # noqa: E731
+    for v in rates:
+        k1 = f(z, v)
+        k2 = f(z + h / 2 * k1, v)
+        k3 = f(z + h / 2 * k2, v)
+        z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(z + h * k3, v))
+        assert abs(z) <= limit * (1 + 1e-2)
+
+
+@pytest.mark.parametrize("v", (-3.0, 0.02, 7.0))
+def test_slow_bristles_are_not_bounded(v):
+    """Where settling is short against the time to yield, the law is Dahl's own."""
+    z, d = jnp.asarray(0.3), jnp.asarray(1.0)
+    found = bristle_rate(jnp.asarray(v), z, d, jnp.asarray(1e-5))
+    assert float(found) == pytest.approx(v - abs(v) * 0.3, rel=1e-8)
+
+
+@pytest.mark.parametrize("omega_m", (-30.0, -2.0, 0.5, 5.0, 80.0))
+def test_lugre_at_constant_speed_is_the_stribeck_curve(omega_m):
+    """Friction of EFFECTS.md, `(T_c + (T_s - T_c) exp(-(w/w_s)^2)) sgn w + b w`, once the bristles have bent."""
+    effect = LuGreMotorFriction(T_c=0.2, b=0.01, excess=0.5, omega_s=4.0, bend=1e-3, settling=1e-4)
+    rate = np.full((400, 3), omega_m)
+    step = 0.3 * np.hypot(1e-3 / omega_m, 1e-4)  # of the time within which it bends
+    (bent,) = np.asarray(followed(effect, jnp.zeros(401), jnp.asarray(rate), jnp.asarray(step)))[-1]
+    motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=jnp.asarray(omega_m))
+    torque = float(effect.torque(motion, DRIVE, jnp.asarray([bent])))
+    level = 0.2 + 0.1 * np.exp(-((omega_m / 4.0) ** 2))
+    assert torque == pytest.approx(-level * np.sign(omega_m) - 0.01 * omega_m, rel=1e-6)
+    derived = {name: float(v) for name, (v, _) in effect.derived(DRIVE).items()}
+    assert derived == pytest.approx({"sigma_0": 200.0, "T_s": 0.3})
+    # A motor that has long turned starts there, to the Stribeck level.
+    assert float(effect.initial_state(motion)[0]) == pytest.approx(1e-3 * np.sign(omega_m))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    (
+        DahlMotorFriction(T_c=0.2, bend=5e-4, settling=NO_LIMIT),
+        LuGreMotorFriction(T_c=0.2, excess=1.0, omega_s=1e-2, bend=5e-4, settling=NO_LIMIT),
+    ),
+    ids=lambda e: e.name,
+)
+def test_bristles_on_the_motor_take_work_and_give_back_no_more_than_they_store(effect):
+    angle, states = along_sine(effect, 1e-3, 30.0, cycles=2)
+    friction = 0.2 * states[:, 0] / 5e-4  # N m, against the motor
+    work = np.concatenate([[0.0], np.cumsum(0.5 * (friction[1:] + friction[:-1]) * np.diff(angle))])
+    stored = 0.5 * 0.2 * states[:, 0] ** 2 / 5e-4
+    lost = work - stored
+    # The trapezoid errs by some 1e-6 of the work.
+    assert np.all(np.diff(lost) > -1e-6 * work[-1])
+    assert lost[-1] > 0.9 * work[-1]
