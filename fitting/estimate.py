@@ -22,6 +22,7 @@ from fitting.residual import (
 )
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import jit_lanes, spread
+from hdjax.program_cache import jit_kept
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -179,7 +180,7 @@ def fit(
     )
 
 
-@eqx.filter_jit
+@jit_kept
 def _weighed(problem: Problem, covariance: Array, swing: float | Array) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)

@@ -10,6 +10,7 @@ from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
 from hdjax.lanes import jit_lanes
+from hdjax.program_cache import jit_kept
 from hdjax.simulate import march
 from hdjax.where import where
 
@@ -77,7 +78,7 @@ class Blocks(eqx.Module):
     before_by_state: Float[Array, "segments states states"]
 
 
-@eqx.filter_jit
+@jit_kept
 def simulate_segments(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:

@@ -20,6 +20,7 @@ from fitting.arrow import chains, project
 from fitting.estimate import Fit, natural_frequency
 from fitting.experiment import Segments
 from fitting.residual import Blocks, Problem, linearise
+from hdjax.program_cache import jit_kept
 
 # Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.
 _MANY_CHAINS = 20
@@ -255,7 +256,7 @@ def _spectrum(series: np.ndarray) -> np.ndarray:
     return np.fft.rfft(series, axis=0) / np.sqrt(series.shape[0])
 
 
-@eqx.filter_jit
+@jit_kept
 def _columns(problem: Problem, found: Blocks) -> tuple[Array, Array, Array]:
     """Residual by row, projected slopes, and the derivative with respect to the state that each chain starts from."""
     joined = problem.segments.joined
