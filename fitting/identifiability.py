@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.arrow import project
 from fitting.estimate import Fit
@@ -169,7 +169,7 @@ def _between(low: float, high: float, unit: str) -> str:
 
 def _reach(estimate: Estimate) -> float:
     """Half the length of a parameter's interval."""
-    return float(student.ppf(0.975, estimate.degrees_of_freedom)) * estimate.std
+    return float(stdtrit(estimate.degrees_of_freedom, 0.975)) * estimate.std
 
 
 def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
 from fitting.estimate import Fit
@@ -77,7 +77,7 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
     index = fit.free.paths.index(path)
     estimate = found.estimates[path]
     # How much the parameter's variance exceeds that of a white residual of unit variance, times t squared.
-    allowed = student.ppf(0.975, estimate.degrees_of_freedom) ** 2 * _inflation(fit, found, index)
+    allowed = stdtrit(estimate.degrees_of_freedom, 0.975) ** 2 * _inflation(fit, found, index)
     reach = np.sqrt(allowed * found.unit_covariance[index, index])
     reach = min(float(reach), _FARTHEST_FIRST)
     problem = eqx.tree_at(

@@ -4,6 +4,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.experiment import Segments
@@ -20,7 +21,7 @@ _LOST = 1e8
 
 
 def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
-    return jnp.asarray(value, dtype=int)
+    return jnp.asarray(np.asarray(value) if isinstance(value, int) else value, dtype=int)
 
 
 class Problem(eqx.Module):

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from fitting.arrow import chains, project
 from fitting.estimate import Fit, natural_frequency
@@ -176,7 +176,7 @@ def _overruled(
     """The robust covariance with larger variances where another estimate is larger by more than chance."""
     own, rival = np.diag(robust), np.diag(other)
     ratio = np.where(own > 0, rival / np.where(own > 0, own, 1.0), 1.0)
-    larger = ratio > f_distribution.ppf(_OVERRULE, other_freedom, freedom)
+    larger = ratio > fdtri(other_freedom, freedom, _OVERRULE)
     stretch = np.where(larger, np.sqrt(ratio), 1.0)
     return robust * np.outer(stretch, stretch), np.where(larger, other_freedom, freedom)
 

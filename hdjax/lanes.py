@@ -46,4 +46,6 @@ def spread(tree: _Tree, lanes: int) -> _Tree:
     shared, everywhere = NamedSharding(mesh, PartitionSpec("lanes")), NamedSharding(mesh, PartitionSpec())
     arrays, rest = eqx.partition(tree, eqx.is_array)
     places = jax.tree.map(lambda a: shared if a.ndim and a.shape[0] == lanes else everywhere, arrays)
-    return eqx.combine(jax.device_put(arrays, places), rest)
+    # By way of the host: JAX would compile a program for each shape that it cuts.
+    hosts = jax.tree.map(np.asarray, arrays)
+    return eqx.combine(jax.device_put(hosts, places), rest)
