@@ -10,7 +10,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy import linalg
-from scipy.signal import correlate
 from scipy.special import chdtrc
 
 from fitting.autocorrelation import autocovariance, left_over
@@ -169,8 +168,9 @@ def independence(
     n = residual.size
     most = min(LAGS, n // 4)
     scale = np.sqrt(np.sum(residual**2) * np.sum(signal**2)) or 1.0
-    both = correlate(residual, signal, mode="full", method="fft")[n - 1 - most : n + most] / scale
     lags = np.arange(-most, most + 1)
+    spectra = (np.fft.rfft(values, 2 * n) for values in (residual, signal))
+    both = np.fft.irfft(next(spectra) * np.conj(next(spectra)), 2 * n)[lags] / scale
     law = _joint_law(residual, signal, most)
     causal = both[most:]
     values, vectors = linalg.eigh(linalg.toeplitz(law) / n)
