@@ -93,7 +93,7 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False
     if read[0].kind == "quasi-static":
         _fit_quasi_static(read, drive_file, out)
     else:
-        _fit_drive(rig_of(read, drive_file), out, seed if posterior else None)
+        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None)
 
 
 def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:

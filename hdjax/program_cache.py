@@ -159,7 +159,7 @@ def _key(function: Callable, options: dict[str, Any], arguments: Any) -> str:
     if "<" in name or name.split(".")[0] not in OWN_PACKAGES:
         raise UnknownCode(f"{name} is not of a module of this project")
     settings = sorted((name, str(value)) for name, value in _settings().items())
-    made_from = (name, sorted(options.items()), settings, surroundings(), fingerprint(arguments))
+    made_from = (name, sorted(options.items()), settings, surroundings(), _source(), fingerprint(arguments))
     return hashlib.sha256(repr(made_from).encode()).hexdigest()
 
 
@@ -167,25 +167,33 @@ def _settings() -> dict[str, Any]:
     return jax.config.values  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@functools.cache
 def surroundings() -> tuple[str, ...]:
-    """What compiled programs depend on besides function, settings and arguments: source, versions and machine."""
-    versions = [f"{name} {importlib.metadata.version(name)}" for name in PACKAGES]
+    """What compiled programs depend on besides function, settings and arguments: versions, processor and devices.
+
+    Raises:
+        UnknownCode: where that can't be told.
+    """
     devices = [f"{d.platform} {d.device_kind} {d.id} {d.process_index}" for d in jax.devices()]
-    machine = (platform.system(), platform.machine(), _processor(), str(os.cpu_count()))
-    return (sys.version, *versions, *devices, *machine, os.environ.get("XLA_FLAGS", ""), _source())
+    return (*_versions(), *devices, *_processor(), os.environ.get("XLA_FLAGS", ""))
 
 
-def _processor() -> str:
+@functools.cache
+def _versions() -> tuple[str, ...]:
+    return (sys.version, *(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES))
+
+
+@functools.cache
+def _processor() -> tuple[str, ...]:
     """What the processor can do: code for another one may end the process."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
-    except OSError:
-        return platform.processor()
+    except OSError as error:
+        raise UnknownCode("only Linux says what its processor can do") from error
     telling = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features", "CPU ")
-    return "\n".join(line for line in lines if line.startswith(telling))
+    return (platform.machine(), str(os.cpu_count()), *(line for line in lines if line.startswith(telling)))
 
 
+@functools.cache
 def _source() -> str:
     """Digest of all source files of this project."""
     digest = hashlib.sha256()
@@ -210,11 +218,12 @@ def _made(path: Path, function: Callable, options: dict[str, Any], arguments: An
     # XLA can't write down what JAX's cache has read, so JAX must not find it there: a name that nothing else has.
     program.__name__ = f"{function.__name__}_{uuid.uuid4().hex}"
     lowered = jax.jit(program, **options).lower(_arrays(jax.tree.leaves(arguments)))
-    calls = frozenset(_CALL.findall(lowered.as_text()))
-    if not all(_LASTING_CALL.fullmatch(name) for name in calls):
+    text = lowered.as_text()
+    calls = _CALL.findall(text)
+    if len(calls) < text.count("custom_call") or not all(_LASTING_CALL.fullmatch(name) for name in calls):
         return None
     compiled = lowered.compile()
-    _write(path, compiled, calls, returned[-1])
+    _write(path, compiled, frozenset(calls), returned[-1])
     return _calling(compiled, returned[-1])
 
 
@@ -284,10 +293,14 @@ def _write(path: Path, compiled: jax.stages.Compiled, calls: frozenset[str], ret
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         _make_room(path.parent, len(packed))
+        # Beside its place first: nobody reads half a program.
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=".")
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(packed).digest() + packed)
-        os.replace(name, path)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(packed).digest() + packed)
+            os.replace(name, path)
+        except OSError:
+            os.unlink(name)
 
 
 def _same(one: Any, other: Any) -> bool:
