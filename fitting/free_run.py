@@ -91,7 +91,9 @@ def free_run(
         model,
         free_parameters(model, (), {}),
         segments,
-        *(jnp.asarray(a) for a in (np.eye(segments.measured.shape[-1]), np.zeros(0), np.ones(states.shape[1]))),
+        jnp.asarray(np.eye(segments.measured.shape[-1])),
+        jnp.asarray(np.zeros(0)),
+        jnp.asarray(np.ones(states.shape[1])),
         substeps=substeps,
     )
     outputs = np.asarray(_simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states)))

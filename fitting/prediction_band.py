@@ -110,7 +110,8 @@ def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) 
         fitted.model,
         fitted.free,
         segments,
-        *(jnp.asarray(a) for a in (np.eye(segments.measured.shape[-1]), np.ones(len(fitted.free.paths)))),
+        jnp.asarray(np.eye(segments.measured.shape[-1])),
+        jnp.asarray(np.ones(len(fitted.free.paths))),
         jnp.asarray(np.ones(fitted.unknowns.states.shape[1])),
         substeps=substeps,
     )

@@ -39,4 +39,4 @@ def density(
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
     """One-sided power spectral density; arguments as in [`cross_density`][]."""
     frequency, found = cross_density(series, series, step=step, window=window)
-    return frequency, found.real
+    return frequency, np.real(found)

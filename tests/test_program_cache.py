@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from fitting.free import FreeParameters, base_paths, strength_paths
-from hdjax import ReducedDrive, program_cache
+from hdjax import ReducedDrive, program_cache, program_store, surroundings
 from hdjax.program_cache import jit_kept
 
 
@@ -95,9 +95,9 @@ def test_other_arguments_are_another_program(folder: Path, name: str):
 
 
 CHANGES: dict[str, Callable[[pytest.MonkeyPatch], object]] = {
-    "source": lambda patch: patch.setattr(program_cache, "_source", lambda: "other"),
-    "versions": lambda patch: patch.setattr(program_cache, "_versions", lambda: ("other",)),
-    "processor": lambda patch: patch.setattr(program_cache, "_processor", lambda: ("other",)),
+    "source": lambda patch: patch.setattr(program_cache, "source", lambda: "other"),
+    "versions": lambda patch: patch.setattr(surroundings, "_versions", lambda: ("other",)),
+    "processor": lambda patch: patch.setattr(surroundings, "_processor", lambda: ("other",)),
     "devices": lambda patch, found=jax.devices: patch.setattr(jax, "devices", lambda: found() * 2),
     "flags": lambda patch: patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true"),
 }
@@ -131,13 +131,13 @@ def test_source_is_read_from_the_files(tmp_path: Path, monkeypatch: pytest.Monke
     class Spec:
         submodule_search_locations = [str(tmp_path / "hdjax")]
 
-    monkeypatch.setattr(program_cache.importlib.util, "find_spec", lambda name: Spec)
-    before = program_cache._source.__wrapped__()
-    assert before == program_cache._source.__wrapped__()
+    monkeypatch.setattr(surroundings.importlib.util, "find_spec", lambda name: Spec)
+    before = surroundings.source.__wrapped__()
+    assert before == surroundings.source.__wrapped__()
     (tmp_path / "hdjax" / "__init__.py").write_text("2")
-    after = program_cache._source.__wrapped__()
+    after = surroundings.source.__wrapped__()
     (tmp_path / "hdjax" / "more.py").write_text("")
-    assert len({before, after, program_cache._source.__wrapped__()}) == 3
+    assert len({before, after, surroundings.source.__wrapped__()}) == 3
 
 
 class Unknown(eqx.Module):
@@ -223,7 +223,7 @@ def test_the_oldest_programs_make_room(folder: Path, monkeypatch: pytest.MonkeyP
     # Use keeps the first one young.
     traced.in_new_process()(X, 3)
     size = max(p.stat().st_size for p in files(folder))
-    monkeypatch.setattr(program_cache, "_MOST_BYTES", int(2.5 * size))
+    monkeypatch.setattr(program_store, "_MOST_BYTES", int(2.5 * size))
     traced.in_new_process()(X, 0)
     assert traced.count == 4 and len(files(folder)) == 2
     traced.in_new_process()(X, 3)
