@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy.stats import wilcoxon
 
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, scales
@@ -286,6 +285,9 @@ def _with_separability(verdicts: list[Verdict]) -> list[Verdict]:
 
 def _p_worse(difference: np.ndarray) -> float:
     """Chance of differences at least this positive where there are none."""
+    # Loaded here: it takes as long as jax, and a plain fit does without.
+    from scipy.stats import wilcoxon
+
     return float(np.asarray(wilcoxon(difference, alternative="greater"))[1])
 
 

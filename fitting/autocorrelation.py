@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from fitting.arrow import chains
 from fitting.estimate import Fit
 from fitting.residual import Problem, Unknowns, blocks
+from hdjax.program_cache import jit_kept
 
 # Directions of a chain's first state that its samples hardly see.
 _BLIND = 1e-12
@@ -61,7 +62,7 @@ def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
     return autocovariance(apart, lags).sum(axis=(0, 1))
 
 
-@eqx.filter_jit
+@jit_kept
 def _by_first_state(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array]:
     """Derivative of each segment's rows by its chain's first state; and the dynamic error by whitened outputs."""
     found = blocks(problem, unknowns)

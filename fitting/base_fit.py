@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from fitting.estimate import Fit, fit, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.experiment import Stretch, cut
@@ -138,7 +138,7 @@ def leaves_white_noise(found: Fit) -> bool:
     pairs = np.array([np.sum(kept[:, k:] * kept[:, :-k]) for k in lags])
     # Each correlation has a variance of pairs / count^2.
     statistic = np.sum(correlation**2 * count**2 / pairs)
-    return bool(statistic < chi2.isf(_FALSE_ALARM, lags.size))
+    return bool(statistic < chdtri(lags.size, _FALSE_ALARM))
 
 
 def _as_followed(found: Fit) -> tuple[Stretch, ...]:

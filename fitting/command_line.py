@@ -33,10 +33,6 @@ from fitting.free_run import WINDOW, free_run
 from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.posterior import sampler
-from fitting.quasi_static import content as quasi_static_content
-from fitting.quasi_static import report as quasi_static_report
-from fitting.quasi_static.fit import fit_quasi_static
-from fitting.quasi_static.preparation import prepare
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
 from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
@@ -97,10 +93,16 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False
     if read[0].kind == "quasi-static":
         _fit_quasi_static(read, drive_file, out)
     else:
-        _fit_drive(rig_of(read, drive_file), out, seed if posterior else None)
+        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None)
 
 
 def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
+    # Loaded here: most fits are of other logs.
+    from fitting.quasi_static import content as quasi_static_content
+    from fitting.quasi_static import report as quasi_static_report
+    from fitting.quasi_static.fit import fit_quasi_static
+    from fitting.quasi_static.preparation import prepare
+
     with _progress() as progress:
         progress("fitting torque-twist curves")
         data = prepare(logs, drive_file)

@@ -2,16 +2,18 @@
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.compare import Account
 from hdjax import Drive, Model
+from hdjax.program_cache import jit_kept
 
 Quantities = Mapping[str, tuple[Array, str]]
 """Value and unit by name."""
@@ -35,28 +37,25 @@ class Derived(eqx.Module):
     @property
     def ci95(self) -> tuple[float, float]:
         """95 % interval."""
-        half = float(student.ppf(0.975, self.degrees_of_freedom)) * self.std
+        half = float(stdtrit(self.degrees_of_freedom, 0.975)) * self.std
         return self.value - half, self.value + half
 
 
-def derived(account: Account, quantities: Callable[[Model], Quantities]) -> dict[str, Derived]:
+def derived(account: Account, quantities: Callable[..., Quantities], *given: float | str) -> dict[str, Derived]:
     """Quantities of a fitted model with their standard errors.
 
     Args:
         account: the fitted model's.
-        quantities: value and unit of each, as a function of the model.
+        quantities: value and unit of each, as a function of the model and of what is given besides.
+        given: further arguments of that function.
     """
-    model, estimates = account.model, account.uncertainty.estimates
-    known = quantities(model)
+    estimates = account.uncertainty.estimates
+    numbers = tuple(jnp.asarray(np.asarray(g)) if isinstance(g, float) else g for g in given)
+    values = jnp.asarray(np.array([e.value for e in estimates.values()]))
+    known, slopes = _values_and_slopes(account.model, tuple(estimates), values, quantities, numbers)
     if not known:
         return {}
-    paths = list(estimates)
-
-    def values(vector: Array) -> Array:
-        moved = model.replace({p: vector[i] for i, p in enumerate(paths)})
-        return jnp.stack([value for value, _ in quantities(moved).values()])
-
-    slopes = np.asarray(jax.jacfwd(values)(jnp.asarray([e.value for e in estimates.values()], dtype=float)))
+    slopes = np.asarray(slopes)
     spread = np.array([e.std for e in estimates.values()])
     with np.errstate(all="ignore"):
         scaled = slopes * spread
@@ -65,8 +64,22 @@ def derived(account: Account, quantities: Callable[[Model], Quantities]) -> dict
     freedom = _degrees_of_freedom(scaled, np.array([e.degrees_of_freedom for e in estimates.values()]))
     return {
         name: Derived(float(value), float(error), unit, float(own))
-        for (name, (value, unit)), error, own in zip(known.items(), errors, freedom, strict=True)
+        for (name, value, unit), error, own in zip(known, errors, freedom, strict=True)
     }
+
+
+@jit_kept
+def _values_and_slopes(
+    model: Model, paths: tuple[str, ...], values: Array, quantities: Callable[..., Quantities], given: tuple[Any, ...]
+) -> tuple[tuple[tuple[str, Array, str], ...], Array]:
+    """Name, value and unit of each quantity, and derivatives of the values by the parameters at `paths`."""
+
+    def at(vector: Array) -> Array:
+        moved = model.replace({p: vector[i] for i, p in enumerate(paths)})
+        return jnp.stack([value for value, _ in quantities(moved, *given).values()])
+
+    known = tuple((name, value, unit) for name, (value, unit) in quantities(model, *given).items())
+    return known, jax.jacfwd(at)(values) if known else jnp.zeros((0, len(paths)))
 
 
 def _degrees_of_freedom(
@@ -84,7 +97,17 @@ def _degrees_of_freedom(
     return np.where(np.isnan(freedom), np.inf, freedom)
 
 
-def drive_figures(model: Model, x_max: float) -> dict[str, tuple[Array, str]]:
+def effect_figures(model: Model, name: str) -> Quantities:
+    """What an effect says of itself beside its parameters.
+
+    Args:
+        model: with the effect.
+        name: of the effect.
+    """
+    return model.effect(name).derived(model.drive)
+
+
+def drive_figures(model: Model, x_max: float | Array) -> dict[str, tuple[Array, str]]:
     """What engineers use of a drive beside its parameters.
 
     Args:

@@ -3,10 +3,10 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import welch
 
 from fitting.autocorrelation import autocorrelation, left_over
 from fitting.estimate import Fit
+from fitting.spectral_density import density
 from hdjax import TwoInertiaModel
 
 _BINS = 40
@@ -58,7 +58,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     residual = left_over(fit)
     simulated = (np.asarray(segments.measured) - np.asarray(fit.error))[weight]
     step = fit.stretches[0].experiment.time_step
-    frequency, density = welch(residual, 1.0 / step, nperseg=min(2048, residual.size))
+    frequency, power = density(residual, step=step, window=min(2048, residual.size))
     x = simulated[:, -1]
     quantities = {"x": x, "v": np.gradient(x, step)}
     order = amplitude = np.zeros(0)
@@ -73,7 +73,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     quantities["v"] = np.clip(quantities["v"], *np.quantile(quantities["v"], [0.001, 0.999]))
     return ResidualDiagnostics(
         frequency=frequency,
-        spectral_density=density,
+        spectral_density=power,
         order=order,
         order_amplitude=amplitude,
         autocorrelation=autocorrelation(fit, min(200, residual.size // 4)),

@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, project
+from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, projected
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import FreeParameters, free_parameters
 from fitting.residual import (
@@ -22,6 +22,7 @@ from fitting.residual import (
 )
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import jit_lanes, spread
+from hdjax.program_cache import jit_kept
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -141,9 +142,10 @@ def fit(
         states = initial_states(model, segments)
     unknowns = Unknowns(free.pack(model), states)
     active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
-    motion = scales(stretches)
+    swing = jnp.asarray(np.asarray(scales(stretches).x))
     outputs = segments.measured.shape[-1]
-    problem = Problem(model, free, segments, jnp.eye(outputs), active, jnp.ones(states.shape[1]), substeps=substeps)
+    unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
+    problem = Problem(model, free, segments, *unweighed, substeps=substeps)
     problem, unknowns = spread((problem, unknowns), states.shape[0])
     if covariance is None:
         _, covariance, _ = _evaluate(problem, unknowns)
@@ -152,7 +154,7 @@ def fit(
     objective, converged, steps = np.inf, False, 0
     error = None
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
-        problem = _weighed(problem, covariance, motion.x)
+        problem = _weighed(problem, covariance, swing)
         unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
             unknowns, changed = _retry_states(problem, unknowns)
@@ -167,7 +169,7 @@ def fit(
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=free.unpack(model, values),
-        problem=_weighed(problem, covariance, motion.x) if reweigh else problem,
+        problem=_weighed(problem, covariance, swing) if reweigh else problem,
         unknowns=unknowns,
         error=error,
         covariance=covariance,
@@ -179,17 +181,15 @@ def fit(
     )
 
 
-@eqx.filter_jit
-def _weighed(problem: Problem, covariance: Array, swing: float | Array) -> Problem:
+@jit_kept
+def _weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
-    return eqx.tree_at(
-        lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, jnp.asarray(swing)))
-    )
+    return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, swing)))
 
 
 def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float):
-    return _compiled_solve(problem, start, jnp.asarray(max_steps), jnp.asarray(damping))
+    return _compiled_solve(problem, start, *(jnp.asarray(np.asarray(a)) for a in (max_steps, damping)))
 
 
 @jit_lanes
@@ -230,24 +230,29 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
     segments would dominate the sum of squares. Masking the later samples lets the same compiled program do it.
     """
     weight = problem.segments.weight
-    held = eqx.tree_at(lambda p: p.active, problem, jnp.zeros_like(problem.active))
+    held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
     model = problem.free.unpack(problem.model, unknowns.parameters)
     fresh = Unknowns(unknowns.parameters, initial_states(model, problem.segments))
-    _, _, old = _evaluate(problem, unknowns)
-    suspect = np.asarray(old > _OUTLIER * jnp.median(old[np.asarray(weight).any(axis=1)]))
+    old = np.asarray(_evaluate(problem, unknowns)[2])
+    suspect = old > _OUTLIER * np.median(old[np.asarray(weight).any(axis=1)])
     if not suspect.any():
         return unknowns, False
     length = weight.shape[1]
     for samples in _growing(problem, length):
         masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
         part = eqx.tree_at(
-            lambda p: (p.segments.weight, p.segments.joined), held, (masked, jnp.zeros_like(held.segments.joined))
+            lambda p: (p.segments.weight, p.segments.joined), held, (masked, _zeros_like(held.segments.joined))
         )
         fresh, *_ = _solve(part, fresh, _RETRY_STEPS, _DAMPING[0])
-    _, _, new = _evaluate(problem, fresh)
-    better = np.asarray(new < 0.99 * old) & suspect
+    new = np.asarray(_evaluate(problem, fresh)[2])
+    better = (new < 0.99 * old) & suspect
     states = jnp.where(better[:, None], fresh.states, unknowns.states)
     return Unknowns(unknowns.parameters, states), bool(np.any(better))
+
+
+def _zeros_like(array: Array) -> Array:
+    """Zeros in the place of an array, without a program that makes them."""
+    return jax.device_put(np.zeros(array.shape, array.dtype), array.sharding)
 
 
 def _growing(problem: Problem, length: int) -> list[int]:
@@ -258,6 +263,7 @@ def _growing(problem: Problem, length: int) -> list[int]:
     return [first * 2**k for k in range(20) if first * 2**k < length] + [length]
 
 
+@jit_kept
 def whitening(covariance: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
     """W with `W covariance W^T = 1`."""
     return jnp.linalg.inv(jnp.linalg.cholesky(covariance))
@@ -395,26 +401,26 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
     count, length = found.problem.segments.weight.shape
     half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
     piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
-    held = eqx.tree_at(lambda p: p.active, found.problem, jnp.zeros_like(found.problem.active))
-    swing = scales(found.stretches).x
-    total, samples = jnp.zeros_like(found.covariance), 0.0
+    held = eqx.tree_at(lambda p: p.active, found.problem, _zeros_like(found.problem.active))
+    swing = jnp.asarray(np.asarray(scales(found.stretches).x))
+    total, samples = np.zeros(found.covariance.shape), 0.0
     # A piece is the head of a segment; segments that begin later have other heads.
     for offset in range(0, length - piece + 1, piece):
         shifted = [Stretch(s.experiment, s.start + offset, s.stop) for s in found.stretches if len(s) >= offset + piece]
         if not shifted or samples >= _NOISE_SAMPLES:
             break
         segments = cut(shifted, length, halo=held.segments.halo, count=count)
-        whole = segments.weight[:, piece - 1 : piece]
-        head = segments.weight * whole * (jnp.arange(length) < piece)[None].astype(whole.dtype)
-        part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, head))
+        weight = np.asarray(segments.weight)
+        head = weight * weight[:, piece - 1 : piece] * (np.arange(length) < piece)[None]
+        part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         covariance = found.covariance
         for turn in range(_REWEIGHTINGS):
             part = _weighed(part, covariance, swing)
             unknowns, _, covariance, _, _ = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
-        total, samples = total + covariance * jnp.sum(head), samples + float(jnp.sum(head))
+        total, samples = total + np.asarray(covariance) * head.sum(), samples + float(head.sum())
     rows = piece * total.shape[0]
-    return total / samples * (rows / (rows - len(found.model.motion_states)))
+    return jnp.asarray(total / samples * (rows / (rows - len(found.model.motion_states))))
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:
@@ -429,12 +435,15 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     """
     problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
     substeps = found.substeps
-    columns = project(linearise(problem, found.unknowns), problem.segments.joined) if np.isfinite(shift) else None
-    error, _, _ = _evaluate(problem, found.unknowns)
+    columns = None
+    if np.isfinite(shift):
+        columns = np.asarray(projected(linearise(problem, found.unknowns), problem.segments.joined))
+    error, white_by_error = np.asarray(_evaluate(problem, found.unknowns)[0]), np.asarray(problem.whitening)
+    count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:
-        better, _, _ = _evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns)
-        white = (better - error) @ problem.whitening.T
-        mean_square = float(jnp.max(jnp.sum(white**2, axis=(0, 1)) / problem.segments.count))
+        better = np.asarray(_evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns)[0])
+        white = (better - error) @ white_by_error.T
+        mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
         moved = 0.0 if columns is None else _standard_errors_moved(columns, white)
         if np.sqrt(mean_square) < tolerance and moved < shift:
             break
@@ -442,12 +451,11 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     return substeps
 
 
-def _standard_errors_moved(columns: Array, white: Array) -> float:
+def _standard_errors_moved(columns: np.ndarray, white: np.ndarray) -> float:
     """How far a whitened output error would move the parameters, in standard errors of their joint estimate."""
     rows = white.reshape(white.shape[0], -1)
-    columns = columns[:, : rows.shape[1]]
-    gradient = np.asarray(jnp.einsum("srp,sr->p", columns, rows))
-    information = np.asarray(jnp.einsum("srp,srq->pq", columns, columns))
+    slopes = columns[:, : rows.shape[1]].reshape(rows.size, -1)
+    gradient, information = slopes.T @ rows.ravel(), slopes.T @ slopes
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
     return float(np.sqrt(max(0.0, (scale * gradient) @ inverse @ (scale * gradient))))

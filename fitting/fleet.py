@@ -126,7 +126,7 @@ def _finished_row(log: Path, folder: Path, drive: Path, out: Path) -> Row:
 def _fit_one(log: Path, name: str, drive: Path) -> Row:
     begin = time.perf_counter()
     try:
-        rig = read_rig([log], drive)
+        rig = read_rig([log], drive, other_holds=False)
         # Fits run side by side, so each keeps to one device.
         with jax.default_device(jax.local_devices()[0]):
             fitted = fit_only(rig.model, rig.experiments, hold=rig.hold)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
+from hdjax.program_cache import jit_kept
 
 # A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
 _LARGEST_LOG = 100.0
@@ -31,6 +32,7 @@ class FreeParameters(eqx.Module):
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     scale: Float[Array, " parameters"]
 
+    @jit_kept
     def pack(self, model: Model) -> Float[Array, " parameters"]:
         """The vector that stands for the model's values."""
         values = [model.get(p) for p in self.paths]
@@ -43,6 +45,7 @@ class FreeParameters(eqx.Module):
             ]
         )
 
+    @jit_kept
     def unpack(self, model: Model, vector: Float[Array, " parameters"]) -> Model:
         """The model with the values that the vector stands for."""
         if not self.paths:
@@ -53,6 +56,7 @@ class FreeParameters(eqx.Module):
         }
         return model.replace(values)
 
+    @jit_kept
     def slopes(self, model: Model) -> Float[Array, " parameters"]:
         """Derivative of each physical value with respect to its entry of the vector."""
         if not self.paths:

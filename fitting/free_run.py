@@ -91,12 +91,12 @@ def free_run(
         model,
         free_parameters(model, (), {}),
         segments,
-        jnp.eye(segments.measured.shape[-1]),
-        jnp.zeros(0),
-        jnp.ones(states.shape[1]),
+        jnp.asarray(np.eye(segments.measured.shape[-1])),
+        jnp.asarray(np.zeros(0)),
+        jnp.asarray(np.ones(states.shape[1])),
         substeps=substeps,
     )
-    outputs = np.asarray(_simulate(problem, Unknowns(jnp.zeros(0), states)))
+    outputs = np.asarray(_simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states)))
     runs = []
     for stretch, output in zip(stretches, outputs, strict=True):
         n = len(stretch)
@@ -167,7 +167,7 @@ def _rest_where_at_rest(model: Model, starts: Fit, lanes: int) -> Array:
     rows = np.maximum(np.asarray(starts.problem.segments.weight).sum(1) * starts.covariance.shape[0], 1.0)
     excess = np.maximum(np.sum(np.asarray(found.residual) ** 2, axis=1) / rows, 1.0)
     rates = np.array([i for i, n in enumerate(model.motion_states) if n in ("omega_m", "omega_l", "v")])
-    states = np.array(starts.unknowns.states[:lanes])
+    states = np.array(starts.unknowns.states)[:lanes]
     for lane in range(lanes):
         matrix = information[lane]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))

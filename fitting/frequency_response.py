@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.signal import StateSpace, csd, welch
+from scipy.linalg import expm
 
 from fitting.experiment import Experiment
+from fitting.spectral_density import cross_density, density
 from hdjax import Drive, Hold, Model
 
 # Averages that a coherence needs to mean something, and the window that they leave at least.
@@ -93,11 +93,10 @@ def frequency_response(
         return None
     windows = [2 * u.size // window - 1 for u, _ in signals]
     share = np.array(windows) / sum(windows)
-    settings = {"fs": 1.0 / step, "nperseg": window, "detrend": "constant"}
-    frequency, _ = welch(signals[0][0], **settings)
-    S_uu = share @ np.array([welch(u, **settings)[1] for u, _ in signals])
-    S_xx = share @ np.array([welch(x, **settings)[1] for _, x in signals])
-    S_ux = share @ np.array([csd(u, x, **settings)[1] for u, x in signals])
+    frequency, _ = density(signals[0][0], step=step, window=window)
+    S_uu = share @ np.array([density(u, step=step, window=window)[1] for u, _ in signals])
+    S_xx = share @ np.array([density(x, step=step, window=window)[1] for _, x in signals])
+    S_ux = share @ np.array([cross_density(u, x, step=step, window=window)[1] for u, x in signals])
     kept = slice(1, -1 if window % 2 == 0 else None)
     frequency, S_uu, S_xx, S_ux = frequency[kept], S_uu[kept], S_xx[kept], S_ux[kept]
     tiny = np.finfo(float).tiny
@@ -152,14 +151,17 @@ def _linear_response(
 ) -> np.ndarray:
     """Response of `x'' + mu x' + slope x = gain u` to a sampled input, from sample to sample."""
     s = 2j * np.pi * frequency
-    methods = {"zero-order": "zoh", "linear": "foh"}
-    if hold not in methods:
+    if hold not in ("zero-order", "linear"):
         # Smooth between samples: what is sampled is what acts.
         return gain / (s**2 + mu * s + slope)
-    oscillator: Any = StateSpace([[0.0, 1.0], [-slope, -mu]], [[0.0], [gain]], [[1.0, 0.0]], [[0.0]])
-    sampled = oscillator.to_discrete(step, method=methods[hold])
+    # One step of x, v, u and the change of u, which a zero-order hold ignores (Franklin, Powell and Workman 1998, 6.3).
+    rates = np.zeros((4, 4))
+    rates[0, 1], rates[1, :3], rates[2, 3] = step, step * np.array([-slope, -mu, gain]), 1.0
+    across = expm(rates)
     z = np.exp(s * step)[:, None, None]
-    return (sampled.C @ np.linalg.solve(z * np.eye(2) - sampled.A, sampled.B) + sampled.D)[:, 0, 0]
+    change = 0.0 if hold == "zero-order" else z - 1.0
+    driven = across[:2, 2:3] + across[:2, 3:] * change
+    return np.linalg.solve(z * np.eye(2) - across[:2, :2], driven)[:, 0, 0]
 
 
 def strong_lines(found: FrequencyResponse) -> np.ndarray:

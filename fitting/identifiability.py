@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.arrow import project
 from fitting.estimate import Fit
@@ -16,6 +16,7 @@ from fitting.sandwich import directions
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import TwoInertiaModel
 from hdjax.parameters import ParameterInfo
+from hdjax.program_cache import jit_kept
 
 # Two standard errors along a direction that are more than 40 % leave it open.
 _WEAK = 0.2
@@ -168,7 +169,7 @@ def _between(low: float, high: float, unit: str) -> str:
 
 def _reach(estimate: Estimate) -> float:
     """Half the length of a parameter's interval."""
-    return float(student.ppf(0.975, estimate.degrees_of_freedom)) * estimate.std
+    return float(stdtrit(estimate.degrees_of_freedom, 0.975)) * estimate.std
 
 
 def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:
@@ -311,7 +312,7 @@ def _with_held(problem: Problem, path: str, value: float) -> Problem:
     return eqx.tree_at(lambda p: p.model, problem, problem.model.replace({path: value}))
 
 
-@eqx.filter_jit
+@jit_kept
 def _wider(joined: Array, found: Blocks, rows: Array, gaps: Array) -> Array:
     """The products of the parameters' columns with further ones beside them."""
     wider = eqx.tree_at(

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
@@ -48,7 +48,7 @@ def without_lone_errors(found: Fit) -> tuple[Stretch, ...] | None:
     if not (spread > 0).all():
         return None
     size = np.max(np.abs(white) / spread, axis=-1)
-    limit = float(norm.isf(0.5 * _FALSE_ALARM / (weight.sum() * spread.size)))
+    limit = -float(ndtri(0.5 * _FALSE_ALARM / (weight.sum() * spread.size)))
     masks, first = [], 0
     for stretch in found.stretches:
         pieces = -(-len(stretch) // length)

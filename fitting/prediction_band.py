@@ -94,7 +94,7 @@ def prediction_bands(
         fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window, like=fitted
     )
     whole = _whole(fitted, stretches, halo, substeps)
-    states = starts.unknowns.states[: len(stretches)]
+    states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
     by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
     white = np.asarray(whitening(noise))
     return tuple(
@@ -110,9 +110,9 @@ def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) 
         fitted.model,
         fitted.free,
         segments,
-        jnp.eye(segments.measured.shape[-1]),
-        jnp.ones(len(fitted.free.paths)),
-        jnp.ones(fitted.unknowns.states.shape[1]),
+        jnp.asarray(np.eye(segments.measured.shape[-1])),
+        jnp.asarray(np.ones(len(fitted.free.paths))),
+        jnp.asarray(np.ones(fitted.unknowns.states.shape[1])),
         substeps=substeps,
     )
 

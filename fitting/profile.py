@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
 from fitting.estimate import Fit
 from fitting.residual import Problem, Unknowns, residual_with_blocks
 from fitting.uncertainty import Uncertainty
+from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
 # Points on each side, in units of the interval that the parabola gives; further rounds reach this much further.
@@ -76,7 +77,7 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
     index = fit.free.paths.index(path)
     estimate = found.estimates[path]
     # How much the parameter's variance exceeds that of a white residual of unit variance, times t squared.
-    allowed = student.ppf(0.975, estimate.degrees_of_freedom) ** 2 * _inflation(fit, found, index)
+    allowed = stdtrit(estimate.degrees_of_freedom, 0.975) ** 2 * _inflation(fit, found, index)
     reach = np.sqrt(allowed * found.unit_covariance[index, index])
     reach = min(float(reach), _FARTHEST_FIRST)
     problem = eqx.tree_at(
@@ -212,12 +213,12 @@ def _cost(problem: Problem, unknowns: Unknowns) -> float:
     return float(_evaluate(problem, unknowns))
 
 
-@eqx.filter_jit
+@jit_kept
 def _evaluate(problem: Problem, unknowns: Unknowns) -> Array:
     return jnp.sum(residual_with_blocks(unknowns, problem).rows ** 2)
 
 
-@eqx.filter_jit
+@jit_kept
 def _solve_lanes(
     problem: Problem, parameters: Float[Array, "lanes parameters"], states: Float[Array, "lanes segments states"]
 ) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes segments states"], Float[Array, " lanes"]]:

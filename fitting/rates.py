@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from fitting.errors import DataError, InputError
 from fitting.findings import Finding
@@ -75,6 +74,9 @@ def angles_together(
     fewest = min(knows_motor.sum(), knows_load.sum())
     if fewest < 8 or (knows_motor & knows_load).sum() >= 0.5 * fewest:
         return motor, load, ()
+    # Loaded here, and not by every log that has no use for it.
+    from scipy.interpolate import CubicSpline
+
     motor_is_quicker = knows_motor.sum() >= knows_load.sum()
     quick, slow = (motor, load) if motor_is_quicker else (load, motor)
     known, wanted = np.isfinite(quick), np.isfinite(slow)

@@ -22,6 +22,7 @@ from hdjax.effects import (
     Motion,
     MotorSideEffect,
 )
+from hdjax.program_cache import jit_kept
 from hdjax.signals import polynomial
 from hdjax.where import where
 
@@ -72,7 +73,7 @@ def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
     return np.append(False, np.abs(late) < 0.5 * step)
 
 
-@eqx.filter_jit
+@jit_kept
 def _regressors(
     model: Model, stacked: Effect, followed: Followed, segments: Segments, goes_on: Bool[Array, " segments"]
 ) -> Regressors:

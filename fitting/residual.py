@@ -4,12 +4,14 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
 from hdjax.lanes import jit_lanes
+from hdjax.program_cache import jit_kept
 from hdjax.simulate import march
 from hdjax.where import where
 
@@ -19,7 +21,7 @@ _LOST = 1e8
 
 
 def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
-    return jnp.asarray(value, dtype=int)
+    return jnp.asarray(np.asarray(value) if isinstance(value, int) else value, dtype=int)
 
 
 class Problem(eqx.Module):
@@ -77,7 +79,7 @@ class Blocks(eqx.Module):
     before_by_state: Float[Array, "segments states states"]
 
 
-@eqx.filter_jit
+@jit_kept
 def simulate_segments(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:

@@ -29,7 +29,7 @@ class Rig(eqx.Module):
         name: of the drive.
         model: base model; its stiffness and damping are placeholders until they are fitted.
         hold: what the drive file says of the torque between samples, or None.
-        experiments: the logs' stretches between gaps, under each hold.
+        experiments: the logs' stretches between gaps, under each hold, or under the one stated alone.
         logs: as read.
         findings: what the health gate saw, by log.
         error_unit: unit of the dynamic error.
@@ -44,21 +44,28 @@ class Rig(eqx.Module):
     error_unit: str = eqx.field(static=True)
 
 
-def read_rig(log_paths: Sequence[Path], drive_path: Path) -> Rig:
+def read_rig(log_paths: Sequence[Path], drive_path: Path, *, other_holds: bool = True) -> Rig:
     """Read a drive file and logs, and refuse what can't be fitted.
+
+    Args:
+        log_paths: of one drive.
+        drive_path: its drive file.
+        other_holds: whether the torque is wanted under other holds as well, where the drive file states one.
 
     Raises:
         InputError: for a bad file, or logs of different kinds.
         DataError: for logs that can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
-    return rig_of(ready_logs(log_paths, drive_file), drive_file)
+    return rig_of(ready_logs(log_paths, drive_file), drive_file, other_holds=other_holds)
 
 
-def rig_of(logs: tuple[Log, ...], drive_file: DriveFile) -> Rig:
+def rig_of(logs: tuple[Log, ...], drive_file: DriveFile, *, other_holds: bool = True) -> Rig:
     """[`read_rig`][] for logs that have been read."""
     if logs[0].kind == "quasi-static":
         raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
+    stated = drive_file.torque_hold
+    holds = HOLDS if stated is None or other_holds else (stated,)
     findings = {}
     for log in logs:
         findings[log.name] = examine(log, drive_file)
@@ -66,8 +73,8 @@ def rig_of(logs: tuple[Log, ...], drive_file: DriveFile) -> Rig:
     return Rig(
         name=drive_file.name,
         model=base_model(drive_file, logs[0]),
-        hold=drive_file.torque_hold,
-        experiments={h: tuple(e for log in logs for e in experiments(log, drive_file, h)) for h in HOLDS},
+        hold=stated,
+        experiments={h: tuple(e for log in logs for e in experiments(log, drive_file, h)) for h in holds},
         logs=logs,
         findings=findings,
         error_unit=logs[0].units.get("dynamic_error", "rad"),

@@ -14,12 +14,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from fitting.arrow import chains, project
 from fitting.estimate import Fit, natural_frequency
 from fitting.experiment import Segments
 from fitting.residual import Blocks, Problem, linearise
+from hdjax.program_cache import jit_kept
 
 # Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.
 _MANY_CHAINS = 20
@@ -175,7 +176,7 @@ def _overruled(
     """The robust covariance with larger variances where another estimate is larger by more than chance."""
     own, rival = np.diag(robust), np.diag(other)
     ratio = np.where(own > 0, rival / np.where(own > 0, own, 1.0), 1.0)
-    larger = ratio > f_distribution.ppf(_OVERRULE, other_freedom, freedom)
+    larger = ratio > fdtri(other_freedom, freedom, _OVERRULE)
     stretch = np.where(larger, np.sqrt(ratio), 1.0)
     return robust * np.outer(stretch, stretch), np.where(larger, other_freedom, freedom)
 
@@ -255,7 +256,7 @@ def _spectrum(series: np.ndarray) -> np.ndarray:
     return np.fft.rfft(series, axis=0) / np.sqrt(series.shape[0])
 
 
-@eqx.filter_jit
+@jit_kept
 def _columns(problem: Problem, found: Blocks) -> tuple[Array, Array, Array]:
     """Residual by row, projected slopes, and the derivative with respect to the state that each chain starts from."""
     joined = problem.segments.joined

@@ -26,6 +26,7 @@ from fitting.residual import Blocks, linearise
 from fitting.spectral_lines import spectral_lines
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
+from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
 DRAWS = 199
@@ -198,7 +199,7 @@ def _filled(parts: Sequence[Regressors]) -> Regressors:
     return jax.tree.map(joined, *parts)
 
 
-@eqx.filter_jit
+@jit_kept
 def _inner_products(
     found: Blocks,
     followed: Followed,

@@ -5,7 +5,7 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.estimate import Fit
 from fitting.normal_law import NORMAL_95
@@ -91,7 +91,7 @@ def _estimate(
     robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
     # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
     error = max(robust, classical)
-    reach = max(float(student.ppf(0.975, freedom)) * robust, NORMAL_95 * classical)
+    reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * classical)
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)

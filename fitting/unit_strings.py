@@ -5,7 +5,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pint
 
 # Coherent SI units by which a base unit is shown, where pint would spell kg m^2/(A s^3).
 _SHOWN = ("V", "N", "N m", "Pa", "W", "ohm", "T", "C")
@@ -34,8 +33,16 @@ class UnitError(ValueError):
 
 
 @cache
+def _pint() -> Any:
+    """pint, loaded where a unit needs it: with its units it takes as long as a fit."""
+    import pint
+
+    return pint
+
+
+@cache
 def _registry() -> Any:
-    registry = pint.UnitRegistry()
+    registry = _pint().UnitRegistry()
     registry.define("@alias revolution = rev")
     return registry
 
@@ -94,13 +101,15 @@ def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
         UnitError: `unit` is not understood, or does not measure what `target` measures. Unlike
             pint's own conversion, a bare number or a count is not taken for an angle.
     """
+    if unit == target:
+        return np.array(values, dtype=np.float64)
     quantity, wanted = _parse(unit), _parse(target)
     if _base_powers(quantity) != _base_powers(wanted):
         raise UnitError(f"unit {unit!r} does not measure what {target!r} does")
     try:
         scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
         return np.asarray(_registry().Quantity(scaled, quantity.units).m_as(wanted.units))
-    except (pint.PintError, ArithmeticError) as error:
+    except (_pint().PintError, ArithmeticError) as error:
         raise UnitError(f"unit {unit!r} does not convert to {target!r}") from error
 
 
@@ -123,7 +132,7 @@ def to_base(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     scaled = np.asarray(values, dtype=np.float64) * float(quantity.magnitude)
     try:
         converted = np.asarray(registry.Quantity(scaled, quantity.units).m_as(base))
-    except (pint.PintError, ArithmeticError) as error:
+    except (_pint().PintError, ArithmeticError) as error:
         raise UnitError(f"unit {unit!r} does not convert to SI base units") from error
     for shown in _SHOWN:
         if registry.get_base_units(registry.Unit(shown))[1] == base:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hdjax.drive import Drive, ReducedDrive
@@ -21,7 +22,7 @@ from hdjax.effects import (
     MotorSideEffect,
     SensorEffect,
 )
-from hdjax.parameters import ParameterInfo, own_parameters
+from hdjax.parameters import ParameterInfo, as_scalar, own_parameters
 from hdjax.signals import PiecewisePolynomial
 
 State = Float[Array, " states"]
@@ -71,7 +72,7 @@ class Model(eqx.Module):
 
     def rest(self) -> State:
         """The state of a drive at rest, unloaded, at angle zero."""
-        return self.settled(jnp.zeros(len(self.motion_states)))
+        return self.settled(jnp.asarray(np.zeros(len(self.motion_states))))
 
     def settled(self, motion_state: Float[Array, " motion_states"]) -> State:
         """The state of a drive that has long moved like this: the effects' own states have followed."""
@@ -119,7 +120,7 @@ class Model(eqx.Module):
     def replace(self, values: Mapping[str, ArrayLike]) -> "Model":
         """The same model with other values at the given dotted paths."""
         paths = tuple(values)
-        arrays = [jnp.asarray(values[p], dtype=float) for p in paths]
+        arrays = [as_scalar(values[p]) for p in paths]
         return eqx.tree_at(lambda m: [m._at(p) for p in paths], self, arrays)
 
     def _of(self, kind: type[_Kind]) -> tuple[_Kind, ...]:

@@ -8,6 +8,8 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from hdjax.program_cache import jit_kept
+
 _Tree = TypeVar("_Tree")
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -18,8 +20,9 @@ _LEAST_LANES = 8
 
 
 def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`eqx.filter_jit` for programs whose lanes [`hdjax.simulate.march`][] moves. None can be called inside another."""
-    return eqx.filter_jit(function, **_WIDE)
+    """[`jit_kept`][hdjax.program_cache.jit_kept] for programs whose lanes [`hdjax.simulate.march`][] moves. None can be
+    called inside another."""
+    return jit_kept(function, **_WIDE)
 
 
 def spread(tree: _Tree, lanes: int) -> _Tree:
@@ -43,4 +46,6 @@ def spread(tree: _Tree, lanes: int) -> _Tree:
     shared, everywhere = NamedSharding(mesh, PartitionSpec("lanes")), NamedSharding(mesh, PartitionSpec())
     arrays, rest = eqx.partition(tree, eqx.is_array)
     places = jax.tree.map(lambda a: shared if a.ndim and a.shape[0] == lanes else everywhere, arrays)
-    return eqx.combine(jax.device_put(arrays, places), rest)
+    # By way of the host: JAX would compile a program for each shape that it cuts.
+    hosts = jax.tree.map(np.asarray, arrays)
+    return eqx.combine(jax.device_put(hosts, places), rest)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ class ParameterInfo:
 
 def as_scalar(value: Any) -> Array:
     """Turn a number into a floating-point scalar array of JAX's default precision."""
-    return jnp.asarray(value, dtype=float)
+    # By way of numpy, since JAX would compile a program that converts a Python number.
+    return jnp.asarray(np.asarray(value) if isinstance(value, float | int) else value, dtype=float)
 
 
 def parameter(

@@ -8,9 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.interpolate import CubicSpline
-from scipy.signal import fftconvolve
-from scipy.signal.windows import kaiser
 
 from hdjax.where import where
 
@@ -207,6 +204,9 @@ def _linear(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _cubic(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
+    # Loaded here, and not by every command that has no use for it.
+    from scipy.interpolate import CubicSpline
+
     coefficients = np.zeros((values.size, DEGREE + 1))
     coefficients[:-1, :4] = CubicSpline(knots[:-1], values).c[::-1].T
     coefficients[-1, 0] = values[-1]
@@ -218,7 +218,7 @@ def _band_limited(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     width = float(np.median(np.diff(knots)))
     reach = 48
     n = np.arange(-reach, reach + 1)
-    window = kaiser(2 * reach + 1, 10.0)
+    window = np.kaiser(2 * reach + 1, 10.0)
     away = np.where(n == 0, 1, n)
     sign = np.where(n % 2 == 0, 1.0, -1.0)
     slope_filter = np.where(n == 0, 0.0, sign / away) * window
@@ -228,8 +228,8 @@ def _band_limited(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     # Odd reflection keeps value and slope continuous where the record ends.
     extended = np.pad(values, reach, mode="reflect", reflect_type="odd")
     u0 = values
-    d0 = fftconvolve(extended, slope_filter, mode="valid")
-    c0 = fftconvolve(extended, curvature_filter, mode="valid")
+    d0 = np.convolve(extended, slope_filter, mode="valid")
+    c0 = np.convolve(extended, curvature_filter, mode="valid")
     u1, d1, c1 = (np.append(a[1:], a[-1]) for a in (u0, d0, c0))
     # The filters count in median intervals, a piece in its own: with jittered stamps they differ.
     stretch = np.diff(knots) / width

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.logs import Log
 from fitting.quasi_static.blocks import average
@@ -121,5 +121,5 @@ def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float)
     """
     excess = np.bincount(stretch, one**2 - other**2)
     error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
-    clear = float(np.mean(excess)) > float(student.ppf(0.95, len(excess) - 1)) * error
+    clear = float(np.mean(excess)) > float(stdtrit(len(excess) - 1, 0.95)) * error
     return clear and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

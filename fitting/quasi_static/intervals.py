@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from fitting.quasi_static.curve_fit import CurveFit, scales
 from fitting.quasi_static.stretches import correlation_length, stretches
@@ -88,7 +88,7 @@ class Scatter:
         weight = np.array([float(np.sum((share @ slope) ** 2)) for share in self.shares])
         total = float(np.sum(weight))
         effective = total**2 / float(np.sum(weight**2)) if total > 0 else 1.0
-        return float(student.ppf(0.975, max(1.0, effective - 1.0)))
+        return float(stdtrit(max(1.0, effective - 1.0), 0.975))
 
 
 def scatter(fit: CurveFit, cluster: np.ndarray) -> Scatter:
@@ -293,7 +293,7 @@ def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:
             reach = share * blocks.amplitude
             other = _with_memory(fit, blocks, memory, reach)
             cost = float(other.residual @ other.residual)
-            if free * (cost / best - 1.0) > student.ppf(0.975, max(1.0, free - 1.0)) ** 2:
+            if free * (cost / best - 1.0) > stdtrit(max(1.0, free - 1.0), 0.975) ** 2:
                 continue
             found = scatter(other, stretches(fit.residual, blocks.log))
             direction = np.eye(len(other.parameters))[-1]

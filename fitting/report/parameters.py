@@ -9,7 +9,7 @@ import numpy as np
 from fitting import formatting
 from fitting.close_loop import Finding
 from fitting.compare import Account
-from fitting.derived import Derived, derived, drive_figures
+from fitting.derived import Derived, derived, drive_figures, effect_figures
 from fitting.report.limits import in_words_of_log, parameter_note
 from fitting.report.outcome import Outcome
 from fitting.uncertainty import Uncertainty
@@ -30,7 +30,7 @@ def account_dict(
         x_max: the largest measured twist.
         start: the model that the fit started from, where that is known.
     """
-    figures = derived(account, lambda m: drive_figures(m, x_max))
+    figures = derived(account, drive_figures, x_max)
     base = [path for path in account.uncertainty.estimates if "." not in path]
     return {
         "effects": [],
@@ -106,7 +106,7 @@ def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) ->
     entry["parameters"] = {
         path: _estimate_dict(path, account, units) for path in account.uncertainty.estimates if path.startswith(prefix)
     }
-    for name, quantity in derived(account, lambda m: m.effect(finding.name).derived(m.drive)).items():
+    for name, quantity in derived(account, effect_figures, finding.name).items():
         unit = _unit_in_log(quantity.unit, prefix + name, account.model, units)
         entry["parameters"][prefix + name] = _derived_dict(name, quantity) | {"unit": unit}
     return entry
