@@ -26,8 +26,10 @@ _WORTH_A_REFIT = 0.2
 _TRIAL_STEPS = 25
 # Nor is one that explains less than this share of what the best one does.
 _SHARE_OF_BEST = 0.03
-# Forms that are refitted inside the equations in each round.
-_SHORT_LIST = 6
+# Families whose likeliest form is refitted inside the equations in each round.
+_FAMILIES = 5
+# Further forms of the best one's family that compete with it there.
+_FORMS = 3
 
 
 class Setting(eqx.Module):
@@ -172,15 +174,20 @@ def look(
     """
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
+    refitted: dict[str, Trial] = {}
+    worth = _worth_a_refit(screened)
+    for lead in _first_of_each_family(worth)[:_FAMILIES]:
+        refitted[lead.effect.name] = _refit(before, lead, data, setting, progress)
+    if refitted:
+        best = min(refitted, key=lambda name: refitted[name].held_out.objective)
+        family = next(lead.effect.family for lead in worth if lead.effect.name == best)
+        others = [lead for lead in worth if lead.effect.family == family and lead.effect.name not in refitted]
+        for lead in others[:_FORMS]:
+            refitted[lead.effect.name] = _refit(before, lead, data, setting, progress)
     found: list[Verdict] = []
-    least = max(0.25 * LEAST_GAIN, _SHARE_OF_BEST * screened.leads[0].gain) if screened.leads else 0.0
-    for rank, lead in enumerate(screened.leads):
-        worth = rank < _SHORT_LIST and lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT
-        trial = None
-        gain = lead.gain
-        if worth:
-            progress(f"refitting with {lead.effect.name}")
-            trial = _try_lead(before, lead, data, setting)
+    for lead in screened.leads:
+        trial, gain = refitted.get(lead.effect.name), lead.gain
+        if trial is not None:
             gain = before.held_out.objective - trial.held_out.objective
             if not np.isfinite(gain):
                 trial, gain = None, -np.inf
@@ -197,6 +204,22 @@ def look(
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     verdicts = _determined_first(_simplest_first(_with_separability(found)))
     return Round(before, screened, tuple(verdicts), bool(verdicts) and _supported(verdicts[0]))
+
+
+def _worth_a_refit(screened: Screen) -> list[Lead]:
+    """Leads that may be more than chance and explain a share of what the best one does, best first."""
+    least = max(0.25 * LEAST_GAIN, _SHARE_OF_BEST * screened.leads[0].gain) if screened.leads else 0.0
+    return [lead for lead in screened.leads if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT]
+
+
+def _first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
+    first = {lead.effect.family: lead for lead in reversed(leads)}
+    return sorted(first.values(), key=lambda lead: -lead.gain)
+
+
+def _refit(before: Trial, lead: Lead, data: Data, setting: Setting, progress: Callable[[str], None]) -> Trial:
+    progress(f"refitting with {lead.effect.name}")
+    return _try_lead(before, lead, data, setting)
 
 
 def _supported(verdict: Verdict) -> bool:
