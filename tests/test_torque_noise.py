@@ -1,0 +1,84 @@
+"""Noise of the logged torque: what it does to estimates, against simulations of the rig itself."""
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import experiment_from_log, split
+from fitting.free import base_paths
+from fitting.sandwich import covariance, linearised
+from fitting.torque_noise import torque_noise_covariance
+
+COUNT, DRAWS = 700, 48
+# Little damping: what the noise leaves is nearly a line at the resonance, and there are few periods of it.
+PHYSICS = {"mu": 1.0, "alpha": 0.0}
+
+
+def fitted(*, torque: float = 0.0, output: float = 0.0, seed: int = 0, count: int = COUNT) -> Fit:
+    """A fit of a log with noise of the torque, relative to its rms of 10, and of the output."""
+    logged = rig.reduced_forcing(count)
+    acting = logged + 10.0 * torque * np.random.default_rng(seed).normal(size=count)
+    motion = rig.reduced_motion(acting, **PHYSICS)
+    log = rig.reduced_log(motion[:, 0], logged, noise=output, seed=seed)
+    model = rig.reduced_model(**PHYSICS)
+    training, _ = split([experiment_from_log(log, hold="zero-order")], held_out=0.01)
+    return fit(model, training, base_paths(model), horizon=1 << 20, substeps=3)
+
+
+def standard_errors(found: Fit) -> np.ndarray | None:
+    regression = linearised(found)
+    described = torque_noise_covariance(found, regression, covariance(regression).unit)
+    return None if described is None else np.sqrt(np.diag(described))
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Fit:
+    return fitted(torque=0.05, output=1e-4)
+
+
+def test_standard_errors_are_the_scatter_of_estimates(noisy: Fit):
+    described = standard_errors(noisy)
+    assert described is not None
+    # The residual that fresh torque noise would leave, by the rig; least squares turns it into a change of estimates.
+    regression = linearised(noisy)
+    (record,), inverse = regression.records, covariance(regression).unit
+    logged = rig.reduced_forcing(COUNT)
+    silent = rig.reduced_motion(logged, **PHYSICS)[:, 0]
+    white = float(noisy.problem.whitening[0, 0])
+    random = np.random.default_rng(5)
+    moved = []
+    for _ in range(DRAWS):
+        motion = rig.reduced_motion(logged + 0.5 * random.normal(size=COUNT), substeps=4, **PHYSICS)[:, 0]
+        disturbance = white * (motion - silent)[: record.residual.shape[0], None]
+        moved.append(inverse @ np.einsum("nop,no->p", record.slopes, disturbance))
+    scatter = np.std(moved, axis=0)
+    # 48 draws know a standard deviation to 10 %, and the log's own noise level is known from some 30 periods.
+    np.testing.assert_allclose(described, scatter, rtol=0.4)
+    # White noise would have promised far too much of the damping.
+    classical = np.sqrt(np.diag(covariance(regression).classical))
+    assert described[0] > 2.0 * classical[0]
+
+
+def test_white_noise_of_the_encoder_is_as_in_textbooks():
+    found = fitted(output=2e-3)
+    described = standard_errors(found)
+    if described is not None:
+        classical = np.sqrt(np.diag(covariance(linearised(found)).classical))
+        np.testing.assert_allclose(described, classical, rtol=0.3)
+
+
+def test_another_colour_is_not_torque_noise():
+    found = fitted(output=2e-3, count=2000)
+    drift = np.cumsum(np.random.default_rng(1).normal(size=found.error.shape[:2]).ravel())
+    walk = 1e-3 * drift.reshape(found.error.shape[:2])[..., None]
+    regression = linearised(found)
+    record = regression.records[0]
+    disturbed = record.residual + walk.reshape(-1, 1)[: record.residual.shape[0]] * float(found.problem.whitening[0, 0])
+    changed = type(regression)(
+        (type(record)(disturbed, record.slopes, record.states, record.present),),
+        regression.information,
+        regression.prior,
+        regression.chunk,
+    )
+    assert torque_noise_covariance(found, changed, covariance(regression).unit) is None
