@@ -10,6 +10,7 @@ from scipy.stats import t as student
 from fitting.estimate import Fit
 from fitting.normal_law import NORMAL_95
 from fitting.sandwich import Covariance, Linearised, covariance, linearised
+from fitting.torque_noise import torque_noise_covariance
 from hdjax.parameters import ParameterInfo
 
 _DISSIPATIVE = ("B_sp", "mu")
@@ -63,7 +64,8 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
 
     The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
     The robust one holds whatever the colour of the residual, see [`fitting.sandwich`][]. Its own uncertainty enters
-    the intervals as Student's t. The larger of the two counts.
+    the intervals as Student's t. Where noise of the torque describes the residual's colour, that gives a third one
+    ([`fitting.torque_noise`][]). The largest counts.
 
     Args:
         fit: the fit.
@@ -73,11 +75,15 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
     if not free.paths:
         empty = np.zeros((0, 0))
         return Uncertainty({}, empty, empty, empty)
-    found = covariance(linearised(fit) if regression is None else regression)
+    regression = linearised(fit) if regression is None else regression
+    found = covariance(regression)
+    through_drive = torque_noise_covariance(fit, regression, found.unit)
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
     estimates = {
-        path: _estimate(path, float(known[path][0]), known[path][1], found, i, float(slopes[i]), free.logarithmic[i])
+        path: _estimate(
+            path, float(known[path][0]), known[path][1], found, through_drive, i, float(slopes[i]), free.logarithmic[i]
+        )
         for i, path in enumerate(free.paths)
     }
     spread = np.sqrt(np.diag(found.robust))
@@ -85,13 +91,21 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
 
 
 def _estimate(
-    path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
+    path: str,
+    value: float,
+    info: ParameterInfo,
+    found: Covariance,
+    through_drive: Float[np.ndarray, "parameters parameters"] | None,
+    i: int,
+    slope: float,
+    logarithmic: bool,
 ) -> Estimate:
     freedom = float(found.degrees_of_freedom[i])
     robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
+    described = 0.0 if through_drive is None else float(np.sqrt(through_drive[i, i]))
     # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
-    error = max(robust, classical)
-    reach = max(float(student.ppf(0.975, freedom)) * robust, NORMAL_95 * classical)
+    error = max(robust, classical, described)
+    reach = max(float(student.ppf(0.975, freedom)) * robust, NORMAL_95 * max(classical, described))
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)
