@@ -237,7 +237,7 @@ def _strength_is_determined(verdict: Verdict) -> bool:
     assert verdict.trial is not None
     if verdict.name not in {e.name for e in verdict.trial.model.effects}:
         return True
-    estimates = uncertainty(verdict.trial.training).estimates
+    estimates = uncertainty(verdict.trial.training, torque_noise=False).estimates
     return any(estimates[p].identifiable for p in strength_paths(verdict.trial.model.effect(verdict.name)))
 
 

@@ -10,6 +10,7 @@ from scipy.special import stdtrit
 from fitting.estimate import Fit
 from fitting.normal_law import NORMAL_95
 from fitting.sandwich import Covariance, Linearised, covariance, linearised
+from fitting.torque_noise import torque_noise_covariance
 from hdjax.parameters import ParameterInfo
 
 _DISSIPATIVE = ("B_sp", "mu")
@@ -58,26 +59,32 @@ class Uncertainty(eqx.Module):
     unit_covariance: Float[np.ndarray, "parameters parameters"]
 
 
-def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertainty:
+def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise: bool = True) -> Uncertainty:
     """Standard errors and intervals of a fit.
 
     The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
     The robust one holds whatever the colour of the residual, see [`fitting.sandwich`][]. Its own uncertainty enters
-    the intervals as Student's t. The larger of the two counts.
+    the intervals as Student's t. Where noise of the torque describes the residual's colour, that gives a third one
+    ([`fitting.torque_noise`][]). The largest counts.
 
     Args:
         fit: the fit.
         regression: the fit as a linear regression, where it is at hand.
+        torque_noise: whether to look for noise of the torque; that compiles a program for each form of a model.
     """
     free = fit.free
     if not free.paths:
         empty = np.zeros((0, 0))
         return Uncertainty({}, empty, empty, empty)
-    found = covariance(linearised(fit) if regression is None else regression)
+    regression = linearised(fit) if regression is None else regression
+    found = covariance(regression)
+    through_drive = torque_noise_covariance(fit, regression, found.unit) if torque_noise else None
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
     estimates = {
-        path: _estimate(path, float(known[path][0]), known[path][1], found, i, float(slopes[i]), free.logarithmic[i])
+        path: _estimate(
+            path, float(known[path][0]), known[path][1], found, through_drive, i, float(slopes[i]), free.logarithmic[i]
+        )
         for i, path in enumerate(free.paths)
     }
     spread = np.sqrt(np.diag(found.robust))
@@ -85,13 +92,26 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None) -> Uncertaint
 
 
 def _estimate(
-    path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
+    path: str,
+    value: float,
+    info: ParameterInfo,
+    found: Covariance,
+    through_drive: Float[np.ndarray, "parameters parameters"] | None,
+    i: int,
+    slope: float,
+    logarithmic: bool,
 ) -> Estimate:
     freedom = float(found.degrees_of_freedom[i])
     robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
+    described = 0.0 if through_drive is None else float(np.sqrt(through_drive[i, i]))
     # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
+<<<<<<< HEAD
     error = max(robust, classical)
     reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * classical)
+=======
+    error = max(robust, classical, described)
+    reach = max(float(student.ppf(0.975, freedom)) * robust, NORMAL_95 * max(classical, described))
+>>>>>>> screen
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)

@@ -1,0 +1,202 @@
+"""Standard errors under noise of the logged torque: a colour that the drive itself gives.
+
+What acts and what was logged differ by noise; the drive answers it, so that the residual is white noise of the
+encoders plus a little motion of the drive's own. Where that describes the residual's spectrum, two or three numbers
+stand for all of its colour, and standard errors follow from few periods, where a free spectrum has little to go by.
+The variances come from the periodogram (Whittle 1953), the estimates' covariance from how each torque sample moves
+them, by one pass against time.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import nnls
+from scipy.stats import kstest
+
+from fitting.estimate import Fit
+from fitting.followed import Followed, follow
+from fitting.residual import Problem
+from fitting.sandwich import Linearised, Record
+from hdjax import Model
+from hdjax.program_cache import jit_kept
+from hdjax.where import where
+
+# Draws of torque noise whose mean periodogram stands for its expectation.
+_DRAWS = 16
+_REWEIGHTINGS = 6
+# A spectrum that the data refuse at this level is not the residual's.
+_REFUSED = 0.01
+
+
+def torque_noise_covariance(
+    fit: Fit, regression: Linearised, inverse: Float[np.ndarray, "parameters parameters"]
+) -> Float[np.ndarray, "parameters parameters"] | None:
+    """Covariance of the free vector where white noise of encoders and torque explains the residual's spectrum.
+
+    Args:
+        fit: the fit.
+        regression: the same as a linear regression.
+        inverse: (J^T J)^-1.
+
+    Returns:
+        The covariance; None where the residual has another colour.
+    """
+    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    followed = follow(problem, fit.unknowns)
+    random = np.random.default_rng(0)
+    noise = jnp.asarray(random.normal(size=(*problem.segments.weight.shape, _DRAWS)))
+    answers = np.asarray(_answers(problem, followed, noise))
+    records = regression.records
+    in_time = _in_time(records, answers)
+    variances = _variances(records, in_time, inverse)
+    if variances is None:
+        return None
+    *encoders, torque = variances
+    slopes = jnp.asarray(_by_segment(records, problem))
+    middle = torque * np.asarray(_torque_scores(problem, followed, slopes))
+    # Noise of the motor's encoder is in both outputs.
+    together = _covariance([r.residual[..., None] for r in records]) - torque * _covariance(in_time)
+    together[np.diag_indices(len(encoders))] = encoders
+    for record in records:
+        middle += np.einsum("nop,oq,nqr->pr", record.slopes, together, record.slopes, optimize=True)
+    return inverse @ middle @ inverse
+
+
+def _in_time(records: Sequence[Record], blocks: np.ndarray) -> list[np.ndarray]:
+    """Rows by segment as stretches."""
+    made, at = [], 0
+    for record in records:
+        count, samples = record.residual.shape[0], blocks.shape[1]
+        mine = slice(at, at - (-count // samples))
+        made.append(blocks[mine].reshape(-1, *blocks.shape[2:])[:count])
+        at = mine.stop
+    return made
+
+
+def _by_segment(
+    records: Sequence[Record], problem: Problem
+) -> Float[np.ndarray, "segments samples outputs parameters"]:
+    """The records' slopes by segment, padded with zeros."""
+    segments, samples = problem.segments.weight.shape
+    found = np.zeros((segments, samples, *records[0].slopes.shape[1:]))
+    at = 0
+    for record in records:
+        count = record.residual.shape[0]
+        stop = at - (-count // samples)
+        found[at:stop].reshape(-1, *found.shape[2:])[:count] = record.slopes
+        at = stop
+    return found
+
+
+def _covariance(series: Sequence[np.ndarray]) -> np.ndarray:
+    """Covariance of the outputs, over samples and draws."""
+    both = np.concatenate([np.moveaxis(s, 2, 0).reshape(-1, s.shape[1]) for s in series])
+    return both.T @ both / both.shape[0]
+
+
+def _variances(
+    records: Sequence[Record], answers: Sequence[np.ndarray], inverse: np.ndarray
+) -> Float[np.ndarray, " sources"] | None:
+    """Variance of each output's white noise and of the torque's, or None where they don't give the spectrum."""
+    measured, expected = [], []
+    for record, answer in zip(records, answers, strict=True):
+        count, outputs = record.residual.shape
+        left = np.stack([_power(_left_over(record, _unit(record, o), inverse)).mean(axis=2) for o in range(outputs)])
+        drive = _power(_left_over(record, answer, inverse)).mean(axis=2)
+        inside = slice(1, (count - 1) // 2)
+        measured.append(_power(record.residual[..., None])[inside, :, 0].ravel())
+        columns = np.concatenate([left, drive[None]])[:, inside]
+        expected.append(columns.reshape(outputs + 1, -1).T)
+    power, shapes = np.concatenate(measured), np.concatenate(expected)
+    known = shapes.sum(axis=1) > 1e-9 * shapes.sum(axis=1).max()
+    power, shapes = power[known], shapes[known]
+    level = np.full(power.size, power.mean())
+    found = np.zeros(shapes.shape[1])
+    for _ in range(_REWEIGHTINGS):
+        found, _ = nnls(shapes / level[:, None], power / level)
+        level = np.maximum(shapes @ found, 1e-6 * power.mean())
+    # Of the right spectrum, the periodogram is an exponential variable.
+    adequate = kstest(1.0 - np.exp(-power / level), "uniform").pvalue > _REFUSED
+    return found if adequate and found[-1] > 0.0 else None
+
+
+def _unit(record: Record, output: int) -> Float[np.ndarray, "n outputs draws"]:
+    """Draws of white noise in one output."""
+    random = np.random.default_rng(1 + output)
+    found = np.zeros((*record.residual.shape, _DRAWS))
+    found[:, output] = random.normal(size=(record.residual.shape[0], _DRAWS))
+    return found
+
+
+def _left_over(record: Record, drawn: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """What a fit would leave of a disturbance: without what initial states and parameters take up."""
+    left = drawn - np.einsum("nop,pq,mrq,mrd->nod", record.slopes, inverse, record.slopes, drawn, optimize=True)
+    for start, columns in record.states:
+        samples, _, states = columns.shape
+        flat = columns.reshape(-1, states)
+        length = np.linalg.norm(flat, axis=0)
+        basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
+        part = left[start : start + samples].reshape(flat.shape[0], -1)
+        left[start : start + samples] = (part - basis @ (basis.T @ part)).reshape(samples, *left.shape[1:])
+    return left
+
+
+def _power(series: np.ndarray) -> np.ndarray:
+    return np.abs(np.fft.rfft(series, axis=0)) ** 2 / series.shape[0]
+
+
+def _pushes(model: Model, followed: Followed) -> Float[Array, "segments samples states"]:
+    """What a unit of torque through a sample interval adds to the state at its end."""
+    zero = jnp.zeros(())
+    rate = jax.jacfwd(lambda torque: model.rates(model.rest(), torque, zero))(zero)
+    return (followed.from_start + followed.from_end) @ rate
+
+
+@jit_kept
+def _answers(problem: Problem, followed: Followed, noise: Array) -> Float[Array, "segments samples outputs draws"]:
+    """Whitened residual that torque noise leaves, segment after segment; it does not stop where one starts anew."""
+    pushes = _pushes(problem.model, followed)
+
+    def step(deviation, inputs):
+        transition, push, drawn = inputs
+        return transition @ deviation + push[:, None] * drawn[None, :], deviation
+
+    def segment(deviation, inputs):
+        joined, *rest = inputs
+        return jax.lax.scan(step, where(joined, deviation, jnp.zeros_like(deviation)), tuple(rest))
+
+    states = jnp.zeros((followed.states.shape[-1], noise.shape[-1]))
+    _, deviations = jax.lax.scan(segment, states, (problem.segments.joined, followed.transition, pushes, noise))
+    outputs = followed.readout @ deviations * problem.segments.weight[:, :, None, None]
+    return -jnp.einsum("ij,snjd->snid", problem.whitening, outputs)
+
+
+@jit_kept
+def _torque_scores(
+    problem: Problem, followed: Followed, slopes: Float[Array, "segments samples outputs parameters"]
+) -> Float[Array, "parameters parameters"]:
+    """Covariance of J^T r for torque noise of unit variance, by the adjoint of the linear response."""
+    pushes = _pushes(problem.model, followed)
+    read = -jnp.einsum("ij,snjk,snip->snkp", problem.whitening, followed.readout, slopes)
+    read = read * problem.segments.weight[:, :, None, None]
+
+    def step(costate, inputs):
+        transition, push, seen = inputs
+        score = push @ costate
+        return seen + transition.T @ costate, score
+
+    def segment(carry, inputs):
+        costate, goes_on = carry
+        joined, *rest = inputs
+        first = where(goes_on, costate, jnp.zeros_like(costate))
+        before, scores = jax.lax.scan(step, first, tuple(rest), reverse=True)
+        return (before, joined), scores
+
+    nothing = (jnp.zeros((followed.states.shape[-1], slopes.shape[-1])), jnp.zeros((), dtype=bool))
+    segments = (problem.segments.joined, followed.transition, pushes, read)
+    _, scores = jax.lax.scan(segment, nothing, segments, reverse=True)
+    return jnp.einsum("snp,snq->pq", scores, scores)
