@@ -105,13 +105,8 @@ def _estimate(
     robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
     described = 0.0 if through_drive is None else float(np.sqrt(through_drive[i, i]))
     # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
-<<<<<<< HEAD
-    error = max(robust, classical)
-    reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * classical)
-=======
     error = max(robust, classical, described)
-    reach = max(float(student.ppf(0.975, freedom)) * robust, NORMAL_95 * max(classical, described))
->>>>>>> screen
+    reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * max(classical, described))
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)
