@@ -277,7 +277,9 @@ def cut(
         count: number of segments, the superfluous ones without weight; [`segment_count`][] where not given.
     """
     pieces = 1 if horizon is None else max(1, -(-horizon // length))
-    parts = [_cut_one(s, length, pieces, halo) for s in stretches]
+    loaded = any(s.experiment.load_torque is not None for s in stretches)
+    warm = all(s.experiment.temperature is not None for s in stretches)
+    parts = [_cut_one(s, length, pieces, halo, loaded=loaded, warm=warm) for s in stretches]
     found = [np.concatenate(column) for column in zip(*parts, strict=True)]
     missing = max(0, (segment_count(stretches, length) if count is None else count) - found[0].shape[0])
     filled = [np.concatenate([column, np.repeat(column[-1:], missing, axis=0)]) for column in found]
@@ -285,8 +287,6 @@ def cut(
     weight[weight.shape[0] - missing :] = 0.0
     joined[joined.shape[0] - missing :] = False
     own_knots = jnp.asarray(knots)
-    loaded = any(s.experiment.load_torque is not None for s in stretches)
-    warm = all(s.experiment.temperature is not None for s in stretches)
     return Segments(
         torque=PiecewisePolynomial(own_knots, jnp.asarray(torque)),
         load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if loaded else None,
@@ -298,9 +298,11 @@ def cut(
     )
 
 
-def _cut_one(stretch: Stretch, length: int, pieces: int, halo: int) -> tuple[np.ndarray, ...]:
-    """Of one stretch's segments by row: knots, torque, load torque, temperature, measured outputs, weight, whether
-    joined."""
+def _cut_one(
+    stretch: Stretch, length: int, pieces: int, halo: int, *, loaded: bool, warm: bool
+) -> tuple[np.ndarray, ...]:
+    """Of one stretch's segments by row: knots, torque, load torque (none acts where only other logs have one),
+    temperature, measured outputs, weight, whether joined."""
     experiment = stretch.experiment
     last = len(experiment) - 1
     begin = np.arange(stretch.start, stretch.stop, length)
@@ -313,17 +315,16 @@ def _cut_one(stretch: Stretch, length: int, pieces: int, halo: int) -> tuple[np.
     known = np.clip(outer, 0, last + 1)
     knots = np.asarray(experiment.torque.knots)[known] + (outer - known) * experiment.time_step
     own = index[:, halo:]
-    load, warmth = (
-        np.zeros((last + 1, 0)) if signal is None else np.asarray(signal.coefficients)
-        for signal in (experiment.load_torque, experiment.temperature)
-    )
+    load, warmth = experiment.load_torque, experiment.temperature
+    on_load = np.zeros((last + 1, torque.shape[-1] if loaded else 0)) if load is None else np.asarray(load.coefficients)
+    # Straight lines need no higher powers.
+    line = np.asarray(warmth.coefficients)[:, :2] if warm and warmth is not None else np.zeros((last + 1, 0))
     own_row = np.clip(own, 0, last)
     return (
         knots - experiment.origin,
         torque,
-        load[own_row],
-        # Straight lines need no higher powers.
-        warmth[own_row, :2],
+        on_load[own_row],
+        line[own_row],
         experiment.measured[np.clip(own, 0, stretch.stop - 1)],
         _weight(experiment, own) * (own < stretch.stop),
         np.arange(begin.size) % pieces != 0,

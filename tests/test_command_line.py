@@ -16,6 +16,7 @@ from fitting.command_line import main
 from fitting.free_run import WINDOW
 from fitting.model_file import StoredModel, to_json
 from hdjax import Model, TwoInertiaModel, hdc_40_050
+from hdjax.effects.thermal import ThermalStiffness
 
 COUNT = 600
 DRIVE = """\
@@ -351,3 +352,15 @@ def test_speeds_to_avoid_of_the_preset(tmp_path: Path, capsys: pytest.CaptureFix
     edges = (band["start_rpm"], band["end_rpm"])
     assert edges == pytest.approx((centre * np.sqrt(2 / 3), centre * np.sqrt(4 / 3)), rel=1e-3)
     assert content["two_motions_rpm"] is None
+
+
+def test_predict_asks_for_the_temperature_that_a_model_depends_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    warm = rig.drive_model().with_effects(ThermalStiffness(k_T=-1e-3, T_0=300.0))
+    model, out = write_model(tmp_path, warm), tmp_path / "predicted.csv"
+    log = write_table(tmp_path / "log.csv", table())
+    assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 2
+    message = capsys.readouterr().err
+    assert "log.csv: there is no temperature, on which thermal_stiffness" in message and "[columns]" in message
+    assert not out.exists()
+    log = write_table(tmp_path / "log.csv", table() | {"temperature": np.linspace(295.0, 310.0, COUNT)})
+    assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 0
