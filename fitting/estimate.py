@@ -243,6 +243,8 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
         part = eqx.tree_at(
             lambda p: (p.segments.weight, p.segments.joined), held, (masked, _zeros_like(held.segments.joined))
         )
+        # The program of the fit, where all is in the same places.
+        part, fresh = spread((part, fresh), weight.shape[0])
         fresh, *_ = _solve(part, fresh, _RETRY_STEPS, _DAMPING[0])
     new = np.asarray(_evaluate(problem, fresh)[2])
     better = (new < 0.99 * old) & suspect
@@ -252,7 +254,7 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
 
 def _zeros_like(array: Array) -> Array:
     """Zeros in the place of an array, without a program that makes them."""
-    return jax.device_put(np.zeros(array.shape, array.dtype), array.sharding)
+    return jax.device_put(np.zeros(array.shape, array.dtype), array.sharding if array.committed else None)
 
 
 def _growing(problem: Problem, length: int) -> list[int]:
@@ -414,6 +416,8 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
         head = weight * weight[:, piece - 1 : piece] * (np.arange(length) < piece)[None]
         part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
+        # The program of the fit, where all is in the same places.
+        part, unknowns = spread((part, unknowns), count)
         covariance = found.covariance
         for turn in range(_REWEIGHTINGS):
             part = _weighed(part, covariance, swing)

@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
-from hdjax.program_cache import jit_kept
 
 # A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
 _LARGEST_LOG = 100.0
@@ -32,41 +33,42 @@ class FreeParameters(eqx.Module):
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     scale: Float[Array, " parameters"]
 
-    @jit_kept
     def pack(self, model: Model) -> Float[Array, " parameters"]:
         """The vector that stands for the model's values."""
         values = [model.get(p) for p in self.paths]
-        if not values:
-            return jnp.zeros(0)
-        return jnp.stack(
-            [
-                jnp.log(v) if positive else v / s
-                for v, positive, s in zip(values, self.logarithmic, self.scale, strict=True)
+        library, (*values, scale) = _library(*values, self.scale)
+        with np.errstate(all="ignore"):
+            entries = [
+                library.log(v) if positive else v / s
+                for v, positive, s in zip(values, self.logarithmic, scale, strict=True)
             ]
-        )
+        return jnp.asarray(library.stack(entries) if entries else np.zeros(0))
 
-    @jit_kept
     def unpack(self, model: Model, vector: Float[Array, " parameters"]) -> Model:
         """The model with the values that the vector stands for."""
         if not self.paths:
             return model
+        library, (entries, scale) = _library(vector, self.scale)
         values = {
-            path: jnp.exp(jnp.clip(vector[i], -_LARGEST_LOG, _LARGEST_LOG)) if positive else vector[i] * self.scale[i]
-            for i, (path, positive) in enumerate(zip(self.paths, self.logarithmic, strict=True))
+            path: library.exp(library.clip(v, -_LARGEST_LOG, _LARGEST_LOG)) if positive else v * s
+            for path, positive, v, s in zip(self.paths, self.logarithmic, entries, scale, strict=True)
         }
         return model.replace(values)
 
-    @jit_kept
     def slopes(self, model: Model) -> Float[Array, " parameters"]:
         """Derivative of each physical value with respect to its entry of the vector."""
-        if not self.paths:
-            return jnp.zeros(0)
-        return jnp.stack(
-            [
-                model.get(p) if positive else s
-                for p, positive, s in zip(self.paths, self.logarithmic, self.scale, strict=True)
-            ]
-        )
+        values = [model.get(p) for p in self.paths]
+        library, (*values, scale) = _library(*values, self.scale)
+        entries = [v if positive else s for v, positive, s in zip(values, self.logarithmic, scale, strict=True)]
+        return jnp.asarray(library.stack(entries) if entries else np.zeros(0))
+
+
+def _library(*arrays: Array) -> tuple[Any, Sequence[Any]]:
+    """What to calculate with, and the arrays for it: JAX inside a program; outside it would compile one for each
+    operation, so there numpy."""
+    if any(isinstance(array, Tracer) for array in arrays):
+        return jnp, arrays
+    return np, [np.asarray(array) for array in arrays]
 
 
 def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float]) -> FreeParameters:

@@ -40,7 +40,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The logs that were read for a fit, each of which then can't be fitted."""
     seen: list[Path] = []
 
-    def refuse(logs: list[Path], drive: Path):
+    def refuse(logs: list[Path], drive: Path, **how: bool):
         seen.extend(logs)
         raise DataError(f"{logs[0]}: no")
 
@@ -92,7 +92,7 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch
     seen: list[Path] = []
     limit = 2
 
-    def read(paths: list[Path], drive: Path):
+    def read(paths: list[Path], drive: Path, **how: bool):
         if len(seen) == limit:
             raise KeyboardInterrupt
         seen.extend(paths)
@@ -112,7 +112,7 @@ def test_a_bug_in_one_fit_stops_nobody(tmp_path: Path, drive: Path, monkeypatch:
     for i in range(2):
         write_log(tmp_path / "logs" / f"{i}.csv", seed=i)
 
-    def broken(logs: list[Path], drive: Path):
+    def broken(logs: list[Path], drive: Path, **how: bool):
         if logs[0].name == "0.csv":
             raise ZeroDivisionError("oops")
         raise DataError(f"{logs[0]}: no")
@@ -130,7 +130,7 @@ def test_a_drive_file_beside_a_log_goes_first(tmp_path: Path, drive: Path, monke
     write_log(tmp_path / "logs" / "two" / "log.csv", seed=1)
     used: dict[str, Path] = {}
 
-    def note(logs: list[Path], drive: Path):
+    def note(logs: list[Path], drive: Path, **how: bool):
         used[logs[0].parent.name] = drive
         raise DataError("no")
 
