@@ -80,7 +80,7 @@ def screen(
     free_now = list(base_paths(model))
     for effect in model.effects:
         free_now += effect_paths(effect)
-    surrogates = jnp.asarray(_surrogates(training, seed)), jnp.asarray(_surrogates(held_out, seed + 1))
+    drawn = jnp.asarray(surrogates(training, seed)), jnp.asarray(surrogates(held_out, seed + 1))
     leads: dict[str, Lead] = {}
     null_gains = np.full(DRAWS, -np.inf)
     for turn in range(max(len(p) for p in proposals.values())):
@@ -89,8 +89,8 @@ def screen(
             for f in forms
         )
         everything = eqx.tree_at(lambda m: m.effects, model, effects)
-        paths, fitted = _score(everything, training, surrogates[0])
-        _, unseen = _score(everything, held_out, surrogates[1])
+        paths, fitted = _score(everything, training, drawn[0])
+        _, unseen = _score(everything, held_out, drawn[1])
         index = {p: i for i, p in enumerate(paths)}
         nuisance = [index[p] for p in free_now]
         for effect in effects:
@@ -174,7 +174,7 @@ def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogat
     return gram, gradient, jnp.einsum("srp,dsr->pd", columns, surrogates)
 
 
-def _surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
+def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour."""
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0

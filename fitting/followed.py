@@ -1,0 +1,151 @@
+"""The motion that a fit found, sample by sample, and how a small force anywhere along it would change it.
+
+To first order every candidate effect is a force (or a reading) along the motion that the model has found. How the
+model answers a force is the same for all of them, so that it is computed once: one matrix a sample interval carries
+the deviation on, two more add what a force that runs in a straight line through the interval does.
+"""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.residual import Problem, Unknowns
+from hdjax import Drive, Model, PiecewisePolynomial, ReducedDrive
+from hdjax.dynamics import State
+from hdjax.effects import Effect, Motion
+from hdjax.lanes import jit_lanes
+from hdjax.signals import polynomial
+from hdjax.simulate import march
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
+"""Where a sample interval, from -1 to 1, is looked into; exact for a sextic's mean and a quintic's first moment."""
+
+
+class Followed(eqx.Module):
+    """A simulated motion on every segment, and its linear response in every sample interval.
+
+    Attributes:
+        states: at each knot, the end of the last interval included.
+        between: at the `NODES` of each interval.
+        transition: what a deviation of the state at an interval's start is at its end.
+        from_start: what a force (a rate of the state) that falls from one to zero through the interval adds.
+        from_end: likewise of one that rises from zero to one.
+        readout: derivative of the outputs by the state, at each sample.
+    """
+
+    states: Float[Array, "segments knots states"]
+    between: Float[Array, "segments samples nodes states"]
+    transition: Float[Array, "segments samples states states"]
+    from_start: Float[Array, "segments samples states states"]
+    from_end: Float[Array, "segments samples states states"]
+    readout: Float[Array, "segments samples outputs states"]
+
+
+class _Pushed(Model):
+    """A model whose rates have a straight line through the interval added; its last state is the part of the interval
+    that has passed."""
+
+    model: Model
+    width: Array
+    at_start: Float[Array, " states"]
+    at_end: Float[Array, " states"]
+    drive: Drive | ReducedDrive
+    effects: tuple[Effect, ...] = ()
+    motion_states: ClassVar[tuple[str, ...]] = ()
+
+    def motion(self, state: State | Sequence[Array]) -> Motion:
+        return self.model.motion(state[:-1])
+
+    def component_rates(self, state: Sequence[Array], torque: Array, load_torque: Array) -> list[Array]:
+        *own, passed = state
+        found = self.model.component_rates(own, torque, load_torque)
+        pushed = [
+            rate + start * (1.0 - passed) + end * passed
+            for rate, start, end in zip(found, self.at_start, self.at_end, strict=True)
+        ]
+        return [*pushed, 1.0 / self.width]
+
+    def outputs(self, state: State) -> Array:
+        return self.model.outputs(state[:-1])
+
+
+@jit_lanes
+def follow(problem: Problem, unknowns: Unknowns) -> Followed:
+    """Simulate the segments and linearise every sample interval along the way."""
+    model = problem.free.unpack(problem.model, unknowns.parameters)
+    halo = problem.segments.halo
+
+    def one(torque, load_torque, state):
+        acting = model.actuate(torque)
+        own = PiecewisePolynomial(acting.knots[halo:], acting.coefficients[halo:])
+        options = {"solver": problem.solver, "substeps": problem.substeps, "unroll": problem.unroll}
+        states, end = march(model, own, load_torque, state, **options)
+        knots = jnp.concatenate([states, end[None]])
+
+        def through(start, at_start, at_end, coefficients, load, width):
+            pushed = _Pushed(model, width, at_start, at_end, model.drive)
+            interval = jnp.stack([jnp.zeros_like(width), width])
+            piece = PiecewisePolynomial(interval, coefficients[None])
+            on_load = None if load is None else PiecewisePolynomial(interval, load[None])
+            initial = jnp.append(start, jnp.zeros_like(width))
+            return march(pushed, piece, on_load, initial, **options)[1][:-1]
+
+        none = jnp.zeros_like(state)
+        linear = jax.jacfwd(through, argnums=(0, 1, 2))
+        load = None if load_torque is None else load_torque.coefficients
+        matrices = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0))(
+            states, none, none, own.coefficients, load, jnp.diff(own.knots)
+        )
+        between = _between(model, knots, own, load)
+        return Followed(knots, between, *matrices, jax.vmap(jax.jacfwd(model.outputs))(states))
+
+    return jax.vmap(one)(problem.segments.torque, problem.segments.load_torque, unknowns.states)
+
+
+def _between(
+    model: Model, knots: Float[Array, "knots states"], torque: PiecewisePolynomial, load: Array | None
+) -> Float[Array, "samples nodes states"]:
+    """States inside the intervals: cubics with the right values and rates at both ends (Hermite)."""
+    width = jnp.diff(torque.knots)
+    on_load = jnp.zeros_like(torque.coefficients) if load is None else load
+    rates = jax.vmap(model.rates)
+    ends = [
+        rates(states, polynomial(torque.coefficients, at[:, None])[:, 0], polynomial(on_load, at[:, None])[:, 0])
+        for states, at in ((knots[:-1], jnp.zeros_like(width)), (knots[1:], width))
+    ]
+    s = jnp.asarray(0.5 * (NODES + 1.0))[None, :, None]
+    y0, y1, r0, r1 = (a[:, None] for a in (knots[:-1], knots[1:], *(r * width[:, None] for r in ends)))
+    rise = y1 - y0
+    return y0 + s * rise + s * (1.0 - s) * ((1.0 - s) * (r0 - rise) - s * (r1 - rise))
+
+
+def respond(
+    followed: Followed,
+    at_start: Float[Array, "segments samples states columns"],
+    at_end: Float[Array, "segments samples states columns"],
+) -> tuple[Float[Array, "segments samples outputs columns"], Float[Array, "segments states columns"]]:
+    """What forces along the motion do to the outputs and to each segment's end, where it starts undisturbed.
+
+    Args:
+        followed: the motion.
+        at_start: each force at the start of each sample interval.
+        at_end: and at its end; in between it runs in a straight line.
+    """
+
+    def one(followed: Followed, at_start, at_end):
+        pushed = followed.from_start @ at_start + followed.from_end @ at_end
+
+        def step(deviation, inputs):
+            transition, push = inputs
+            return transition @ deviation + push, deviation
+
+        undisturbed = jnp.zeros(pushed.shape[1:])
+        end, deviations = jax.lax.scan(step, undisturbed, (followed.transition, pushed))
+        return followed.readout @ deviations, end
+
+    return jax.vmap(one)(followed, at_start, at_end)

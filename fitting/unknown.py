@@ -1,0 +1,336 @@
+"""What is missing where the catalogue does not say: a learned torque inside the equations, of the variables that matter.
+
+Which place and which variables is decided on training data alone, by leaving parts of them out in turn; the held-out
+stretches then judge one learned torque, like any other effect.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import eigh, null_space
+
+from fitting.attribution import Data, Setting, Trial, attempt
+from fitting.linear_look import (
+    Look,
+    Products,
+    best_step,
+    left_after,
+    look_along,
+    parameter_torques,
+    products,
+    push,
+    surrogate_gains,
+)
+from fitting.screening import surrogates
+from hdjax import ReducedModel
+from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
+
+# Parts that training data are left out in, in turn.
+_FOLDS = 4
+# How many coefficients a function of one variable may have, and of two.
+_SIZES = {1: (1, 2, 3, 4, 5, 7, 9, 11, 13, 16), 2: (3, 5, 7, 9, 12, 16, 20, 24)}
+# A poorer error by this share (in the objective) is no reason for more coefficients, or for a second variable.
+_WORTH_A_COEFFICIENT, _WORTH_A_VARIABLE = 0.005, 0.03
+# A rival that gains this share of what the best one does, to first order, is refitted as well.
+_NEARLY = 0.8
+# Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
+_SAME_FUNCTION = 0.99
+# Motions that so few samples reach are no part of the range.
+_RARE = 5e-4
+# First-order changes of a logarithm are taken no larger than this.
+_LARGEST_CHANGE = 1.0
+# Instants of the motion that stand for the density of the data.
+_INSTANTS = 3000
+
+
+class Candidate(eqx.Module):
+    """A place and variables, as the first look sees them.
+
+    Attributes:
+        form: the place.
+        variables: what the torque depends on.
+        gain: decrease of the objective on parts of the training data that were left out, to first order.
+        effect: the learned torque, at the coefficients that suit best to first order.
+        drive_step: change of the free vector that goes with it.
+        known: functions of the variables that the free parameters stand for already, at the instants that are kept.
+    """
+
+    form: type[LearnedTorque] = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
+    gain: float
+    effect: LearnedTorque
+    drive_step: Float[np.ndarray, " parameters"]
+    known: Float[np.ndarray, "instants known"]
+
+
+class Unknown(eqx.Module):
+    """A learned torque that the data support.
+
+    Attributes:
+        before: the model without it.
+        trial: the model with it.
+        candidates: all places and variables, best first by the first look.
+        chosen: the one that was taken.
+        motion: its variables at some instants of the training data, by column.
+        gain: decrease of the held-out objective.
+        p_value: chance of such a gain where nothing is missing.
+    """
+
+    before: Trial
+    trial: Trial
+    candidates: tuple[Candidate, ...]
+    chosen: Candidate
+    motion: Float[np.ndarray, "instants variables"]
+    gain: float
+    p_value: float
+
+    @property
+    def effect(self) -> LearnedTorque:
+        """The learned torque with fitted values."""
+        return self.trial.model.effect(self.chosen.form.name)
+
+
+class _Sight(eqx.Module):
+    """A look, with what candidates share.
+
+    Attributes:
+        look: at the fit.
+        pushes: each place, by the form's name.
+        values: variables at each knot.
+        weight: of each knot.
+    """
+
+    look: Look
+    pushes: dict[str, Array]
+    values: dict[str, Float[np.ndarray, "segments knots"]]
+    weight: Float[np.ndarray, "segments knots"]
+
+
+def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]) -> Unknown | None:
+    """Learn what a model lacks.
+
+    Args:
+        before: the model.
+        data: the stretches.
+        setting: how they are cut.
+        seed: of the surrogates behind the p-value.
+        progress: told what is being done.
+
+    Returns:
+        The learned torque; None where none brings the training error down.
+    """
+    progress("looking for what the missing torque depends on")
+    sight = _sight(before.training)
+    found = sorted(_candidates(sight), key=lambda c: -c.gain)
+    best: tuple[float, Candidate, Trial] | None = None
+    for candidate in _rivals(found):
+        progress(f"learning a torque of {' and '.join(candidate.variables)}")
+        trial = _refitted(before, candidate, data, setting)
+        score = _penalised(trial)
+        if np.isfinite(score) and score < _penalised(before) and (best is None or score < best[0]):
+            best = score, candidate, trial
+    if best is None:
+        return None
+    _, chosen, trial = best
+    gain = before.held_out.objective - trial.held_out.objective
+    p_value = _p_value(sight, before, chosen, gain, seed)
+    instants = _instants(sight)
+    motion = np.stack([sight.values[v].reshape(-1)[instants] for v in chosen.variables], axis=1)
+    return Unknown(before, trial, tuple(found), chosen, motion, gain, p_value)
+
+
+def _sight(fit) -> _Sight:
+    look = look_along(fit)
+    reduced = isinstance(look.model, ReducedModel)
+    forms = [f for f in LEARNED if not (f.needs_motor and reduced)]
+    values = {n: np.asarray(getattr(look.motion, n)) for n in UNITS if getattr(look.motion, n) is not None}
+    weight = np.asarray(look.problem.segments.weight)
+    finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
+    # The last knot of a segment is the first one of the next.
+    weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
+    return _Sight(look, {f.name: push(look, f) for f in forms}, values, weight)
+
+
+def _candidates(sight: _Sight) -> list[Candidate]:
+    """Every place with every variable, and with the best one of them and another."""
+    axes = {(n, fine): _axis(sight, n, fine) for n in sight.values for fine in (True, False)}
+    functions = {key: _evaluated(axis, sight.values[key[0]]) for key, axis in axes.items()}
+    found = []
+    for form in LEARNED:
+        if form.name not in sight.pushes:
+            continue
+        acting = sight.pushes[form.name]
+        own = np.asarray(parameter_torques(sight.look, acting))
+
+        def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
+            fine = len(variables) == 1
+            chosen = tuple(axes[n, fine] for n in variables)
+            raw = _all_products([functions[n, fine] for n in variables])
+            return _candidate(sight, form, variables, chosen, raw, own)
+
+        alone = [c for c in (look_at((n,)) for n in sight.values) if c is not None]
+        found += alone
+        if alone:
+            best = max(alone, key=lambda c: c.gain).variables[0]
+            pairs = [tuple(n for n in sight.values if n in (best, other)) for other in sight.values if other != best]
+            found += [c for c in map(look_at, pairs) if c is not None]
+    return found
+
+
+def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """All products of one function of each part."""
+    found = parts[0]
+    for part in parts[1:]:
+        found = (found[..., :, None] * part[..., None, :]).reshape(*found.shape[:-1], -1)
+    return found
+
+
+def _axis(sight: _Sight, variable: str, fine: bool) -> Axis:
+    seen = sight.values[variable][sight.weight > 0]
+    low, high = np.quantile(seen, [_RARE, 1.0 - _RARE])
+    reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
+    return axis_over(variable, float(low), float(low + reach), fine=fine)
+
+
+def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
+    return np.asarray(jax.vmap(jax.vmap(axis.functions))(values))
+
+
+def _candidate(
+    sight: _Sight,
+    form: type[LearnedTorque],
+    variables: tuple[str, ...],
+    axes: tuple[Axis, ...],
+    raw: Float[np.ndarray, "segments knots functions"],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> Candidate | None:
+    """One place and choice of variables, with as many coefficients as parts of the data that were left out call for."""
+    instants = _instants(sight)
+    flat = raw.reshape(-1, raw.shape[2])[instants]
+    known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants])
+    sizes = _SIZES[len(variables)]
+    mixing = _smooth_first(flat, known, _roughness(axes))[:, : max(sizes)]
+    if mixing.shape[1] == 0:
+        return None
+    torques = raw @ mixing
+    # One width, one program.
+    padded = np.pad(torques, ((0, 0), (0, 0), (0, max(sizes) - torques.shape[2])))
+    found = products(sight.look, sight.pushes[form.name], padded)
+    parameters = own.shape[2]
+    best: tuple[float, int] | None = None
+    base = _left_out(found, parameters)
+    for size in (s for s in sizes if s <= mixing.shape[1]):
+        gain = base - _left_out(found, parameters + size)
+        if best is None or gain > best[0] + _WORTH_A_COEFFICIENT:
+            best = gain, size
+    if best is None or not best[0] > 0:
+        return None
+    gain, size = best
+    step = best_step(_first(found, parameters + size))
+    effect = form(axes=axes, mixing=mixing[:, :size], c=step[parameters:])
+    return Candidate(form, variables, gain, effect, step[:parameters], known)
+
+
+def _instants(sight: _Sight) -> np.ndarray:
+    """Some of the knots with weight, evenly spread."""
+    kept = np.flatnonzero(sight.weight.reshape(-1) > 0)
+    return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
+
+
+def _same_functions(raw: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Those free parameters that are functions of the same variables at the same place: the learned torque leaves what
+    they can do to them."""
+    size = np.sqrt(np.mean(own**2, axis=0))
+    own = own[:, size > 0] / size[size > 0]
+    coefficients = np.linalg.lstsq(raw, own, rcond=1e-10)[0]
+    left = np.mean((own - raw @ coefficients) ** 2, axis=0)
+    return own[:, left < 1.0 - _SAME_FUNCTION]
+
+
+def _roughness(axes: Sequence[Axis]) -> np.ndarray:
+    """Penalty on the curvature of a function over the unit range of each axis, per pair of products."""
+    parts = []
+    for axis in axes:
+        if isinstance(axis, AngleAxis):
+            order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
+            parts.append(np.diag((2 * np.pi * order) ** 4))
+        else:
+            bends = np.diff(np.eye(axis.count), 2, axis=0)
+            rises = np.diff(np.eye(axis.count), axis=0)
+            # The slope, counted little, puts the constant before the straight line.
+            parts.append(axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises)
+    total = np.zeros((1, 1))
+    for part in parts:
+        total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
+    return total
+
+
+def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Combinations of functions, smoothest first, each of unit rms on the data, uncorrelated with each other and with
+    what is known already (the basis of Demmler and Reinsch 1975)."""
+    moment = raw.T @ raw / len(raw)
+    free = null_space((raw.T @ known / len(raw)).T, rcond=1e-8) if known.shape[1] else np.eye(raw.shape[1])
+    inside = free.T @ moment @ free
+    seen, directions = np.linalg.eigh(inside)
+    # Where there are no data, nothing can be learned.
+    free = free @ directions[:, seen > 1e-6 * np.max(seen, initial=0.0)]
+    if free.shape[1] == 0:
+        return free
+    _, vectors = eigh(free.T @ roughness @ free, free.T @ moment @ free)
+    return free @ vectors
+
+
+def _first(found: Products, columns: int) -> Products:
+    return Products(found.gram[..., :columns, :columns], found.gradient[..., :columns], found.square, found.samples)
+
+
+def _left_out(found: Products, columns: int) -> float:
+    """The objective on each part of the data after least squares on the others, with the first columns free."""
+    part = np.arange(found.samples.size) * _FOLDS // found.samples.size
+    total = np.zeros(found.square.shape[1:])
+    first = _first(found, columns)
+    for fold in range(min(_FOLDS, found.samples.size)):
+        step = best_step(first.of(part != fold))
+        total += left_after(first.of(part == fold), step)
+    return 0.5 * float(np.linalg.slogdet(total / found.samples.sum())[1])
+
+
+def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates that are worth a refit: the best one, a second variable counting only where it adds much; and the
+    best one of those elsewhere or of other variables, where it gains nearly as much."""
+    order = sorted(found, key=lambda c: -(c.gain - _WORTH_A_VARIABLE * (len(c.variables) - 1)))
+    best = order[:1]
+    others = [c for c in order[1:] if c.form is not best[0].form or not set(c.variables) & set(best[0].variables)]
+    return best + [c for c in others[:1] if c.gain > _NEARLY * best[0].gain]
+
+
+def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial:
+    free = before.training.free
+    change = np.where(free.logarithmic, np.clip(candidate.drive_step, -_LARGEST_CHANGE, _LARGEST_CHANGE), 0.0)
+    change = np.where(free.logarithmic, change, candidate.drive_step)
+    moved = free.unpack(before.model, free.pack(before.model) + change)
+    return attempt(moved.with_effects(candidate.effect), data, before.hold, setting, start=before, contains_start=True)
+
+
+def _penalised(trial: Trial) -> float:
+    """The training objective, with what each parameter would gain on noise (Schwarz 1978)."""
+    samples = float(trial.training.problem.segments.count)
+    return trial.training.objective + 0.5 * len(trial.training.free.paths) * np.log(samples) / samples
+
+
+def _p_value(sight: _Sight, before: Trial, chosen: Candidate, gain: float, seed: int) -> float:
+    unseen = _sight(before.held_out)
+    torques = []
+    for one in (sight, unseen):
+        raw = _all_products([_evaluated(a, np.nan_to_num(one.values[a.variable])) for a in chosen.effect.axes])
+        torques.append(raw @ np.asarray(chosen.effect.mixing))
+    null = surrogate_gains(
+        (sight.look, unseen.look),
+        (sight.pushes[chosen.form.name], unseen.pushes[chosen.form.name]),
+        (torques[0], torques[1]),
+        (surrogates(before.training, seed), surrogates(before.held_out, seed + 1)),
+    )
+    return (1 + int(np.sum(null >= gain))) / (1 + null.size)
