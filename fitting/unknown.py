@@ -1,4 +1,4 @@
-"""What is missing where the catalogue does not say: a learned torque inside the equations, of the variables that matter.
+"""What is missing where the catalogue does not say: a learned torque inside the equations, of variables that matter.
 
 Which place and which variables is decided on training data alone, by leaving parts of them out in turn; the held-out
 stretches then judge one learned torque, like any other effect.
@@ -8,11 +8,12 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import eigh, null_space
 
-from fitting.attribution import Data, Setting, Trial, attempt
+from fitting.attribution import LEAST_GAIN, SIGNIFICANCE, Data, Setting, Trial, attempt
 from fitting.linear_look import (
     Look,
     Products,
@@ -25,7 +26,8 @@ from fitting.linear_look import (
     surrogate_gains,
 )
 from fitting.screening import surrogates
-from hdjax import ReducedModel
+from hdjax import Model, ReducedModel
+from hdjax.effects import Motion
 from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
 
 # Parts that training data are left out in, in turn.
@@ -74,7 +76,8 @@ class Unknown(eqx.Module):
         trial: the model with it.
         candidates: all places and variables, best first by the first look.
         chosen: the one that was taken.
-        motion: its variables at some instants of the training data, by column.
+        states: of the model without it, at the instants that stand for the density of the data.
+        push: what a unit of torque at its place adds to their rates.
         gain: decrease of the held-out objective.
         p_value: chance of such a gain where nothing is missing.
     """
@@ -83,14 +86,20 @@ class Unknown(eqx.Module):
     trial: Trial
     candidates: tuple[Candidate, ...]
     chosen: Candidate
-    motion: Float[np.ndarray, "instants variables"]
+    states: Float[np.ndarray, "instants states"]
+    push: Float[np.ndarray, "instants states"]
     gain: float
     p_value: float
 
     @property
-    def effect(self) -> LearnedTorque:
-        """The learned torque with fitted values."""
-        return self.trial.model.effect(self.chosen.form.name)
+    def motion(self) -> Motion:
+        """The motion at the instants."""
+        return jax.vmap(self.before.model.motion)(jnp.asarray(self.states))
+
+    def torque(self, effect: LearnedTorque) -> Float[np.ndarray, " instants"]:
+        """A learned torque at the instants."""
+        torque = jax.vmap(lambda m: effect.torque(m, self.before.model.drive, jnp.zeros(0)))(self.motion)
+        return np.asarray(torque)
 
 
 class _Sight(eqx.Module):
@@ -138,8 +147,45 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     gain = before.held_out.objective - trial.held_out.objective
     p_value = _p_value(sight, before, chosen, gain, seed)
     instants = _instants(sight)
-    motion = np.stack([sight.values[v].reshape(-1)[instants] for v in chosen.variables], axis=1)
-    return Unknown(before, trial, tuple(found), chosen, motion, gain, p_value)
+    states, acting = (
+        np.asarray(a).reshape(-1, a.shape[2])[instants]
+        for a in (sight.look.followed.states, sight.pushes[chosen.form.name])
+    )
+    return Unknown(before, trial, tuple(found), chosen, states, acting, gain, p_value)
+
+
+def is_supported(found: Unknown | None) -> bool:
+    """Whether a learned torque is more than chance and more than an imperfection of the solver."""
+    return found is not None and found.gain > LEAST_GAIN and found.p_value <= SIGNIFICANCE
+
+
+def share_of(named: Model, found: Unknown) -> float:
+    """Share of a learned torque's mean square that the effects of a model, beyond those it was learned with, make up.
+
+    Near one the learned torque, which was free to be anything, has come out as those effects.
+
+    Args:
+        named: the model with the effects.
+        found: the learned torque.
+    """
+    bare = eqx.tree_at(lambda m: m.effects, named, found.before.model.effects)
+    hidden = jnp.asarray(named.rest())[found.states.shape[1] :]
+    zero = jnp.zeros(())
+
+    def added(state: Array) -> Array:
+        own = named.rates(jnp.concatenate([state, hidden]), zero, zero)
+        return own[: state.shape[0]] - bare.rates(state, zero, zero)
+
+    rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states)))
+    theirs = np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
+    learned = found.torque(found.trial.model.effect(found.chosen.form.name))
+    theirs, learned = (without(a, found.chosen.known) for a in (theirs, learned))
+    return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))
+
+
+def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> np.ndarray:
+    """What of values is no combination of known functions."""
+    return values - known @ np.linalg.lstsq(known, values, rcond=1e-10)[0]
 
 
 def _sight(fit) -> _Sight:

@@ -121,7 +121,7 @@ class LearnedMeshTorque(MeshTorqueEffect):
     name: ClassVar[str] = "learned_mesh_torque"
 
     axes: tuple[Axis, ...]
-    mixing: Float[Array, "functions coefficients"]
+    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
     c: tuple[Scalar, ...] = parameter(
         unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
     )
@@ -142,7 +142,7 @@ class LearnedMotorTorque(MotorSideEffect):
     name: ClassVar[str] = "learned_motor_torque"
 
     axes: tuple[Axis, ...]
-    mixing: Float[Array, "functions coefficients"]
+    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
     c: tuple[Scalar, ...] = parameter(
         unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
     )
@@ -163,7 +163,7 @@ class LearnedLoadTorque(LoadSideEffect):
     name: ClassVar[str] = "learned_load_torque"
 
     axes: tuple[Axis, ...]
-    mixing: Float[Array, "functions coefficients"]
+    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
     c: tuple[Scalar, ...] = parameter(
         unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
     )
