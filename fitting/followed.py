@@ -88,7 +88,7 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
         knots = jnp.concatenate([states, end[None]])
 
         def through(start, at_start, at_end, coefficients, load, width):
-            pushed = _Pushed(model, width, at_start, at_end, model.drive)
+            pushed = _Pushed(model=model, width=width, at_start=at_start, at_end=at_end, drive=model.drive)
             interval = jnp.stack([jnp.zeros_like(width), width])
             piece = PiecewisePolynomial(interval, coefficients[None])
             on_load = None if load is None else PiecewisePolynomial(interval, load[None])
@@ -98,13 +98,15 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
         none = jnp.zeros_like(state)
         linear = jax.jacfwd(through, argnums=(0, 1, 2))
         load = None if load_torque is None else load_torque.coefficients
-        matrices = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0))(
+        transition, from_start, from_end = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0))(
             states, none, none, own.coefficients, load, jnp.diff(own.knots)
         )
         between = _between(model, knots, own, load)
-        return Followed(knots, between, *matrices, jax.vmap(jax.jacfwd(model.outputs))(states))
+        return knots, between, transition, from_start, from_end, jax.vmap(jax.jacfwd(model.outputs))(states)
 
-    return jax.vmap(one)(problem.segments.torque, problem.segments.load_torque, unknowns.states)
+    found = jax.vmap(one)(problem.segments.torque, problem.segments.load_torque, unknowns.states)
+    knots, between, transition, from_start, from_end, readout = found
+    return Followed(knots, between, transition, from_start, from_end, readout)
 
 
 def _between(
@@ -114,12 +116,13 @@ def _between(
     width = jnp.diff(torque.knots)
     on_load = jnp.zeros_like(torque.coefficients) if load is None else load
     rates = jax.vmap(model.rates)
-    ends = [
-        rates(states, polynomial(torque.coefficients, at[:, None])[:, 0], polynomial(on_load, at[:, None])[:, 0])
-        for states, at in ((knots[:-1], jnp.zeros_like(width)), (knots[1:], width))
-    ]
+
+    def rise_at(states: Array, at: Array) -> Array:
+        return width[:, None] * rates(states, polynomial(torque.coefficients, at), polynomial(on_load, at))
+
+    r0, r1 = rise_at(knots[:-1], jnp.zeros_like(width))[:, None], rise_at(knots[1:], width)[:, None]
+    y0, y1 = knots[:-1, None], knots[1:, None]
     s = jnp.asarray(0.5 * (NODES + 1.0))[None, :, None]
-    y0, y1, r0, r1 = (a[:, None] for a in (knots[:-1], knots[1:], *(r * width[:, None] for r in ends)))
     rise = y1 - y0
     return y0 + s * rise + s * (1.0 - s) * ((1.0 - s) * (r0 - rise) - s * (r1 - rise))
 

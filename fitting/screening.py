@@ -1,14 +1,16 @@
 """A first look at the whole catalogue: what would each effect explain, to first order?
 
 At zero strength an effect changes nothing, but the derivative of the simulated outputs with respect to its strength is
-there, inside the equations of motion and all of them in one program. Least squares on those derivatives gives each
-effect's strength and gain to first order (a score test), on held-out data too. The same linear algebra applied to
+there: the answer of the present model to a small force along its own motion. Least squares on those derivatives gives
+each effect's strength and gain to first order (a score test), on held-out data too. The same linear algebra applied to
 surrogates of the residual gives the law of the best gain where there is nothing to find.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,15 +18,20 @@ from scipy.fft import prev_fast_len
 
 from fitting.arrow import project
 from fitting.estimate import STEP_ANGLE, Fit, suggested_substeps
-from fitting.experiment import scales
-from fitting.free import FreeParameters, base_paths, effect_paths, strength_paths
-from fitting.residual import Problem, Unknowns, blocks
+from fitting.experiment import Segments, scales
+from fitting.followed import Followed, follow, respond
+from fitting.free import strength_paths
+from fitting.regressors import Regressors, regressors
+from fitting.residual import Blocks, linearise
 from hdjax import Model, ReducedModel
 from hdjax.effects import CATALOGUE, Effect
-from hdjax.lanes import jit_lanes
+from hdjax.where import where
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
+
+# Columns that one program takes at once; as many proposals as fit share it.
+_COLUMNS = 16
 
 
 class Lead(eqx.Module):
@@ -74,37 +81,27 @@ def screen(
     """
     model = training.model
     motion = scales(training.stretches)
-    forms = [f for f in catalogue if not (f.needs_motor and isinstance(model, ReducedModel))]
     present = {e.name for e in model.effects}
-    proposals = {f.name: f.proposals(motion) for f in forms}
-    free_now = list(base_paths(model))
-    for effect in model.effects:
-        free_now += effect_paths(effect)
-    drawn = jnp.asarray(surrogates(training, seed)), jnp.asarray(surrogates(held_out, seed + 1))
+    forms = [f for f in catalogue if f.name not in present and not (f.needs_motor and isinstance(model, ReducedModel))]
+    proposals = tuple(proposal for f in forms for proposal in f.proposals(motion))
+    free_now = training.free.paths
     leads: dict[str, Lead] = {}
     null_gains = np.full(DRAWS, -np.inf)
-    for turn in range(max(len(p) for p in proposals.values())):
-        effects = tuple(
-            model.effect(f.name) if f.name in present else proposals[f.name][min(turn, len(proposals[f.name]) - 1)]
-            for f in forms
-        )
-        everything = eqx.tree_at(lambda m: m.effects, model, effects)
-        paths, fitted = _score(everything, training, drawn[0])
-        _, unseen = _score(everything, held_out, drawn[1])
-        index = {p: i for i, p in enumerate(paths)}
-        nuisance = [index[p] for p in free_now]
-        for effect in effects:
-            if effect.name in present or turn >= len(proposals[effect.name]):
-                continue
-            own = [index[p] for p in strength_paths(effect)]
-            positive = [i for i in own if everything.parameters()[paths[i]][1].positive]
-            step, gain = _linear_gain(fitted, unseen, nuisance, own, positive)
-            null_gains = np.maximum(null_gains, _null_gains(fitted, unseen, nuisance, own))
+    looks = zip(_scores(training, proposals, seed), _scores(held_out, proposals, seed + 1), strict=True)
+    for (own, fitted), (_, unseen) in looks:
+        for index, columns in own.items():
+            effect = proposals[index]
+            paths = strength_paths(effect)
+            info = model.with_effects(effect).parameters()
+            positive = [c for c, p in zip(columns, paths, strict=True) if info[p][1].positive]
+            nuisance = list(range(len(free_now)))
+            step, gain = _linear_gain(fitted, unseen, nuisance, columns, positive)
+            null_gains = np.maximum(null_gains, _null_gains(fitted, unseen, nuisance, columns))
             if effect.name in leads and leads[effect.name].gain >= gain:
                 continue
-            strengths = {paths[i]: float(everything.get(paths[i])) + step[i] for i in own}
-            filled = everything.replace(strengths).effect(effect.name)
-            changes = {paths[i]: step[i] for i in nuisance}
+            strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
+            filled = model.with_effects(effect).replace(strengths).effect(effect.name)
+            changes = {p: step[i] for i, p in enumerate(free_now)}
             leads[effect.name] = Lead(filled, changes, gain)
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), null_gains)
@@ -114,7 +111,7 @@ class _Score(eqx.Module):
     """Inner products of sensitivities with each other, with the residual, and with its surrogates.
 
     Attributes:
-        gram: of the projected columns.
+        gram: of the projected columns: of what was free already, then of strengths.
         gradient: columns against the residual.
         surrogate_gradients: columns against each surrogate.
         rows: number of measured values.
@@ -126,55 +123,111 @@ class _Score(eqx.Module):
     rows: float
 
 
-def _score(everything: Model, fit: Fit, surrogates: Array) -> tuple[tuple[str, ...], _Score]:
-    paths = list(base_paths(everything))
-    for effect in everything.effects:
-        paths += effect_paths(effect)
-    known = everything.parameters()
-    # Plain units: a strength of zero has no logarithm.
-    free = FreeParameters(tuple(paths), (False,) * len(paths), jnp.ones(len(paths)))
-    vector = jnp.stack([known[p][0] for p in paths])
-    problem = Problem(
-        everything,
-        free,
-        fit.problem.segments,
-        fit.problem.whitening,
-        jnp.ones(len(paths)),
-        jnp.ones(len(everything.state_names)),
-        # A first-order look needs no finer sensitivities; the residual is the fit's own.
-        substeps=suggested_substeps(everything, fit.stretches, step_angle=2 * STEP_ANGLE),
-        unroll=False,
+def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[dict[int, list[int]], _Score]]:
+    """The proposals' inner products, a few proposals at a time: each one's columns, and the score that has them."""
+    # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
+    # than this; the residual is the fit's own.
+    problem = replace(
+        fit.problem,
+        model=fit.model,
+        active=jnp.ones_like(fit.problem.active),
+        substeps=suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE),
     )
-    unknowns = Unknowns(vector, _states(everything, fit))
-    residual = jnp.asarray(fit.error) @ fit.problem.whitening.T
-    gram, gradient, against = _inner_products(problem, unknowns, residual, surrogates)
-    weight = fit.problem.segments.weight
-    rows = float(jnp.sum(weight)) * fit.problem.segments.measured.shape[-1]
-    return tuple(paths), _Score(np.asarray(gram), np.asarray(gradient), np.asarray(against), rows)
+    followed: Followed = _on_host(follow(problem, fit.unknowns))
+    found: Blocks = _on_host(linearise(problem, fit.unknowns))
+    slopes = fit.free.slopes(fit.model)[None, None, :]
+    found = replace(
+        found,
+        by_parameter=found.by_parameter / slopes,
+        before_by_parameter=found.before_by_parameter / slopes,
+    )
+    segments: Segments = _on_host(problem.segments)
+    whitening = _on_host(problem.whitening)
+    residual = _on_host(fit.error) @ whitening.T
+    surrogates = jnp.asarray(_surrogates(fit, seed))
+    rows = float(np.sum(segments.weight)) * residual.shape[-1]
+    already = slopes.size
+    for own, forces in _batches(fit.model, proposals, followed, segments):
+        products = _inner_products(found, followed, segments, whitening, forces, residual, surrogates)
+        gram, gradient, against = (np.asarray(a) for a in products)
+        yield (
+            {i: [already + c for c in columns] for i, columns in own.items()},
+            _Score(gram, gradient, against, rows),
+        )
 
 
-def _states(everything: Model, fit: Fit) -> Array:
-    """The fit's initial states, with those of the effects that it does not have at rest."""
-    known = dict(zip(fit.model.state_names, fit.unknowns.states.T, strict=True))
-    rest = dict(zip(everything.state_names, everything.rest(), strict=True))
-    segments = fit.unknowns.states.shape[0]
-    columns = [known.get(n, jnp.full(segments, rest[n])) for n in everything.state_names]
-    return jnp.stack(columns, axis=1)
+def _on_host(tree):
+    """Arrays by way of the host: what follows is not shared among devices."""
+    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)) if eqx.is_array(a) else a, tree)
 
 
-@jit_lanes
-def _inner_products(problem: Problem, unknowns: Unknowns, error: Array, surrogates: Array):
-    found = blocks(problem, unknowns)
-    columns = project(found, problem.segments.joined)
-    # Residuals are measured minus simulated: what a strength explains is minus its derivative.
-    columns = -columns[:, : surrogates.shape[2]]
-    residual = error.reshape(error.shape[0], -1)
-    gram = jnp.einsum("srp,srq->pq", columns, columns)
-    gradient = jnp.einsum("srp,sr->p", columns, residual)
-    return gram, gradient, jnp.einsum("srp,dsr->pd", columns, surrogates)
+def _batches(
+    model: Model, proposals: Sequence[Effect], followed: Followed, segments: Segments
+) -> Iterator[tuple[dict[int, list[int]], Regressors]]:
+    """Regressors of the proposals, as many as go into one program; the columns of each, by its place in the list."""
+    own: dict[int, list[int]] = {}
+    waiting: list[Regressors] = []
+    taken, index = 0, 0
+    for form in dict.fromkeys(type(p) for p in proposals):
+        same = [p for p in proposals if type(p) is form]
+        found = jax.tree.map(np.asarray, regressors(model, same, followed, segments))
+        strengths = len(strength_paths(same[0]))
+        for i in range(len(same)):
+            if waiting and taken + strengths > _COLUMNS:
+                yield own, _filled(waiting)
+                own, waiting, taken = {}, [], 0
+            mine = slice(i * strengths, (i + 1) * strengths)
+            waiting.append(jax.tree.map(lambda a, mine=mine: a[..., mine], found))
+            own[index] = list(range(taken, taken + strengths))
+            taken, index = taken + strengths, index + 1
+    if waiting:
+        yield own, _filled(waiting)
 
 
-def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
+def _filled(parts: Sequence[Regressors]) -> Regressors:
+    """The parts side by side, with columns of zeros up to the next size that has a program."""
+    missing = -sum(part.reading.shape[-1] for part in parts) % _COLUMNS
+
+    def joined(*columns: np.ndarray) -> np.ndarray:
+        return np.concatenate([*columns, np.zeros((*columns[0].shape[:-1], missing))], axis=-1)
+
+    return jax.tree.map(joined, *parts)
+
+
+@eqx.filter_jit
+def _inner_products(
+    found: Blocks,
+    followed: Followed,
+    segments: Segments,
+    whitening: Float[Array, "outputs outputs"],
+    forces: Regressors,
+    residual: Float[Array, "segments samples outputs"],
+    surrogates: Float[Array, "draws segments rows"],
+) -> tuple[Float[Array, "columns columns"], Float[Array, " columns"], Float[Array, "columns draws"]]:
+    outputs, end = respond(followed, forces.at_start, forces.at_end)
+    outputs = (outputs + forces.reading) * segments.weight[:, :, None, None]
+    white = jnp.einsum("ij,snjc->snic", whitening, outputs)
+    rows = surrogates.shape[2]
+    # Residuals are measured minus simulated. What follows a segment's rows of outputs is its states' prior.
+    columns = -white.reshape(white.shape[0], rows, -1)
+    columns = jnp.pad(columns, ((0, 0), (0, found.residual.shape[1] - rows), (0, 0)))
+    before = where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
+    extended = replace(
+        found,
+        by_parameter=jnp.concatenate([found.by_parameter, columns], axis=2),
+        before_by_parameter=jnp.concatenate([found.before_by_parameter, before], axis=2),
+    )
+    # What a strength explains is minus its derivative.
+    explains = -project(extended, segments.joined)[:, :rows]
+    flat = explains.reshape(-1, explains.shape[2])
+    return (
+        flat.T @ flat,
+        flat.T @ residual.reshape(-1),
+        flat.T @ surrogates.reshape(surrogates.shape[0], -1).T,
+    )
+
+
+def _surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour."""
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0

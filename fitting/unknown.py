@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from scipy.linalg import eigh, null_space
 
 from fitting.attribution import LEAST_GAIN, SIGNIFICANCE, Data, Setting, Trial, attempt
+from fitting.base_fit import leaves_white_noise
 from fitting.linear_look import (
     Look,
     Products,
@@ -25,10 +26,10 @@ from fitting.linear_look import (
     push,
     surrogate_gains,
 )
-from fitting.screening import surrogates
+from fitting.screening import _surrogates as surrogates
 from hdjax import Model, ReducedModel
 from hdjax.effects import Motion
-from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
+from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -134,16 +135,20 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     progress("looking for what the missing torque depends on")
     sight = _sight(before.training)
     found = sorted(_candidates(sight), key=lambda c: -c.gain)
-    best: tuple[float, Candidate, Trial] | None = None
-    for candidate in _rivals(found):
-        progress(f"learning a torque of {' and '.join(candidate.variables)}")
-        trial = _refitted(before, candidate, data, setting)
-        score = _penalised(trial)
-        if np.isfinite(score) and score < _penalised(before) and (best is None or score < best[0]):
-            best = score, candidate, trial
+    best: tuple[Candidate, Trial] | None = None
+    for several in (False, True):
+        if best is not None and leaves_white_noise(best[1].training):
+            break
+        for candidate in _rivals([c for c in found if (len(c.variables) > 1) == several]):
+            if best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE * several:
+                break
+            progress(f"learning a torque of {' and '.join(candidate.variables)}")
+            trial = _refitted(before, candidate, data, setting)
+            if _penalised(trial) < _penalised(before if best is None else best[1]):
+                best = candidate, trial
     if best is None:
         return None
-    _, chosen, trial = best
+    chosen, trial = best
     gain = before.held_out.objective - trial.held_out.objective
     p_value = _p_value(sight, before, chosen, gain, seed)
     instants = _instants(sight)
@@ -202,8 +207,6 @@ def _sight(fit) -> _Sight:
 
 def _candidates(sight: _Sight) -> list[Candidate]:
     """Every place with every variable, and with the best one of them and another."""
-    axes = {(n, fine): _axis(sight, n, fine) for n in sight.values for fine in (True, False)}
-    functions = {key: _evaluated(axis, sight.values[key[0]]) for key, axis in axes.items()}
     found = []
     for form in LEARNED:
         if form.name not in sight.pushes:
@@ -212,16 +215,20 @@ def _candidates(sight: _Sight) -> list[Candidate]:
         own = np.asarray(parameter_torques(sight.look, acting))
 
         def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
-            fine = len(variables) == 1
-            chosen = tuple(axes[n, fine] for n in variables)
-            raw = _all_products([functions[n, fine] for n in variables])
-            return _candidate(sight, form, variables, chosen, raw, own)
+            axes = tuple(_axis(sight, n, b) for n, b in zip(variables, _others(variables), strict=True))
+            raw = _all_products([_evaluated(a, sight.values[a.variable]) for a in axes])
+            return _candidate(sight, form, variables, axes, raw, own)
 
         alone = [c for c in (look_at((n,)) for n in sight.values) if c is not None]
         found += alone
         if alone:
             best = max(alone, key=lambda c: c.gain).variables[0]
-            pairs = [tuple(n for n in sight.values if n in (best, other)) for other in sight.values if other != best]
+            pairs = [
+                tuple(n for n in sight.values if n in (best, other))
+                for other in sight.values
+                # The angles of both shafts are one and the same, but for the twist.
+                if other != best and not {best, other} <= set(ANGLES)
+            ]
             found += [c for c in map(look_at, pairs) if c is not None]
     return found
 
@@ -234,15 +241,25 @@ def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
     return found
 
 
-def _axis(sight: _Sight, variable: str, fine: bool) -> Axis:
+def _others(variables: tuple[str, ...]) -> tuple[str | None, ...]:
+    """The variable beside each."""
+    return (None,) if len(variables) == 1 else (variables[1], variables[0])
+
+
+def _axis(sight: _Sight, variable: str, beside: str | None) -> Axis:
     seen = sight.values[variable][sight.weight > 0]
     low, high = np.quantile(seen, [_RARE, 1.0 - _RARE])
     reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
-    return axis_over(variable, float(low), float(low + reach), fine=fine)
+    return axis_over(variable, float(low), float(low + reach), beside=beside)
 
 
 def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
-    return np.asarray(jax.vmap(jax.vmap(axis.functions))(values))
+    return np.asarray(_all_functions(axis, jnp.asarray(values)))
+
+
+@eqx.filter_jit
+def _all_functions(axis: Axis, values: Array) -> Array:
+    return jax.vmap(jax.vmap(axis.functions))(values)
 
 
 def _candidate(
@@ -345,12 +362,8 @@ def _left_out(found: Products, columns: int) -> float:
 
 
 def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates that are worth a refit: the best one, a second variable counting only where it adds much; and the
-    best one of those elsewhere or of other variables, where it gains nearly as much."""
-    order = sorted(found, key=lambda c: -(c.gain - _WORTH_A_VARIABLE * (len(c.variables) - 1)))
-    best = order[:1]
-    others = [c for c in order[1:] if c.form is not best[0].form or not set(c.variables) & set(best[0].variables)]
-    return best + [c for c in others[:1] if c.gain > _NEARLY * best[0].gain]
+    """The candidates, best first, that are worth a refit: the best one, and another one that gains nearly as much."""
+    return [c for c in found[:2] if c.gain > _NEARLY * found[0].gain]
 
 
 def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial:

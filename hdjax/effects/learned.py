@@ -199,16 +199,18 @@ _RATES = ("v", "omega_m", "omega_l")
 _NEAR_STANDSTILL = 0.005
 
 
-def axis_over(variable: str, low: float, high: float, *, fine: bool = True) -> Axis:
+def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:
     """The axis that suits a quantity which the data have between two values.
 
     Args:
         variable: the quantity.
         low: smallest value.
         high: largest value.
-        fine: whether it stands alone; a product of two axes must do with fewer functions of each.
+        beside: the other quantity, where there are two: a product must do with fewer functions of each. Friction may
+            depend on an angle, but what depends on a rate and on something else is damping, which is smooth.
     """
     if variable in ANGLES:
-        return AngleAxis(variable, ANGLES[variable] if fine else min(ANGLES[variable], 4))
-    bend = _NEAR_STANDSTILL * max(abs(low), abs(high)) if variable in _RATES else None
-    return SplineAxis(variable, low=low, high=high, bend=bend, intervals=(17 if bend else 9) if fine else 5)
+        return AngleAxis(variable, ANGLES[variable] if beside is None else min(ANGLES[variable], 4))
+    turns = variable in _RATES and (beside is None or beside in ANGLES)
+    bend = _NEAR_STANDSTILL * max(abs(low), abs(high)) if turns else None
+    return SplineAxis(variable, low=low, high=high, bend=bend, intervals=5 if beside else 17 if turns else 9)
