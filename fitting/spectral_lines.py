@@ -1,0 +1,52 @@
+"""The strongest lines in what a fit leaves over: where to look for a frequency that no shaft turns at."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import median_filter
+from scipy.signal import find_peaks
+
+from fitting.estimate import Fit
+
+# A line stands out of the median of so many frequencies around it.
+_NEIGHBOURS = 41
+# By this factor in power at least: among 10,000 frequencies of noise the largest is about 10 times the mean.
+_STANDS_OUT = 15.0
+
+
+def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
+    """Frequencies [rad/s] of the strongest lines in the residual, strongest first.
+
+    The periodogram of the longest stretch's whitened residual (Hann window), summed over the outputs and divided by the
+    median of its surroundings, so that the colour of the noise and the drive's resonance do not pass for lines.
+
+    Args:
+        fit: a fit.
+        most: how many lines at most.
+    """
+    series = _longest(fit)
+    count = series.shape[0]
+    if count < 4 * _NEIGHBOURS:
+        return ()
+    window = np.hanning(count)[:, None]
+    # Twice the length: a frequency between two of the grid's is then no more than a quarter of a step away.
+    power = np.sum(np.abs(np.fft.rfft(series * window, n=2 * count, axis=0)) ** 2, axis=1)
+    around = median_filter(power, size=2 * _NEIGHBOURS, mode="nearest")
+    ratio = power / np.maximum(around, 1e-300)
+    # The lowest frequencies are drift, not lines: fewer than two periods in the log.
+    ratio[:4] = 0.0
+    peaks, _ = find_peaks(ratio, height=_STANDS_OUT, distance=8)
+    strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
+    step = float(np.median(np.diff(fit.stretches[0].experiment.time)))
+    return tuple((2.0 * np.pi * (strongest / (2 * count * step))).tolist())
+
+
+def _longest(fit: Fit) -> Float[np.ndarray, "samples outputs"]:
+    """The whitened residual along the longest stretch, its samples without weight zero."""
+    error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T
+    length = error.shape[1]
+    first, best = 0, (0, 0, 0)
+    for stretch in fit.stretches:
+        best = max(best, (len(stretch), first, first + -(-len(stretch) // length)))
+        first += -(-len(stretch) // length)
+    samples, start, stop = best
+    return error[start:stop].reshape(-1, error.shape[2])[:samples]

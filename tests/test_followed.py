@@ -1,0 +1,76 @@
+"""The linear response along a motion: against differences of simulations that know nothing of it."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import split
+from fitting.followed import Followed, follow, respond
+from fitting.free import base_paths, strength_paths
+from fitting.regressors import regressors
+from fitting.residual import simulate_segments
+from hdjax.effects import Effect
+from hdjax.effects.actuation import InputDelay, TorqueBias
+from hdjax.effects.damping import DisplacementDamping, QuadraticDamping
+from hdjax.effects.effect import Scales
+from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.load import GravityLoad
+from hdjax.effects.stiffness import QuadraticStiffness
+
+COUNT = 256
+SCALES = Scales(x=1e-3, x_max=3e-3, v=0.2, omega_m=5.0, omega_l=0.1, time_step=rig.STEP)
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    """Two segments, of which the second is joined to the first where the horizon says so."""
+    training, _ = split([rig.drive_experiment(COUNT)], held_out=0.02)
+    model = rig.drive_model()
+    return fit(model, training, base_paths(model), horizon=64, substeps=3, halo=4)
+
+
+@pytest.fixture(scope="module")
+def followed(found: Fit) -> Followed:
+    return follow(replace(found.problem, model=found.model), found.unknowns)
+
+
+def simulated(found: Fit, effect: Effect) -> np.ndarray:
+    """What the encoders read with the effect, by the program of the fit; its own states start at rest."""
+    model = found.model.with_effects(effect)
+    rest = jnp.broadcast_to(model.rest()[4:], (found.unknowns.states.shape[0], len(effect.states)))
+    unknowns = replace(found.unknowns, states=jnp.concatenate([found.unknowns.states, rest], axis=1))
+    outputs, _ = simulate_segments(replace(found.problem, model=model, substeps=12), unknowns)
+    return np.asarray(outputs)
+
+
+CASES = {
+    "bias": (TorqueBias(), {"bias": 1e-3}, 1e-3),
+    "quadratic stiffness": (QuadraticStiffness(), {"k2": 1e-3}, 2e-3),
+    "quadratic damping": (QuadraticDamping(), {"c2": 1e-4}, 5e-3),
+    "displacement damping": (DisplacementDamping(), {"c_x": 1.0}, 5e-3),
+    "kinematic error": (KinematicError(), {"cos_2": 1e-8}, 2e-3),
+    "gravity": (GravityLoad(), {"sine": 1e-3}, 1e-3),
+    # Beginning late, the torque makes a jump inside the interval; a line has its impulse and its first moment only.
+    "delay": (InputDelay.proposals(SCALES)[0], {"delay": 1e-7}, 2e-2),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Followed, case: str):
+    effect, strength, tolerance = CASES[case]
+    (name, size), *_ = strength.items()
+    start = float(getattr(effect, name))
+    both = [eqx.tree_at(lambda e: getattr(e, name), effect, jnp.asarray(start + sign * size)) for sign in (0.0, 1.0)]
+    slope = (simulated(found, both[1]) - simulated(found, both[0])) / size
+    forces = regressors(found.model, [effect], followed, found.problem.segments)
+    column = [p.split(".")[1] for p in strength_paths(effect)].index(name)
+    outputs, _ = respond(followed, forces.at_start, forces.at_end)
+    answer = np.asarray(outputs + forces.reading)[..., column]
+    real = np.asarray(found.problem.segments.weight)[:, :, None] > 0
+    off = np.where(real, answer - slope, 0.0)
+    assert np.abs(off).max() < tolerance * np.abs(np.where(real, slope, 0.0)).max()

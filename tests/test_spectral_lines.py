@@ -1,0 +1,31 @@
+"""Lines are found where they are, and none in noise."""
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import experiment_from_log, split
+from fitting.free import base_paths
+from fitting.spectral_lines import spectral_lines
+
+
+def found(forcing: np.ndarray, hidden: np.ndarray) -> Fit:
+    """The base model's fit of a reduced log under a forcing that is not all logged."""
+    motion = rig.reduced_motion(forcing + hidden)
+    experiment = experiment_from_log(rig.reduced_log(motion[:, 0], forcing, noise=1e-3), hold="zero-order")
+    model = rig.reduced_model()
+    return fit(model, split([experiment])[0], base_paths(model), horizon=128, substeps=2)
+
+
+@pytest.mark.parametrize("omega", [7.0, 62.0, 141.0])
+def test_a_hidden_line_is_found(omega: float):
+    time = np.arange(2000) * rig.REDUCED_STEP
+    lines = spectral_lines(found(rig.reduced_forcing(2000), 1.5 * np.sin(omega * time)))
+    resolution = 2 * np.pi / (1600 * rig.REDUCED_STEP)
+    assert lines[0] == pytest.approx(omega, abs=0.5 * resolution)
+
+
+def test_noise_has_no_lines():
+    forcing = rig.reduced_forcing(2000)
+    assert spectral_lines(found(forcing, np.zeros(2000))) == ()
