@@ -15,6 +15,7 @@ from scipy.linalg import eigh, null_space
 
 from fitting.attribution import LEAST_GAIN, SIGNIFICANCE, Data, Setting, Trial, attempt
 from fitting.base_fit import leaves_white_noise
+from fitting.estimate import Fit
 from fitting.linear_look import (
     Look,
     Products,
@@ -148,6 +149,8 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
                 best = candidate, trial
     if best is None:
         return None
+    if not leaves_white_noise(best[1].training):
+        best = _refined(best, before, data, setting, progress)
     chosen, trial = best
     gain = before.held_out.objective - trial.held_out.objective
     p_value = _p_value(sight, before, chosen, gain, seed)
@@ -157,6 +160,27 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
         for a in (sight.look.followed.states, sight.pushes[chosen.form.name])
     )
     return Unknown(before, trial, tuple(found), chosen, states, acting, gain, p_value)
+
+
+def _refined(
+    best: tuple[Candidate, Trial], before: Trial, data: Data, setting: Setting, progress: Callable[[str], None]
+) -> tuple[Candidate, Trial]:
+    """The same torque with as many coefficients as a second look calls for, along the motion that the first fit found:
+    the first look is but first order."""
+    first, trial = best
+    sight = _sight(trial.training, (first.form,))
+    acting = sight.pushes[first.form.name]
+    own = np.asarray(parameter_torques(sight.look, acting))
+    raw = _all_products([_evaluated(a, sight.values[a.variable]) for a in first.effect.axes])
+    again = _candidate(sight, first.form, first.variables, first.effect.axes, raw, own)
+    if again is None:
+        return best
+    progress("learning its shape more closely")
+    finer = _refitted(trial, again, data, setting)
+    if not _penalised(finer) < _penalised(trial):
+        return best
+    again = eqx.tree_at(lambda c: c.gain, again, first.gain)
+    return again, finer
 
 
 def is_supported(found: Unknown | None) -> bool:
@@ -193,10 +217,10 @@ def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> n
     return values - known @ np.linalg.lstsq(known, values, rcond=1e-10)[0]
 
 
-def _sight(fit) -> _Sight:
+def _sight(fit: Fit, places: Sequence[type[LearnedTorque]] = LEARNED) -> _Sight:
     look = look_along(fit)
     reduced = isinstance(look.model, ReducedModel)
-    forms = [f for f in LEARNED if not (f.needs_motor and reduced)]
+    forms = [f for f in places if not (f.needs_motor and reduced)]
     values = {n: np.asarray(getattr(look.motion, n)) for n in UNITS if getattr(look.motion, n) is not None}
     weight = np.asarray(look.problem.segments.weight)
     finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
@@ -273,7 +297,8 @@ def _candidate(
     """One place and choice of variables, with as many coefficients as parts of the data that were left out call for."""
     instants = _instants(sight)
     flat = raw.reshape(-1, raw.shape[2])[instants]
-    known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants])
+    parameters = own.shape[2] - _coefficients(sight.look.model, form)
+    known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants][:, :parameters])
     sizes = _SIZES[len(variables)]
     mixing = _smooth_first(flat, known, _roughness(axes))[:, : max(sizes)]
     if mixing.shape[1] == 0:
@@ -281,8 +306,7 @@ def _candidate(
     torques = raw @ mixing
     # One width, one program.
     padded = np.pad(torques, ((0, 0), (0, 0), (0, max(sizes) - torques.shape[2])))
-    found = products(sight.look, sight.pushes[form.name], padded)
-    parameters = own.shape[2]
+    found = _instead_of_own(products(sight.look, sight.pushes[form.name], padded), sight.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
     base = _left_out(found, parameters)
     for size in (s for s in sizes if s <= mixing.shape[1]):
@@ -295,6 +319,28 @@ def _candidate(
     step = best_step(_first(found, parameters + size))
     effect = form(axes=axes, mixing=mixing[:, :size], c=step[parameters:])
     return Candidate(form, variables, gain, effect, step[:parameters], known)
+
+
+def _coefficients(model: Model, form: type[LearnedTorque]) -> int:
+    """How many coefficients of a learned torque at this place a model has already; its last effect."""
+    return next((len(e.c) for e in model.effects if isinstance(e, form)), 0)
+
+
+def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Products:
+    """Products with what the model's learned torque explains put back into the residual, and its columns left out."""
+    if kept == free:
+        return found
+    own = np.zeros(found.gram.shape[-1])
+    own[kept:free] = np.asarray(look.problem.free.pack(look.model))[kept:free]
+    moved = found.gram @ own
+    against = found.gradient @ own
+    others = np.delete(np.arange(own.size), np.s_[kept:free])
+    return Products(
+        found.gram[..., others[:, None], others],
+        (found.gradient + moved)[..., others],
+        found.square + against + np.swapaxes(against, 1, 2) + moved @ own,
+        found.samples,
+    )
 
 
 def _instants(sight: _Sight) -> np.ndarray:
@@ -367,10 +413,11 @@ def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial:
-    free = before.training.free
-    change = np.where(free.logarithmic, np.clip(candidate.drive_step, -_LARGEST_CHANGE, _LARGEST_CHANGE), 0.0)
-    change = np.where(free.logarithmic, change, candidate.drive_step)
-    moved = free.unpack(before.model, free.pack(before.model) + change)
+    free, step = before.training.free, candidate.drive_step
+    # The coefficients of a learned torque that is there already come last.
+    change = np.pad(step, (0, len(free.paths) - step.size))
+    change = np.where(free.logarithmic, np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE), change)
+    moved = free.unpack(before.model, free.pack(before.model) + change).without_effect(candidate.form.name)
     return attempt(moved.with_effects(candidate.effect), data, before.hold, setting, start=before, contains_start=True)
 
 

@@ -111,7 +111,8 @@ def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unkn
     assert share_of(wrong, rubbing) < 0.3
 
 
-def test_a_function_of_two_variables_is_recovered():
+@pytest.mark.slow
+def test_a_function_of_two_variables_is_found():
     strength = 3e3
 
     def torque(x, v):
@@ -120,12 +121,20 @@ def test_a_function_of_two_variables_is_recovered():
     found = found_of(torque)
     assert is_supported(found)
     assert found.chosen.variables == ("x", "v")
+    before, after = (np.sqrt(float(t.held_out.covariance[0, 0])) for t in (found.before, found.trial))
+    assert before > 10 * NOISE
+    assert after < 1.3 * NOISE
     curve = curve_of(found)
-    error, inside = misfit(curve, torque(curve.at[:, 0], curve.at[:, 1]))
-    assert error < 0.2
-    assert inside > 0.8
+    # Along an oscillation functions of twist and rate trade off against each other, so that the sum is known better
+    # than the surface.
+    error, _ = misfit(curve, torque(curve.at[:, 0], curve.at[:, 1]))
+    assert error < 0.5
+    best = shapes(curve).closest[0]
+    assert best.expression.split(" ", 1)[1] == "x^2 v"
+    assert best.families == ("nonlinear_damping",)
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_from_noise():
     for seed in range(3):
         trial, data = base_trial(lambda x, v: 0.0, seed)
