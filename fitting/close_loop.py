@@ -16,9 +16,10 @@ from fitting.attribution import (
     Trial,
     attempt,
     halo_for,
+    is_worse,
     look,
 )
-from fitting.base_fit import base_fit
+from fitting.base_fit import base_fit, leaves_white_noise
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
@@ -30,6 +31,7 @@ from fitting.estimate import (
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
 from fitting.outliers import with_weights
+from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -69,6 +71,8 @@ class Loop(eqx.Module):
         findings: supported effects, largest gain first.
         rounds: every look at the catalogue.
         dropped: effects that a later one made superfluous.
+        doubted: effects that were found, but that a learned torque contradicts.
+        unknown: the learned torque, where the catalogue does not explain what is missing.
         noise: covariance of the measurement noise of the outputs.
         residual_before: diagnostics of what the base model leaves over.
         residual_after: likewise of the final model.
@@ -85,6 +89,8 @@ class Loop(eqx.Module):
     findings: tuple[Finding, ...]
     rounds: tuple[Round, ...]
     dropped: tuple[str, ...] = eqx.field(static=True)
+    doubted: tuple[str, ...] = eqx.field(static=True)
+    unknown: Unknown | None
     noise: Float[Array, "outputs outputs"]
     residual_before: ResidualDiagnostics
     residual_after: ResidualDiagnostics
@@ -133,13 +139,19 @@ def close_loop(
     progress("finding starting values")
     base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
-    current, rounds, dropped = _add_effects(
+    named, rounds, dropped = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
     )
     clock.lap("attribution")
+    trusted, unknown = _what_is_unknown(base, named, data, setting, seed=seed, progress=progress)
+    clock.lap("unknown effects")
+    noise = measurement_noise((named if unknown is None else unknown.trial).training)
+    decision = _decide(base, trusted, unknown, noise)
+    if decision == "effect_found":
+        unknown = None
+    current = trusted if unknown is None else unknown.trial
     progress("final fit over long horizons")
     training, validation = data[current.hold]
-    noise = measurement_noise(current.training)
     final = long_fit(current.training)
     clock.lap("final fit")
     progress("free runs on held-out data")
@@ -147,15 +159,19 @@ def close_loop(
     before = after
     if current is not base:
         before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
-    findings = _findings(base, current, rounds, data, setting, before, after, noise)
+    findings = _findings(base, trusted, current, rounds, data, setting, before, after, noise)
+    if unknown is not None:
+        findings = (*findings, _unknown_finding(unknown, trusted is base, data, setting, before, after, noise))
     clock.lap("free runs")
     return Loop(
-        decision=_decide(base, current, findings, noise),
+        decision=decision,
         before=before,
         after=after,
         findings=findings,
         rounds=rounds,
         dropped=dropped,
+        doubted=tuple(e.name for e in named.model.effects if trusted is not named),
+        unknown=unknown,
         noise=noise,
         residual_before=diagnose(base.training),
         residual_after=diagnose(current.training),
@@ -226,8 +242,44 @@ def _add_effects(
     return current, tuple(rounds), tuple(dropped)
 
 
+def _what_is_unknown(
+    base: Trial, named: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
+) -> tuple[Trial, Unknown | None]:
+    """The model whose names can be trusted, and the torque that is learned beside them.
+
+    A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data better,
+    and does not come out as the named effect.
+    """
+    if leaves_white_noise(named.training):
+        return named, None
+    beside = learn(named, data, setting, seed=seed, progress=progress)
+    if beside is None or not is_supported(beside):
+        return named, None
+    if named is base:
+        return base, beside
+    instead = learn(base, data, setting, seed=seed, progress=progress)
+    if instead is None or not is_supported(instead) or not is_worse(named, instead.trial):
+        return named, beside
+    if named.hold == base.hold and share_of(named.model, instead) >= _EXPLAINED:
+        return named, beside
+    return base, instead
+
+
+def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:
+    left = excess(trusted.held_out, noise)
+    if trusted is base:
+        return "model_sufficient" if unknown is None and np.max(left) < _EXCESS else "unexplained"
+    at_first = excess(base.held_out, noise)
+    explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
+    misfit = np.argmax(at_first)
+    if left[misfit] < _EXCESS or explained[misfit] >= _EXPLAINED:
+        return "effect_found"
+    return "unexplained"
+
+
 def _findings(
     base: Trial,
+    trusted: Trial,
     current: Trial,
     rounds: Sequence[Round],
     data: Data,
@@ -237,7 +289,7 @@ def _findings(
     noise: Float[Array, "outputs outputs"],
 ) -> tuple[Finding, ...]:
     """The accepted effects, each with what the held-out error would be without it."""
-    names = [e.name for e in current.model.effects]
+    names = [e.name for e in trusted.model.effects]
     changed_hold = current.hold != base.hold
     found = []
     for this in rounds:
@@ -245,7 +297,7 @@ def _findings(
         is_hold = winner.name.endswith(" hold")
         if not this.accepted or not (winner.name in names or (is_hold and changed_hold)):
             continue
-        if len(names) + changed_hold == 1:
+        if len(current.model.effects) + changed_hold == 1:
             without = before.validation_rmse
         elif is_hold:
             poorer = attempt(current.model, data, base.hold, setting, start=current)
@@ -260,15 +312,20 @@ def _findings(
     return tuple(sorted(found, key=lambda f: -f.validation_gain))
 
 
-def _decide(
-    base: Trial, current: Trial, findings: Sequence[Finding], noise: Float[Array, "outputs outputs"]
-) -> Decision:
-    left = excess(current.held_out, noise)
-    at_first = excess(base.held_out, noise)
-    if not findings:
-        return "model_sufficient" if np.max(left) < _EXCESS else "unexplained"
-    explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
-    misfit = np.argmax(at_first)
-    if left[misfit] < _EXCESS or explained[misfit] >= _EXPLAINED:
-        return "effect_found"
-    return "unexplained"
+def _unknown_finding(
+    unknown: Unknown,
+    alone: bool,
+    data: Data,
+    setting: Setting,
+    before: Account,
+    after: Account,
+    noise: Float[Array, "outputs outputs"],
+) -> Finding:
+    """The learned torque, with what the held-out error would be without it."""
+    name = unknown.chosen.form.name
+    poorer = unknown.before
+    without = before.validation_rmse
+    if not alone:
+        without = validation_rmse(poorer.training, *data[poorer.hold], noise=noise, halo=setting.halo)
+    effect = after.model.effect(name)
+    return Finding(effect, name, effect.family, 1.0 - after.validation_rmse / without, unknown.p_value)

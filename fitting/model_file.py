@@ -12,10 +12,13 @@ from jaxtyping import Array, Float
 
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
-from hdjax.effects import BY_NAME
-from hdjax.parameters import own_parameters
+from hdjax.effects import BY_NAME, Effect
+from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, SplineAxis
+from hdjax.parameters import own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
+
+_MOST_FUNCTIONS = 1000
 
 
 class StoredModel(eqx.Module):
@@ -43,7 +46,7 @@ def to_json(stored: StoredModel) -> str:
         "schema": SCHEMA,
         "kind": "two-inertia" if isinstance(model, TwoInertiaModel) else "reduced",
         "drive": _values(model.drive),
-        "effects": [{"name": e.name, "parameters": _values(e)} for e in model.effects],
+        "effects": [{"name": e.name, "parameters": _values(e)} | _learned_content(e) for e in model.effects],
         "torque_hold": stored.hold,
         "substeps": stored.substeps,
         "halo": stored.halo,
@@ -72,13 +75,51 @@ def read_model(path: str | Path) -> StoredModel:
 
 
 def _values(module: eqx.Module) -> dict[str, float]:
-    return {name: float(getattr(module, name)) for name, _ in own_parameters(module)}
+    return {name: float(own_value(module, name)) for name, _ in own_parameters(module)}
+
+
+def _learned_content(effect: Effect) -> dict[str, Any]:
+    """What a learned torque has beside its coefficients."""
+    if not isinstance(effect, LearnedTorque):
+        return {}
+    axes = [
+        {"variable": a.variable, "orders": a.orders}
+        if isinstance(a, AngleAxis)
+        else {
+            "variable": a.variable,
+            "low": float(a.low),
+            "high": float(a.high),
+            "bend": None if a.bend is None else float(a.bend),
+            "intervals": a.intervals,
+        }
+        for a in effect.axes
+        if isinstance(a, AngleAxis | SplineAxis)
+    ]
+    return {"axes": axes, "mixing": np.asarray(effect.mixing).tolist()}
+
+
+def _effect(content: Any) -> Effect:
+    learned = {form.name: form for form in LEARNED}
+    if content["name"] not in learned:
+        return BY_NAME[content["name"]](**content["parameters"])
+    axes: tuple[Axis, ...] = tuple(AngleAxis(**a) if "orders" in a else SplineAxis(**a) for a in content["axes"])
+    for axis in axes:
+        if axis.variable not in UNITS or axis.count > _MOST_FUNCTIONS:
+            raise ValueError(f"{axis.variable} with {axis.count} functions")
+        if isinstance(axis, SplineAxis) and not (axis.intervals >= 1 and axis.low < axis.high):
+            raise ValueError(f"{axis.variable} from {axis.low} to {axis.high}")
+    mixing = jnp.asarray(content["mixing"], dtype=float)
+    coefficients = [content["parameters"][f"c_{i}"] for i in range(len(content["parameters"]))]
+    wanted = (math.prod(a.count for a in axes), len(coefficients))
+    if mixing.shape != wanted or not bool(jnp.all(jnp.isfinite(mixing))):
+        raise ValueError(f"a mixing of shape {mixing.shape} where {wanted} was expected")
+    return learned[content["name"]](axes=axes, mixing=mixing, c=coefficients)
 
 
 def _stored(content: Any) -> StoredModel:
     if content["schema"] != SCHEMA:
         raise ValueError(f"schema {content['schema']!r} where {SCHEMA!r} was expected")
-    effects = tuple(BY_NAME[e["name"]](**e["parameters"]) for e in content["effects"])
+    effects = tuple(_effect(e) for e in content["effects"])
     if content["kind"] == "two-inertia":
         model: Model = TwoInertiaModel(Drive(**content["drive"]), effects)
     else:

@@ -22,7 +22,7 @@ from hdjax.effects import (
     MotorSideEffect,
     SensorEffect,
 )
-from hdjax.parameters import ParameterInfo, as_scalar, own_parameters
+from hdjax.parameters import ParameterInfo, as_scalar, own_parameters, own_value
 from hdjax.signals import PiecewisePolynomial
 
 State = Float[Array, " states"]
@@ -103,7 +103,7 @@ class Model(eqx.Module):
         """All parameters by dotted path: the drive's by their symbol, an effect's as `name.symbol`."""
         found = {name: (getattr(self.drive, name), i) for name, i in own_parameters(self.drive)}
         for e in self.effects:
-            found |= {f"{e.name}.{n}": (getattr(e, n), i) for n, i in own_parameters(e)}
+            found |= {f"{e.name}.{n}": (own_value(e, n), i) for n, i in own_parameters(e)}
         return found
 
     def get(self, path: str) -> Array:
@@ -115,7 +115,7 @@ class Model(eqx.Module):
         if "." not in path:
             return getattr(self.drive, path)
         name, field = path.split(".")
-        return getattr(self.effect(name), field)
+        return own_value(self.effect(name), field)
 
     def replace(self, values: Mapping[str, ArrayLike]) -> "Model":
         """The same model with other values at the given dotted paths."""

@@ -55,6 +55,10 @@ def as_scalar(value: Any) -> Array:
     return jnp.asarray(np.asarray(value) if isinstance(value, float | int) else value, dtype=float)
 
 
+def _as_scalars(values: Any) -> tuple[Array, ...]:
+    return tuple(as_scalar(value) for value in values)
+
+
 def parameter(
     default: float | None = None,
     *,
@@ -64,6 +68,7 @@ def parameter(
     bounds: tuple[float, float] = (-math.inf, math.inf),
     plausible: tuple[float, float] = (0.0, math.inf),
     role: Role = "base",
+    several: bool = False,
 ) -> Any:
     """Declare a field of an equinox module as a physical parameter.
 
@@ -74,14 +79,15 @@ def parameter(
         source: where the law or the magnitude comes from.
         bounds: open interval of sensible values; a lower bound of 0 makes the fitter work on its logarithm.
         role: see [`ParameterInfo`][].
+        several: whether the field holds any number of such parameters, which are then called `field_0`, `field_1`, ...
 
     Returns:
         A dataclass field.
     """
     info = ParameterInfo(unit=unit, doc=doc, source=source, bounds=bounds, plausible=plausible, role=role)
     options: dict[str, Any] = {
-        "converter": as_scalar,
-        "metadata": {"parameter": info},
+        "converter": _as_scalars if several else as_scalar,
+        "metadata": {"parameter": info, "several": several},
         "kw_only": True,
     }
     if default is not None:
@@ -90,8 +96,20 @@ def parameter(
 
 
 def own_parameters(module: eqx.Module) -> Iterator[tuple[str, ParameterInfo]]:
-    """The parameters that a module declares itself, as (field name, info)."""
+    """The parameters that a module declares itself, as (name, info)."""
     for field in dataclasses.fields(module):
         info = field.metadata.get("parameter")
-        if info is not None:
+        if info is None:
+            continue
+        if field.metadata["several"]:
+            yield from ((f"{field.name}_{i}", info) for i in range(len(getattr(module, field.name))))
+        else:
             yield field.name, info
+
+
+def own_value(module: eqx.Module, name: str) -> Any:
+    """The value of one of [`own_parameters`][]."""
+    if name in {field.name for field in dataclasses.fields(module)}:
+        return getattr(module, name)
+    stem, _, index = name.rpartition("_")
+    return getattr(module, stem)[int(index)]

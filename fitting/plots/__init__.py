@@ -2,5 +2,6 @@
 
 from fitting.plots.gallery import fit_plots as fit_plots
 from fitting.plots.gallery import plots as plots
+from fitting.plots.learned_torque import learned_torque as learned_torque
 from fitting.plots.long_trace import decimated as decimated
 from fitting.plots.plot import Plot as Plot

@@ -20,6 +20,7 @@ from fitting.report.parameters import account_dict, effect_dict, no_account
 from fitting.report.posterior import posterior_dict
 from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
+from fitting.report.unknown import unknown_dict
 
 SCHEMA = "hdjax-report/1"
 
@@ -66,6 +67,7 @@ def report_dict(
         "meaning": [],
         "dropped": list(outcome.dropped),
         "unexplained": unexplained(outcome, noise),
+        "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
         "hold": outcome.hold,
         "setting": _setting(outcome),

@@ -5,6 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.report.separating import plain_family
+from fitting.report.unknown import place_and_variables
 
 _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
 
@@ -15,7 +16,7 @@ def summary(report: Mapping[str, Any]) -> str:
     noise = report["noise"]["dynamic_error"]
     before = report["before"]["rmse"]["validation"]
     after = report["after"]["rmse"]["validation"]
-    families = list(dict.fromkeys(e["family"] for e in report["after"]["effects"]))
+    families = list(dict.fromkeys(e["family"] for e in report["after"]["effects"] if e["family"] != "unknown"))
     found = formatting.words([plain_family(f) for f in families]) if families else ""
     decision = report["decision"]
     if decision == "fit_only":
@@ -40,6 +41,13 @@ def summary(report: Mapping[str, Any]) -> str:
     opening = "Something is missing that the catalogue does not explain."
     if families:
         opening = f"A part was found ({found}), but something else is missing that the catalogue does not explain."
+    if report["unknown"]:
+        learned = report["unknown"]
+        words = place_and_variables(learned["place"], learned["variables"])
+        return (
+            f"{opening} A learned {words}, removes {_removed(before, after)} of the held-out error, which falls from "
+            f"{_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
+        )
     return (
         f"{opening} What is left over is {formatting.number(left['times_noise'])} times the measurement noise, and "
         f"depends most on the {left['depends_on']} (which accounts for "

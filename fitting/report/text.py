@@ -35,7 +35,10 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     for effect in report["after"]["effects"]:
         gain = formatting.percent(effect["validation_gain"])
         lines.append(f"[Effect: {effect['name']}] {effect['family']}, gain {gain}, {chance(effect, report)}")
-        lines += _parameter_lines(effect["parameters"])
+        if effect["family"] != "unknown":
+            lines += _parameter_lines(effect["parameters"])
+    if report["unknown"]:
+        lines += [f"[Learned torque: {report['unknown']['name']}]", f"    {report['unknown']['says']}"]
     for other in report["alternatives"]:
         kind = "ruled out" if other["separable"] else "TIE"
         lines.append(f"[Alternative: {other['name']}] {kind}. {other['separating_experiment']}")

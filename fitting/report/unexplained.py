@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from fitting.close_loop import Loop
-from fitting.diagnostics import Dependence
+from fitting.diagnostics import Dependence, diagnose
 from fitting.report.outcome import Outcome
 
 
@@ -13,7 +13,7 @@ def unexplained(outcome: Outcome, noise: float) -> dict[str, Any] | None:
     """How much is left over, and on what it depends most; None where that is not the decision."""
     if not isinstance(outcome, Loop) or outcome.decision != "unexplained":
         return None
-    residual = outcome.residual_after
+    residual = outcome.residual_after if outcome.unknown is None else diagnose(outcome.unknown.before.training)
     shares = {name: explained_share(d, residual.rms) for name, d in residual.dependence.items()}
     most = max(shares, key=lambda name: shares[name])
     words = {"x": "dynamic error", "v": "rate of the dynamic error"}

@@ -1,0 +1,104 @@
+"""A learned torque as a curve (or a surface) with standard errors, over the range that the data have."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitting.uncertainty import Uncertainty
+from fitting.unknown import Unknown
+from hdjax import Model
+from hdjax.effects import Motion
+from hdjax.effects.learned import ANGLES, LEARNED, LearnedTorque, functions
+
+PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load"), strict=True))
+"""Where each learned torque acts."""
+
+_POINTS = {1: 200, 2: 41}
+
+
+class LearnedCurve(eqx.Module):
+    """A learned torque.
+
+    Attributes:
+        place: "mesh", "motor" or "load".
+        variables: what it depends on.
+        at: variables at instants of the training data, by column; angles within one turn where the data have more.
+        torque: at those instants [N m].
+        std: its standard error.
+        known: what the drive's own parameters stand for at those instants: the torque is without it.
+        grid: evenly spaced values of each variable over the range of the data.
+        on_grid: the torque there, one axis for each variable.
+        std_on_grid: its standard error.
+    """
+
+    place: str = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
+    at: Float[np.ndarray, "instants variables"]
+    torque: Float[np.ndarray, " instants"]
+    std: Float[np.ndarray, " instants"]
+    known: Float[np.ndarray, "instants known"]
+    grid: tuple[Float[np.ndarray, " points"], ...]
+    on_grid: Float[np.ndarray, "..."]
+    std_on_grid: Float[np.ndarray, "..."]
+
+
+def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> LearnedCurve:
+    """The curve of a learned torque.
+
+    Args:
+        found: the learned torque and the motion that it was learned from.
+        model: with the final values.
+        uncertainty: of them.
+    """
+    name = found.chosen.form.name
+    effect = model.effect(name)
+    assert isinstance(effect, LearnedTorque)
+    covariance = _covariance(uncertainty, name)
+    values = np.stack([np.asarray(getattr(found.motion, v)) for v in found.chosen.variables], axis=1)
+    for column, variable in zip(values.T, found.chosen.variables, strict=True):
+        if variable in ANGLES and np.ptp(column) > 2 * np.pi:
+            column[:] = np.mod(column, 2 * np.pi)
+    points = _POINTS[values.shape[1]]
+    grid = tuple(np.linspace(*_range(column), points) for column in values.T)
+    mesh = np.stack([g.reshape(-1) for g in np.meshgrid(*grid, indexing="ij")], axis=1)
+    torque, std = _evaluated(effect, covariance, values)
+    on_grid, std_on_grid = (a.reshape([points] * len(grid)) for a in _evaluated(effect, covariance, mesh))
+    return LearnedCurve(
+        PLACES[name],
+        found.chosen.variables,
+        values,
+        torque,
+        std,
+        found.chosen.known,
+        grid,
+        on_grid,
+        std_on_grid,
+    )
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(values, [1e-3, 1.0 - 1e-3])
+    return float(low), float(high)
+
+
+def _covariance(uncertainty: Uncertainty, name: str) -> np.ndarray:
+    """Covariance of the learned torque's coefficients."""
+    paths = list(uncertainty.estimates)
+    own = [i for i, path in enumerate(paths) if path.startswith(f"{name}.")]
+    std = np.array([uncertainty.estimates[paths[i]].std for i in own])
+    return np.asarray(uncertainty.correlation)[np.ix_(own, own)] * np.outer(std, std)
+
+
+def _evaluated(effect: LearnedTorque, covariance: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Torque and standard error at rows of the variables."""
+    names = [axis.variable for axis in effect.axes]
+
+    def at(row):
+        zero = jnp.zeros(())
+        return functions(effect.axes, Motion(**({"x": zero, "v": zero} | dict(zip(names, row, strict=True)))))
+
+    basis = np.asarray(jax.vmap(at)(jnp.asarray(values))) @ np.asarray(effect.mixing)
+    variance = np.einsum("np,pq,nq->n", basis, covariance, basis)
+    return basis @ np.asarray(jnp.stack(effect.c)), np.sqrt(np.maximum(variance, 0.0))

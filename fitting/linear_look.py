@@ -1,0 +1,237 @@
+"""What torques along a fitted motion would explain of what a fit leaves over, to first order."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.arrow import project
+from fitting.estimate import Fit
+from fitting.followed import Followed, follow, respond
+from fitting.residual import Blocks, Problem, linearise
+from hdjax import Model
+from hdjax.effects import Motion
+from hdjax.effects.learned import LearnedTorque
+from hdjax.where import where
+
+# Passes of "least squares, then weigh the outputs by what is left over".
+_REWEIGHTINGS = 2
+
+
+class Look(eqx.Module):
+    """A fit, linearised along its motion.
+
+    Attributes:
+        problem: what was solved, at the solution.
+        blocks: its residual and derivatives.
+        followed: the motion and its answer to small forces.
+        motion: at each knot.
+        error: whitened output error.
+    """
+
+    problem: Problem
+    blocks: Blocks
+    followed: Followed
+    motion: Motion
+    error: Float[Array, "segments samples outputs"]
+
+    @property
+    def model(self) -> Model:
+        """The fitted model."""
+        return self.problem.model
+
+
+class Products(eqx.Module):
+    """Inner products of what torques would do to the outputs, for each segment and pair of outputs.
+
+    The free parameters' columns come first, then those of the torques; what each simulation's first state could do as
+    well is taken off.
+
+    Attributes:
+        gram: of the columns.
+        gradient: columns of one output against the residual of the other.
+        square: of the residual.
+        samples: number of samples with weight.
+    """
+
+    gram: Float[np.ndarray, "segments outputs outputs columns columns"]
+    gradient: Float[np.ndarray, "segments outputs outputs columns"]
+    square: Float[np.ndarray, "segments outputs outputs"]
+    samples: Float[np.ndarray, " segments"]
+
+    def of(self, which: np.ndarray) -> "Products":
+        """Those of some segments, added up."""
+        return Products(*(np.sum(a[which], axis=0, keepdims=True) for a in vars(self).values()))
+
+    def mixed(self, mixing: Float[np.ndarray, "columns fewer"]) -> "Products":
+        """Those of combinations of the columns."""
+        return Products(mixing.T @ self.gram @ mixing, self.gradient @ mixing, self.square, self.samples)
+
+
+def look_along(fit: Fit) -> Look:
+    """Linearise a fit along its motion."""
+    problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
+    followed = follow(problem, fit.unknowns)
+    return Look(
+        problem,
+        linearise(problem, fit.unknowns),
+        followed,
+        _motion(fit.model, followed.states),
+        jnp.asarray(fit.error) @ fit.problem.whitening.T,
+    )
+
+
+@eqx.filter_jit
+def _motion(model: Model, states: Float[Array, "segments knots states"]) -> Motion:
+    return jax.vmap(jax.vmap(model.motion))(states)
+
+
+def push(look: Look, form: type[LearnedTorque]) -> Float[Array, "segments knots states"]:
+    """What a unit of torque at the form's place adds to the state's rates, at each knot."""
+    probe = form(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,))
+    return _push(look.model.with_effects(probe), probe.name, look.followed.states)
+
+
+@eqx.filter_jit
+def _push(model: Model, name: str, states: Array) -> Array:
+    zero = jnp.zeros(())
+
+    def rates(strength: Array, state: Array) -> Array:
+        return model.replace({f"{name}.c_0": strength}).rates(state, zero, zero)
+
+    return jax.vmap(jax.vmap(lambda state: jax.jacfwd(rates)(zero, state)))(states)
+
+
+def parameter_torques(
+    look: Look, push: Float[Array, "segments knots states"]
+) -> Float[Array, "segments knots parameters"]:
+    """The free parameters as torques at one place: what torque there a unit of each stands for, at each knot.
+
+    Zero for a parameter that acts at another place.
+    """
+    return _parameter_torques(look.problem, look.followed.states, push)
+
+
+@eqx.filter_jit
+def _parameter_torques(problem: Problem, states: Array, push: Array) -> Array:
+    zero = jnp.zeros(())
+    vector = problem.free.pack(problem.model)
+
+    def rates(vector: Array, state: Array) -> Array:
+        return problem.free.unpack(problem.model, vector).rates(state, zero, zero)
+
+    found = jax.vmap(jax.vmap(lambda state: jax.jacfwd(rates)(vector, state)))(states)
+    square = jnp.sum(push**2, axis=-1)[..., None]
+    torque = jnp.einsum("skq,skqp->skp", push, found) / square
+    elsewhere = jnp.sum((found - push[..., None] * torque[:, :, None, :]) ** 2, axis=(0, 1, 2))
+    there = elsewhere < 1e-12 * jnp.sum(found**2, axis=(0, 1, 2))
+    return where(there, torque, 0.0)
+
+
+def products(
+    look: Look, push: Float[Array, "segments knots states"], torques: Float[np.ndarray, "segments knots columns"]
+) -> Products:
+    """What torques at one place would do to the outputs.
+
+    Args:
+        look: the fit.
+        push: the place, from [`push`][].
+        torques: at each knot; in a straight line between.
+    """
+    found = _products(look, push, jnp.asarray(torques))
+    return Products(*(np.asarray(a) for a in found))
+
+
+@eqx.filter_jit
+def _products(look: Look, push: Array, torques: Array) -> tuple[Array, Array, Array, Array]:
+    columns = _columns(look, push, torques)
+    error = look.error
+    gram = jnp.einsum("snip,snjq->sijpq", columns, columns)
+    gradient = jnp.einsum("snip,snj->sijp", columns, error)
+    return gram, gradient, jnp.einsum("sni,snj->sij", error, error), jnp.sum(look.problem.segments.weight, axis=1)
+
+
+def _columns(look: Look, push: Array, torques: Array) -> Float[Array, "segments samples outputs columns"]:
+    """The whitened outputs' derivative by the free parameters and by each torque."""
+    segments, found = look.problem.segments, look.blocks
+    forces = push[..., None] * torques[:, :, None, :]
+    moved, end = respond(look.followed, forces[:, :-1], forces[:, 1:])
+    white = jnp.einsum("ij,snjp->snip", look.problem.whitening, moved * segments.weight[:, :, None, None])
+    rows = -white.reshape(*found.residual.shape[:1], -1, white.shape[-1])
+    # The prior of the hidden states, behind the samples, does not know of torques.
+    rows = jnp.pad(rows, ((0, 0), (0, found.residual.shape[1] - rows.shape[1]), (0, 0)))
+    before = where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
+    both = eqx.tree_at(
+        lambda b: (b.by_parameter, b.before_by_parameter),
+        found,
+        (
+            jnp.concatenate([found.by_parameter, rows], axis=2),
+            jnp.concatenate([found.before_by_parameter, before], axis=2),
+        ),
+    )
+    # A residual is measured minus simulated.
+    projected = -project(both, segments.joined)[:, : white.shape[1] * white.shape[2]]
+    return projected.reshape(*white.shape[:3], -1)
+
+
+def surrogate_gains(
+    looks: tuple[Look, Look],
+    pushes: tuple[Array, Array],
+    torques: tuple[np.ndarray, np.ndarray],
+    surrogates: tuple[np.ndarray, np.ndarray],
+) -> Float[np.ndarray, " draws"]:
+    """What torques gain on unseen data where there is nothing to find.
+
+    Args:
+        looks: at the data that are fitted, and at unseen data.
+        pushes: the place, likewise.
+        torques: likewise.
+        surrogates: residuals of the same colour with random phases, by draw, segment and row.
+    """
+    (gram, gradient), (unseen_gram, unseen_gradient) = (
+        [np.asarray(a) for a in _against(look, p, jnp.asarray(t), jnp.asarray(s))]
+        for look, p, t, s in zip(looks, pushes, torques, surrogates, strict=True)
+    )
+    known = len(looks[0].problem.free.paths)
+    loss = []
+    for columns in (known, gram.shape[0]):
+        step = np.zeros_like(gradient)
+        step[:columns] = solved(gram[:columns, :columns], gradient[:columns])
+        loss.append(-2 * np.sum(step * unseen_gradient, axis=0) + np.sum(step * (unseen_gram @ step), axis=0))
+    rows = float(jnp.sum(looks[1].problem.segments.weight)) * looks[1].error.shape[2]
+    return (loss[0] - loss[1]) / (2 * rows)
+
+
+@eqx.filter_jit
+def _against(look: Look, push: Array, torques: Array, surrogates: Array) -> tuple[Array, Array]:
+    columns = _columns(look, push, torques)
+    rows = columns.reshape(columns.shape[0], -1, columns.shape[-1])
+    return jnp.einsum("srp,srq->pq", rows, rows), jnp.einsum("srp,dsr->pd", rows, surrogates)
+
+
+def best_step(found: Products) -> Float[np.ndarray, " columns"]:
+    """The step that leaves the smallest determinant of the outputs' error covariance: least squares that weigh the
+    outputs by what is left over."""
+    total = found if found.square.shape[0] == 1 else found.of(np.arange(found.square.shape[0]))
+    weight = np.eye(total.square.shape[1])
+    step = np.zeros(total.gram.shape[-1])
+    for _ in range(_REWEIGHTINGS):
+        step = solved(
+            np.einsum("ij,ijpq->pq", weight, total.gram[0]), np.einsum("ij,ijp->p", weight, total.gradient[0])[:, None]
+        )[:, 0]
+        weight = np.linalg.pinv(left_after(total, step) / total.samples[0], hermitian=True)
+    return step
+
+
+def left_after(found: Products, step: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "outputs outputs"]:
+    """Squares of the outputs' errors after a step, added up."""
+    against = np.sum(found.gradient, axis=0) @ step
+    return np.sum(found.square, axis=0) - against - against.T + np.sum(found.gram, axis=0) @ step @ step
+
+
+def solved(gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Least squares; directions without information do not move."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    return scale[:, None] * (inverse @ (scale[:, None] * gradient))

@@ -1,0 +1,216 @@
+"""An effect that no formula is known for: a torque that is some smooth function of one or two quantities.
+
+The function is linear in its coefficients, so that all coefficients at zero are the base model exactly.
+"""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.parameters import Scalar, as_scalar, parameter
+
+FAMILY = "unknown"
+SOURCE = "learned from data"
+
+
+class Axis(eqx.Module):
+    """Functions of one quantity of the motion.
+
+    Attributes:
+        variable: the quantity, a field of [`hdjax.effects.Motion`][].
+        count: how many functions there are.
+    """
+
+    variable: eqx.AbstractVar[str]
+
+    @property
+    @abc.abstractmethod
+    def count(self) -> int:
+        """How many functions there are."""
+
+    @abc.abstractmethod
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        """The functions at one value of the quantity."""
+
+
+class SplineAxis(Axis):
+    """Cubic B-splines on even knots; a straight line beyond the data.
+
+    Attributes:
+        variable: the quantity.
+        low: smallest value that the data have.
+        high: largest value.
+        bend: where given, the knots are even in `asinh(value / bend)`: dense near zero, where friction turns.
+        intervals: number of intervals between knots.
+    """
+
+    variable: str = eqx.field(static=True)
+    low: Scalar = eqx.field(converter=as_scalar)
+    high: Scalar = eqx.field(converter=as_scalar)
+    bend: Scalar | None = eqx.field(converter=lambda b: None if b is None else as_scalar(b), default=None)
+    intervals: int = eqx.field(static=True, default=9)
+
+    @property
+    def count(self) -> int:
+        return self.intervals + 3
+
+    def _stretched(self, value: Array) -> Array:
+        return value if self.bend is None else jnp.arcsinh(value / self.bend)
+
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        low, high = self._stretched(self.low), self._stretched(self.high)
+        place = (self._stretched(value) - low) / (high - low) * self.intervals
+        inside = jnp.clip(place, 0.0, self.intervals)
+        distance = inside - jnp.arange(-1.0, self.intervals + 2.0)
+        near, far = jnp.maximum(1.0 - jnp.abs(distance), 0.0), jnp.maximum(2.0 - jnp.abs(distance), 0.0)
+        slope = jnp.sign(distance) * (2.0 * near**2 - 0.5 * far**2)
+        return (far**3 - 4.0 * near**3) / 6.0 + (place - inside) * slope
+
+
+class AngleAxis(Axis):
+    """One, and cosine and sine of the whole orders of an angle.
+
+    Attributes:
+        variable: the angle.
+        orders: the highest order.
+    """
+
+    variable: str = eqx.field(static=True)
+    orders: int = eqx.field(static=True)
+
+    @property
+    def count(self) -> int:
+        return 1 + 2 * self.orders
+
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        cosine, sine = jnp.cos(value), jnp.sin(value)
+        turned = [jnp.ones_like(value), jnp.zeros_like(value)]
+        found = turned[:1]
+        for _ in range(self.orders):
+            # By rotation: a product is cheaper than a cosine.
+            turned = [turned[0] * cosine - turned[1] * sine, turned[0] * sine + turned[1] * cosine]
+            found += turned
+        return jnp.stack(found)
+
+
+def functions(axes: tuple[Axis, ...], motion: Motion) -> Float[Array, " functions"]:
+    """All products of one function of each axis, at one instant of a motion."""
+    found = jnp.ones(1)
+    for axis in axes:
+        value = getattr(motion, axis.variable)
+        assert value is not None, f"this motion has no {axis.variable}"
+        found = (found[:, None] * axis.functions(value)[None, :]).reshape(-1)
+    return found
+
+
+class LearnedMeshTorque(MeshTorqueEffect):
+    """Learned torque in the mesh.
+
+    Attributes:
+        axes: what it depends on.
+        mixing: which combination of the axes' functions each coefficient multiplies.
+        c: coefficients.
+    """
+
+    family: ClassVar[str] = FAMILY
+    name: ClassVar[str] = "learned_mesh_torque"
+
+    axes: tuple[Axis, ...]
+    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
+    c: tuple[Scalar, ...] = parameter(
+        unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        """None: what it may depend on is for the data to say."""
+        return ()
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return functions(self.axes, motion) @ (self.mixing @ jnp.stack(self.c))
+
+
+class LearnedMotorTorque(MotorSideEffect):
+    """Learned torque on the motor; attributes as in [`LearnedMeshTorque`][]."""
+
+    family: ClassVar[str] = FAMILY
+    name: ClassVar[str] = "learned_motor_torque"
+
+    axes: tuple[Axis, ...]
+    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
+    c: tuple[Scalar, ...] = parameter(
+        unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        """None: what it may depend on is for the data to say."""
+        return ()
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return functions(self.axes, motion) @ (self.mixing @ jnp.stack(self.c))
+
+
+class LearnedLoadTorque(LoadSideEffect):
+    """Learned torque on the load; attributes as in [`LearnedMeshTorque`][]."""
+
+    family: ClassVar[str] = FAMILY
+    name: ClassVar[str] = "learned_load_torque"
+
+    axes: tuple[Axis, ...]
+    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
+    c: tuple[Scalar, ...] = parameter(
+        unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        """None: what it may depend on is for the data to say."""
+        return ()
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return functions(self.axes, motion) @ (self.mixing @ jnp.stack(self.c))
+
+
+LearnedTorque = LearnedMeshTorque | LearnedMotorTorque | LearnedLoadTorque
+LEARNED: tuple[type[LearnedTorque], ...] = (LearnedMeshTorque, LearnedMotorTorque, LearnedLoadTorque)
+"""A learned torque at each place where it can enter."""
+
+UNITS = {
+    "x": "rad",
+    "v": "rad/s",
+    "theta_m": "rad",
+    "omega_m": "rad/s",
+    "theta_l": "rad",
+    "omega_l": "rad/s",
+}
+"""What a learned torque may depend on, with its unit."""
+
+ANGLES = {"theta_m": 6, "theta_l": 3}
+"""Those that are angles of a shaft, each with the highest order that it is given."""
+
+_RATES = ("v", "omega_m", "omega_l")
+# Share of the largest rate within which the knots are even.
+_NEAR_STANDSTILL = 0.005
+
+
+def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:
+    """The axis that suits a quantity which the data have between two values.
+
+    Args:
+        variable: the quantity.
+        low: smallest value.
+        high: largest value.
+        beside: the other quantity, where there are two: a product must do with fewer functions of each. Friction may
+            depend on an angle, but what depends on a rate and on something else is damping, which is smooth.
+    """
+    if variable in ANGLES:
+        return AngleAxis(variable, ANGLES[variable] if beside is None else min(ANGLES[variable], 4))
+    turns = variable in _RATES and (beside is None or beside in ANGLES)
+    bend = _NEAR_STANDSTILL * max(abs(low), abs(high)) if turns else None
+    return SplineAxis(variable, low=low, high=high, bend=bend, intervals=5 if beside else 17 if turns else 9)

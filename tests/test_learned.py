@@ -1,0 +1,174 @@
+"""The learned torque as an effect: what its functions are, at each place, and nothing at zero."""
+
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+import rig
+from fitting.errors import InputError
+from fitting.model_file import StoredModel, read_model, to_json
+from hdjax.effects import Effect, Motion, Scales
+from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.learned import (
+    ANGLES,
+    LEARNED,
+    UNITS,
+    AngleAxis,
+    Axis,
+    LearnedLoadTorque,
+    LearnedMeshTorque,
+    LearnedMotorTorque,
+    SplineAxis,
+    axis_over,
+    functions,
+)
+
+
+@eqx.filter_jit
+def rates(model, state):
+    return model.rates(state, jnp.zeros(()), jnp.zeros(()))
+
+
+@eqx.filter_jit
+def slopes(model, state):
+    return jax.jacfwd(lambda s: rates(model, s))(state)
+
+
+@eqx.filter_jit
+def evaluated(axis: Axis, values):
+    return jax.vmap(axis.functions)(values)
+
+
+def learned(form, *axes: Axis, c=None):
+    count = int(np.prod([a.count for a in axes])) if axes else 1
+    return form(axes=axes, mixing=jnp.eye(count), c=np.zeros(count) if c is None else c)
+
+
+def test_splines_are_those_of_scipy():
+    axis = SplineAxis("x", low=-2.0, high=3.0, intervals=5)
+    knots = np.arange(-5.0, 9.0)
+    inside = np.linspace(-2.0, 3.0, 41)
+    found = np.asarray(evaluated(axis, jnp.asarray(inside)))
+    wanted = BSpline.design_matrix(np.minimum(inside, 3.0 - 1e-12), knots, 3).toarray()[:, : axis.count]
+    np.testing.assert_allclose(found, wanted[:, : axis.count], atol=1e-9)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-12)
+
+
+def test_beyond_the_data_a_spline_goes_on_straight():
+    axis = SplineAxis("x", low=-1.0, high=1.0, intervals=4)
+    end, before, far = np.asarray(evaluated(axis, jnp.asarray([1.0, 1.0 - 1e-6, 4.0])))
+    # Of a slope from a step of 1e-6, over three units.
+    np.testing.assert_allclose(far, end + 3.0 * (end - before) / 1e-6, atol=1e-4)
+
+
+def test_rates_have_their_knots_near_zero():
+    axis = axis_over("omega_m", -30.0, 40.0)
+    assert isinstance(axis, SplineAxis) and axis.bend is not None
+    values = np.linspace(-30.0, 40.0, 4001)
+    basis = np.asarray(evaluated(axis, jnp.asarray(values)))
+    friction = np.tanh(values / 0.4)
+    left = friction - basis @ np.linalg.lstsq(basis, friction, rcond=None)[0]
+    assert np.sqrt(np.mean(left**2)) < 0.01
+
+
+def test_angles_are_periodic():
+    axis = axis_over("theta_m", 0.0, 100.0)
+    assert isinstance(axis, AngleAxis) and axis.orders == ANGLES["theta_m"]
+    found = axis.functions(jnp.asarray(0.7))
+    wanted = [1.0] + [f(n * 0.7) for n in range(1, axis.orders + 1) for f in (np.cos, np.sin)]
+    np.testing.assert_allclose(found, wanted, atol=1e-14)
+    np.testing.assert_allclose(found, axis.functions(jnp.asarray(0.7 - 4 * np.pi)), atol=1e-12)
+
+
+def test_two_variables_are_products():
+    one, other = axis_over("x", -1.0, 1.0, beside="theta_m"), axis_over("theta_m", 0.0, 1.0, beside="x")
+    motion = Motion(x=jnp.asarray(0.3), v=jnp.zeros(()), theta_m=jnp.asarray(2.0))
+    wanted = np.outer(one.functions(motion.x), other.functions(jnp.asarray(2.0))).reshape(-1)
+    np.testing.assert_array_equal(functions((one, other), motion), wanted)
+
+
+@pytest.mark.parametrize("form", LEARNED, ids=lambda form: form.name)
+def test_zero_coefficients_are_the_base_model(form: type[Effect]):
+    base = rig.drive_model()
+    whole = base.with_effects(learned(form, axis_over("omega_m", -10.0, 10.0), axis_over("x", -1e-3, 1e-3)))
+    # Beyond the data as well.
+    for state in (jnp.asarray([1.3, 0.025, 4.0, 0.05]), jnp.asarray([50.0, 0.9, -30.0, 0.5])):
+        found, wanted = (rates(m, state) for m in (whole, base))
+        np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("variable", list(UNITS))
+def test_gradients_agree_with_differences(variable: str):
+    state = jnp.asarray([1.3, 0.025, 4.0, 0.05])
+    axis = axis_over(variable, -0.7, 0.9)
+    effect = learned(LearnedMotorTorque, axis, c=0.1 * np.sin(np.arange(axis.count)))
+    model = rig.drive_model().with_effects(effect)
+    found = np.asarray(slopes(model, state))
+    step = 1e-6
+    ends = [[np.asarray(rates(model, state + s * step * e)) for s in (1, -1)] for e in jnp.eye(4)]
+    wanted = np.stack([(after - before) / (2 * step) for after, before in ends], axis=1)
+    # Central differences of a cubic: the third derivative times the step squared, and rounding.
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-4 * np.abs(wanted).max())
+
+
+def test_each_place_is_where_it_says():
+    state = jnp.asarray([1.3, 0.025, 4.0, 0.05])
+    base = rig.drive_model()
+    added = {f: rates(base.with_effects(learned(f, c=[2.0])), state) - rates(base, state) for f in LEARNED}
+    np.testing.assert_allclose(added[LearnedMotorTorque], [0, 0, 2.0 / rig.J_M, 0], rtol=1e-9)
+    np.testing.assert_allclose(added[LearnedLoadTorque], [0, 0, 0, 2.0 / rig.J_L], rtol=1e-9)
+    np.testing.assert_allclose(added[LearnedMeshTorque], [0, 0, -2.0 / rig.N / rig.J_M, 2.0 / rig.J_L], rtol=1e-9)
+
+
+def test_nothing_is_proposed_without_data():
+    scales = Scales(x=1.0, x_max=1.0, v=1.0, omega_m=1.0, omega_l=1.0, time_step=1.0)
+    assert all(form.proposals(scales) == () for form in LEARNED)
+
+
+def written() -> str:
+    axes = (axis_over("omega_m", -30.0, 1e2 / 3), axis_over("theta_l", 0.0, 1.0, beside="omega_m"))
+    count = axes[0].count * axes[1].count
+    mixing = np.random.default_rng(0).normal(size=(count, 3))
+    effect = LearnedMotorTorque(axes=axes, mixing=mixing, c=[1 / 3, -1e-5, 2.0])
+    model = rig.drive_model().with_effects(CoulombFriction(T_c=1.0, v_0=0.1), effect)
+    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+
+
+def read(text: str, folder: Path):
+    path = folder / "model.json"
+    path.write_text(text, encoding="utf-8")
+    return read_model(path)
+
+
+def test_round_trip(tmp_path: Path):
+    found = read(written(), tmp_path)
+    assert to_json(found) == written()
+    effect = found.model.effect("learned_motor_torque")
+    assert isinstance(effect, LearnedMotorTorque)
+    assert float(found.model.get("learned_motor_torque.c_1")) == -1e-5
+    assert np.isfinite(rates(found.model, jnp.asarray([1.0, 0.02, 3.0, 0.1]))).all()
+
+
+BROKEN = {
+    "no axes": lambda e: e.pop("axes"),
+    "unknown variable": lambda e: e["axes"][0].update(variable="colour"),
+    "empty range": lambda e: e["axes"][0].update(high=-40.0),
+    "too many functions": lambda e: e["axes"][1].update(orders=10**9),
+    "other shape": lambda e: e["mixing"].pop(),
+    "not finite": lambda e: e["mixing"][0].__setitem__(0, float("nan")),
+    "a coefficient less": lambda e: e["parameters"].pop("c_1"),
+}
+
+
+@pytest.mark.parametrize("change", BROKEN.values(), ids=BROKEN.keys())
+def test_broken_files(change, tmp_path: Path):
+    content = json.loads(written())
+    change(content["effects"][1])
+    with pytest.raises(InputError, match=r"give the model\.json of a report"):
+        read(json.dumps(content), tmp_path)

@@ -1,0 +1,184 @@
+"""A learned torque finds what was hidden: the right place and variables, the function itself within its band."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.attribution import Setting, Trial, attempt
+from fitting.close_loop import Loop, close_loop
+from fitting.experiment import experiment_from_log, split
+from fitting.free_run import free_run
+from fitting.learned_curve import LearnedCurve, learned_curve
+from fitting.model_file import StoredModel, read_model, to_json
+from fitting.report import report_dict, write_report
+from fitting.shapes import shapes
+from fitting.uncertainty import uncertainty
+from fitting.unknown import Unknown, is_supported, learn, share_of
+from hdjax import Model
+from hdjax.effects.damping import QuadraticDamping
+from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.stiffness import QuadraticStiffness
+
+COUNT, STEP = 1600, 4e-3
+NOISE = 1e-3
+FRICTION = (10.0, 0.3)
+SETTING = Setting(horizon=128, halo=4, substeps=2, count=16)
+TRUTH = rig.reduced_model()
+
+
+def hidden_motion(forcing: np.ndarray, torque) -> np.ndarray:
+    """Twist of the reduced rig with a torque of twist and rate that no model knows of."""
+
+    def rates(y, u):
+        x, v = y
+        spring = rig.OMEGA_0**2 * (x + rig.REDUCED_ALPHA * x**3)
+        return v, rig.GAIN * u - rig.MU * v - spring - torque(x, v)
+
+    return rig.rk4(rates, (0.0, 0.0), forcing, STEP, 10)[:, 0]
+
+
+def silent(message: str) -> None:
+    pass
+
+
+def base_trial(torque, seed: int = 0) -> tuple[Trial, dict]:
+    """The base model's fit of a motion with a hidden torque, from the truth of everything else."""
+    forcing = rig.reduced_forcing(COUNT, seed=seed)
+    log = rig.reduced_log(hidden_motion(forcing, torque), forcing, noise=NOISE, seed=seed)
+    data = {"zero-order": split([experiment_from_log(log, hold="zero-order")])}
+    return attempt(TRUTH, data, "zero-order", SETTING), data
+
+
+def found_of(torque) -> Unknown:
+    trial, data = base_trial(torque)
+    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    assert found is not None
+    return found
+
+
+def curve_of(found: Unknown) -> LearnedCurve:
+    return learned_curve(found, found.trial.model, uncertainty(found.trial.training))
+
+
+def misfit(curve: LearnedCurve, wanted: np.ndarray) -> tuple[float, float]:
+    """Rms difference from the truth, both without what the drive's own parameters can do, over the truth's rms; and
+    the share of the data at which the truth is inside the 95 % band."""
+    left = wanted - curve.known @ np.linalg.lstsq(curve.known, wanted, rcond=None)[0]
+    difference = curve.torque - left
+    inside = np.mean(np.abs(difference) < 1.96 * curve.std + 0.02 * np.std(left))
+    return float(np.sqrt(np.mean(difference**2) / np.mean(left**2))), float(inside)
+
+
+@pytest.fixture(scope="module")
+def rubbing() -> Unknown:
+    return found_of(lambda x, v: FRICTION[0] * math.tanh(v / FRICTION[1]))
+
+
+def test_a_function_of_one_variable_is_recovered(rubbing: Unknown):
+    assert is_supported(rubbing)
+    assert rubbing.chosen.variables == ("v",)
+    curve = curve_of(rubbing)
+    assert (curve.place, curve.known.shape[1]) == ("mesh", 1)
+    error, inside = misfit(curve, FRICTION[0] * np.tanh(curve.at[:, 0] / FRICTION[1]))
+    assert error < 0.15
+    assert inside > 0.8
+
+
+def test_unseen_data_are_explained_down_to_the_noise(rubbing: Unknown):
+    before, after = (np.sqrt(float(t.held_out.covariance[0, 0])) for t in (rubbing.before, rubbing.trial))
+    assert before > 2 * NOISE
+    assert after < 1.2 * NOISE
+    assert rubbing.gain == pytest.approx(np.log(before / after), rel=1e-3)
+
+
+def test_the_shape_is_named(rubbing: Unknown):
+    found = shapes(curve_of(rubbing))
+    best = found.closest[0]
+    assert best.expression.split(" ", 1)[1] == "sgn(v)"
+    assert best.families == ("coulomb_friction",)
+    assert best.explained > 0.95
+    assert [s.explained for s in found.closest] == sorted((s.explained for s in found.closest), reverse=True)
+
+
+def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unknown):
+    right = TRUTH.with_effects(CoulombFriction(T_c=8.0, v_0=FRICTION[1]))
+    wrong = TRUTH.with_effects(QuadraticStiffness(k2=1.0))
+    assert share_of(right, rubbing) > 0.95
+    assert share_of(wrong, rubbing) < 0.3
+
+
+@pytest.mark.slow
+def test_a_function_of_two_variables_is_found():
+    strength = 3e3
+
+    def torque(x, v):
+        return strength * x * x * v
+
+    found = found_of(torque)
+    assert is_supported(found)
+    assert found.chosen.variables == ("x", "v")
+    before, after = (np.sqrt(float(t.held_out.covariance[0, 0])) for t in (found.before, found.trial))
+    assert before > 10 * NOISE
+    assert after < 1.3 * NOISE
+    curve = curve_of(found)
+    # Along an oscillation functions of twist and rate trade off against each other, so that the sum is known better
+    # than the surface.
+    error, _ = misfit(curve, torque(curve.at[:, 0], curve.at[:, 1]))
+    assert error < 0.5
+    best = shapes(curve).closest[0]
+    assert best.expression.split(" ", 1)[1] == "x^2 v"
+    assert best.families == ("nonlinear_damping",)
+
+
+@pytest.mark.slow
+def test_nothing_is_learned_from_noise():
+    for seed in range(3):
+        trial, data = base_trial(lambda x, v: 0.0, seed)
+        assert not is_supported(learn(trial, data, SETTING, seed=seed, progress=silent))
+
+
+@pytest.fixture(scope="module")
+def loop() -> Loop:
+    """A loop whose catalogue lacks the family of what is hidden."""
+    experiment = rig.reduced_experiment(COUNT, noise=NOISE, friction=FRICTION)
+    catalogue = (QuadraticStiffness, QuadraticDamping)
+    placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
+    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=catalogue, hold="zero-order", max_effects=1)
+
+
+def test_what_the_catalogue_lacks_is_unexplained(loop: Loop):
+    assert loop.decision == "unexplained"
+    assert [f.family for f in loop.findings] == ["unknown"]
+    assert loop.unknown is not None and "v" in loop.unknown.chosen.variables
+    assert loop.after.validation_rmse < 2 * NOISE < loop.before.validation_rmse
+    assert loop.findings[0].p_value <= 0.01
+    assert float(loop.after.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=1e-3)
+
+
+def test_the_report_tells_it(loop: Loop, tmp_path: Path):
+    stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
+    units = {"dynamic_error": "V", "forcing": "<b>V</b>"}
+    paths = write_report(tmp_path, loop, model_json=to_json(stored), units=units)
+    report = json.loads(paths["report.json"].read_text())
+    told = report["unknown"]
+    assert told["family"] == "unknown" and told["place"] == "mesh" and "v" in told["variables"]
+    assert told["rmse"]["before"] > 2 * told["rmse"]["after"]
+    assert told["shapes"][0]["r_squared"] <= 1.0
+    assert [e["family"] for e in report["after"]["effects"]] == ["unknown"]
+    assert "does not explain" in report["summary"] and "twist rate" in report["summary"]
+    page = paths["report.html"].read_text()
+    assert "What the learned torque looks like" in page and 'id="learned-torque"' in page
+    assert "<b>V</b>" not in page
+    # What was written predicts what the loop predicted.
+    read = read_model(paths["model.json"])
+    options = {"covariance": loop.noise, "halo": loop.setting.halo, "substeps": loop.after_substeps}
+    (run,) = free_run(read.model, loop.stretches[1], **options)
+    assert run.rmse == pytest.approx(loop.after.validation_rmse, rel=0.05)
+
+
+def test_a_report_without_one_says_so(loop: Loop):
+    assert report_dict(Loop(**(vars(loop) | {"unknown": None, "findings": ()})))["unknown"] is None
