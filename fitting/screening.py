@@ -149,11 +149,11 @@ def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[
     segments: Segments = _on_host(problem.segments)
     whitening = _on_host(problem.whitening)
     residual = _on_host(fit.error) @ whitening.T
-    surrogates = jnp.asarray(_surrogates(fit, seed))
+    drawn = jnp.asarray(surrogates(fit, seed))
     rows = float(np.sum(segments.weight)) * residual.shape[-1]
     already = slopes.size
     for own, forces in _batches(fit.model, proposals, followed, segments):
-        products = _inner_products(found, followed, segments, whitening, forces, residual, surrogates)
+        products = _inner_products(found, followed, segments, whitening, forces, residual, drawn)
         gram, gradient, against = (np.asarray(a) for a in products)
         yield (
             {i: [already + c for c in columns] for i, columns in own.items()},
@@ -232,7 +232,7 @@ def _inner_products(
     )
 
 
-def _surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
+def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour."""
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0

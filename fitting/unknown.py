@@ -27,7 +27,7 @@ from fitting.linear_look import (
     push,
     surrogate_gains,
 )
-from fitting.screening import _surrogates as surrogates
+from fitting.screening import surrogates
 from hdjax import Model, ReducedModel
 from hdjax.effects import Motion
 from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
