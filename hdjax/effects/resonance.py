@@ -46,7 +46,8 @@ class ExtraResonance(LoadSideEffect):
 
     @classmethod
     def _at(cls, omega_3: float, scales: Scales, mass_ratio: float = 0.0) -> "ExtraResonance":
-        rate = scales.x * scales.natural_frequency
+        # Near its own resonance it swings far more than the drive twists.
+        rate = 10.0 * scales.x * scales.natural_frequency
         return cls(mass_ratio=mass_ratio, omega_3=omega_3, twist_span=rate / omega_3, rate_span=rate)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
