@@ -184,10 +184,11 @@ class TwoInertiaModel(Model):
         on_motor = torque - transmission * tau
         for effect in self._of(MotorSideEffect):
             on_motor = on_motor + effect.torque(motion, drive, own[effect.name])
-        on_load = tau + load_torque
+        on_load, load_inertia = tau + load_torque, drive.J_l
         for effect in self._of(LoadSideEffect):
             on_load = on_load + effect.torque(motion, drive, own[effect.name])
-        rates = [state[2], state[3], on_motor / drive.J_m, on_load / drive.J_l]
+            load_inertia = load_inertia - effect.inertia_taken(drive)
+        rates = [state[2], state[3], on_motor / drive.J_m, on_load / load_inertia]
         return self._with_own_rates(motion, rates, own)
 
     def outputs(self, state: State) -> Float[Array, "2"]:

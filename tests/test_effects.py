@@ -240,7 +240,7 @@ def energy(model: TwoInertiaModel, states) -> np.ndarray:
         total = total + value["share"] * K * (x - own[0]) ** 2 / 2
     if "extra_resonance" in names:
         J_3 = value["mass_ratio"] * value["J_l"]
-        total = total + J_3 * (value["omega_3"] ** 2 * own[0] ** 2 + own[1] ** 2) / 2
+        total = total + J_3 * (value["omega_3"] ** 2 * own[0] ** 2 + own[1] ** 2 - omega_l**2) / 2
     return total
 
 

@@ -39,10 +39,10 @@ def three_masses(J_3: float, K_3: float, B_3: float) -> tuple[np.ndarray, np.nda
     stiffness[1:, 1:] += K_3 * pair
     damping[:2, :2] += B * pair
     damping[1:, 1:] += B_3 * pair
-    return np.diag([N**2 * J_M, J_L, J_3]), damping, stiffness
+    return np.diag([N**2 * J_M, J_L - J_3, J_3]), damping, stiffness
 
 
-@given(ratio=st.floats(1e-3, 2.0), omega=st.floats(50.0, 3000.0), zeta=st.floats(1e-3, 0.5))
+@given(ratio=st.floats(1e-3, 0.8), omega=st.floats(50.0, 3000.0), zeta=st.floats(1e-3, 0.5))
 def test_poles_and_transfer_function_of_three_masses(ratio, omega, zeta):
     J_3 = ratio * J_L
     K_3, B_3 = J_3 * omega**2, 2 * zeta * omega * J_3

@@ -4,6 +4,7 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
@@ -155,6 +156,10 @@ class LoadSideEffect(Effect):
     @abc.abstractmethod
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         """Torque on the load, along +theta_l [N m]."""
+
+    def inertia_taken(self, drive: Drive) -> Array:
+        """Inertia that is not on the load, although the drive's J_l counts it [kg m^2]."""
+        return jnp.zeros_like(drive.J_l)
 
 
 class MeshTorqueEffect(Effect):
