@@ -30,7 +30,7 @@ from fitting.linear_look import (
 from fitting.screening import _surrogates as surrogates
 from hdjax import Model, ReducedModel
 from hdjax.effects import Motion
-from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
+from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over, combined
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -98,10 +98,12 @@ class Unknown(eqx.Module):
         """The motion at the instants."""
         return jax.vmap(self.before.model.motion)(jnp.asarray(self.states))
 
-    def torque(self, effect: LearnedTorque) -> Float[np.ndarray, " instants"]:
-        """A learned torque at the instants."""
-        torque = jax.vmap(lambda m: effect.torque(m, self.before.model.drive, jnp.zeros(0)))(self.motion)
-        return np.asarray(torque)
+    @property
+    def torque(self) -> Float[np.ndarray, " instants"]:
+        """The learned torque at the instants."""
+        effect = self.trial.model.effect(self.chosen.form.name)
+        assert isinstance(effect, LearnedTorque)
+        return np.asarray(jax.vmap(lambda m: combined(effect.axes, effect.mixing, effect.c, m))(self.motion))
 
 
 class _Sight(eqx.Module):
@@ -207,8 +209,7 @@ def share_of(named: Model, found: Unknown) -> float:
 
     rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states)))
     theirs = np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
-    learned = found.torque(found.trial.model.effect(found.chosen.form.name))
-    theirs, learned = (without(a, found.chosen.known) for a in (theirs, learned))
+    theirs, learned = (without(a, found.chosen.known) for a in (theirs, found.torque))
     return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))
 
 
@@ -317,7 +318,7 @@ def _candidate(
         return None
     gain, size = best
     step = best_step(_first(found, parameters + size))
-    effect = form(axes=axes, mixing=mixing[:, :size], c=step[parameters:])
+    effect = form(axes=axes, mixing=mixing[:, :size], c=tuple(step[parameters:]))
     return Candidate(form, variables, gain, effect, step[:parameters], known)
 
 
