@@ -143,7 +143,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
         if best is not None and leaves_white_noise(best[1].training):
             break
         for candidate in _rivals([c for c in found if (len(c.variables) > 1) == several]):
-            if best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE * several:
+            if several and best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE:
                 break
             progress(f"learning a torque of {' and '.join(candidate.variables)}")
             trial = _refitted(before, candidate, data, setting)
@@ -152,7 +152,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     if best is None:
         return None
     if not leaves_white_noise(best[1].training):
-        best = _refined(best, before, data, setting, progress)
+        best = _refined(best, data, setting, progress)
     chosen, trial = best
     gain = before.held_out.objective - trial.held_out.objective
     p_value = _p_value(sight, before, chosen, gain, seed)
@@ -165,7 +165,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
 
 
 def _refined(
-    best: tuple[Candidate, Trial], before: Trial, data: Data, setting: Setting, progress: Callable[[str], None]
+    best: tuple[Candidate, Trial], data: Data, setting: Setting, progress: Callable[[str], None]
 ) -> tuple[Candidate, Trial]:
     """The same torque with as many coefficients as a second look calls for, along the motion that the first fit found:
     the first look is but first order."""
