@@ -295,17 +295,15 @@ def _with_separability(verdicts: list[Verdict]) -> list[Verdict]:
     best = verdicts[0].trial if verdicts else None
     if best is None:
         return verdicts
+    reference = _segment_squares(best.held_out, best.held_out)
     marked = []
     for verdict in verdicts:
-        separable = verdict.trial is None or is_worse(verdict.trial, best)
+        separable = True
+        if verdict.trial is not None:
+            difference = _segment_squares(verdict.trial.held_out, best.held_out) - reference
+            separable = bool(np.any(difference)) and _p_worse(difference) < 0.05
         marked.append(eqx.tree_at(lambda v: v.separable, verdict, separable))
     return marked
-
-
-def is_worse(trial: Trial, other: Trial) -> bool:
-    """Whether held-out data tell a model from a better one (5 %)."""
-    difference = _segment_squares(trial.held_out, other.held_out) - _segment_squares(other.held_out, other.held_out)
-    return bool(np.any(difference)) and _p_worse(difference) < 0.05
 
 
 def _p_worse(difference: np.ndarray) -> float:

@@ -16,7 +16,6 @@ from fitting.attribution import (
     Trial,
     attempt,
     halo_for,
-    is_worse,
     look,
 )
 from fitting.base_fit import base_fit, leaves_white_noise
@@ -258,7 +257,9 @@ def _what_is_unknown(
     if named is base:
         return base, beside
     instead = learn(base, data, setting, seed=seed, progress=progress)
-    if instead is None or not is_supported(instead) or not is_worse(named, instead.trial):
+    if instead is None or not is_supported(instead):
+        return named, beside
+    if named.held_out.objective <= instead.trial.held_out.objective:
         return named, beside
     if named.hold == base.hold and share_of(named.model, instead) >= _EXPLAINED:
         return named, beside

@@ -109,7 +109,7 @@ def _effect(content: Any) -> Effect:
         if isinstance(axis, SplineAxis) and not (axis.intervals >= 1 and axis.low < axis.high):
             raise ValueError(f"{axis.variable} from {axis.low} to {axis.high}")
     mixing = jnp.asarray(content["mixing"], dtype=float)
-    coefficients = [content["parameters"][f"c_{i}"] for i in range(len(content["parameters"]))]
+    coefficients = tuple(content["parameters"][f"c_{i}"] for i in range(len(content["parameters"])))
     wanted = (math.prod(a.count for a in axes), len(coefficients))
     if mixing.shape != wanted or not bool(jnp.all(jnp.isfinite(mixing))):
         raise ValueError(f"a mixing of shape {mixing.shape} where {wanted} was expected")

@@ -30,7 +30,7 @@ from fitting.linear_look import (
 from fitting.screening import surrogates
 from hdjax import Model, ReducedModel
 from hdjax.effects import Motion
-from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over
+from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over, combined
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -98,10 +98,12 @@ class Unknown(eqx.Module):
         """The motion at the instants."""
         return jax.vmap(self.before.model.motion)(jnp.asarray(self.states))
 
-    def torque(self, effect: LearnedTorque) -> Float[np.ndarray, " instants"]:
-        """A learned torque at the instants."""
-        torque = jax.vmap(lambda m: effect.torque(m, self.before.model.drive, jnp.zeros(0)))(self.motion)
-        return np.asarray(torque)
+    @property
+    def torque(self) -> Float[np.ndarray, " instants"]:
+        """The learned torque at the instants."""
+        effect = self.trial.model.effect(self.chosen.form.name)
+        assert isinstance(effect, LearnedTorque)
+        return np.asarray(jax.vmap(lambda m: combined(effect.axes, effect.mixing, effect.c, m))(self.motion))
 
 
 class _Sight(eqx.Module):
@@ -141,7 +143,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
         if best is not None and leaves_white_noise(best[1].training):
             break
         for candidate in _rivals([c for c in found if (len(c.variables) > 1) == several]):
-            if best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE * several:
+            if several and best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE:
                 break
             progress(f"learning a torque of {' and '.join(candidate.variables)}")
             trial = _refitted(before, candidate, data, setting)
@@ -150,7 +152,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     if best is None:
         return None
     if not leaves_white_noise(best[1].training):
-        best = _refined(best, before, data, setting, progress)
+        best = _refined(best, data, setting, progress)
     chosen, trial = best
     gain = before.held_out.objective - trial.held_out.objective
     p_value = _p_value(sight, before, chosen, gain, seed)
@@ -163,7 +165,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
 
 
 def _refined(
-    best: tuple[Candidate, Trial], before: Trial, data: Data, setting: Setting, progress: Callable[[str], None]
+    best: tuple[Candidate, Trial], data: Data, setting: Setting, progress: Callable[[str], None]
 ) -> tuple[Candidate, Trial]:
     """The same torque with as many coefficients as a second look calls for, along the motion that the first fit found:
     the first look is but first order."""
@@ -207,8 +209,7 @@ def share_of(named: Model, found: Unknown) -> float:
 
     rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states)))
     theirs = np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
-    learned = found.torque(found.trial.model.effect(found.chosen.form.name))
-    theirs, learned = (without(a, found.chosen.known) for a in (theirs, learned))
+    theirs, learned = (without(a, found.chosen.known) for a in (theirs, found.torque))
     return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))
 
 
@@ -317,7 +318,7 @@ def _candidate(
         return None
     gain, size = best
     step = best_step(_first(found, parameters + size))
-    effect = form(axes=axes, mixing=mixing[:, :size], c=step[parameters:])
+    effect = form(axes=axes, mixing=mixing[:, :size], c=tuple(step[parameters:]))
     return Candidate(form, variables, gain, effect, step[:parameters], known)
 
 

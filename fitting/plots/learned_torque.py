@@ -56,7 +56,7 @@ def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
         "yaxis2": {"range": [0, 4], "visible": False, "side": "right"},
         "bargap": 0,
     }
-    traces = [density, band, line_trace(at, torque, name="learned", color=AFTER, width=2)]
+    traces = [density, band, line_trace(at, torque, name="learned", color=AFTER, width=2.0)]
     return _plot(curve, figure(traces, 360, **layout))
 
 

@@ -56,7 +56,9 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     """What these data can't tell, a sentence each."""
     final = report["after"] if report["after"]["parameters"] else report["before"]
     found = report["identifiability"]
-    parts = [final, *report["after"]["effects"]]
+    # A learned torque's coefficients mean nothing one by one.
+    learned = tuple(f"{e['name']}." for e in report["after"]["effects"] if e["family"] == "unknown")
+    parts = [final, *(e for e in report["after"]["effects"] if e["family"] != "unknown")]
     told = [e.get("note") for part in parts for e in part["parameters"].values()]
     notes = [n for n in (*told, *(d["sentence"] for d in found["directions"])) if n]
     notes += [h["sentence"] for h in found["held"]]
@@ -66,7 +68,8 @@ def limits(report: Mapping[str, Any]) -> list[str]:
                 f"A tie: {other['name']} ({plain_family(other['family'])}) explains the held-out data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
-    return notes + _correlated(final["correlations"])
+    own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
+    return notes + _correlated(own)
 
 
 def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:

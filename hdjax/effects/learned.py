@@ -108,6 +108,11 @@ def functions(axes: tuple[Axis, ...], motion: Motion) -> Float[Array, " function
     return found
 
 
+def combined(axes: tuple[Axis, ...], mixing: Array, c: tuple[Array, ...], motion: Motion) -> Array:
+    """The function of the axes that coefficients stand for, at one instant of a motion."""
+    return functions(axes, motion) @ (mixing @ jnp.stack(c))
+
+
 class LearnedMeshTorque(MeshTorqueEffect):
     """Learned torque in the mesh.
 
@@ -132,7 +137,7 @@ class LearnedMeshTorque(MeshTorqueEffect):
         return ()
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
-        return functions(self.axes, motion) @ (self.mixing @ jnp.stack(self.c))
+        return combined(self.axes, self.mixing, self.c, motion)
 
 
 class LearnedMotorTorque(MotorSideEffect):
@@ -153,7 +158,7 @@ class LearnedMotorTorque(MotorSideEffect):
         return ()
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return functions(self.axes, motion) @ (self.mixing @ jnp.stack(self.c))
+        return combined(self.axes, self.mixing, self.c, motion)
 
 
 class LearnedLoadTorque(LoadSideEffect):
@@ -174,7 +179,7 @@ class LearnedLoadTorque(LoadSideEffect):
         return ()
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return functions(self.axes, motion) @ (self.mixing @ jnp.stack(self.c))
+        return combined(self.axes, self.mixing, self.c, motion)
 
 
 LearnedTorque = LearnedMeshTorque | LearnedMotorTorque | LearnedLoadTorque
