@@ -1,0 +1,273 @@
+"""Cases: a drive, its encoders, three experiments and what is hidden, all from a seed and the case's name."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from undeclared.detection import detectability
+from undeclared.equations import integrate
+from undeclared.excitation import STANDING, TURNING, Excitation, excitation
+from undeclared.hidden import FAMILIES, Form, forms_of
+from undeclared.mechanism import Mechanism, altered, read_encoders
+from undeclared.noise import Encoders, draw_encoders
+
+LEAST = 2.0
+"""Least strength of a hidden effect, in units of its detection limit."""
+
+LOGS = ("train_1", "train_2", "heldout")
+# Longest solver step [s]: the dry friction is resolved to a few percent of the noise, as the tests check.
+FINEST = 5e-6
+_ATTEMPTS = 12
+# What depends on an angle needs a motor that turns; whoever looks for it would turn it.
+_OF_ANGLE = {
+    "kinematic_error",
+    "cogging",
+    "encoder_eccentricity",
+    "gravity_load",
+    "position_dependent_friction",
+    "position_dependent_stiffness",
+}
+# Sampling rate [Hz] and samples of the three logs.
+_SIZES = ((1000.0, (10000, 10000, 8000)), (2000.0, (16000, 12000, 12000)), (4000.0, (20000, 16000, 16000)))
+
+
+@dataclass(frozen=True)
+class Case:
+    """What to draw.
+
+    Attributes:
+        name: of the case; with the seed it fixes everything.
+        forms: what is hidden; nothing in a clean case.
+        seed: of the study.
+    """
+
+    name: str
+    forms: tuple[Form, ...]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """One experiment as it went.
+
+    Attributes:
+        excitation: what was commanded.
+        states: true ones, (samples, states).
+        readings: of noiseless encoders, (samples, 2).
+        torque: commanded motor torque, as logged.
+        warm: kelvin above the reference.
+    """
+
+    excitation: Excitation
+    states: np.ndarray
+    readings: np.ndarray
+    torque: np.ndarray
+    warm: np.ndarray
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A case that was drawn and run.
+
+    Attributes:
+        case: what was asked for.
+        base: the drive without what is hidden.
+        true: with it.
+        changes: the hidden parameters, by field.
+        strengths: of the forms, in their own units.
+        detectable: strength of each in units of its detection limit.
+        encoders: their noise.
+        runs: the three experiments.
+        dt: sampling interval [s].
+        substeps: solver steps in each.
+    """
+
+    case: Case
+    base: Mechanism
+    true: Mechanism
+    changes: dict
+    strengths: tuple[float, ...]
+    detectable: tuple[float, ...]
+    encoders: Encoders
+    runs: tuple[Run, ...]
+    dt: float
+    substeps: int
+
+
+def single_cases(count: int, seed: int, families: Sequence[str]) -> list[Case]:
+    """Cases with one effect each: the families in turn, and the forms of each in turn."""
+    cases = []
+    for i in range(count):
+        family, turn = families[i % len(families)], i // len(families)
+        forms = forms_of(family)
+        cases.append(Case(f"{family}-{turn}", (forms[turn % len(forms)],), seed))
+    return cases
+
+
+def clean_cases(count: int, seed: int) -> list[Case]:
+    """Cases with nothing hidden; the noise is white in even ones and coloured in odd ones."""
+    return [Case(f"clean_{'coloured' if i % 2 else 'white'}-{i // 2}", (), seed) for i in range(count)]
+
+
+def pair_cases(count: int, seed: int, families: Sequence[str] = FAMILIES) -> list[Case]:
+    """Cases with two effects of different families."""
+    cases = []
+    usual = [f for f in families if f != "unknown"]
+    if count and len(usual) < 2:
+        raise ValueError("pairs need two families at least; name more with --kinds")
+    for i in range(count):
+        random = _random(seed, f"pair-{i}")
+        first, second = random.choice(len(usual), size=2, replace=False)
+        forms = tuple(forms_of(usual[j]) for j in (first, second))
+        cases.append(Case(f"pair-{i}", tuple(f[random.integers(len(f))] for f in forms), seed))
+    return cases
+
+
+def draw(case: Case) -> Drawn:
+    """Draw and run a case until each of its effects is at least LEAST detection limits strong.
+
+    Raises:
+        RuntimeError: where no experiment shows the effect at a plausible strength.
+    """
+    for attempt in range(_ATTEMPTS):
+        drawn = _attempt(case, _random(case.seed, case.name, attempt))
+        if drawn is not None:
+            return drawn
+    raise RuntimeError(f"{case.name}: no experiment of {_ATTEMPTS} shows {[f.name for f in case.forms]}")
+
+
+def _random(seed: int, name: str, attempt: int = 0) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(name.encode()), attempt])
+
+
+def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
+    dt, counts = _size(random)
+    base = _base(random, dt)
+    encoders = draw_encoders(random, colour=random.uniform() < 0.3 if case.forms else "coloured" in case.name)
+    heats = any(form.heats for form in case.forms) or random.uniform() < 0.15
+    turning = TURNING[:2] if any(form.family in _OF_ANGLE for form in case.forms) else TURNING
+    bench = _Bench(base, encoders, dt, int(np.ceil(dt / FINEST)), _excitations(random, base, counts, dt, turning), heats)
+    warm = bench.temperatures(random)
+    changes, strengths, detectable = {}, [], []
+    for form in case.forms:
+        shape = int(random.integers(2**31))
+        strength = form.low * (form.high / form.low) ** random.uniform()
+        while True:
+            alone = form.changes(strength, np.random.default_rng(shape), base)
+            seen = bench.detectability(alone, warm)
+            if seen >= LEAST or strength >= form.high:
+                break
+            strength = min(1.5 * strength, form.high)
+        # Whatever leaves the numbers is no experiment.
+        if not LEAST <= seen < np.inf:
+            return None
+        changes |= alone
+        strengths.append(strength)
+        detectable.append(seen)
+    true = bench.mechanism(changes)
+    runs = tuple(bench.run(true, i, warm) for i in range(len(LOGS)))
+    if not all(_plausible(run, base) for run in runs):
+        return None
+    return Drawn(
+        case, base, true, changes, tuple(strengths), tuple(detectable), encoders, runs, dt, bench.substeps
+    )
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """The bench on which drives of one case run."""
+
+    base: Mechanism
+    encoders: Encoders
+    dt: float
+    substeps: int
+    excitations: tuple[Excitation, ...]
+    heats: bool
+
+    def mechanism(self, changes: dict) -> Mechanism:
+        """The base with hidden changes; a dead time becomes solver steps."""
+        known = {name: value for name, value in changes.items() if name != "dead_time"}
+        if "dead_time" in changes:
+            known["dead_steps"] = round(changes["dead_time"] / self.dt * self.substeps)
+        return altered(self.base, known)
+
+    def run(self, mechanism: Mechanism, index: int, warm: Sequence[np.ndarray]) -> Run:
+        """One of the experiments on one mechanism."""
+        commanded = self.excitations[index]
+        angle, rate = commanded.start
+        states, torque = integrate(
+            mechanism,
+            np.array([angle, rate, angle / mechanism.ratio, rate / mechanism.ratio]),
+            commanded.shaking,
+            dt=self.dt,
+            substeps=self.substeps,
+            follow=commanded.follow,
+            pull=commanded.pull,
+            brake=commanded.brake,
+            warm=warm[index],
+        )
+        return Run(commanded, states, np.column_stack(read_encoders(mechanism, states)), torque, warm[index])
+
+    def detectability(self, changes: dict, warm: Sequence[np.ndarray]) -> float:
+        """Of changes alone, in the two logs that the loop is given."""
+        runs = [self.run(self.mechanism(changes), i, warm) for i in range(2)]
+        if not all(np.isfinite(run.states).all() for run in runs):
+            return np.inf
+        logs = [(run.states, run.readings, run.torque, run.excitation.brake) for run in runs]
+        return detectability(self.base, logs, sigma=self.encoders.rms, dt=self.dt)
+
+    def temperatures(self, random: np.random.Generator) -> list[np.ndarray]:
+        """Kelvin above the reference in each log: where it starts, and an exponential drift; zero where nothing heats."""
+        found = []
+        for commanded in self.excitations:
+            share = np.linspace(0, 1, commanded.shaking.size)
+            start, drift, pace = random.uniform(-5, 15), random.uniform(-8, 12), random.uniform(0.2, 1.0)
+            found.append(self.heats * (start + drift * (1 - np.exp(-share / pace))))
+        return found
+
+
+def _size(random: np.random.Generator) -> tuple[float, tuple[int, ...]]:
+    rate, counts = _SIZES[random.choice(len(_SIZES), p=[0.25, 0.5, 0.25])]
+    return 1 / rate, counts
+
+
+def _base(random: np.random.Generator, dt: float) -> Mechanism:
+    """A drive: stiffness of sizes 14 to 25, a natural frequency that the sampling resolves, light damping."""
+
+    def between(low: float, high: float) -> float:
+        return float(np.exp(random.uniform(np.log(low), np.log(high))))
+
+    k1, ratio = between(4e3, 2.2e4), float(random.choice([50, 50, 80, 100, 120]))
+    omega_0 = 2 * np.pi * between(35.0, min(80.0, 1 / (14 * dt)))
+    share, zeta = between(4.0, 30.0), between(0.005, 0.03)
+    load_inertia = (1 + share) / share * k1 / omega_0**2
+    return Mechanism(
+        ratio=ratio,
+        motor_inertia=share * load_inertia / ratio**2,
+        load_inertia=load_inertia,
+        k1=k1,
+        k3=k1 * between(1e3, 1.5e4),
+        c1=2 * zeta * k1 / omega_0,
+    )
+
+
+def _excitations(
+    random: np.random.Generator, base: Mechanism, counts: Sequence[int], dt: float, turning: Sequence[str]
+) -> tuple[Excitation, ...]:
+    """One log in which the motor stays about where it is, one in which it turns or the load is braked, and one of either
+    kind."""
+    kinds = [str(random.choice(STANDING)), str(random.choice(turning))]
+    kinds.append(str(random.choice(kinds)))
+    found = []
+    for kind, count in zip(kinds, counts, strict=True):
+        twist = float(np.exp(random.uniform(np.log(3e-4), np.log(1e-3))))
+        found.append(excitation(kind, random, base, twist=twist, count=count, dt=dt))
+    return tuple(found)
+
+
+def _plausible(run: Run, base: Mechanism) -> bool:
+    """Whether the drive stayed in one piece: finite, and with less than ten milliradians of twist."""
+    twist = run.states[:, 0] / base.ratio - run.states[:, 2]
+    return bool(np.isfinite(run.states).all() and np.abs(twist).max() < 1e-2)
