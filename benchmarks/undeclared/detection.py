@@ -1,13 +1,13 @@
 """When is an effect there to be found at all? The benchmark's definition of the detection limit.
 
-The logs are cut into segments of six natural periods, as a fit would. Each is simulated without the effect from its true state
-under the torque that was commanded; what then differs in the two encoders' readings, less what other base parameters (K,
-K alpha, B_sp, one set for all logs) and other initial states (for each segment) would absorb to first order, is the effect's
-trace. Its norm in units of the encoders' noise, sqrt(sum (trace / sigma)^2), is the distance d between "with" and "without" that
-the best possible test has. Of it the held-out fifth of the data sees d sqrt(0.2).
+The logs are cut into segments of six natural periods, as a fit would. Each is simulated without the effect from its
+true state under the torque that was commanded. What then differs in the two encoders' readings, less what other base
+parameters (K, K alpha, B_sp, one set for all logs) and other initial states (for each segment) would absorb to first
+order, is the effect's trace. Its norm in units of the encoders' noise, sqrt(sum (trace / sigma)^2), is the distance d
+between "with" and "without" that the best possible test has. Of it the held-out fifth of the data sees d sqrt(0.2).
 
-At the limit that is 5.5: 3.9 for an error of the first kind of 1e-4 (one percent over about a hundred forms and shapes) and 1.6
-for finding it in 95 of 100 cases. Coloured noise enters by its rms.
+At the limit that is 5.5: 3.9 for an error of the first kind of 1e-4 (one percent over about a hundred forms and shapes)
+and 1.6 for finding it in 95 of 100 cases. Coloured noise enters by its rms.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,9 @@ def detectability(
         variants = _variants(base, states[starts, :4])
         runs = [_segments(p, y, torque[window], brake[window], dt, substeps) for p, y, _ in variants]
         difference = _white(readings[window] - runs[0], sigma)
-        slopes = [_white((run - runs[0]) / size, sigma) for run, (_, _, size) in zip(runs[1:], variants[1:], strict=True)]
+        slopes = [
+            _white((run - runs[0]) / size, sigma) for run, (_, _, size) in zip(runs[1:], variants[1:], strict=True)
+        ]
         global_, local = np.stack(slopes[:3], axis=-1), np.linalg.qr(np.stack(slopes[3:], axis=-1)).Q
         both = np.concatenate([global_, difference[..., None]], axis=-1)
         both = both - local @ (np.swapaxes(local, 1, 2) @ both)

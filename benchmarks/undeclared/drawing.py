@@ -16,10 +16,16 @@ from undeclared.noise import Encoders, draw_encoders
 LEAST = 2.0
 """Least strength of a hidden effect, in units of its detection limit."""
 
+FAINT = 20.0
+"""A faint effect is drawn between LEAST and this."""
+
 LOGS = ("train_1", "train_2", "heldout")
 # Longest solver step [s]: the dry friction is resolved to a few percent of the noise, as the tests check.
 FINEST = 5e-6
 _ATTEMPTS = 12
+_FAINT_SHARE = 0.25
+# A log whose twist stays this far below what was meant is one of a drive that is stuck.
+_STUCK = 0.3
 # What depends on an angle needs a motor that turns; whoever looks for it would turn it.
 _OF_ANGLE = {
     "kinematic_error",
@@ -41,11 +47,13 @@ class Case:
         name: of the case; with the seed it fixes everything.
         forms: what is hidden; nothing in a clean case.
         seed: of the study.
+        faint: whether what is hidden is drawn near its detection limit instead of from its usual range.
     """
 
     name: str
     forms: tuple[Form, ...]
     seed: int
+    faint: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,12 +105,13 @@ class Drawn:
 
 
 def single_cases(count: int, seed: int, families: Sequence[str]) -> list[Case]:
-    """Cases with one effect each: the families in turn, and the forms of each in turn."""
+    """Cases with one effect each: the families in turn, and the forms of each in turn; a quarter of them faint."""
     cases = []
     for i in range(count):
         family, turn = families[i % len(families)], i // len(families)
         forms = forms_of(family)
-        cases.append(Case(f"{family}-{turn}", (forms[turn % len(forms)],), seed))
+        faint = bool(stream(seed, f"{family}-{turn}/faint").uniform() < _FAINT_SHARE)
+        cases.append(Case(f"{family}-{turn}", (forms[turn % len(forms)],), seed, faint))
     return cases
 
 
@@ -118,7 +127,7 @@ def pair_cases(count: int, seed: int, families: Sequence[str] = FAMILIES) -> lis
     if count and len(usual) < 2:
         raise ValueError("pairs need two families at least; name more with --kinds")
     for i in range(count):
-        random = _random(seed, f"pair-{i}")
+        random = stream(seed, f"pair-{i}")
         first, second = random.choice(len(usual), size=2, replace=False)
         forms = tuple(forms_of(usual[j]) for j in (first, second))
         cases.append(Case(f"pair-{i}", tuple(f[random.integers(len(f))] for f in forms), seed))
@@ -132,13 +141,14 @@ def draw(case: Case) -> Drawn:
         RuntimeError: where no experiment shows the effect at a plausible strength.
     """
     for attempt in range(_ATTEMPTS):
-        drawn = _attempt(case, _random(case.seed, case.name, attempt))
+        drawn = _attempt(case, stream(case.seed, case.name, attempt))
         if drawn is not None:
             return drawn
     raise RuntimeError(f"{case.name}: no experiment of {_ATTEMPTS} shows {[f.name for f in case.forms]}")
 
 
-def _random(seed: int, name: str, attempt: int = 0) -> np.random.Generator:
+def stream(seed: int, name: str, attempt: int = 0) -> np.random.Generator:
+    """Random numbers of one purpose of a study."""
     return np.random.default_rng([seed, zlib.crc32(name.encode()), attempt])
 
 
@@ -148,18 +158,15 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
     encoders = draw_encoders(random, colour=random.uniform() < 0.3 if case.forms else "coloured" in case.name)
     heats = any(form.heats for form in case.forms) or random.uniform() < 0.15
     turning = TURNING[:2] if any(form.family in _OF_ANGLE for form in case.forms) else TURNING
-    bench = _Bench(base, encoders, dt, int(np.ceil(dt / FINEST)), _excitations(random, base, counts, dt, turning), heats)
+    bench = _Bench(
+        base, encoders, dt, int(np.ceil(dt / FINEST)), _excitations(random, base, counts, dt, turning), heats
+    )
     warm = bench.temperatures(random)
     changes, strengths, detectable = {}, [], []
     for form in case.forms:
         shape = int(random.integers(2**31))
-        strength = form.low * (form.high / form.low) ** random.uniform()
-        while True:
-            alone = form.changes(strength, np.random.default_rng(shape), base)
-            seen = bench.detectability(alone, warm)
-            if seen >= LEAST or strength >= form.high:
-                break
-            strength = min(1.5 * strength, form.high)
+        aim = _between(random, LEAST, FAINT) if case.faint else None
+        strength, alone, seen = _strength(form, shape, _between(random, form.low, form.high), aim, bench, warm)
         # Whatever leaves the numbers is no experiment.
         if not LEAST <= seen < np.inf:
             return None
@@ -170,9 +177,29 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
     runs = tuple(bench.run(true, i, warm) for i in range(len(LOGS)))
     if not all(_plausible(run, base) for run in runs):
         return None
-    return Drawn(
-        case, base, true, changes, tuple(strengths), tuple(detectable), encoders, runs, dt, bench.substeps
-    )
+    return Drawn(case, base, true, changes, tuple(strengths), tuple(detectable), encoders, runs, dt, bench.substeps)
+
+
+def _strength(
+    form: Form, shape: int, strength: float, aim: float | None, bench: "_Bench", warm: Sequence[np.ndarray]
+) -> tuple[float, dict, float]:
+    """A strength that can be found, the changes that it makes, and how detectable they are.
+
+    It is the one drawn, or more where that is too little, or the one that is as faint as aimed at.
+    """
+    for _ in range(_ATTEMPTS):
+        alone = form.changes(strength, np.random.default_rng(shape), bench.base)
+        seen = bench.detectability(alone, warm)
+        if not np.isfinite(seen):
+            break
+        if aim is not None and form.low < form.high and not 0.7 < seen / aim < 1.4:
+            # Most effects leave a trace in proportion to their strength; those that do not are met after a few rounds.
+            strength *= np.clip(aim / max(seen, 1e-3), 1e-4, 1e2)
+            continue
+        if aim is not None or seen >= LEAST or strength >= form.high:
+            break
+        strength = min(1.5 * strength, form.high)
+    return strength, alone, seen
 
 
 @dataclass(frozen=True)
@@ -219,7 +246,7 @@ class _Bench:
         return detectability(self.base, logs, sigma=self.encoders.rms, dt=self.dt)
 
     def temperatures(self, random: np.random.Generator) -> list[np.ndarray]:
-        """Kelvin above the reference in each log: where it starts, and an exponential drift; zero where nothing heats."""
+        """Kelvin above the reference in each log: a start and an exponential drift; zero where nothing heats."""
         found = []
         for commanded in self.excitations:
             share = np.linspace(0, 1, commanded.shaking.size)
@@ -236,19 +263,16 @@ def _size(random: np.random.Generator) -> tuple[float, tuple[int, ...]]:
 def _base(random: np.random.Generator, dt: float) -> Mechanism:
     """A drive: stiffness of sizes 14 to 25, a natural frequency that the sampling resolves, light damping."""
 
-    def between(low: float, high: float) -> float:
-        return float(np.exp(random.uniform(np.log(low), np.log(high))))
-
-    k1, ratio = between(4e3, 2.2e4), float(random.choice([50, 50, 80, 100, 120]))
-    omega_0 = 2 * np.pi * between(35.0, min(80.0, 1 / (14 * dt)))
-    share, zeta = between(4.0, 30.0), between(0.005, 0.03)
+    k1, ratio = _between(random, 4e3, 2.2e4), float(random.choice([50, 50, 80, 100, 120]))
+    omega_0 = 2 * np.pi * _between(random, 35.0, min(80.0, 1 / (14 * dt)))
+    share, zeta = _between(random, 4.0, 30.0), _between(random, 0.005, 0.03)
     load_inertia = (1 + share) / share * k1 / omega_0**2
     return Mechanism(
         ratio=ratio,
         motor_inertia=share * load_inertia / ratio**2,
         load_inertia=load_inertia,
         k1=k1,
-        k3=k1 * between(1e3, 1.5e4),
+        k3=k1 * _between(random, 1e3, 1.5e4),
         c1=2 * zeta * k1 / omega_0,
     )
 
@@ -256,18 +280,24 @@ def _base(random: np.random.Generator, dt: float) -> Mechanism:
 def _excitations(
     random: np.random.Generator, base: Mechanism, counts: Sequence[int], dt: float, turning: Sequence[str]
 ) -> tuple[Excitation, ...]:
-    """One log in which the motor stays about where it is, one in which it turns or the load is braked, and one of either
-    kind."""
+    """A log at about one angle, one in which the motor turns or the load is braked, and one of either kind."""
     kinds = [str(random.choice(STANDING)), str(random.choice(turning))]
     kinds.append(str(random.choice(kinds)))
     found = []
     for kind, count in zip(kinds, counts, strict=True):
-        twist = float(np.exp(random.uniform(np.log(3e-4), np.log(1e-3))))
+        twist = _between(random, 3e-4, 1e-3)
         found.append(excitation(kind, random, base, twist=twist, count=count, dt=dt))
     return tuple(found)
 
 
 def _plausible(run: Run, base: Mechanism) -> bool:
-    """Whether the drive stayed in one piece: finite, and with less than ten milliradians of twist."""
+    """Whether the drive stayed in one piece (finite, with less than ten milliradians of twist) and was not stuck."""
     twist = run.states[:, 0] / base.ratio - run.states[:, 2]
-    return bool(np.isfinite(run.states).all() and np.abs(twist).max() < 1e-2)
+    if not (np.isfinite(run.states).all() and np.abs(twist).max() < 1e-2):
+        return False
+    return bool(np.std(twist) > _STUCK * run.excitation.twist)
+
+
+def _between(random: np.random.Generator, low: float, high: float) -> float:
+    """Log-uniform."""
+    return float(np.exp(random.uniform(np.log(low), np.log(high))))

@@ -1,8 +1,8 @@
 """The rig's equations of motion in numba, with true signs, gaps and stops, in fixed fine steps.
 
-Dry friction on motor and load is a true sign with stiction: a side at rest stays there as long as what pulls it is below the
-holding torque; one whose rate changes sign within a step is arrested at its end and judged anew. Slipping springs stop
-at their limits. Nothing is located in time: the steps are fine enough.
+Dry friction on motor and load is a true sign with stiction: a side at rest stays there while what pulls it is below the
+holding torque; one whose rate changes sign within a step is arrested at its end and judged anew. Slipping springs
+stop at their limits. Nothing is located in time: the steps are fine enough.
 """
 
 import math
@@ -52,7 +52,7 @@ def _spring(x, p):
 
 @numba.njit(cache=True, error_model="numpy")
 def _mesh(x, v, phi, y, warm, p, out):
-    """Torque between the sides and what its change over the motor angle does to the motor; rates of its memory to `out`."""
+    """Torque between the sides, and what its change with the motor angle does to the motor; its memory's rates."""
     torque = _spring(x, p)
     if p.warm_k != 0.0:
         torque *= 1.0 + p.warm_k * warm
@@ -153,7 +153,7 @@ def _pulls(t, y, u, brake, warm, p, out):
 
 @numba.njit(cache=True, error_model="numpy")
 def rates(t, y, u, brake, warm, side_m, side_l, p, out):
-    """Rates of all states while motor and load slide to their sides (1, -1), rest (0) or are free of dry friction (2)."""
+    """Rates of all states while motor and load slide to their sides (1, -1), rest (0) or have no dry friction (2)."""
     motor, load = _pulls(t, y, u, brake, warm, p, out)
     if side_m != 2:
         motor = 0.0 if side_m == 0 else motor - side_m * _level_m(y[1], y[0], side_m, p)

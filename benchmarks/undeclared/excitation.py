@@ -16,6 +16,7 @@ class Excitation:
 
     Attributes:
         kind: one of STANDING or TURNING.
+        twist: rms of the dynamic error that was meant [rad].
         shaking: motor torque that is commanded openly [N m].
         follow: motor angle and rate that the slow controller follows, (samples, 2).
         pull: the controller's gains on angle and rate.
@@ -23,6 +24,7 @@ class Excitation:
     """
 
     kind: str
+    twist: float
     shaking: np.ndarray
     follow: np.ndarray
     pull: tuple[float, float]
@@ -73,9 +75,8 @@ def excitation(kind: str, random: np.random.Generator, base: Mechanism, *, twist
     angle = dt * (np.cumsum(rate) - rate)
     whole = base.motor_inertia + base.load_inertia / base.ratio**2
     bandwidth = 2 * np.pi * random.uniform(0.8, 2.0)
-    return Excitation(
-        kind, shaking, np.column_stack([angle, rate]), (whole * bandwidth**2, 1.4 * whole * bandwidth), brake
-    )
+    pull = (whole * bandwidth**2, 1.4 * whole * bandwidth)
+    return Excitation(kind, twist, shaking, np.column_stack([angle, rate]), pull, brake)
 
 
 def _multisine(random: np.random.Generator, count: int, dt: float, low: float, high: float) -> np.ndarray:

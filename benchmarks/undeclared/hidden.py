@@ -1,4 +1,8 @@
-"""What can be hidden: for each family of the study several forms, with the range of their strength and the shape drawn anew."""
+"""What can be hidden: for each family several forms, each with the range of its strength; its shape is drawn anew.
+
+Ranges follow the vendors' tables and the literature where these give them; torques are shares of what a twist of one
+milliradian takes, so that they suit drives of all sizes.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -116,59 +120,83 @@ def _slips(s, random, base):
 
 
 def _rub(load: float = 0.0, ripple: float = 0.0) -> Shape:
-    """Strength: torque at the output [N m]."""
+    """Strength: share of the load torque."""
 
     def changes(s, random, base):
-        return {"rub": s, "rub_load": load, "rub_ripple": ripple, "rub_order": 2.0, "rub_phase": _phase(random)}
+        return {
+            "rub": s * base.load_torque,
+            "rub_load": load / base.load_torque,
+            "rub_ripple": ripple,
+            "rub_phase": _phase(random),
+        }
 
     return changes
 
 
+def _viscosity(random: np.random.Generator, inertia: float) -> float:
+    """Viscous drag [N m s/rad] that stops an inertia within one to ten seconds."""
+    return inertia * _between(random, 0.1, 1.0)
+
+
 def _dry_motor(s, random, base):
-    """Strength: torque at the motor [N m]."""
-    return {"hold_m": s, "slide_m": s, "drag_m": _between(random, 1e-4, 6e-4)}
+    """Strength: share of the motor torque."""
+    level = s * base.motor_torque
+    return {"hold_m": level, "slide_m": level, "drag_m": _viscosity(random, base.motor_inertia)}
 
 
 def _stribeck_motor(s, random, base):
-    """Strength: sliding torque at the motor [N m]."""
-    sink = _between(random, 0.2, 4.0)
-    return {"slide_m": s, "hold_m": s * random.uniform(1.2, 2.0), "sink_m": sink, "drag_m": _between(random, 1e-4, 6e-4)}
+    """Strength: share of the motor torque, sliding."""
+    level = s * base.motor_torque
+    return {
+        "slide_m": level,
+        "hold_m": level * random.uniform(1.2, 2.0),
+        "sink_m": _between(random, 0.2, 4.0),
+        "drag_m": _viscosity(random, base.motor_inertia),
+    }
 
 
 def _bristles_motor(s, random, base):
-    """Strength: sliding torque at the motor [N m]."""
-    stiffness = s / _between(random, 3e-3, 3e-2)
+    """Strength: share of the motor torque, sliding."""
+    level = s * base.motor_torque
+    stiffness = level / _between(random, 3e-3, 3e-2)
     return {
-        "slide_m": s,
-        "hold_m": s * random.uniform(1.0, 1.6),
+        "slide_m": level,
+        "hold_m": level * random.uniform(1.0, 1.6),
         "sink_m": _between(random, 0.2, 2.0),
         "bristle_m": stiffness,
         "bristle_drag_m": 0.3 * float(np.sqrt(stiffness * base.motor_inertia)),
-        "drag_m": _between(random, 1e-4, 4e-4),
+        "drag_m": _viscosity(random, base.motor_inertia),
     }
 
 
 def _viscous_motor(s, random, base):
-    """Strength: N m s/rad at the motor."""
-    return {"drag_m": s}
+    """Strength: rate at which it stops the bare motor [1/s]."""
+    return {"drag_m": s * base.motor_inertia}
 
 
 def _leaning_motor(s, random, base):
-    """Strength: torque at the motor [N m], larger one way."""
+    """Strength: share of the motor torque, larger one way."""
     return _dry_motor(s, random, base) | {"lean_m": _sign(random) * random.uniform(0.1, 0.3)}
 
 
 def _dry_load(s, random, base):
-    """Strength: torque at the output [N m]."""
-    return {"hold_l": s, "slide_l": s, "drag_l": _between(random, 5e-3, 5e-2)}
+    """Strength: share of the load torque."""
+    level = s * base.load_torque
+    return {"hold_l": level, "slide_l": level, "drag_l": _viscosity(random, base.load_inertia)}
+
+
+def _viscous_load(s, random, base):
+    """Strength: rate at which it stops the bare load [1/s]."""
+    return {"drag_l": s * base.load_inertia}
 
 
 def _bristles_load(s, random, base):
-    """Strength: sliding torque at the output [N m]."""
-    stiffness = s / _between(random, 1e-4, 6e-4)
+    """Strength: share of the load torque, sliding."""
+    level = s * base.load_torque
+    stiffness = level / _between(random, 1e-4, 6e-4)
     return {
-        "slide_l": s,
-        "hold_l": s * random.uniform(1.0, 1.5),
+        "slide_l": level,
+        "hold_l": level * random.uniform(1.0, 1.5),
         "sink_l": _between(random, 0.01, 0.1),
         "bristle_l": stiffness,
         "bristle_drag_l": 0.3 * float(np.sqrt(stiffness * base.load_inertia)),
@@ -196,41 +224,42 @@ def _stiffness_ripple(order: float, reacts: float) -> Shape:
 
 
 def _rippled_motor(shares: tuple[float, float], orders: tuple[float, float]) -> Shape:
-    """Strength: mean torque at the motor [N m]."""
+    """Strength: share of the motor torque in the mean."""
 
     def changes(s, random, base):
         phases = np.array([_phase(random), _phase(random)])
         ripple = {"ripple_m": np.array(shares), "ripple_m_order": np.array(orders), "ripple_m_phase": phases}
-        return {"hold_m": s, "slide_m": s} | ripple
+        return {"hold_m": s * base.motor_torque, "slide_m": s * base.motor_torque} | ripple
 
     return changes
 
 
 def _cogs(shares: dict[int, float]) -> Shape:
-    """Strength: torque of the leading line at the motor [N m]."""
+    """Strength: leading line's share of the motor torque."""
 
     def changes(s, random, base):
         amplitude, order, phase = np.zeros(3), np.zeros(3), np.zeros(3)
         for i, (n, share) in enumerate(shares.items()):
-            amplitude[i], order[i], phase[i] = s * share, n, _phase(random)
+            amplitude[i], order[i], phase[i] = s * share * base.motor_torque, n, _phase(random)
         return {"cog": amplitude, "cog_order": order, "cog_phase": phase}
 
     return changes
 
 
 def _weight(s, random, base):
-    """Strength: m g r [N m]."""
-    return {"weight": s, "weight_phase": _phase(random)}
+    """Strength: m g r over the load torque."""
+    return {"weight": s * base.load_torque, "weight_phase": _phase(random)}
 
 
 def _pushes(count: int, steady: bool) -> Shape:
-    """Strength: amplitude at the load [N m]."""
+    """Strength: amplitude over the load torque."""
 
     def changes(s, random, base):
-        amplitude = np.array([s, 0.6 * s if count == 2 else 0.0])
+        level = s * base.load_torque
+        amplitude = np.array([level, 0.6 * level if count == 2 else 0.0])
         rate = base.omega_0 * np.exp(random.uniform(np.log(0.05), np.log(1.5), size=2))
         phase = random.uniform(0, 2 * np.pi, size=2)
-        push = _sign(random) * s if steady else 0.0
+        push = _sign(random) * level if steady else 0.0
         return {"push": push, "push_amplitude": amplitude, "push_rate": rate, "push_phase": phase}
 
     return changes
@@ -263,13 +292,13 @@ def _gain(s, random, base):
 
 
 def _bias(s, random, base):
-    """Strength: torque at the motor [N m]."""
-    return {"bias": _sign(random) * s}
+    """Strength: share of the motor torque."""
+    return {"bias": _sign(random) * s * base.motor_torque}
 
 
 def _gain_and_bias(s, random, base):
-    """Strength: deviation of the gain; the bias is a fifth of it in N m."""
-    return _gain(s, random, base) | {"bias": _sign(random) * 0.2 * s}
+    """Strength: deviation of the gain, and the bias over the motor torque."""
+    return _gain(s, random, base) | _bias(s, random, base)
 
 
 def _dead_time(s, random, base):
@@ -292,6 +321,11 @@ def _creep(two: bool) -> Shape:
     return changes
 
 
+def _windage(s, random, base):
+    """Strength: rate at which it slows the bare motor at 1 rad/s [1/s]."""
+    return {"windage": s * base.motor_inertia}
+
+
 FORMS = (
     Form("kinematic_error", "two lobes", 7.5e-5, 2.9e-4, _teeth({2: 1.0})),
     Form("kinematic_error", "orders 1, 2, 4", 7.5e-5, 2.9e-4, _teeth({2: 1.0, 1: 0.4, 4: 0.3})),
@@ -308,37 +342,37 @@ FORMS = (
     Form("hysteresis", "Maxwell slip", 0.03, 0.4, _slips, ("K", "alpha", "B_sp")),
     Form("hysteresis", "Dahl", 0.03, 0.4, _bouc_wen(1.0, 1.0)),
     Form("hysteresis", "Bouc-Wen, sharper", 0.03, 0.4, _bouc_wen(None, None)),
-    Form("coulomb_friction", "dry", 0.1, 2.0, _rub()),
-    Form("coulomb_friction", "growing with load", 0.1, 2.0, _rub(load=0.1)),
-    Form("motor_friction", "dry", 0.005, 0.1, _dry_motor),
-    Form("motor_friction", "Stribeck", 0.005, 0.08, _stribeck_motor),
-    Form("motor_friction", "bristles", 0.005, 0.1, _bristles_motor),
-    Form("motor_friction", "viscous", 2e-4, 5e-3, _viscous_motor),
-    Form("motor_friction", "leaning", 0.005, 0.1, _leaning_motor),
-    Form("load_friction", "dry", 0.1, 3.0, _dry_load),
-    Form("load_friction", "viscous", 0.02, 0.5, lambda s, random, base: {"drag_l": s}),
-    Form("load_friction", "bristles", 0.1, 3.0, _bristles_load),
+    Form("coulomb_friction", "dry", 0.01, 0.15, _rub()),
+    Form("coulomb_friction", "growing with load", 0.01, 0.15, _rub(load=0.5)),
+    Form("motor_friction", "dry", 0.05, 0.5, _dry_motor),
+    Form("motor_friction", "Stribeck", 0.05, 0.4, _stribeck_motor),
+    Form("motor_friction", "bristles", 0.05, 0.5, _bristles_motor),
+    Form("motor_friction", "viscous", 0.5, 10.0, _viscous_motor),
+    Form("motor_friction", "leaning", 0.05, 0.5, _leaning_motor),
+    Form("load_friction", "dry", 0.02, 0.4, _dry_load),
+    Form("load_friction", "viscous", 0.5, 10.0, _viscous_load),
+    Form("load_friction", "bristles", 0.02, 0.4, _bristles_load),
     Form("nonlinear_damping", "rate times its size", 0.1, 2.0, _power_damping("c2")),
     Form("nonlinear_damping", "cubic", 0.1, 2.0, _power_damping("c3")),
     Form("nonlinear_damping", "with twist squared", 0.1, 2.0, _power_damping("cx")),
     Form("position_dependent_stiffness", "two cycles", 5e-3, 0.1, _stiffness_ripple(2.0, 1.0)),
     Form("position_dependent_stiffness", "two cycles, no reaction", 5e-3, 0.1, _stiffness_ripple(2.0, 0.0)),
     Form("position_dependent_stiffness", "one cycle", 5e-3, 0.1, _stiffness_ripple(1.0, 1.0)),
-    Form("position_dependent_friction", "motor, two cycles", 0.01, 0.1, _rippled_motor((0.6, 0.0), (2.0, 0.0))),
-    Form("position_dependent_friction", "motor, 1 and 2", 0.01, 0.1, _rippled_motor((0.4, 0.4), (1.0, 2.0))),
-    Form("position_dependent_friction", "mesh, two cycles", 0.2, 2.0, _rub(ripple=0.6)),
-    Form("cogging", "two cycles", 0.003, 0.05, _cogs({2: 1.0})),
-    Form("cogging", "orders 1, 2, 4", 0.003, 0.05, _cogs({4: 1.0, 2: 0.5, 1: 0.3})),
-    Form("cogging", "one cycle", 0.003, 0.05, _cogs({1: 1.0})),
-    Form("gravity_load", "pendulum", 0.2, 5.0, _weight),
-    Form("load_disturbance", "a line", 0.05, 1.0, _pushes(1, False)),
-    Form("load_disturbance", "two lines", 0.05, 1.0, _pushes(2, False)),
-    Form("load_disturbance", "a line and a constant", 0.05, 1.0, _pushes(1, True)),
+    Form("position_dependent_friction", "motor, two cycles", 0.05, 0.5, _rippled_motor((0.6, 0.0), (2.0, 0.0))),
+    Form("position_dependent_friction", "motor, 1 and 2", 0.05, 0.5, _rippled_motor((0.4, 0.4), (1.0, 2.0))),
+    Form("position_dependent_friction", "mesh, two cycles", 0.02, 0.15, _rub(ripple=0.6)),
+    Form("cogging", "two cycles", 0.02, 0.3, _cogs({2: 1.0})),
+    Form("cogging", "orders 1, 2, 4", 0.02, 0.3, _cogs({4: 1.0, 2: 0.5, 1: 0.3})),
+    Form("cogging", "one cycle", 0.02, 0.3, _cogs({1: 1.0})),
+    Form("gravity_load", "pendulum", 0.03, 0.6, _weight),
+    Form("load_disturbance", "a line", 0.01, 0.15, _pushes(1, False)),
+    Form("load_disturbance", "two lines", 0.01, 0.15, _pushes(2, False)),
+    Form("load_disturbance", "a line and a constant", 0.01, 0.15, _pushes(1, True)),
     Form("extra_resonance", "flexible load", 0.05, 0.5, _third(0.6, 1.8)),
     Form("extra_resonance", "soft fixture", 0.05, 0.5, _third(0.2, 0.6)),
     Form("temperature", "stiffness", 2e-4, 2e-3, _warm_spring, ("K", "alpha"), heats=True),
     Form("temperature", "damping", 5e-3, 0.05, _warm_oil, ("B_sp",), heats=True),
-    Form("torque_sensor", "bias", 0.003, 0.05, _bias),
+    Form("torque_sensor", "bias", 0.02, 0.3, _bias),
     Form("torque_sensor", "gain", 0.01, 0.1, _gain),
     Form("torque_sensor", "gain and bias", 0.01, 0.1, _gain_and_bias),
     Form("input_delay", "dead time", 1e-4, 3e-3, _dead_time),
@@ -348,8 +382,8 @@ FORMS = (
     Form("encoder_eccentricity", "load disc", 1e-4, 4e-4, _disc("load")),
     Form("creep", "one time", 0.01, 0.1, _creep(False)),
     Form("creep", "two times", 0.01, 0.08, _creep(True), ("K", "B_sp")),
-    Form("unknown", "windage of the motor", 2e-6, 2e-4, lambda s, random, base: {"windage": s}),
-    Form("unknown", "tethered load", 0.5, 20.0, lambda s, random, base: {"tether": s}),
+    Form("unknown", "windage of the motor", 0.01, 0.3, _windage),
+    Form("unknown", "tethered load", 1e-4, 3e-3, lambda s, random, base: {"tether": s * base.k1}),
 )
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))

@@ -18,8 +18,8 @@ _NONE_2, _NONE_3, _NONE_4 = np.zeros(2), np.zeros(3), np.zeros(4)
 class Mechanism(NamedTuple):
     """One drive. Torques in N m, angles in rad; every default means "not there".
 
-    The first six are the base; `k1`, `k3`, `c1` are K, K alpha and B_sp. What follows stands in the order of the torque's road
-    from the amplifier to the encoders.
+    The first six are the base; `k1`, `k3`, `c1` are K, K alpha and B_sp. What follows stands in the order of the
+    torque's road from the amplifier to the encoders.
     """
 
     ratio: float = 50.0
@@ -28,13 +28,13 @@ class Mechanism(NamedTuple):
     k1: float = 7000.0
     k3: float = 0.0
     c1: float = 0.3
-    # Amplifier: u -> gain u + bias, behind a dead time of whole solver steps, a lag [s], a ramp between commands (0 or 1).
+    # Amplifier: gain u + bias, behind a dead time of whole solver steps, a lag [s], a ramp between commands (0 or 1).
     gain: float = 1.0
     bias: float = 0.0
     dead_steps: int = 0
     lag: float = 0.0
     ramp: float = 0.0
-    # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one direction and a ripple), or bristles; viscous
+    # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; viscous
     # drag, windage; cogging lines.
     hold_m: float = 0.0
     slide_m: float = 0.0
@@ -71,7 +71,7 @@ class Mechanism(NamedTuple):
     ripple_k_order: float = 2.0
     ripple_k_phase: float = 0.0
     ripple_k_reacts: float = 1.0
-    # Losses of the mesh: dry with a sharp sign (saturated within rub_rate), growing with load, rippled; powers of the rate.
+    # Losses of the mesh: dry with a sharp sign (saturated within rub_rate), growing with load, rippled; powers of rate.
     rub: float = 0.0
     rub_load: float = 0.0
     rub_rate: float = 5e-4
@@ -124,13 +124,23 @@ class Mechanism(NamedTuple):
         return 1 / (self.ratio**2 * self.motor_inertia) + 1 / self.load_inertia
 
     @property
+    def load_torque(self) -> float:
+        """What a twist of one milliradian takes, at the output [N m]: the measure of torques on this drive."""
+        return 1e-3 * self.k1
+
+    @property
+    def motor_torque(self) -> float:
+        """The same at the motor [N m]."""
+        return self.load_torque / self.ratio
+
+    @property
     def omega_0(self) -> float:
         """Natural frequency [rad/s]."""
         return float(np.sqrt(self.compliance * self.k1))
 
 
 def altered(mechanism: Mechanism, changes: dict) -> Mechanism:
-    """The mechanism with changes, each of its field's own type: numba compiles anew for an integer in a float's place."""
+    """The mechanism with changes, each of its field's own type, which the record of the equations asks for."""
     kept = {name: type(getattr(mechanism, name)) for name in changes}
     return mechanism._replace(
         **{n: np.asarray(v, float) if kept[n] is np.ndarray else kept[n](v) for n, v in changes.items()}

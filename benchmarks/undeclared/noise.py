@@ -13,7 +13,7 @@ class Encoders:
     Attributes:
         noise: rms of the noise before quantisation.
         step: of the scale; 0 where it is too fine to matter.
-        memory: correlation of neighbouring samples of the noise's coloured part, which has two thirds of its power; 0 is white.
+        memory: correlation of neighbouring samples of the noise's coloured part, two thirds of its power; 0 is white.
     """
 
     noise: tuple[float, float]

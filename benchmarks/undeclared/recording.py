@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undeclared.drawing import LOGS, Drawn, _random
+from undeclared.drawing import LOGS, Drawn, stream
 from undeclared.mechanism import Mechanism
 
 ROOM = 25.0
@@ -19,7 +19,7 @@ def record(drawn: Drawn, folder: Path) -> dict:
         What answer.json says.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    random = _random(drawn.case.seed, drawn.case.name + "/noise")
+    random = stream(drawn.case.seed, drawn.case.name + "/noise")
     braked = any(np.any(run.excitation.brake) for run in drawn.runs)
     heated = any(np.any(run.warm) for run in drawn.runs)
     errors = []
@@ -64,10 +64,11 @@ def _answer(drawn: Drawn, noise: float) -> dict:
         "forms": [form.name for form in drawn.case.forms],
         "strengths": list(drawn.strengths),
         "detection_limits": list(drawn.detectable),
+        "faint": drawn.case.faint,
         "base": {"K": base.k1, "alpha": alpha, "B_sp": base.c1},
         "undefined": undefined,
         "drive": {"N": base.ratio, "J_m": base.motor_inertia, "J_l": base.load_inertia},
-        "hidden": {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in drawn.changes.items() if "teeth" not in k},
+        "hidden": {k: np.asarray(v).tolist() for k, v in drawn.changes.items() if "teeth" not in k},
         "excitation": [run.excitation.kind for run in drawn.runs],
         "sampling_rate": 1 / drawn.dt,
         "noise": noise,
