@@ -10,7 +10,7 @@ from undeclared.detection import detectability
 from undeclared.equations import integrate
 from undeclared.excitation import STANDING, TURNING, Excitation, excitation
 from undeclared.hidden import FAMILIES, Form, forms_of
-from undeclared.mechanism import Mechanism, altered, read_encoders
+from undeclared.mechanism import Mechanism, read_encoders
 from undeclared.noise import Encoders, draw_encoders
 
 LEAST = 2.0
@@ -120,16 +120,13 @@ def clean_cases(count: int, seed: int) -> list[Case]:
     return [Case(f"clean_{'coloured' if i % 2 else 'white'}-{i // 2}", (), seed) for i in range(count)]
 
 
-def pair_cases(count: int, seed: int, families: Sequence[str] = FAMILIES) -> list[Case]:
+def pair_cases(count: int, seed: int) -> list[Case]:
     """Cases with two effects of different families."""
     cases = []
-    usual = [f for f in families if f != "unknown"]
-    if count and len(usual) < 2:
-        raise ValueError("pairs need two families at least; name more with --kinds")
+    families = [family for family in FAMILIES if family != "unknown"]
     for i in range(count):
         random = stream(seed, f"pair-{i}")
-        first, second = random.choice(len(usual), size=2, replace=False)
-        forms = tuple(forms_of(usual[j]) for j in (first, second))
+        forms = [forms_of(families[j]) for j in random.choice(len(families), size=2, replace=False)]
         cases.append(Case(f"pair-{i}", tuple(f[random.integers(len(f))] for f in forms), seed))
     return cases
 
@@ -173,7 +170,7 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
         changes |= alone
         strengths.append(strength)
         detectable.append(seen)
-    true = bench.mechanism(changes)
+    true = base._replace(**changes)
     runs = tuple(bench.run(true, i, warm) for i in range(len(LOGS)))
     if not all(_plausible(run, base) for run in runs):
         return None
@@ -213,13 +210,6 @@ class _Bench:
     excitations: tuple[Excitation, ...]
     heats: bool
 
-    def mechanism(self, changes: dict) -> Mechanism:
-        """The base with hidden changes; a dead time becomes solver steps."""
-        known = {name: value for name, value in changes.items() if name != "dead_time"}
-        if "dead_time" in changes:
-            known["dead_steps"] = round(changes["dead_time"] / self.dt * self.substeps)
-        return altered(self.base, known)
-
     def run(self, mechanism: Mechanism, index: int, warm: Sequence[np.ndarray]) -> Run:
         """One of the experiments on one mechanism."""
         commanded = self.excitations[index]
@@ -239,7 +229,7 @@ class _Bench:
 
     def detectability(self, changes: dict, warm: Sequence[np.ndarray]) -> float:
         """Of changes alone, in the two logs that the loop is given."""
-        runs = [self.run(self.mechanism(changes), i, warm) for i in range(2)]
+        runs = [self.run(self.base._replace(**changes), i, warm) for i in range(2)]
         if not all(np.isfinite(run.states).all() for run in runs):
             return np.inf
         logs = [(run.states, run.readings, run.torque, run.excitation.brake) for run in runs]

@@ -64,7 +64,7 @@ def _mesh(x, v, phi, y, warm, p, out):
         reaction = p.ripple_k_reacts * p.ripple_k * p.ripple_k_order * math.sin(angle) * energy
     elastic = torque
     viscous = p.c1 * (math.exp(-p.warm_c * warm) if p.warm_c != 0.0 else 1.0)
-    if p.gap_damps > 0.0 or abs(x) > p.gap:
+    if p.gap_damps > 0.0 or abs(x) >= p.gap:
         torque += viscous * v
     torque += v * (p.c2 * abs(v) + p.c3 * v * v + p.cx * x * x)
     if p.rub > 0.0:
@@ -180,9 +180,9 @@ def _sides(t, y, u, brake, warm, p, out):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _command(commands, k, step, part, substeps, p):
-    """Torque at the amplifier `part` of a solver step into step `step` of interval k."""
-    at = k * substeps + step - p.dead_steps
+def _command(commands, k, step, part, substeps, dead, p):
+    """Torque at the amplifier, `dead` solver steps late, `part` of a step into step `step` of interval k."""
+    at = k * substeps + step - dead
     i = at // substeps
     now, before = commands[max(i, 0)], commands[max(i - 1, 0)]
     if p.ramp == 0.0:
@@ -200,6 +200,7 @@ def _move(y, by, along, to):
 def _integrate(p, start, shaking, follow, pull, brake, warm, dt, substeps):
     count = shaking.size
     h = dt / substeps
+    dead = int(round(p.dead_time / h))
     y, kept, commands = start.copy(), np.empty((count, start.size)), np.empty(count)
     k1, k2, k3, k4, at = np.empty((5, start.size))
     for k in range(count):
@@ -207,10 +208,11 @@ def _integrate(p, start, shaking, follow, pull, brake, warm, dt, substeps):
         commands[k] = shaking[k] + pull[0] * (follow[k, 0] - y[0]) + pull[1] * (follow[k, 1] - y[1])
         for j in range(substeps):
             t = k * dt + j * h
-            u0 = _command(commands, k, j, 0.0, substeps, p)
+            u0 = _command(commands, k, j, 0.0, substeps, dead, p)
             u1, u2 = u0, u0
             if p.ramp != 0.0:
-                u1, u2 = _command(commands, k, j, 0.5, substeps, p), _command(commands, k, j, 1.0, substeps, p)
+                u1 = _command(commands, k, j, 0.5, substeps, dead, p)
+                u2 = _command(commands, k, j, 1.0, substeps, dead, p)
             side_m, side_l = _sides(t, y, u0, brake[k], warm[k], p, k1)
             rates(t, y, u0, brake[k], warm[k], side_m, side_l, p, k1)
             _move(y, 0.5 * h, k1, at)

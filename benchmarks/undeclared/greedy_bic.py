@@ -8,6 +8,7 @@ none lowers it. Nothing is simulated, and internal states and widths are guessed
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from scipy.signal import lfilter
 
 from undeclared.logs import Table, rate
@@ -62,36 +63,43 @@ def _bic(columns: np.ndarray, left: np.ndarray, weight: np.ndarray) -> float:
 def _weak_log(table: Table, omega_0: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Left sides (2, windows) and groups of columns (2, windows, terms) of one log."""
     half = max(4, int(0.4 * 2 * np.pi / omega_0 / table.dt))
-    s = np.linspace(-1, 1, 2 * half + 1)
-    bump = (1 - s**2) ** 6
-    curved = 12 * (1 - s**2) ** 4 * (11 * s**2 - 1) / (half * table.dt) ** 2
+    s, unit = np.linspace(-1, 1, 2 * half + 1), half * table.dt
+    bump = Polynomial([1, 0, -1]) ** 6
+    plain, steep, curved = bump(s), bump.deriv()(s) / unit, bump.deriv(2)(s) / unit**2
+    # The sums integrate a parabola exactly: angles of many revolutions are multiplied by this.
+    curved -= np.mean(curved)
+    curved *= 2 * np.sum(plain) / np.sum(curved * (unit * s) ** 2)
+    # Of what is held between samples, the exact integral.
+    held = np.append(np.diff(bump.integ()(s)) * half, 0.0)
 
-    def weak(signal: np.ndarray, kernel: np.ndarray = bump) -> np.ndarray:
+    def weak(signal: np.ndarray, kernel: np.ndarray = plain) -> np.ndarray:
         return np.convolve(signal, kernel[::-1], mode="valid")[::half]
 
     c = table.columns
     brake = c.get("load_torque", np.zeros_like(table.x))
-    # What is held between samples lags the samples by half an interval.
-    held = np.append(0.5 * (c["motor_torque"][1:] + c["motor_torque"][:-1]), c["motor_torque"][-1])
-    held_before = np.concatenate([held[:1], held[:-1]])
     left = np.stack(
         [
-            table.motor_inertia * weak(c["motor_angle"] - c["motor_angle"][0], curved) - weak(held_before),
-            table.load_inertia * weak(c["load_angle"] - c["load_angle"][0], curved) - weak(brake),
+            table.motor_inertia * weak(c["motor_angle"], curved) - weak(c["motor_torque"], held),
+            table.load_inertia * weak(c["load_angle"], curved) - weak(brake, held),
         ]
     )
-    return left, {
+    groups = {
         name: np.stack([np.stack([weak(m) for m, _ in terms], 1), np.stack([weak(load) for _, load in terms], 1)])
-        for name, terms in _terms(table, omega_0, held_before).items()
+        for name, terms in _terms(table, omega_0).items()
     }
+    x = table.x - np.mean(table.x)
+    # With a constant, since the encoders' zeros are nobody's.
+    spring = np.stack([weak(x), weak(x**3), -weak(x, steep), weak(np.ones_like(x))], 1)
+    return left, {"base": np.stack([-spring / table.ratio, spring])} | groups
 
 
-def _terms(table: Table, omega_0: float, torque: np.ndarray) -> dict[str, list[Column]]:
+def _terms(table: Table, omega_0: float) -> dict[str, list[Column]]:
     """Groups of terms; a name is a family, with the form behind a colon."""
     c, x = table.columns, table.x - np.mean(table.x)
     phi, lam = c["motor_angle"], c["load_angle"]
     span = 0.3 * 2 * np.pi / omega_0
     v, w, r = (rate(signal, table.dt, span) for signal in (x, phi, lam))
+    torque = 0.5 * (c["motor_torque"] + np.roll(c["motor_torque"], 1))
     zero, one = np.zeros_like(x), np.ones_like(x)
     size = float(np.std(x))
 
@@ -106,7 +114,6 @@ def _terms(table: Table, omega_0: float, torque: np.ndarray) -> dict[str, list[C
 
     waves = [f(n * phi) for n in (1, 2, 4) for f in (np.cos, np.sin)]
     found = {
-        "base": mesh(x, x**3, v),
         "stiffness_shape:even": mesh(x**2),
         "stiffness_shape:quintic": mesh(x**5),
         "hysteresis:Dahl": mesh(_play(x, 0.3 * size)),

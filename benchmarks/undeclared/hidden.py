@@ -133,15 +133,15 @@ def _rub(load: float = 0.0, ripple: float = 0.0) -> Shape:
     return changes
 
 
-def _viscosity(random: np.random.Generator, inertia: float) -> float:
-    """Viscous drag [N m s/rad] that stops an inertia within one to ten seconds."""
-    return inertia * _between(random, 0.1, 1.0)
+def _viscosity(s: float, random: np.random.Generator, inertia: float) -> float:
+    """Viscous drag [N m s/rad] beside dry friction: at its usual strengths, what stops an inertia in some seconds."""
+    return s * inertia * _between(random, 0.3, 3.0)
 
 
 def _dry_motor(s, random, base):
     """Strength: share of the motor torque."""
     level = s * base.motor_torque
-    return {"hold_m": level, "slide_m": level, "drag_m": _viscosity(random, base.motor_inertia)}
+    return {"hold_m": level, "slide_m": level, "drag_m": _viscosity(s, random, base.motor_inertia)}
 
 
 def _stribeck_motor(s, random, base):
@@ -151,7 +151,7 @@ def _stribeck_motor(s, random, base):
         "slide_m": level,
         "hold_m": level * random.uniform(1.2, 2.0),
         "sink_m": _between(random, 0.2, 4.0),
-        "drag_m": _viscosity(random, base.motor_inertia),
+        "drag_m": _viscosity(s, random, base.motor_inertia),
     }
 
 
@@ -165,7 +165,7 @@ def _bristles_motor(s, random, base):
         "sink_m": _between(random, 0.2, 2.0),
         "bristle_m": stiffness,
         "bristle_drag_m": 0.3 * float(np.sqrt(stiffness * base.motor_inertia)),
-        "drag_m": _viscosity(random, base.motor_inertia),
+        "drag_m": _viscosity(s, random, base.motor_inertia),
     }
 
 
@@ -182,7 +182,7 @@ def _leaning_motor(s, random, base):
 def _dry_load(s, random, base):
     """Strength: share of the load torque."""
     level = s * base.load_torque
-    return {"hold_l": level, "slide_l": level, "drag_l": _viscosity(random, base.load_inertia)}
+    return {"hold_l": level, "slide_l": level, "drag_l": _viscosity(s, random, base.load_inertia)}
 
 
 def _viscous_load(s, random, base):
@@ -302,7 +302,7 @@ def _gain_and_bias(s, random, base):
 
 
 def _dead_time(s, random, base):
-    """Strength: seconds; the rig rounds it to solver steps."""
+    """Strength: seconds; the solver rounds it to whole steps."""
     return {"dead_time": s}
 
 

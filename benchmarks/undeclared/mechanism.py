@@ -28,14 +28,14 @@ class Mechanism(NamedTuple):
     k1: float = 7000.0
     k3: float = 0.0
     c1: float = 0.3
-    # Amplifier: gain u + bias, behind a dead time of whole solver steps, a lag [s], a ramp between commands (0 or 1).
+    # Amplifier: gain u + bias, behind a dead time [s], a lag [s], a ramp between commands (0 or 1).
     gain: float = 1.0
     bias: float = 0.0
-    dead_steps: int = 0
+    dead_time: float = 0.0
     lag: float = 0.0
     ramp: float = 0.0
-    # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; viscous
-    # drag, windage; cogging lines.
+    # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; drag,
+    # windage; cogging lines.
     hold_m: float = 0.0
     slide_m: float = 0.0
     sink_m: float = 1.0
@@ -137,14 +137,6 @@ class Mechanism(NamedTuple):
     def omega_0(self) -> float:
         """Natural frequency [rad/s]."""
         return float(np.sqrt(self.compliance * self.k1))
-
-
-def altered(mechanism: Mechanism, changes: dict) -> Mechanism:
-    """The mechanism with changes, each of its field's own type, which the record of the equations asks for."""
-    kept = {name: type(getattr(mechanism, name)) for name in changes}
-    return mechanism._replace(
-        **{n: np.asarray(v, float) if kept[n] is np.ndarray else kept[n](v) for n, v in changes.items()}
-    )
 
 
 def table(lines: dict[int, tuple[float, float]]) -> dict[str, np.ndarray]:

@@ -34,7 +34,7 @@ def main() -> None:
         jax.config.update("jax_compilation_cache_dir", str(args.cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     if args.baselines and not args.markdown and not sindy_is_there():
-        print("PySINDy is not installed, so that it is left out; pip install -e '.[benchmarks]' brings it")
+        print("PySINDy is not installed, so that it is left out; pip install -e '.[sindy]' brings it")
     cases = _cases(args)
     results = []
     for number, case in enumerate(cases, start=1):
@@ -72,7 +72,7 @@ def _cases(args: argparse.Namespace) -> list[Case]:
     cases = [
         *single_cases(args.cases, args.seed, args.kinds),
         *clean_cases(args.clean, args.seed),
-        *pair_cases(args.pairs, args.seed, args.kinds),
+        *pair_cases(args.pairs, args.seed),
     ]
     return [case for case in cases if not args.only or case.name in args.only]
 
