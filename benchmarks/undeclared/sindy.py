@@ -11,7 +11,10 @@ import numpy as np
 from undeclared.logs import Table, rate
 
 _THRESHOLDS = (0.003, 0.01, 0.03, 0.1)
-_SMALLEST_STEP = 1e-4
+
+
+def _sign(signal):
+    return np.sign(signal)
 
 
 def sindy_is_there() -> bool:
@@ -38,7 +41,7 @@ def sindy_error(tables: Sequence[Table], omega_0: float) -> tuple[float, list[st
     best, kept, errors = np.inf, None, None
     for threshold in _THRESHOLDS:
         library = pysindy.PolynomialLibrary(degree=3) + pysindy.CustomLibrary(
-            [np.sign], function_names=[lambda name: f"sgn({name})"]
+            [_sign], function_names=[lambda name: f"sgn({name})"]
         )
         model = pysindy.SINDy(
             optimizer=pysindy.STLSQ(threshold=threshold),
