@@ -287,4 +287,7 @@ def test_lists_of_cases():
     assert {c.forms[0].family for c in cases} == set(FAMILIES)
     # A longer study goes on with the cases of a shorter one.
     assert cases[:10] == drawing.single_cases(10, 0, FAMILIES)
-    assert all(c.forms[0].family != c.forms[1].family for c in drawing.pair_cases(30, 0))
+    for first, second in (case.forms for case in drawing.pair_cases(200, 0)):
+        assert first.family != second.family
+        changed = [set(f.changes(f.high, np.random.default_rng(0), BASE)) for f in (first, second)]
+        assert not changed[0] & changed[1]

@@ -22,7 +22,7 @@ def result(truth: list[str], said: list[str], *, ties: tuple[str, ...] = (), dec
         "undefined": [],
         "noise": 1e-6,
         "coloured": False,
-        "faint": False,
+        "detection_limits": [100.0],
     }
     return {
         "case": case | more.pop("case", {}),
@@ -68,7 +68,7 @@ def test_tables_count():
     results = [
         result(["backlash"], ["backlash"]),
         result(["backlash"], ["creep"]),
-        result(["creep"], ["backlash"], ties=("creep",), case={"faint": True}),
+        result(["creep"], ["backlash"], ties=("creep",), case={"detection_limits": [3.0]}),
         result([], []),
         result([], ["creep"], case={"coloured": True}),
         result(["creep", "backlash"], ["backlash"], ties=("creep",)),
@@ -80,6 +80,8 @@ def test_tables_count():
     assert confusion[0] == ("backlash", "1", "0", "creep 1")
     assert confusion[1] == ("creep", "0", "1", "")
     assert confusion[2][1].startswith("66.7 % (2 of 3;")
+    strengths = [row[:4] for row in told["Hidden effect, by strength"].rows]
+    assert strengths == [("up to 20 detection limits", "0", "1", "0"), ("up to 1000 detection limits", "1", "0", "1")]
     # Clopper and Pearson's interval for 1 of 2 is 1.3 to 98.7 %: (1 - p)^2 = 0.975 at its end.
     assert told["Clean cases: false alarms"].rows[-1] == ("all", "50.0 % (1 of 2; 1.3 to 98.7 %)", "creep 1")
     pairs = dict(told["Pairs of effects"].rows)

@@ -48,12 +48,18 @@ class Case:
         forms: what is hidden; nothing in a clean case.
         seed: of the study.
         faint: whether what is hidden is drawn near its detection limit instead of from its usual range.
+        coloured: whether the noise is; where None, by chance.
     """
 
     name: str
     forms: tuple[Form, ...]
     seed: int
     faint: bool = False
+    coloured: bool | None = None
+
+
+class NoExperimentError(RuntimeError):
+    """No experiment shows what is to be hidden at a plausible strength."""
 
 
 @dataclass(frozen=True)
@@ -82,26 +88,22 @@ class Drawn:
     Attributes:
         case: what was asked for.
         base: the drive without what is hidden.
-        true: with it.
         changes: the hidden parameters, by field.
         strengths: of the forms, in their own units.
         detectable: strength of each in units of its detection limit.
         encoders: their noise.
         runs: the three experiments.
         dt: sampling interval [s].
-        substeps: solver steps in each.
     """
 
     case: Case
     base: Mechanism
-    true: Mechanism
     changes: dict
     strengths: tuple[float, ...]
     detectable: tuple[float, ...]
     encoders: Encoders
     runs: tuple[Run, ...]
     dt: float
-    substeps: int
 
 
 def single_cases(count: int, seed: int, families: Sequence[str]) -> list[Case]:
@@ -117,31 +119,37 @@ def single_cases(count: int, seed: int, families: Sequence[str]) -> list[Case]:
 
 def clean_cases(count: int, seed: int) -> list[Case]:
     """Cases with nothing hidden; the noise is white in even ones and coloured in odd ones."""
-    return [Case(f"clean_{'coloured' if i % 2 else 'white'}-{i // 2}", (), seed) for i in range(count)]
+    names = ("white", "coloured")
+    return [Case(f"clean_{names[i % 2]}-{i // 2}", (), seed, coloured=bool(i % 2)) for i in range(count)]
 
 
 def pair_cases(count: int, seed: int) -> list[Case]:
     """Cases with two effects of different families."""
-    cases = []
     families = [family for family in FAMILIES if family != "unknown"]
-    for i in range(count):
-        random = stream(seed, f"pair-{i}")
-        forms = [forms_of(families[j]) for j in random.choice(len(families), size=2, replace=False)]
-        cases.append(Case(f"pair-{i}", tuple(f[random.integers(len(f))] for f in forms), seed))
-    return cases
+    return [Case(f"pair-{i}", _pair(stream(seed, f"pair-{i}"), families), seed) for i in range(count)]
+
+
+def _pair(random: np.random.Generator, families: Sequence[str]) -> tuple[Form, ...]:
+    """Two forms that change different parameters of the mechanism: a second motor friction would replace the first."""
+    while True:
+        chosen = [forms_of(families[i]) for i in random.choice(len(families), size=2, replace=False)]
+        pair = tuple(forms[random.integers(len(forms))] for forms in chosen)
+        first, second = (set(form.changes(form.high, random, Mechanism())) for form in pair)
+        if not first & second:
+            return pair
 
 
 def draw(case: Case) -> Drawn:
     """Draw and run a case until each of its effects is at least LEAST detection limits strong.
 
     Raises:
-        RuntimeError: where no experiment shows the effect at a plausible strength.
+        NoExperimentError: where no experiment shows the effect at a plausible strength.
     """
     for attempt in range(_ATTEMPTS):
         drawn = _attempt(case, stream(case.seed, case.name, attempt))
         if drawn is not None:
             return drawn
-    raise RuntimeError(f"{case.name}: no experiment of {_ATTEMPTS} shows {[f.name for f in case.forms]}")
+    raise NoExperimentError(f"{case.name}: no experiment of {_ATTEMPTS} shows {[f.name for f in case.forms]}")
 
 
 def stream(seed: int, name: str, attempt: int = 0) -> np.random.Generator:
@@ -152,7 +160,10 @@ def stream(seed: int, name: str, attempt: int = 0) -> np.random.Generator:
 def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
     dt, counts = _size(random)
     base = _base(random, dt)
-    encoders = draw_encoders(random, colour=random.uniform() < 0.3 if case.forms else "coloured" in case.name)
+    if any(form.straight for form in case.forms):
+        base = base._replace(k3=0.0)
+    by_chance = bool(random.uniform() < 0.3)
+    encoders = draw_encoders(random, colour=by_chance if case.coloured is None else case.coloured)
     heats = any(form.heats for form in case.forms) or random.uniform() < 0.15
     turning = TURNING[:2] if any(form.family in _OF_ANGLE for form in case.forms) else TURNING
     bench = _Bench(
@@ -170,11 +181,10 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
         changes |= alone
         strengths.append(strength)
         detectable.append(seen)
-    true = base._replace(**changes)
-    runs = tuple(bench.run(true, i, warm) for i in range(len(LOGS)))
+    runs = tuple(bench.run(base._replace(**changes), i, warm) for i in range(len(LOGS)))
     if not all(_plausible(run, base) for run in runs):
         return None
-    return Drawn(case, base, true, changes, tuple(strengths), tuple(detectable), encoders, runs, dt, bench.substeps)
+    return Drawn(case, base, changes, tuple(strengths), tuple(detectable), encoders, runs, dt)
 
 
 def _strength(
@@ -191,7 +201,7 @@ def _strength(
             break
         if aim is not None and form.low < form.high and not 0.7 < seen / aim < 1.4:
             # Most effects leave a trace in proportion to their strength; those that do not are met after a few rounds.
-            strength *= np.clip(aim / max(seen, 1e-3), 1e-4, 1e2)
+            strength = min(strength * np.clip(aim / max(seen, 1e-3), 1e-4, 1e2), form.high)
             continue
         if aim is not None or seen >= LEAST or strength >= form.high:
             break

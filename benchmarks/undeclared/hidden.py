@@ -27,6 +27,7 @@ class Form:
         changes: the mechanism's changed parameters, from strength, a generator for the shape, and the base.
         undefined: base parameters that have no one true value beside this form.
         heats: whether it needs a temperature that changes.
+        straight: whether it stands in the place of the base's cubic, so that the base has none.
     """
 
     family: str
@@ -36,6 +37,7 @@ class Form:
     changes: Shape
     undefined: tuple[str, ...] = ()
     heats: bool = False
+    straight: bool = False
 
 
 def _phase(random: np.random.Generator) -> float:
@@ -86,7 +88,6 @@ def _slopes(s, random, base):
     knee, further = random.uniform(4e-4, 7e-4), 1 + random.uniform(0.2, 0.6) * s
     slope = base.k1 * (1 + s)
     return {
-        "k3": 0.0,
         "slope_2": slope,
         "slope_3": slope * further,
         "knee_1": knee,
@@ -332,7 +333,7 @@ FORMS = (
     Form("kinematic_error", "rounded wave", 7.5e-5, 2.9e-4, _teeth({2: 1.0, 4: 0.25, 6: 0.08})),
     Form("kinematic_error", "sidebands", 7.5e-5, 2.9e-4, _teeth({2: 1.0}, wobble=0.3)),
     Form("stiffness_shape", "quadratic", 0.01, 0.15, _quadratic),
-    Form("stiffness_shape", "three slopes", 0.2, 0.6, _slopes, ("alpha",)),
+    Form("stiffness_shape", "three slopes", 0.2, 0.6, _slopes, ("alpha",), straight=True),
     Form("stiffness_shape", "quintic", 0.02, 0.3, _quintic),
     Form("stiffness_shape", "lopsided", 0.01, 0.1, _lopsided, ("K", "alpha")),
     Form("stiffness_shape", "soft centre", 0.05, 0.3, _soft, ("K", "alpha")),

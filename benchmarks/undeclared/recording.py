@@ -55,7 +55,6 @@ def _drive_file(base: Mechanism, heated: bool) -> str:
 
 def _answer(drawn: Drawn, noise: float) -> dict:
     base = drawn.base
-    alpha = 0.0 if "slope_2" in drawn.changes else base.k3 / base.k1
     undefined = sorted({name for form in drawn.case.forms for name in form.undefined})
     return {
         "name": drawn.case.name,
@@ -65,7 +64,7 @@ def _answer(drawn: Drawn, noise: float) -> dict:
         "strengths": list(drawn.strengths),
         "detection_limits": list(drawn.detectable),
         "faint": drawn.case.faint,
-        "base": {"K": base.k1, "alpha": alpha, "B_sp": base.c1},
+        "base": {"K": base.k1, "alpha": base.k3 / base.k1, "B_sp": base.c1},
         "undefined": undefined,
         "drive": {"N": base.ratio, "J_m": base.motor_inertia, "J_l": base.load_inertia},
         "hidden": {k: np.asarray(v).tolist() for k, v in drawn.changes.items() if "teeth" not in k},

@@ -5,9 +5,15 @@
 A case that has its JSON in the folder is not run again.
 """
 
+# ruff: noqa: E402
+
+import os
+
+# XLA reads this once, when jax loads; it would warn at length of tuning flags in compiled programs that were kept.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 import argparse
 import json
-import os
 import sys
 import tempfile
 from pathlib import Path
@@ -17,7 +23,7 @@ import jax
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from fitting.files import write_whole
-from undeclared.drawing import Case, clean_cases, draw, pair_cases, single_cases
+from undeclared.drawing import Case, NoExperimentError, clean_cases, draw, pair_cases, single_cases
 from undeclared.hidden import FAMILIES
 from undeclared.recording import record
 from undeclared.sindy import sindy_is_there
@@ -40,7 +46,11 @@ def main() -> None:
     for number, case in enumerate(cases, start=1):
         path = _result_path(args.out, case, args)
         if not path.exists() and not args.markdown:
-            result = _run(case, args)
+            try:
+                result = _run(case, args)
+            except NoExperimentError as error:
+                print(f"{number:4d} of {len(cases)}  not drawn: {error}", flush=True)
+                continue
             write_whole({path: json.dumps(result, indent=1, allow_nan=False) + "\n"})
             print(f"{number:4d} of {len(cases)}  {_line(result)}", flush=True)
         if path.exists():

@@ -65,7 +65,10 @@ def tables(results: Sequence[dict]) -> list[Table]:
     clean = [r for r in usual if not r["case"]["families"]]
     found = []
     if single:
-        found += [_confusion(single), _verdicts("Hidden effect, by strength", single, _by_strength)]
+        found += [
+            _confusion(single),
+            _verdicts("Hidden effect, by strength", sorted(single, key=_limits), _by_strength),
+        ]
     if clean:
         found.append(_false_alarms(clean))
     if pairs:
@@ -115,10 +118,15 @@ def _confusion(results: Sequence[dict]) -> Table:
     return Table("First family named (rows: truth)", columns, rows)
 
 
+def _limits(result: dict) -> float:
+    return min(result["case"]["detection_limits"])
+
+
 def _by_strength(result: dict) -> str:
-    if result["case"]["faint"]:
-        return "faint: 2 to 20 detection limits"
-    return "usual magnitude"
+    for most in (20, 1000):
+        if _limits(result) <= most:
+            return f"up to {most} detection limits"
+    return "above"
 
 
 def _verdicts(title: str, results: Sequence[dict], key: Callable[[dict], str]) -> Table:
