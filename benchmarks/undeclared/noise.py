@@ -1,0 +1,50 @@
+"""What encoders add: white or coloured noise, and the steps of their scale."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """Two encoders. Angles in rad, motor first.
+
+    Attributes:
+        noise: rms of the noise before quantisation.
+        step: of the scale; 0 where it is too fine to matter.
+        memory: correlation of neighbouring samples of the noise's coloured part, two thirds of its power; 0 is white.
+    """
+
+    noise: tuple[float, float]
+    step: tuple[float, float]
+    memory: float
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Rms of noise and quantisation."""
+        motor, load = (float(np.hypot(n, s / np.sqrt(12))) for n, s in zip(self.noise, self.step, strict=True))
+        return motor, load
+
+    def read(self, readings: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Recorded readings (samples, 2) of noiseless ones."""
+        recorded = np.empty_like(readings)
+        for i in range(2):
+            noisy = readings[:, i] + self.noise[i] * self._unit_noise(len(readings), random)
+            recorded[:, i] = np.round(noisy / self.step[i]) * self.step[i] if self.step[i] else noisy
+        return recorded
+
+    def _unit_noise(self, count: int, random: np.random.Generator) -> np.ndarray:
+        white = random.normal(size=count)
+        if not self.memory:
+            return white
+        pushed = np.sqrt(1 - self.memory**2) * random.normal(size=count + 500)
+        return np.sqrt(1 / 3) * white + np.sqrt(2 / 3) * lfilter([1.0], [1.0, -self.memory], pushed)[500:]
+
+
+def draw_encoders(random: np.random.Generator, *, colour: bool) -> Encoders:
+    """A motor encoder with 3e-6 to 2e-5 rad of noise and a load encoder with 0.5e-6 to 2e-6 rad; a third of them with a
+    scale of 18 and 22 bit."""
+    noise = tuple(float(np.exp(random.uniform(np.log(a), np.log(b)))) for a, b in ((3e-6, 2e-5), (5e-7, 2e-6)))
+    step = (2 * np.pi / 2**18, 2 * np.pi / 2**22) if random.uniform() < 1 / 3 else (0.0, 0.0)
+    return Encoders((noise[0], noise[1]), step, float(random.uniform(0.5, 0.95)) if colour else 0.0)

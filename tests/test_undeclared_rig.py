@@ -1,0 +1,293 @@
+"""The study's rig against scipy, closed forms and the balance of energy; and that each of its forms makes a log."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+pytest.importorskip("numba", reason="the study's rig needs the extra `benchmark`")
+
+from fitting.rig import read_rig
+from undeclared import drawing
+from undeclared.detection import LIMIT, detectability
+from undeclared.equations import integrate
+from undeclared.hidden import FAMILIES, FORMS, Form, forms_of
+from undeclared.mechanism import Mechanism, read_encoders, table
+from undeclared.noise import Encoders
+from undeclared.recording import record
+
+DT = 5e-4
+BASE = Mechanism(k3=2e7)
+START = np.array([0.3, 5.0, 0.3 / 50, -0.2])
+
+
+def shaking(count: int, *, rms: float = 0.3, seed: int = 0) -> np.ndarray:
+    return rms * np.random.default_rng(seed).normal(size=count)
+
+
+def test_smooth_effects_against_scipy():
+    """All that has a smooth right side, at once; its equations are written anew here."""
+    p = BASE._replace(
+        **table({2: (2e-4, 0.7), 1: (1e-4, -0.4)}),
+        wobble=0.3,
+        wobble_phase=0.2,
+        k2=3e5,
+        k5=1e12,
+        soft=0.1,
+        soft_width=4e-4,
+        c3=2.0,
+        cx=5e4,
+        ripple_k=0.05,
+        ripple_k_phase=0.5,
+        creep_k=np.array([300.0, 0.0]),
+        creep_time=np.array([0.05, 1.0]),
+        warm_k=-1e-3,
+        warm_c=0.02,
+        lag=1e-3,
+        gain=0.95,
+        bias=0.02,
+        drag_m=1e-3,
+        drag_l=0.05,
+        cog=np.array([0.02, 0.0, 0.0]),
+        cog_order=np.array([4.0, 0.0, 0.0]),
+        weight=1.5,
+        weight_phase=0.3,
+        tether=3.0,
+        push=0.1,
+        push_amplitude=np.array([0.5, 0.0]),
+        push_rate=np.array([200.0, 0.0]),
+        third_inertia=0.01,
+        third_stiffness=3000.0,
+        third_damping=0.2,
+    )
+    torque, heat = shaking(60), 12.0
+
+    def rates(t, y, u):
+        a, w, b, r, c, q, z, s = y
+        e = (2e-4 * np.cos(2 * a + 0.7) + 1e-4 * np.cos(a - 0.4)) * (1 + 0.3 * np.cos(b + 0.2))
+        e_a = (-4e-4 * np.sin(2 * a + 0.7) - 1e-4 * np.sin(a - 0.4)) * (1 + 0.3 * np.cos(b + 0.2))
+        e_b = (2e-4 * np.cos(2 * a + 0.7) + 1e-4 * np.cos(a - 0.4)) * -0.3 * np.sin(b + 0.2)
+        x, v = a / 50 + e - b, w * (1 / 50 + e_a) + r * (e_b - 1)
+        spring = 7000 * x + 3e5 * x**2 + 2e7 * x**3 + 1e12 * x**5 - 700 * x * np.exp(-((x / 4e-4) ** 2))
+        tau = spring * (1 - 1e-3 * heat) * (1 + 0.05 * np.cos(2 * a + 0.5)) + 0.3 * np.exp(-0.02 * heat) * v
+        tau += 2.0 * v**3 + 5e4 * x**2 * v + 300 * (x - z)
+        reaction = 0.1 * np.sin(2 * a + 0.5) * (3500 * x**2 + 0.25 * 2e7 * x**4)
+        third = 3000 * (b - c) + 0.2 * (r - q)
+        motor = s - (1 / 50 + e_a) * tau + reaction - 1e-3 * w + 0.02 * np.cos(4 * a)
+        load = (1 - e_b) * tau + 0.1 + 0.5 * np.sin(200 * t) - 0.05 * r - 3 * b - 1.5 * np.sin(b + 0.3) - third
+        return [w, motor / 5e-4, r, load / 5e-2, q, third / 0.01, (x - z) / 0.05, (0.95 * u + 0.02 - s) / 1e-3]
+
+    states, commanded = integrate(p, START, torque, dt=DT, substeps=100, warm=np.full(60, heat))
+    assert np.array_equal(commanded, torque)
+    y = np.array([*START, START[2], START[3], 0.0, 0.95 * torque[0] + 0.02])
+    for k, u in enumerate(torque):
+        assert states[k, [0, 1, 2, 3, 4, 5, 13, 15]] == pytest.approx(y, rel=1e-9, abs=1e-9)
+        y = solve_ivp(rates, (k * DT, (k + 1) * DT), y, args=(u,), method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+
+
+def test_bouc_wen_and_bristles_against_scipy():
+    """Both have a kink where the rate turns: scipy's steps find it by their error control."""
+    p = BASE._replace(
+        bouc_k=2000.0, bouc_yield=3e-4, bouc_power=1.5, bouc_share=0.7,
+        slide_m=0.03, hold_m=0.05, sink_m=2.0, bristle_m=5.0, bristle_drag_m=0.01,
+    )  # fmt: skip
+    torque = shaking(40)
+
+    def rates(t, y, u):
+        a, w, b, r, z, s = y
+        x, v = a / 50 - b, w / 50 - r
+        bent = (abs(z) / 3e-4) ** 1.5
+        turn = v - bent * (0.7 * abs(v) * np.sign(z) + 0.3 * v)
+        slip = w - 5.0 * abs(w) * s / (0.03 + 0.02 * np.exp(-((w / 2.0) ** 2)))
+        tau = 7000 * x + 2e7 * x**3 + 0.3 * v + 2000 * z
+        return [w, (u - tau / 50 - 5.0 * s - 0.01 * slip) / 5e-4, r, tau / 5e-2, turn, slip]
+
+    states, _ = integrate(p, START, torque, dt=DT, substeps=100)
+    y = np.array([*START, 0.0, 0.0])
+    for k, u in enumerate(torque):
+        # RK4 with 5e-6 s loses its order at a kink, which leaves 1e-7 of the motion.
+        assert states[k, [0, 1, 2, 3, 6, 11]] == pytest.approx(y, rel=1e-6, abs=1e-7)
+        y = solve_ivp(rates, (0, DT), y, args=(u,), method="DOP853", rtol=1e-11, atol=1e-13, max_step=5e-5).y[:, -1]
+
+
+def energy(p: Mechanism, states: np.ndarray) -> np.ndarray:
+    """Of a drive with any spring, wobbling teeth, stiffness ripple, weight, tether and third inertia [J]."""
+    a, w, b, r, c, q = states[:, :6].T
+    x = a / p.ratio + 2e-4 * np.cos(2 * a) * (1 + p.wobble * np.cos(b)) * np.any(p.teeth) - b
+    bent = np.maximum(np.abs(x) - p.gap, 0.0)
+    if p.slope_2:
+        first, second = np.minimum(bent, p.knee_1), np.clip(bent - p.knee_1, 0, p.knee_2 - p.knee_1)
+        third = np.maximum(bent - p.knee_2, 0)
+        spring = 0.5 * p.k1 * first**2 + second * (p.k1 * p.knee_1) + 0.5 * p.slope_2 * second**2
+        force = p.k1 * p.knee_1 + p.slope_2 * (p.knee_2 - p.knee_1)
+        spring += third * force + 0.5 * p.slope_3 * third**2
+    else:
+        spring = 0.5 * p.k1 * bent**2 + 0.25 * p.k3 * bent**4
+    spring = spring * (1 + p.ripple_k * np.cos(p.ripple_k_order * a + p.ripple_k_phase))
+    moving = 0.5 * p.motor_inertia * w**2 + 0.5 * p.load_inertia * r**2 + 0.5 * p.third_inertia * q**2
+    held = 0.5 * p.tether * b**2 - p.weight * np.cos(b + p.weight_phase) + 0.5 * p.third_stiffness * (b - c) ** 2
+    return moving + spring + held
+
+
+CONSERVATIVE = {
+    "teeth": table({2: (2e-4, 0.0)}) | {"wobble": 0.4},
+    "ripple": {"ripple_k": 0.1, "ripple_k_phase": 0.3},
+    "load": {"weight": 2.0, "weight_phase": 0.4, "tether": 5.0},
+    "third": {"third_inertia": 0.01, "third_stiffness": 3000.0},
+    "gap": {"gap": 1e-4, "gap_damps": 0.0},
+    "slopes": {"k3": 0.0, "slope_2": 9000.0, "slope_3": 12000.0, "knee_1": 4e-4, "knee_2": 9e-4},
+}
+
+
+@pytest.mark.parametrize("name", CONSERVATIVE)
+def test_energy_is_kept(name: str):
+    p = BASE._replace(c1=0.0, **CONSERVATIVE[name])
+    states, _ = integrate(p, START, np.zeros(400), dt=DT, substeps=100)
+    of = energy(p, states)
+    assert np.ptp(states[:, 0] / 50 - states[:, 2]) > 5e-4
+    # Knees and gaps cost the integration two of its orders: 2e-7 where the gap is crossed, 1e-12 elsewhere.
+    assert np.ptp(of) < 1e-6 * np.max(np.abs(of))
+
+
+LOSSES = (
+    "hysteresis coulomb_friction motor_friction load_friction nonlinear_damping position_dependent_friction creep"
+).split()
+
+
+@pytest.mark.parametrize("form", [f for f in FORMS if f.family in LOSSES], ids=lambda f: f"{f.family}-{f.name}")
+def test_losses_lose(form: Form):
+    """In the end there is less energy than without the loss; on the way, memory stores some and returns it."""
+    base = BASE._replace(c1=1e-6)
+    lossy = base._replace(**form.changes(form.high, np.random.default_rng(0), BASE))
+    kept, left = (energy(base, integrate(p, START, np.zeros(600), dt=DT, substeps=100)[0]) for p in (base, lossy))
+    assert left[-1] < 0.999 * kept[-1]
+
+
+@pytest.mark.parametrize("form", FORMS, ids=lambda f: f"{f.family}-{f.name}")
+def test_every_form_moves_the_log_and_nothing_does_at_zero(form: Form):
+    base = Mechanism()
+    torque, warm = shaking(200), np.full(200, 10.0)
+
+    def readings(strength: float) -> np.ndarray:
+        p = base._replace(**form.changes(strength, np.random.default_rng(3), base))
+        return np.column_stack(read_encoders(p, integrate(p, START, torque, dt=DT, substeps=100, warm=warm)[0]))
+
+    plain = np.column_stack(read_encoders(base, integrate(base, START, torque, dt=DT, substeps=100)[0]))
+    strong = readings(form.high)
+    assert np.isfinite(strong).all()
+    assert np.abs(strong - plain).max() > 1e-7
+    if form.low < form.high:
+        assert readings(0.0) == pytest.approx(plain, rel=1e-13, abs=1e-13)
+
+
+def test_dry_friction_holds_slides_and_stops():
+    """A motor without spring, in closed form."""
+    p = Mechanism(k1=1e-9, c1=0.0, hold_m=0.05, slide_m=0.04, sink_m=1e-9)
+    still, _ = integrate(p, np.zeros(4), np.full(50, 0.0499), dt=DT, substeps=100)
+    assert np.all(still[:, :2] == 0.0)
+    loose, _ = integrate(p, np.zeros(4), np.full(50, 0.051), dt=DT, substeps=100)
+    time = DT * np.arange(50)
+    # The very first stage, at rest, still meets the holding torque: a sixth of a step's worth.
+    assert loose[:, 1] == pytest.approx((0.051 - 0.04) / 5e-4 * time, abs=2e-5)
+    slowing, _ = integrate(p, np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(50), dt=DT, substeps=100)
+    assert slowing[:, 1] == pytest.approx(np.maximum(1.0 - 0.04 / 5e-4 * time, 0.0), abs=1e-9)
+
+
+def test_dead_time_is_a_shift():
+    torque = np.concatenate([np.zeros(20), shaking(60)])
+    late, _ = integrate(BASE._replace(dead_time=3 * DT), np.zeros(4), torque, dt=DT, substeps=50)
+    prompt, _ = integrate(BASE, np.zeros(4), torque, dt=DT, substeps=50)
+    assert late[3:, :4] == pytest.approx(prompt[:-3, :4], rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        forms_of("motor_friction")[0],
+        forms_of("load_friction")[0],
+        forms_of("coulomb_friction")[0],
+        forms_of("backlash")[0],
+    ],
+    ids=lambda f: f.family,
+)
+def test_steps_are_fine_enough_for_nonsmooth_effects(form: Form):
+    """Half the step changes the twist by far less than an encoder's noise, 1e-6 rad."""
+    p = BASE._replace(**form.changes(0.3 * form.high, np.random.default_rng(0), BASE))
+    runs = [
+        integrate(p, np.zeros(4), np.repeat(shaking(50), 12), dt=DT, substeps=n)[0]
+        for n in (int(DT / drawing.FINEST), 2 * int(DT / drawing.FINEST))
+    ]
+    first, second = (states[:, 0] / 50 - states[:, 2] for states in runs)
+    assert np.std(first) > 5e-5
+    assert np.sqrt(np.mean((first - second) ** 2)) < 1e-7
+
+
+def seen(p: Mechanism, sigma: tuple[float, float] = (1e-5, 1e-6)) -> float:
+    torque = np.repeat(shaking(400), 5)
+    states, _ = integrate(p, np.zeros(4), torque, dt=DT, substeps=20)
+    readings = np.column_stack(read_encoders(p, states))
+    return detectability(BASE, [(states, readings, torque, np.zeros(2000))], sigma=sigma, dt=DT)
+
+
+def test_detectability_sees_what_a_refit_leaves():
+    one = seen(BASE._replace(bias=0.01))
+    assert one > 1.0
+    assert seen(BASE._replace(bias=0.02)) == pytest.approx(2 * one, rel=0.05)
+    assert seen(BASE._replace(bias=0.01), sigma=(2e-5, 2e-6)) == pytest.approx(one / 2, rel=1e-3)
+    # What another stiffness or damping can do is not there to be found.
+    assert seen(BASE) < 1e-2
+    assert seen(BASE._replace(k1=7007.0, c1=0.303)) < 0.05
+    # One sample of one encoder, off by so many sigma: a fifth of its square counts.
+    states, _ = integrate(BASE, np.zeros(4), shaking(400), dt=DT, substeps=20)
+    readings = np.column_stack(read_encoders(BASE, states))
+    readings[100, 1] += 1e-4
+    found = detectability(BASE, [(states, readings, shaking(400), np.zeros(400))], sigma=(1e-5, 1e-6), dt=DT)
+    assert found == pytest.approx(100 * np.sqrt(0.2) / LIMIT, rel=0.05)
+
+
+def test_noise_has_its_rms_and_colour():
+    random = np.random.default_rng(0)
+    for encoders in (Encoders((1e-5, 1e-6), (0.0, 0.0), 0.9), Encoders((1e-5, 1e-6), (2e-5, 2e-6), 0.0)):
+        error = encoders.read(np.zeros((200000, 2)) + np.linspace(0, 1, 200000)[:, None], random)
+        error -= np.linspace(0, 1, 200000)[:, None]
+        assert np.std(error, axis=0) == pytest.approx(encoders.rms, rel=0.02)
+        neighbours = np.corrcoef(error[1:, 1], error[:-1, 1])[0, 1]
+        assert neighbours == pytest.approx(2 / 3 * encoders.memory, abs=0.02)
+
+
+def test_a_case_becomes_a_log_folder_that_the_loop_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(drawing, "_SIZES", ((1000.0, (1200, 1200, 800)),) * 3)
+    (form,) = [f for f in FORMS if f.name == "stiffness" and f.family == "temperature"]
+    case = drawing.Case("try-1", (form,), 5)
+    answer = record(drawing.draw(case), tmp_path)
+    assert answer == json.loads((tmp_path / "answer.json").read_text())
+    assert answer["families"] == ["temperature"]
+    assert answer["detection_limits"][0] >= drawing.LEAST
+    rig = read_rig([tmp_path / "train_1.csv", tmp_path / "train_2.csv"], tmp_path / "drive.toml")
+    log = rig.logs[0]
+    assert log.time.size == 1200
+    assert rig.hold == "zero-order"
+    assert log.temperature is not None and 273 < log.temperature.min() < 330
+    again = record(drawing.draw(case), tmp_path / "again")
+    assert again == answer
+    assert (tmp_path / "again" / "train_1.csv").read_bytes() == (tmp_path / "train_1.csv").read_bytes()
+
+
+def test_faint_cases_are_faint(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(drawing, "_SIZES", ((1000.0, (1200, 1200, 800)),) * 3)
+    drawn = drawing.draw(drawing.Case("try-2", (forms_of("torque_sensor")[0],), 6, faint=True))
+    assert drawing.LEAST <= drawn.detectable[0] < 1.5 * drawing.FAINT
+
+
+def test_lists_of_cases():
+    cases = drawing.single_cases(3 * len(FAMILIES), 0, FAMILIES)
+    assert len({c.name for c in cases}) == len(cases)
+    assert {c.forms[0].family for c in cases} == set(FAMILIES)
+    # A longer study goes on with the cases of a shorter one.
+    assert cases[:10] == drawing.single_cases(10, 0, FAMILIES)
+    for first, second in (case.forms for case in drawing.pair_cases(200, 0)):
+        assert first.family != second.family
+        changed = [set(f.changes(f.high, np.random.default_rng(0), BASE)) for f in (first, second)]
+        assert not changed[0] & changed[1]
