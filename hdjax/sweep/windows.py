@@ -52,4 +52,4 @@ def largest_between(
     c4 = -15.0 * jump + 8.0 * p0 + 7.0 * p1 + 3.0 * q0 - 2.0 * q1
     c5 = 6.0 * jump - 3.0 * (p0 + p1) - q0 + q1
     top = x0 + s * (p0 + s * (q0 + s * (c3 + s * (c4 + s * c5))))
-    return jnp.maximum(jnp.abs(x1), where(turns, jnp.abs(top), 0.0))
+    return jnp.maximum(jnp.maximum(jnp.abs(x0), jnp.abs(x1)), where(turns, jnp.abs(top), 0.0))
