@@ -27,7 +27,6 @@ from hdjax.where import where
 MOTIONS = ("low", "middle", "high")
 _LOPSIDED: tuple[type[Effect], ...] = (QuadraticStiffness,)
 _BISECTIONS = 50
-_ITERATIONS = 25
 _SOLVED = 1e-10
 _LONGEST_STEP = 0.5
 _PEAK_SAMPLES = 64
@@ -160,6 +159,8 @@ def balance_lanes(
     omega: Float[Array, " lanes"],
     amplitude: Float[Array, " lanes"],
     kept: Waves,
+    *,
+    iterations: int,
 ) -> Balanced:
     """Newton's method from one-harmonic motions.
 
@@ -170,6 +171,7 @@ def balance_lanes(
         omega: forcing frequency [rad/s].
         amplitude: of the motion to start from [rad].
         kept: the harmonics.
+        iterations: at most.
     """
     square = equation.drive.omega_0**2
     n = kept.orders.size
@@ -211,7 +213,7 @@ def balance_lanes(
         return where(jnp.isfinite(moved), moved, u), where(jnp.isfinite(length), length, jnp.inf), count + 1
 
     def unfinished(carry: tuple[Array, Array, Array]) -> Array:
-        return jnp.any(carry[1] > _SOLVED) & (carry[2] < _ITERATIONS)
+        return jnp.any(carry[1] > _SOLVED) & (carry[2] < iterations)
 
     phase = jnp.arctan2(equation.drive.mu * omega, square * (1.0 + 0.75 * equation.drive.alpha * amplitude**2) - omega**2)
     start = jnp.zeros((n, amplitude.size)).at[first].set(amplitude * jnp.cos(phase))
@@ -245,14 +247,20 @@ def _eliminated(matrix: Float[Array, "n n lanes"], right: Float[Array, "n lanes"
     wherever there is damping; what rounding leaves, the next Newton step sees.
     """
     n = matrix.shape[0]
-    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
-    sign = jnp.ones_like(right[0])
-    for j in range(0, n, 2):
-        a, b, c, d = rows[j, j], rows[j, j + 1], rows[j + 1, j], rows[j + 1, j + 1]
+
+    def block(j: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        rows, sign = carry
+        pair = jax.lax.dynamic_slice_in_dim(rows, 2 * j, 2, axis=0)
+        columns = jax.lax.dynamic_slice_in_dim(rows, 2 * j, 2, axis=1)
+        own = jax.lax.dynamic_slice_in_dim(columns, 2 * j, 2, axis=0)
+        a, b, c, d = own[0, 0], own[0, 1], own[1, 0], own[1, 1]
         determinant = a * d - b * c
-        sign = sign * jnp.sign(determinant)
-        pivot = rows[j : j + 2] / determinant[None, None]
-        upper, lower = d[None] * pivot[0] - b[None] * pivot[1], a[None] * pivot[1] - c[None] * pivot[0]
-        rows = rows - rows[:, j, None] * upper[None] - rows[:, j + 1, None] * lower[None]
-        rows = rows.at[j].set(upper).at[j + 1].set(lower)
+        first, second = pair / determinant[None, None]
+        solved = jnp.stack([d[None] * first - b[None] * second, a[None] * second - c[None] * first])
+        rows = rows - columns[:, 0, None] * solved[None, 0] - columns[:, 1, None] * solved[None, 1]
+        return jax.lax.dynamic_update_slice_in_dim(rows, solved, 2 * j, axis=0), sign * jnp.sign(determinant)
+
+    rows = jnp.concatenate([matrix, right[:, None]], axis=1)
+    # A loop, not its steps written out: that program takes a quarter of a minute to compile.
+    rows, sign = jax.lax.fori_loop(0, n // 2, block, (rows, jnp.ones_like(right[0])))
     return rows[:, -1], sign

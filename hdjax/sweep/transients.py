@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hdjax.lanes import jit_lanes, spread
+from hdjax.sweep.blocks import in_tiles, tile_for
 from hdjax.sweep.adaptive import march_adaptively
 from hdjax.sweep.request import Case, Request, duration
 from hdjax.sweep.splitting import ABA864, STRANG, march_split
@@ -63,59 +63,41 @@ def transients(
         route: how.
         values: parameters of the points, by path.
     """
-    count = len(next(iter(values.values())))
-    devices = len(jax.local_devices())
     # One shape of program for pilots and chunks: compiling another takes longer than the lanes that fill this one.
-    tile = 1 << max(min(request.design.size, _TILE) - 1, 1).bit_length()
-    block = min(_BLOCK, tile) if route.method != "adaptive" else min(_ADAPTIVE_BLOCK, tile)
-    lanes = block if route.method == "adaptive" else tile
-    together = devices if lanes % (devices * block) == 0 else 1
-    substeps = jnp.asarray(route.substeps, dtype=int)
-    fixed = dataclasses.replace(route, substeps=route.substeps if route.method == "adaptive" else 0)
-    parts = []
-    for begin in range(0, count, lanes):
-        own = {path: v[begin : begin + lanes] for path, v in values.items()}
-        # The last point fills the rest.
-        filled = {path: jnp.asarray(np.pad(v, (0, lanes - len(v)), mode="edge")) for path, v in own.items()}
-        parts.append(_lanes(case, spread(filled, lanes), substeps, _Wanted(request), fixed, together, block))
-    flat = [jax.tree.map(lambda a: np.asarray(a).reshape(lanes, *a.shape[3:]), part) for part in parts]
-    return jax.tree.map(lambda *rows: np.concatenate(rows)[:count], *flat)
+    tile, block = tile_for(request.design.size, _TILE), _BLOCK
+    if route.method == "adaptive":
+        tile, block = _ADAPTIVE_BLOCK, _ADAPTIVE_BLOCK
+    fixed = route if route.method == "adaptive" else dataclasses.replace(route, substeps=0)
+    wanted = (request.duration, request.periods, request.windows, request.peaks)
+    steps = jnp.asarray(route.substeps, dtype=int)
+    return in_tiles(_Lanes(fixed, *wanted), (case, steps), values, tile=tile, block=block)
 
 
-class _Wanted:
-    """What of a request shapes the program: requests that differ in their design alone share it."""
+class _Lanes(eqx.Module):
+    """Transients of a block of points: what of a request shapes the program. Other designs and other numbers of steps
+    share it."""
 
-    def __init__(self, request: Request):
-        self.request = request
-        self._key = (request.duration, request.periods, request.windows, request.peaks)
+    route: Route = eqx.field(static=True)
+    duration: float | None = eqx.field(static=True)
+    periods: float | None = eqx.field(static=True)
+    windows: int = eqx.field(static=True)
+    peaks: bool = eqx.field(static=True)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Wanted) and self._key == other._key
+    def __call__(self, constants: tuple[Case, Array], values: dict[str, Array]) -> tuple[Windows, Array]:
+        case, substeps = constants
+        dtype = jnp.float32 if self.route.single else jnp.result_type(float)
 
-    def __hash__(self) -> int:
-        return hash(self._key)
+        def lane(values: dict[str, Array]) -> tuple[Windows, Array]:
+            own = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, case.at(values))
+            return _motion(own, self, substeps)
 
-
-@jit_lanes
-def _lanes(
-    case: Case, values: dict[str, Array], substeps: Array, wanted: _Wanted, route: Route, together: int, block: int
-) -> tuple[Windows, Array]:
-    dtype = jnp.float32 if route.single else jnp.result_type(float)
-
-    def lane(values: dict[str, Array]) -> tuple[Windows, Array]:
-        own = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, case.at(values))
-        return _motion(own, wanted.request, route, substeps)
-
-    # One block of each device at a time: the device's axis stays whole through the loop.
-    blocks = jax.tree.map(lambda v: jnp.moveaxis(v.reshape(together, -1, block), 1, 0), values)
-    found = jax.lax.map(jax.vmap(jax.vmap(lane)), blocks)
-    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), found)
+        return jax.vmap(lane)(values)
 
 
-def _motion(case: Case, request: Request, route: Route, substeps: Array) -> tuple[Windows, Array]:
+def _motion(case: Case, wanted: _Lanes, substeps: Array) -> tuple[Windows, Array]:
     """One point's transient from rest."""
-    model, length = case.model, duration(request, case)
-    common = {"windows": request.windows, "peaks": request.peaks}
+    model, route, length = case.model, wanted.route, duration(wanted, case)
+    common = {"windows": wanted.windows, "peaks": wanted.peaks}
     if route.method == "adaptive":
         scale = _size(case, length)
         return march_adaptively(
@@ -123,7 +105,7 @@ def _motion(case: Case, request: Request, route: Route, substeps: Array) -> tupl
             case.forcing,
             model.rest(),
             length,
-            windows=request.windows,
+            windows=wanted.windows,
             looks=route.substeps,
             tolerance=route.tolerance,
             scale=scale,
