@@ -38,7 +38,8 @@ def in_tiles(
     for begin in range(0, count, tile):
         own = {path: v[begin : begin + tile] for path, v in values.items()}
         filled = {path: jnp.asarray(np.pad(v, (0, tile - len(v)), mode="edge")) for path, v in own.items()}
-        shared = spread(filled, tile)
+        # The same blocks on any number of devices: so the same points give the same bits.
+        shared = spread(filled, tile) if tile >= block * len(jax.local_devices()) else filled
         sharding = next(iter(shared.values())).sharding
         mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
         parts.append(_tile(program, constants, shared, mesh, block))
