@@ -97,7 +97,7 @@ def variables(request: Request) -> tuple[Variable, ...]:
 def extra_dims(request: Request, plan: Plan) -> dict[str, np.ndarray]:
     """Coordinates of the dimensions behind those of the design."""
     if isinstance(plan.route, SteadyRoute):
-        return {"motion": np.array(MOTIONS), "harmonic": np.array(plan.route.orders)}
+        return {"motion": np.arange(1, MOTIONS + 1), "harmonic": np.array(plan.route.orders)}
     return {"window": np.arange(1, request.windows + 1) / request.windows}
 
 
@@ -145,4 +145,4 @@ def _durations(case: Case, request: Request, values: Mapping[str, np.ndarray]) -
     omega = values.get("forcing.omega")
     if request.periods is not None and omega is not None:
         return request.periods * 2 * np.pi / omega
-    return np.full(len(next(iter(values.values()))), float(duration(request, case)))
+    return np.full(len(next(iter(values.values()))), float(duration(case, request.duration, request.periods)))

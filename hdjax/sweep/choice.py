@@ -10,17 +10,20 @@ from jaxtyping import Int
 
 from hdjax.sweep.request import Case, Request, duration
 from hdjax.sweep.splitting import splits
-from hdjax.sweep.transients import Route, transients
+from hdjax.sweep.transients import Method, Route, transients
 from hdjax.sweep.windows import Windows
 
 SAMPLED = 64
 """Points that a route is chosen on, and as many others that it is checked on."""
 _REFERENCE = 1e-11
 # What a step costs beside a Strang step in double precision, measured on a CPU.
-_COST = {"strang": 1.0, "aba864": 3.0, "tsit5": 6.0}
+_COST = {"strang": 1.0, "aba864": 3.0, "srkn14": 6.0, "tsit5": 6.0}
 _LOOKS_PER_TURN = 24
 _MOST_STEPS_PER_TURN = 512
-_FINER = 1.5
+_FINER = 1.25
+_SAFETY = 0.5
+# Steps of ABA(8,6,4) for a turn below which a Strang step, and above which a step of higher order, may be cheaper.
+_FEW_STEPS, _MANY_STEPS = 10.0, 24.0
 # Below this the rounding errors of single precision would be asked too much of.
 _SINGLE_FROM = 1e-4
 _ATTEMPTS = 4
@@ -89,27 +92,44 @@ def drawn_points(request: Request) -> tuple[Int[np.ndarray, " pilot"], Int[np.nd
 
 
 def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, np.ndarray]) -> Route:
+    """The cheapest route within half the tolerance on the pilot."""
     turns = _turns_per_window(case, request, values)
-    methods = ("strang", "aba864") if splits(case.model, case.forcing) else ("tsit5",)
-    singles = (True, False) if request.tolerance >= _SINGLE_FROM and methods[0] == "strang" else (False,)
-    best, least = None, math.inf
-    for method in methods:
-        for single in singles:
-            cost = _COST[method] * (0.5 if single else 1.0)
-            substeps, before, rises = max(1, math.ceil(turns)), math.inf, 0
-            while cost * substeps < least and substeps <= max(1.0, turns) * _MOST_STEPS_PER_TURN and rises < 3:
-                route = Route(method, substeps, single)
-                errors, _ = _errors(transients(case, request, route, values), truth)
-                worst = float(np.max(errors, initial=0.0))
-                if worst <= 0.5 * request.tolerance:
-                    best, least = route, cost * substeps
-                    break
-                # Rounding errors don't shrink with the step.
-                rises = rises + 1 if worst > 0.9 * before and worst < 0.1 else 0
-                before, substeps = min(before, worst), math.ceil(_FINER * substeps)
-    if best is None:
-        best = Route("adaptive", _looks_for(turns), tolerance=0.01 * request.tolerance)
-    return best
+    split = splits(case.model, case.forcing)
+    singles = (True, False) if split and request.tolerance >= _SINGLE_FROM else (False,)
+    for single in singles:
+
+        def needed(method: Method, most: float, single: bool = single) -> Route | None:
+            return _fewest_steps(case, request, Route(method, 1, single), values, truth, turns, most)
+
+        if not split:
+            found = needed("tsit5", math.inf)
+        elif (found := needed("aba864", math.inf)) is not None:
+            each = found.substeps / turns
+            # Each further method is a program to compile: only where it can win.
+            other = "strang" if each < _FEW_STEPS else "srkn14" if each > _MANY_STEPS else None
+            if other is not None:
+                most = found.substeps * _COST["aba864"] / _COST[other]
+                found = needed(other, most) or found
+        if found is not None:
+            return found
+    return Route("adaptive", _looks_for(turns), tolerance=0.01 * request.tolerance)
+
+
+def _fewest_steps(
+    case: Case, request: Request, route: Route, values: dict, truth: tuple, turns: float, most: float
+) -> Route | None:
+    """The route with as few steps as the pilot allows, or none where more steps don't help or cost more than others."""
+    substeps, least, rises = max(1, math.ceil(turns)), math.inf, 0
+    while substeps <= min(most, max(1.0, turns) * _MOST_STEPS_PER_TURN) and rises < 3:
+        tried = dataclasses.replace(route, substeps=substeps)
+        errors, _ = _errors(transients(case, request, tried, values), truth)
+        worst = float(np.max(errors, initial=0.0))
+        if worst <= _SAFETY * request.tolerance:
+            return tried
+        # Rounding errors don't shrink with the step.
+        rises = rises + 1 if worst > 0.9 * least and worst < 0.1 else 0
+        least, substeps = min(least, worst), math.ceil(_FINER * substeps)
+    return None
 
 
 def _errors(found: tuple[Windows, np.ndarray], truth: tuple[Windows, np.ndarray]) -> tuple[np.ndarray, int]:
@@ -129,7 +149,7 @@ def _turns_per_window(case: Case, request: Request, values: dict) -> float:
     def one(values: dict) -> tuple[jax.Array, jax.Array]:
         own = case.at(values)
         omega_0 = own.model.drive.omega_0
-        return jnp.maximum(omega_0, getattr(own.forcing, "omega", omega_0)), duration(request, own)
+        return jnp.maximum(omega_0, getattr(own.forcing, "omega", omega_0)), duration(own, request.duration, request.periods)
 
     fastest, longest = jax.vmap(one)({path: jnp.asarray(v) for path, v in values.items()})
     return float(jnp.max(fastest * longest)) / (2 * math.pi) / request.windows

@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -80,16 +80,6 @@ class Request:
         return bool({"peak", "settling_time"} & set(self.outputs))
 
 
-class Lasting(Protocol):
-    """What says how long a transient is."""
-
-    @property
-    def duration(self) -> float | None: ...
-
-    @property
-    def periods(self) -> float | None: ...
-
-
 class Case(eqx.Module):
     """A model and its forcing, into which a point's values are put.
 
@@ -144,10 +134,10 @@ def digest(case: Case, request: Request) -> str:
     return hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:24]
 
 
-def duration(request: Lasting, case: Case) -> Array:
-    """How long a point's transient is [s]."""
-    if request.duration is not None:
-        return jnp.asarray(request.duration, dtype=case.model.drive.omega_0.dtype)
-    if request.periods is None or not hasattr(case.forcing, "omega"):
+def duration(case: Case, seconds: float | None, periods: float | None) -> Array:
+    """How long a point's transient is [s]: so many seconds, or so many periods of its forcing."""
+    if seconds is not None:
+        return jnp.asarray(seconds, dtype=case.model.drive.omega_0.dtype)
+    if periods is None or not hasattr(case.forcing, "omega"):
         raise ValueError("`periods` needs a forcing with a frequency `omega`; give a `duration`")
-    return request.periods * (2.0 * np.pi) / case.forcing.omega  # pyright: ignore[reportFunctionMemberAccess]
+    return periods * (2.0 * np.pi) / case.forcing.omega  # pyright: ignore[reportFunctionMemberAccess]

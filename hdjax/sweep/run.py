@@ -17,6 +17,11 @@ from hdjax.sweep.store import Store, required
 
 _MEMORY = 1 << 29
 _LARGEST_CHUNK = 1 << 16
+_MEANINGS = {
+    "motion": "steady motion, by rising amplitude: 1 on the low branch, 2 between the folds, 3 on the high branch",
+    "harmonic": "multiple of the forcing frequency",
+    "window": "part of the duration at whose end the value stands",
+}
 _COPIES = 4  # of a chunk's values that are about at a time
 
 
@@ -145,7 +150,7 @@ def dataset(case: Case, request: Request, chosen: Plan, found: dict[str, np.ndar
     for v in variables(request):
         values = found[v.name].reshape(*shape.values(), *found[v.name].shape[1:])
         data[v.name] = ((*shape, *v.dims), values, {"units": v.unit, "long_name": v.doc})
-        coordinates |= {d: ((d,), extra[d]) for d in v.dims}
+        coordinates |= {d: ((d,), extra[d], {"long_name": _MEANINGS[d]}) for d in v.dims}
     if "motions" in data and "forcing.omega" in design.axes:
         data["fold"] = _folds(data["motions"])
     if request.duration is not None and "window" in coordinates:

@@ -24,7 +24,8 @@ from hdjax.sweep.twist import TwistEquation
 from hdjax.sweep.windows import largest_between
 from hdjax.where import where
 
-MOTIONS = ("low", "middle", "high")
+MOTIONS = 3
+"""At most, by rising amplitude: on the low branch, between the folds, and on the high branch."""
 _LOPSIDED: tuple[type[Effect], ...] = (QuadraticStiffness,)
 _BISECTIONS = 50
 _SOLVED = 1e-10

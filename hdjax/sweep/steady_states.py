@@ -122,7 +122,7 @@ def steady_states(
 def _arranged(found: Balanced, count: int, point: np.ndarray, motion: np.ndarray, route: SteadyRoute) -> SteadyStates:
     n = len(route.orders)
     unknowns = np.asarray(found.unknowns)
-    shape = (count, len(MOTIONS))
+    shape = (count, MOTIONS)
 
     def placed(rows: np.ndarray, nothing: float | bool) -> np.ndarray:
         full = np.full((*shape, *rows.shape[1:]), nothing, rows.dtype)
@@ -224,7 +224,7 @@ def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) 
     orders = np.array(route.orders, dtype=float)
     rows = [getattr(found, name)[point, motion] for name in ("mean", "cosine", "sine", "peak")]
     own = {path: jnp.asarray(v[point]) for path, v in values.items()}
-    errors, reached = (np.asarray(a) for a in _one_period(case, own, *map(jnp.asarray, rows), orders))
+    errors, reached = (np.asarray(a) for a in _one_period(case, own, *map(jnp.asarray, (*rows, orders))))
     reference = f"one period by adaptive Dopri8 of diffrax at rtol {_REFERENCE:g}"
     good = errors[reached]
     error, median = (float(np.max(good)), float(np.median(good))) if good.size else (math.nan, math.nan)
@@ -232,7 +232,7 @@ def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) 
 
 
 @eqx.filter_jit
-def _one_period(case: Case, values: dict, mean: Array, cosine: Array, sine: Array, peak: Array, orders: np.ndarray):
+def _one_period(case: Case, values: dict, mean: Array, cosine: Array, sine: Array, peak: Array, orders: Array):
     """How far a motion that starts on each series has left it within a period, and whether it was integrated."""
 
     def one(values: dict, mean: Array, cosine: Array, sine: Array, peak: Array) -> tuple[Array, Array]:

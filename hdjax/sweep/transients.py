@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float
 from hdjax.sweep.blocks import in_tiles, tile_for
 from hdjax.sweep.adaptive import march_adaptively
 from hdjax.sweep.request import Case, Request, duration
-from hdjax.sweep.splitting import ABA864, STRANG, march_split
+from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split
 from hdjax.sweep.stepping import march_steps
 from hdjax.sweep.windows import Windows
 
-Method = Literal["strang", "aba864", "tsit5", "adaptive"]
-_SPLITTINGS = {"strang": STRANG, "aba864": ABA864}
+Method = Literal["strang", "aba864", "srkn14", "tsit5", "adaptive"]
+_SPLITTINGS = {"strang": STRANG, "aba864": ABA864, "srkn14": SRKN14}
 # The lanes that are moved together: their states and constants stay in a core's cache.
 _BLOCK = 1024
 # Adaptive lanes wait for the slowest of their block.
@@ -48,8 +48,8 @@ class Route:
         precision = "single" if self.single else "double"
         if self.method == "adaptive":
             return f"adaptive Dopri8 of diffrax at rtol {self.tolerance:g}, {precision} precision"
-        names = {"strang": STRANG.name, "aba864": ABA864.name, "tsit5": "Tsit5"}
-        return f"fixed-step lanes, {names[self.method]}, {self.substeps} steps a window, {precision} precision"
+        name = "Tsit5" if self.method == "tsit5" else _SPLITTINGS[self.method].name
+        return f"fixed-step lanes, {name}, {self.substeps} steps a window, {precision} precision"
 
 
 def transients(
@@ -96,7 +96,7 @@ class _Lanes(eqx.Module):
 
 def _motion(case: Case, wanted: _Lanes, substeps: Array) -> tuple[Windows, Array]:
     """One point's transient from rest."""
-    model, route, length = case.model, wanted.route, duration(wanted, case)
+    model, route, length = case.model, wanted.route, duration(case, wanted.duration, wanted.periods)
     common = {"windows": wanted.windows, "peaks": wanted.peaks}
     if route.method == "adaptive":
         scale = _size(case, length)
