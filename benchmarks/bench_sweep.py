@@ -256,7 +256,9 @@ def against_scipy(few: Columns, truth: np.ndarray, size: np.ndarray, ours: float
         error = float(np.max(np.abs(found - truth[: len(rows)]) / size[: len(rows)]))
         if error <= TOLERANCE:
             break
-    print(f"SciPy DOP853 at rtol {rtol:.0e}: error {error:.1e}, {each * 1e3:.1f} ms a drive, {each / ours:.0f} times hdjax's")
+    print(
+        f"SciPy DOP853 at rtol {rtol:.0e}: error {error:.1e}, {each * 1e3:.1f} ms a drive, {each / ours:.0f} times hdjax's"
+    )
 
 
 def scaling(sizes: list[int]) -> None:

@@ -92,11 +92,15 @@ def _text(result) -> str:
         f"{a['checked_median_error']:.1e} in the median",
     ]
     if not a["tolerance_kept"]:
-        lines.append(f"The asked tolerance of {a['tolerance']:g} is not kept on these points: some motions magnify errors")
+        lines.append(
+            f"The asked tolerance of {a['tolerance']:g} is not kept on these points: some motions magnify errors"
+        )
     if "motions" in result:
         several, lost = int((result.motions > 1).sum()), int(result.lost.sum())
         lines.append(f"{several} points have several steady motions; at {lost} one was not found, mostly at a fold")
     for name in ("peak", "amplitude", "settling_time"):
         if name in result and np.isfinite(result[name]).any():
-            lines.append(f"{name}: {float(result[name].min()):.4g} to {float(result[name].max()):.4g} {result[name].units}")
+            lines.append(
+                f"{name}: {float(result[name].min()):.4g} to {float(result[name].max()):.4g} {result[name].units}"
+            )
     return "\n".join(lines)

@@ -126,7 +126,9 @@ def _range(path: Path, section: str, table: Mapping[str, Any]) -> tuple[float, f
         raise InputError(f"{path}: [{section}] spacing must be linear or log, but is {spacing}")
     start, end = (_number(path, f"[{section}] {key}", table[key]) for key in ("from", "to"))
     if spacing == "log" and not (start > 0.0 and end > 0.0):
-        raise InputError(f"{path}: [{section}] must run from above zero for spacing log, but runs from {start} to {end}")
+        raise InputError(
+            f"{path}: [{section}] must run from above zero for spacing log, but runs from {start} to {end}"
+        )
     return start, end, spacing
 
 

@@ -149,7 +149,9 @@ def _turns_per_window(case: Case, request: Request, values: dict) -> float:
     def one(values: dict) -> tuple[jax.Array, jax.Array]:
         own = case.at(values)
         omega_0 = own.model.drive.omega_0
-        return jnp.maximum(omega_0, getattr(own.forcing, "omega", omega_0)), duration(own, request.duration, request.periods)
+        return jnp.maximum(omega_0, getattr(own.forcing, "omega", omega_0)), duration(
+            own, request.duration, request.periods
+        )
 
     fastest, longest = jax.vmap(one)({path: jnp.asarray(v) for path, v in values.items()})
     return float(jnp.max(fastest * longest)) / (2 * math.pi) / request.windows

@@ -7,8 +7,7 @@ import jax
 
 from hdjax.sweep.answers import Plan
 from hdjax.sweep.request import Case, Request
-from hdjax.sweep.run import work
-from hdjax.sweep.store import Store, required
+from hdjax.sweep.store import Store, required, work
 
 _RETRIES = 3
 

@@ -12,8 +12,9 @@ import numpy as np
 from hdjax.dynamics import Model
 from hdjax.sweep.answers import Plan, answers, extra_dims, plan, variables
 from hdjax.sweep.design import SAMPLE
+from hdjax.sweep.hosts import spread_chunks
 from hdjax.sweep.request import Case, Request, digest
-from hdjax.sweep.store import Store, required
+from hdjax.sweep.store import Store, required, work
 
 _MEMORY = 1 << 29
 _LARGEST_CHUNK = 1 << 16
@@ -85,12 +86,6 @@ def opened(folder: Path, case: Case, request: Request, *, memory: int = _MEMORY)
     return kept, chosen
 
 
-def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) -> int:
-    """Work out a chunk and keep it."""
-    kept.write(chunk, answers(case, request, chosen, request.design.values(kept.points(chunk))))
-    return chunk
-
-
 def _fill(
     kept: Store,
     case: Case,
@@ -106,8 +101,6 @@ def _fill(
     if not waiting:
         return
     if workers or scheduler:
-        from hdjax.sweep.hosts import spread_chunks
-
         chunks: Iterator[int] = spread_chunks(kept, case, request, chosen, waiting, workers, scheduler)
     else:
         chunks = (work(kept, case, request, chosen, chunk) for chunk in waiting)

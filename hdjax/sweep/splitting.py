@@ -9,7 +9,6 @@ steps resolve the oscillation itself (McLachlan 1995; Blanes, Casas, Farres, Las
 import itertools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -20,7 +19,7 @@ from hdjax.sweep.twist import SPRINGS, TwistEquation, twist_equation
 from hdjax.sweep.windows import Windows, largest_between
 from hdjax.where import where
 
-_LEAST_DETUNING = 1e-10
+_LEAST_DETUNING = 1e-9
 _LEAST_RATE = 1e-3
 
 

@@ -216,7 +216,9 @@ def balance_lanes(
     def unfinished(carry: tuple[Array, Array, Array]) -> Array:
         return jnp.any(carry[1] > _SOLVED) & (carry[2] < iterations)
 
-    phase = jnp.arctan2(equation.drive.mu * omega, square * (1.0 + 0.75 * equation.drive.alpha * amplitude**2) - omega**2)
+    phase = jnp.arctan2(
+        equation.drive.mu * omega, square * (1.0 + 0.75 * equation.drive.alpha * amplitude**2) - omega**2
+    )
     start = jnp.zeros((n, amplitude.size)).at[first].set(amplitude * jnp.cos(phase))
     start = start.at[first + 1].set(amplitude * jnp.sin(phase))
     u, length, _ = jax.lax.while_loop(unfinished, improve, (start, jnp.full_like(amplitude, jnp.inf), jnp.asarray(0)))

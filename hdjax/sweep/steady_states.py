@@ -90,7 +90,9 @@ def require_balanced(model: Model, forcing: object) -> None:
         raise ValueError(f"a steady sweep needs a Harmonic forcing, but has {type(forcing).__name__}")
     if not has_twist_equation(model):
         names = [e.name for e in model.effects]
-        raise ValueError(f"a steady sweep can't carry {names}, which act beyond the mesh or have memory; ask a transient")
+        raise ValueError(
+            f"a steady sweep can't carry {names}, which act beyond the mesh or have memory; ask a transient"
+        )
 
 
 def steady_states(
@@ -208,7 +210,9 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     full = SteadyRoute(_PILOT_HARMONICS, odd)
     found = steady_states(case, request, full, values)
     size = np.hypot(found.cosine, found.sine) / found.peak[..., None]
-    needed = [h for h in _HARMONICS if np.nanmax(size[..., np.array(full.orders) > h], initial=0.0) <= request.tolerance]
+    needed = [
+        h for h in _HARMONICS if np.nanmax(size[..., np.array(full.orders) > h], initial=0.0) <= request.tolerance
+    ]
     route = SteadyRoute(min(needed, default=_HARMONICS[-1]), odd)
     others = request.design.values(other)
     while True:

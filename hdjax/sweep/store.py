@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from hdjax.sweep.answers import Plan, extra_dims, variables
+from hdjax.sweep.answers import Plan, answers, extra_dims, variables
 from hdjax.sweep.request import Case, Request, digest
 
 _PLAN = "plan.json"
@@ -100,6 +100,12 @@ class Store:
         """All variables, one point a row."""
         group = required("zarr").open_group(self.path / "data", mode="r")
         return {v.name: group[v.name][:] for v in variables(self._request)}
+
+
+def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) -> int:
+    """Work out a chunk and keep it."""
+    kept.write(chunk, answers(case, request, chosen, request.design.values(kept.points(chunk))))
+    return chunk
 
 
 def required(name: str) -> Any:

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hdjax.sweep.blocks import in_tiles, tile_for
 from hdjax.sweep.adaptive import march_adaptively
+from hdjax.sweep.blocks import in_tiles, tile_for
 from hdjax.sweep.request import Case, Request, duration
 from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split
 from hdjax.sweep.stepping import march_steps

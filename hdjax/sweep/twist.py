@@ -28,8 +28,8 @@ class TwistEquation(eqx.Module):
 
     drive: Drive | ReducedDrive
     effects: tuple[MeshTorqueEffect, ...]
-    gain: Float[Array, ""]
-    per_torque: Float[Array, ""]
+    gain: Float[Array, "*lanes"]
+    per_torque: Float[Array, "*lanes"]
 
     def kick(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
         """Acceleration by what the spring adds to its linear part, where all effects are [`SPRINGS`][]."""
