@@ -135,7 +135,8 @@ void split(long drives, long steps, double duration, double A, const double *w0,
             }
         }
         for (int i = 0; i < BLOCK; i++)
-            x_end[b * BLOCK + i] = last[0][i] * q[i] + last[1][i] * p[i] + response[0][i] * c[i] - response[1][i] * s[i];
+            x_end[b * BLOCK + i] = last[0][i] * q[i] + last[1][i] * p[i]
+                                 + response[0][i] * c[i] - response[1][i] * s[i];
     }
 }
 """
@@ -257,7 +258,8 @@ def against_scipy(few: Columns, truth: np.ndarray, size: np.ndarray, ours: float
         if error <= TOLERANCE:
             break
     print(
-        f"SciPy DOP853 at rtol {rtol:.0e}: error {error:.1e}, {each * 1e3:.1f} ms a drive, {each / ours:.0f} times hdjax's"
+        f"SciPy DOP853 at rtol {rtol:.0e}: error {error:.1e}, {each * 1e3:.1f} ms a drive, "
+        f"{each / ours:.0f} times hdjax's"
     )
 
 

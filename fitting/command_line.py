@@ -1,4 +1,4 @@
-"""The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds | sweep`."""
+"""The command line: `hdjax fit | close-loop | predict | simulate | sweep | demo | amplitudes | seed-tables | speeds`"""
 
 # ruff: noqa: E402
 

@@ -88,8 +88,8 @@ def _text(result) -> str:
     a = result.attrs
     lines = [
         f"{a['points']} points: {a['route']}",
-        f"Error on {a['checked_points']} drawn points against {a['checked_against']}: {a['checked_error']:.1e} at most, "
-        f"{a['checked_median_error']:.1e} in the median",
+        f"Error on {a['checked_points']} drawn points against {a['checked_against']}: "
+        f"{a['checked_error']:.1e} at most, {a['checked_median_error']:.1e} in the median",
     ]
     if not a["tolerance_kept"]:
         lines.append(

@@ -54,7 +54,7 @@ def read_sweep_file(path: Path) -> SweepFile:
         model = _model(path, sections["drive"], sections["effects"])
         forcing = _forcing(path, sections["forcing"])
         _known(path, "sweep", sections["sweep"], _SWEEP)
-        settings = {k: tuple(v) if isinstance(v, list) else v for k, v in sections["sweep"].items()}
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in sections["sweep"].items()}
         design = Design(_axes(path, sections["axes"]), _sample(path, sections["sample"]))
         return SweepFile(model, forcing, Request(design, **settings))
     except (TypeError, ValueError) as error:

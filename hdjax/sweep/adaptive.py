@@ -41,7 +41,7 @@ def march_adaptively(
         The motion, and whether the solver reached the end.
     """
 
-    def field(t: Array, y: Array, _: object) -> Array:
+    def field(t, y: Array, _: object) -> Array:
         return model.rates(y, forcing(t), jnp.zeros_like(t))
 
     times = jnp.linspace(0.0, 1.0, windows * looks + 1) * duration
@@ -59,8 +59,8 @@ def march_adaptively(
     )
     states = jnp.asarray(solution.ys)
     x, v, a = jax.vmap(lambda y, t: twist(model, y, forcing(t)))(states, times)
-    ends = [(x[part], v[part], a[part]) for part in (slice(None, -1), slice(1, None))]
-    between = largest_between(*ends, jnp.full_like(x[1:], 1.0) * (duration / (windows * looks)))
+    starts, ends = ((x[part], v[part], a[part]) for part in (slice(None, -1), slice(1, None)))
+    between = largest_between(starts, ends, jnp.full_like(x[1:], 1.0) * (duration / (windows * looks)))
     peak = jnp.max(between.reshape(windows, looks), axis=1)
     reached = (solution.result == dfx.RESULTS.successful) & jnp.all(jnp.isfinite(x))
     return Windows(x[looks::looks], v[looks::looks], peak), reached

@@ -42,6 +42,7 @@ def in_tiles(
         shared = spread(filled, tile) if tile >= block * len(jax.local_devices()) else filled
         sharding = next(iter(shared.values())).sharding
         mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
+        assert mesh is None or isinstance(mesh, Mesh)
         parts.append(_tile(program, constants, shared, mesh, block))
     # What runs while the next tile is sent off is fetched last.
     rows = [jax.tree.map(np.asarray, part) for part in parts]

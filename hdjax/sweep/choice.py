@@ -1,4 +1,4 @@
-"""Which route a sweep's transients take: the cheapest that keeps the tolerance on points drawn from the sweep itself."""
+"""Which route a sweep's transients take: the cheapest that keeps the tolerance on points drawn from the sweep."""
 
 import dataclasses
 import math

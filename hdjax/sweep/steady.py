@@ -185,8 +185,8 @@ def balance_lanes(
 
     def forces(u: Array) -> tuple[Array, Array, Array]:
         """Accelerations at the samples, in units of omega_0^2, and their derivatives by twist and phase rate."""
-        x, v = kept.basis.T @ u, omega[None, :] * (kept.slope.T @ u)
-        outside = kept.push[:, None] * push[None, :] + still[None, :]
+        x, v = jnp.asarray(kept.basis.T) @ u, omega[None, :] * (jnp.asarray(kept.slope.T) @ u)
+        outside = jnp.asarray(kept.push)[:, None] * push[None, :] + still[None, :]
 
         def of_one(eq: TwistEquation, x: Array, v: Array, outside: Array) -> tuple[Array, Array, Array]:
             one, none = jnp.ones_like(x), jnp.zeros_like(x)
@@ -237,10 +237,10 @@ def _peak(u: Array, kept: Waves, omega: Array) -> Array:
     even = (np.arange(kept.orders.size) % 2 == 0)[:, None]
     cosine, sine = np.cos(k * angles), np.sin(k * angles)
     basis, slope = np.where(even, cosine, sine), np.where(even, -k * sine, k * cosine)
-    x, v, a = basis.T @ u, slope.T @ u, (-k * k * basis).T @ u
-    ends = [(x[part], v[part], a[part]) for part in (slice(None, -1), slice(1, None))]
+    x, v, a = (jnp.asarray(w.T) @ u for w in (basis, slope, -k * k * basis))
+    starts, ends = ((x[part], v[part], a[part]) for part in (slice(None, -1), slice(1, None)))
     h = jnp.full_like(x[:-1], 2 * np.pi / _PEAK_SAMPLES)
-    return jnp.max(largest_between(*ends, h), axis=0)
+    return jnp.max(largest_between(starts, ends, h), axis=0)
 
 
 def _eliminated(matrix: Float[Array, "n n lanes"], right: Float[Array, "n lanes"]) -> tuple[Array, Array]:

@@ -244,7 +244,7 @@ def _one_period(case: Case, values: dict, mean: Array, cosine: Array, sine: Arra
         # In radians of the forcing, so that lanes step alike.
         start = jnp.stack([mean + jnp.sum(cosine), jnp.sum(orders * sine)])
 
-        def field(angle: Array, y: Array, _: object) -> Array:
+        def field(angle, y: Array, _: object) -> Array:
             outside = push * jnp.cos(angle) + still
             return jnp.stack([y[1], equation.acceleration(y[0], omega * y[1], outside) / omega**2])
 
