@@ -12,8 +12,9 @@ from fitting.errors import InputError
 from fitting.model_file import read_model
 from hdjax import PRESETS, Harmonic, Model, TwoInertiaModel
 from hdjax.effects import BY_NAME
-from hdjax.parameters import own_parameters
 from hdjax.sweep import Design, Request, drawn, spread_values
+from hdjax.sweep.design import RULES
+from hdjax.sweep.request import OUTPUTS
 
 _SECTIONS = ("drive", "effects", "forcing", "axes", "sample", "sweep")
 _FORCING = ("amplitude", "omega", "phase", "offset")
@@ -53,8 +54,7 @@ def read_sweep_file(path: Path) -> SweepFile:
     try:
         model = _model(path, sections["drive"], sections["effects"])
         forcing = _forcing(path, sections["forcing"])
-        _known(path, "sweep", sections["sweep"], _SWEEP)
-        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in sections["sweep"].items()}
+        settings = _settings(path, sections["sweep"])
         design = Design(_axes(path, sections["axes"]), _sample(path, sections["sample"]))
         return SweepFile(model, forcing, Request(design, **settings))
     except (TypeError, ValueError) as error:
@@ -78,7 +78,8 @@ def _model(path: Path, drive: dict[str, Any], effects: dict[str, Any]) -> Model:
         if name not in BY_NAME:
             raise InputError(f"{path}: [effects.{name}] is no effect; there are {', '.join(BY_NAME)}")
         table = _table(path, f"effects.{name}", values)
-        _known(path, f"effects.{name}", table, [n for n, _ in own_parameters(BY_NAME[name])])  # pyright: ignore
+        own_names = [f.name for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata]
+        _known(path, f"effects.{name}", table, own_names)
         numbers = {k: _number(path, f"[effects.{name}] {k}", v) for k, v in table.items()}
         model = model.with_effects(BY_NAME[name](**numbers))
     return model
@@ -88,6 +89,33 @@ def _forcing(path: Path, table: dict[str, Any]) -> Harmonic:
     _known(path, "forcing", table, _FORCING)
     numbers = {k: _number(path, f"[forcing] {k}", v) for k, v in table.items()}
     return Harmonic(**({"amplitude": 1.0, "omega": 1.0} | numbers))
+
+
+def _settings(path: Path, table: dict[str, Any]) -> dict[str, Any]:
+    """What is wanted of each point, of the right kinds."""
+    _known(path, "sweep", table, _SWEEP)
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        if key == "response":
+            found[key] = _one_of(path, "[sweep] response", value, tuple(OUTPUTS))
+        elif key == "outputs":
+            if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+                raise InputError(f"{path}: [sweep] outputs must be a list of names, but is {value!r}")
+            found[key] = tuple(value)
+        elif key in ("windows", "seed"):
+            number = _number(path, f"[sweep] {key}", value)
+            if number != int(number) or number < 0:
+                raise InputError(f"{path}: [sweep] {key} must be a whole number, but is {value!r}")
+            found[key] = int(number)
+        else:
+            found[key] = _number(path, f"[sweep] {key}", value)
+    return found
+
+
+def _one_of(path: Path, where: str, value: object, names: tuple[str, ...]) -> Any:
+    if value not in names:
+        raise InputError(f"{path}: {where} must be one of {', '.join(names)}, but is {value!r}")
+    return value
 
 
 def _axes(path: Path, table: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -113,8 +141,9 @@ def _sample(path: Path, table: dict[str, Any]) -> dict[str, np.ndarray]:
     for name, one in ranges.items():
         _known(path, f"sample.ranges.{name}", _table(path, f"sample.ranges.{name}", one), ("from", "to", "spacing"))
     asked = {name: _range(path, f"sample.ranges.{name}", one) for name, one in ranges.items()}
-    options = {k: table[k] for k in ("rule", "seed") if k in table}
-    return drawn(asked, _count(path, "sample", table), **options)
+    rule = _one_of(path, "[sample] rule", table.get("rule", RULES[0]), RULES)
+    seed = int(_number(path, "[sample] seed", table.get("seed", 0)))
+    return drawn(asked, _count(path, "sample", table), rule=rule, seed=seed)
 
 
 def _range(path: Path, section: str, table: Mapping[str, Any]) -> tuple[float, float, Any]:
