@@ -36,7 +36,7 @@ def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
     drive = (jnp.asarray(mu), jnp.ones(n), jnp.asarray(alpha), jnp.ones(n))
     lanes = eqx.tree_at(lambda m: (m.drive.mu, m.drive.omega_0, m.drive.alpha, m.drive.gain), model, drive)
     found, exists = amplitude_roots(twist_equation(lanes), jnp.full(n, AMPLITUDE), jnp.asarray(omega))
-    assert set(np.sum(exists, axis=1)) == {1, 3}
+    assert set(np.sum(np.asarray(exists), axis=1).tolist()) == {1, 3}
     for i in range(n):
         c, d = 0.75 * alpha[i], 1.0 - omega[i] ** 2
         z = np.roots([c * c, 2 * c * d, d * d + (mu[i] * omega[i]) ** 2, -(AMPLITUDE**2)])
@@ -49,7 +49,10 @@ def test_points_solve_the_harmonic_balance_of_the_drive(effects):
     given, request = case(*effects), request_of(9)
     values = request.design.values(np.arange(request.design.size))
     found = steady_states(given, request, SteadyRoute(9, True), values)
-    assert not found.lost.any()
+    # A one-harmonic motion beyond the saddles of a softening spring, or with less damping, has no relative.
+    assert found.exists.any(axis=1).all()
+    # Samples of a force with corners are not exact.
+    tolerance = 1e-3 if effects else 1e-9
     for i in range(0, request.design.size, 4):
         model = given.model.replace({"alpha": values["alpha"][i]})
         one = solve(balance(model, harmonic_series(1.0, AMPLITUDE), harmonics=9), values["forcing.omega"][i])
@@ -57,7 +60,7 @@ def test_points_solve_the_harmonic_balance_of_the_drive(effects):
         true = np.asarray(one.x.cosine)[::2]
         # That solver finds one of the motions.
         nearest = np.nanmin(np.max(np.abs(found.cosine[i] - true), axis=-1))
-        assert nearest < 1e-9
+        assert nearest < tolerance
 
 
 def test_the_motion_between_the_folds_is_unstable_and_the_series_is_the_motion():

@@ -41,7 +41,7 @@ def steady_request() -> Request:
 
 def slow_request() -> Request:
     design = Design({"forcing.omega": np.linspace(0.5, 2.0, CHUNK * CHUNKS)})
-    return Request(design, "transient", ("peak", "trace"), duration=3000.0, windows=8)
+    return Request(design, "transient", ("peak", "trace"), duration=500.0, windows=8)
 
 
 def begun(folder: Path) -> Store:
