@@ -1,6 +1,7 @@
 """A sweep's chunks on the workers of a Dask cluster."""
 
 import contextlib
+import pickle
 from collections.abc import Iterator
 
 import jax
@@ -37,15 +38,16 @@ def spread_chunks(
             )
             address = stack.enter_context(cluster)
         client = stack.enter_context(distributed.Client(address))
-        shared = client.scatter((kept, case, request, chosen, double), broadcast=True)
+        # Bytes: a worker must know the precision before it makes arrays of them.
+        shared = client.scatter((pickle.dumps((kept, case, request, chosen)), double), broadcast=True)
         # The store remembers what is done, not the scheduler: a later run must ask anew.
         futures = client.map(_on_worker, chunks, given=shared, pure=False, retries=_RETRIES)
         for future in distributed.as_completed(futures):
             yield future.result()
 
 
-def _on_worker(chunk: int, given: tuple[Store, Case, Request, Plan, bool]) -> int:
+def _on_worker(chunk: int, given: tuple[bytes, bool]) -> int:
     """A worker's process is the sweep's own: its precision is set as that of whoever asked."""
-    kept, case, request, chosen, double = given
+    task, double = given
     jax.config.update("jax_enable_x64", double)
-    return work(kept, case, request, chosen, chunk)
+    return work(*pickle.loads(task), chunk)
