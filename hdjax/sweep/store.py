@@ -84,6 +84,10 @@ class Store:
                     marks[int(mark.name)] = True
         return marks
 
+    def has(self, chunk: int) -> bool:
+        """Whether a chunk is whole."""
+        return (self.path / _MARKS / str(chunk)).exists()
+
     def points(self, chunk: int) -> np.ndarray:
         """The points of a chunk."""
         return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self._request.design.size))
@@ -103,8 +107,9 @@ class Store:
 
 
 def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) -> int:
-    """Work out a chunk and keep it."""
-    kept.write(chunk, answers(case, request, chosen, request.design.values(kept.points(chunk))))
+    """Work out a chunk and keep it, unless it was kept: the worker that did it may have died before it said so."""
+    if not kept.has(chunk):
+        kept.write(chunk, answers(case, request, chosen, request.design.values(kept.points(chunk))))
     return chunk
 
 
