@@ -50,4 +50,5 @@ def _on_worker(chunk: int, given: tuple[bytes, bool]) -> int:
     """A worker's process is the sweep's own: its precision is set as that of whoever asked."""
     task, double = given
     jax.config.update("jax_enable_x64", double)
-    return work(*pickle.loads(task), chunk)
+    kept, case, request, chosen = pickle.loads(task)
+    return work(kept, case, request, chosen, chunk)
