@@ -42,6 +42,9 @@ _WORTH_A_COEFFICIENT, _WORTH_A_VARIABLE = 0.005, 0.03
 _NEARLY = 0.8
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
 _SAME_FUNCTION = 0.99
+# What explains less than this share of the error, to first order, is not refitted: of what a model without effects leaves,
+# and beside effects that have a name already.
+_LEAST_SHARE, _LEAST_SHARE_BESIDE = 0.005, 0.02
 # Motions that so few samples reach are no part of the range.
 _RARE = 5e-4
 # First-order changes of a logarithm are taken no larger than this.
@@ -137,7 +140,8 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     """
     progress("looking for what the missing torque depends on")
     sight = _sight(before.training)
-    found = sorted(_candidates(sight), key=lambda c: -c.gain)
+    least = _LEAST_SHARE_BESIDE if before.model.effects else _LEAST_SHARE
+    found = sorted((c for c in _candidates(sight) if c.gain > least), key=lambda c: -c.gain)
     best: tuple[Candidate, Trial] | None = None
     for several in (False, True):
         if best is not None and leaves_white_noise(best[1].training):
