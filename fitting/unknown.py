@@ -42,7 +42,7 @@ _WORTH_A_COEFFICIENT, _WORTH_A_VARIABLE = 0.005, 0.03
 _NEARLY = 0.8
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
 _SAME_FUNCTION = 0.99
-# What explains less than this share of the error, to first order, is not refitted: of what a model without effects leaves,
+# What explains less than this share of the error, to first order, is not refitted: of what the base model leaves,
 # and beside effects that have a name already.
 _LEAST_SHARE, _LEAST_SHARE_BESIDE = 0.005, 0.02
 # Motions that so few samples reach are no part of the range.
