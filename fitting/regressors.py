@@ -44,9 +44,9 @@ class Regressors(eqx.Module):
         reading: of the outputs at the samples.
     """
 
-    at_start: Float[Array, "segments samples states columns"]
-    at_end: Float[Array, "segments samples states columns"]
-    reading: Float[Array, "segments samples outputs columns"]
+    at_start: Float[Array | np.ndarray, "segments samples states columns"]
+    at_end: Float[Array | np.ndarray, "segments samples states columns"]
+    reading: Float[Array | np.ndarray, "segments samples outputs columns"]
 
 
 def regressors(model: Model, proposals: Sequence[Effect], followed: Followed, segments: Segments) -> Regressors:
@@ -62,7 +62,14 @@ def regressors(model: Model, proposals: Sequence[Effect], followed: Followed, se
     if isinstance(stacked, MeshTorqueEffect | MotorSideEffect | LoadSideEffect):
         # A torque is the same whatever other torques there are: one program for all models that the loop comes by.
         model = replace(model, effects=tuple(e for e in model.effects if isinstance(e, MeshGeometryEffect)))
-    return _regressors(model, stacked, followed, segments, jnp.asarray(continues(segments)))
+    found = _regressors(model, stacked, followed, segments, jnp.asarray(continues(segments)))
+    return jax.tree.map(lambda a: _finite(np.asarray(a)), found)
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """An effect that runs away along the motion explains nothing."""
+    lost = ~np.isfinite(values).all(axis=(0, 1, 2))
+    return np.where(lost, 0.0, values) if lost.any() else values
 
 
 def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
@@ -73,8 +80,7 @@ def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
     return np.append(False, np.abs(late) < 0.5 * step)
 
 
-@jit_kept
-def _regressors(
+def _looked_along(
     model: Model, stacked: Effect, followed: Followed, segments: Segments, goes_on: Bool[Array, " segments"]
 ) -> Regressors:
     kept = len(model.state_names)
@@ -99,13 +105,11 @@ def _regressors(
 
     found = jax.vmap(of, out_axes=-1)(stacked)
     # From (..., strengths, proposals) to one axis, a proposal's strengths side by side.
-    return jax.tree.map(lambda a: _finite(jnp.swapaxes(a, -1, -2).reshape(*a.shape[:-2], -1)), found)
+    return jax.tree.map(lambda a: jnp.swapaxes(a, -1, -2).reshape(*a.shape[:-2], -1), found)
 
 
-def _finite(values: Array) -> Array:
-    """An effect that runs away along the motion explains nothing."""
-    lost = jnp.any(~jnp.isfinite(values), axis=(0, 1, 2), keepdims=True)
-    return where(lost, jnp.zeros_like(values), values)
+# A program of little work for each form: compiling it well would take longer than what that saves.
+_regressors = jit_kept(_looked_along, compiler_options={"xla_backend_optimization_level": 1})
 
 
 def _rates_and_reading(

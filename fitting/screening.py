@@ -175,7 +175,7 @@ def _batches(
     taken, index = 0, 0
     for form in dict.fromkeys(type(p) for p in proposals):
         same = [p for p in proposals if type(p) is form]
-        found = jax.tree.map(np.asarray, regressors(model, same, followed, segments))
+        found = regressors(model, same, followed, segments)
         strengths = len(strength_paths(same[0]))
         for i in range(len(same)):
             if waiting and taken + strengths > _COLUMNS:
