@@ -44,9 +44,9 @@ class Regressors(eqx.Module):
         reading: of the outputs at the samples.
     """
 
-    at_start: Float[Array | np.ndarray, "segments samples states columns"]
-    at_end: Float[Array | np.ndarray, "segments samples states columns"]
-    reading: Float[Array | np.ndarray, "segments samples outputs columns"]
+    at_start: Float[Array, "segments samples states columns"]
+    at_end: Float[Array, "segments samples states columns"]
+    reading: Float[Array, "segments samples outputs columns"]
 
 
 def regressors(model: Model, proposals: Sequence[Effect], followed: Followed, segments: Segments) -> Regressors:
