@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Array, Float
 
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, scales
@@ -109,9 +110,7 @@ Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
 """Training and held-out stretches for each assumption about the torque between samples."""
 
 
-def attempt(
-    model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None, contains_start: bool = False
-) -> Trial:
+def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None) -> Trial:
     """Fit a model and look at it on held-out data.
 
     Args:
@@ -120,28 +119,59 @@ def attempt(
         hold: what the torque does between samples.
         setting: how the data are cut.
         start: a trial whose error covariance weighs the outputs at the start.
-        contains_start: whether the model can do whatever that of `start` does; a fit that is worse is then given up.
     """
-    training_stretches, held_out_stretches = data[hold]
+    training = _trained(model, data, hold, setting, None if start is None else start.training.covariance)
+    return _judged(training, data, hold, setting)
+
+
+def challenge(models: Sequence[Model], data: Data, hold: Hold, setting: Setting, *, champion: Trial) -> Trial | None:
+    """The best fit of several starts, if it explains the training data at least as well as the model that it is to
+    replace.
+
+    Args:
+        models: one and the same model at several starting values.
+        data: the stretches.
+        hold: what the torque does between samples.
+        setting: how the data are cut.
+        champion: the model to replace.
+    """
+    limit = champion.training.objective + LEAST_GAIN
+    fits = [_trained(m, data, hold, setting, champion.training.covariance, give_up_above=limit) for m in models]
+    best = min(fits, key=lambda found: found.objective)
+    return _judged(best, data, hold, setting) if best.objective <= limit else None
+
+
+def _trained(
+    model: Model,
+    data: Data,
+    hold: Hold,
+    setting: Setting,
+    covariance: Float[Array, "outputs outputs"] | None,
+    *,
+    give_up_above: float = np.inf,
+) -> Fit:
     paths = base_paths(model)
     for effect in model.effects:
         paths += effect_paths(effect)
-    training = fit(
+    return fit(
         model,
-        training_stretches,
+        data[hold][0],
         paths,
         horizon=setting.horizon,
         halo=setting.halo,
         substeps=setting.substeps,
         count=setting.count,
-        covariance=None if start is None else start.training.covariance,
+        covariance=covariance,
         max_steps=_TRIAL_STEPS,
-        give_up_above=start.training.objective + LEAST_GAIN if start is not None and contains_start else np.inf,
+        give_up_above=give_up_above,
     )
+
+
+def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
     held_out = fit(
         training.model,
-        held_out_stretches,
-        paths,
+        data[hold][1],
+        training.free.paths,
         horizon=setting.horizon,
         halo=setting.halo,
         substeps=setting.substeps,
@@ -176,31 +206,33 @@ def look(
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     refitted: dict[str, Trial] = {}
     worth = _worth_a_refit(screened)
-    for lead in _first_of_each_family(worth)[:_FAMILIES]:
-        refitted[lead.effect.name] = _refit(before, lead, data, setting, progress)
+
+    def refit(leads: Sequence[Lead]) -> None:
+        for lead in leads:
+            progress(f"refitting with {lead.effect.name}")
+            trial = _try_lead(before, lead, data, setting)
+            if trial is not None and np.isfinite(trial.held_out.objective):
+                refitted[lead.effect.name] = trial
+
+    first = _first_of_each_family(worth)[:_FAMILIES]
+    refit(first)
     if refitted:
         best = min(refitted, key=lambda name: refitted[name].held_out.objective)
         family = next(lead.effect.family for lead in worth if lead.effect.name == best)
-        others = [lead for lead in worth if lead.effect.family == family and lead.effect.name not in refitted]
-        for lead in others[:_FORMS]:
-            refitted[lead.effect.name] = _refit(before, lead, data, setting, progress)
+        refit([lead for lead in worth if lead.effect.family == family and lead not in first][:_FORMS])
     found: list[Verdict] = []
     for lead in screened.leads:
-        trial, gain = refitted.get(lead.effect.name), lead.gain
-        if trial is not None:
-            gain = before.held_out.objective - trial.held_out.objective
-            if not np.isfinite(gain):
-                trial, gain = None, -np.inf
+        trial = refitted.get(lead.effect.name)
+        gain = lead.gain if trial is None else before.held_out.objective - trial.held_out.objective
         p_value = screened.p_value(gain)
         found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
     for hold in data:
         if hold == before.hold:
             continue
         progress(f"refitting with a {hold} torque")
-        trial = attempt(before.model, data, hold, setting, start=before)
-        gain = before.held_out.objective - trial.held_out.objective
-        p_value = screened.p_value(gain)
-        found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, p_value, True))
+        trial = challenge([before.model], data, hold, setting, champion=before)
+        gain = -np.inf if trial is None else before.held_out.objective - trial.held_out.objective
+        found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     verdicts = _determined_first(_simplest_first(_with_separability(found)))
     return Round(before, screened, tuple(verdicts), bool(verdicts) and _supported(verdicts[0]))
@@ -215,11 +247,6 @@ def _worth_a_refit(screened: Screen) -> list[Lead]:
 def _first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
     first = {lead.effect.family: lead for lead in reversed(leads)}
     return sorted(first.values(), key=lambda lead: -lead.gain)
-
-
-def _refit(before: Trial, lead: Lead, data: Data, setting: Setting, progress: Callable[[str], None]) -> Trial:
-    progress(f"refitting with {lead.effect.name}")
-    return _try_lead(before, lead, data, setting)
 
 
 def _supported(verdict: Verdict) -> bool:
@@ -251,8 +278,8 @@ def _determined_first(verdicts: list[Verdict]) -> list[Verdict]:
     return verdicts
 
 
-def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
-    """Refit with the effect, from the first-order estimate and from what is typical; the best on training data."""
+def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial | None:
+    """Refit with the effect, from the first-order estimate and from what is typical."""
     model = before.model
     known = model.parameters()
     moved = {}
@@ -263,11 +290,8 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial:
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
     typical = lead.effect.typical(scales(before.training.stretches, model))
-    trials = [
-        attempt(start, data, before.hold, setting, start=before, contains_start=True)
-        for start in (first, *(model.with_effects(e) for e in typical))
-    ]
-    return min(trials, key=lambda t: t.training.objective)
+    starts = [first, *(model.with_effects(effect) for effect in typical)]
+    return challenge(starts, data, before.hold, setting, champion=before)
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:

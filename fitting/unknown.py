@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import eigh, null_space
 
-from fitting.attribution import LEAST_GAIN, SIGNIFICANCE, Data, Setting, Trial, attempt
+from fitting.attribution import LEAST_GAIN, SIGNIFICANCE, Data, Setting, Trial, challenge
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.linear_look import (
@@ -151,7 +151,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
                 break
             progress(f"learning a torque of {' and '.join(candidate.variables)}")
             trial = _refitted(before, candidate, data, setting)
-            if _penalised(trial) < _penalised(before if best is None else best[1]):
+            if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
                 best = candidate, trial
     if best is None:
         return None
@@ -183,7 +183,7 @@ def _refined(
         return best
     progress("learning its shape more closely")
     finer = _refitted(trial, again, data, setting)
-    if not _penalised(finer) < _penalised(trial):
+    if finer is None or not _penalised(finer) < _penalised(trial):
         return best
     again = eqx.tree_at(lambda c: c.gain, again, first.gain)
     return again, finer
@@ -417,13 +417,13 @@ def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
     return [c for c in found[:2] if c.gain > _NEARLY * found[0].gain]
 
 
-def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial:
+def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial | None:
     free, step = before.training.free, candidate.drive_step
     # The coefficients of a learned torque that is there already come last.
     change = np.pad(step, (0, len(free.paths) - step.size))
     change = np.where(free.logarithmic, np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE), change)
     moved = free.unpack(before.model, free.pack(before.model) + change).without_effect(candidate.form.name)
-    return attempt(moved.with_effects(candidate.effect), data, before.hold, setting, start=before, contains_start=True)
+    return challenge([moved.with_effects(candidate.effect)], data, before.hold, setting, champion=before)
 
 
 def _penalised(trial: Trial) -> float:
