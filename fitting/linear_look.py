@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.arrow import project
 from fitting.estimate import Fit
-from fitting.followed import Followed, follow, respond
+from fitting.explained import explained
+from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem, linearise
 from hdjax import Model
 from hdjax.effects import Motion
@@ -154,25 +154,11 @@ def _products(look: Look, push: Array, torques: Array) -> tuple[Array, Array, Ar
 
 def _columns(look: Look, push: Array, torques: Array) -> Float[Array, "segments samples outputs columns"]:
     """The whitened outputs' derivative by the free parameters and by each torque."""
-    segments, found = look.problem.segments, look.blocks
     forces = push[..., None] * torques[:, :, None, :]
-    moved, end = respond(look.followed, forces[:, :-1], forces[:, 1:])
-    white = jnp.einsum("ij,snjp->snip", look.problem.whitening, moved * segments.weight[:, :, None, None])
-    rows = -white.reshape(*found.residual.shape[:1], -1, white.shape[-1])
-    # The prior of the hidden states, behind the samples, does not know of torques.
-    rows = jnp.pad(rows, ((0, 0), (0, found.residual.shape[1] - rows.shape[1]), (0, 0)))
-    before = where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
-    both = eqx.tree_at(
-        lambda b: (b.by_parameter, b.before_by_parameter),
-        found,
-        (
-            jnp.concatenate([found.by_parameter, rows], axis=2),
-            jnp.concatenate([found.before_by_parameter, before], axis=2),
-        ),
+    segments = look.problem.segments
+    return explained(
+        look.blocks, look.followed, segments, look.problem.whitening, forces[:, :-1], forces[:, 1:], jnp.zeros(())
     )
-    # A residual is measured minus simulated.
-    projected = -project(both, segments.joined)[:, : white.shape[1] * white.shape[2]]
-    return projected.reshape(*white.shape[:3], -1)
 
 
 def surrogate_gains(

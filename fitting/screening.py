@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import prev_fast_len
 
-from fitting.arrow import project
 from fitting.estimate import STEP_ANGLE, Fit, suggested_substeps
 from fitting.experiment import Segments, scales
-from fitting.followed import Followed, follow, respond
+from fitting.explained import explained
+from fitting.followed import Followed, follow
 from fitting.free import strength_paths
 from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks, linearise
@@ -27,7 +27,6 @@ from fitting.spectral_lines import spectral_lines
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.program_cache import jit_kept
-from hdjax.where import where
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -209,22 +208,8 @@ def _inner_products(
     residual: Float[Array, "segments samples outputs"],
     surrogates: Float[Array, "draws segments rows"],
 ) -> tuple[Float[Array, "columns columns"], Float[Array, " columns"], Float[Array, "columns draws"]]:
-    outputs, end = respond(followed, forces.at_start, forces.at_end)
-    outputs = (outputs + forces.reading) * segments.weight[:, :, None, None]
-    white = jnp.einsum("ij,snjc->snic", whitening, outputs)
-    rows = surrogates.shape[2]
-    # Residuals are measured minus simulated. What follows a segment's rows of outputs is its states' prior.
-    columns = -white.reshape(white.shape[0], rows, -1)
-    columns = jnp.pad(columns, ((0, 0), (0, found.residual.shape[1] - rows), (0, 0)))
-    before = where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
-    extended = replace(
-        found,
-        by_parameter=jnp.concatenate([found.by_parameter, columns], axis=2),
-        before_by_parameter=jnp.concatenate([found.before_by_parameter, before], axis=2),
-    )
-    # What a strength explains is minus its derivative.
-    explains = -project(extended, segments.joined)[:, :rows]
-    flat = explains.reshape(-1, explains.shape[2])
+    explains = explained(found, followed, segments, whitening, forces.at_start, forces.at_end, forces.reading)
+    flat = explains.reshape(-1, explains.shape[-1])
     return (
         flat.T @ flat,
         flat.T @ residual.reshape(-1),

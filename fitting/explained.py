@@ -1,0 +1,50 @@
+"""What forces along a motion explain of the residual, beside the parameters that are free already."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from fitting.arrow import project
+from fitting.experiment import Segments
+from fitting.followed import Followed, respond
+from fitting.residual import Blocks
+from hdjax.where import where
+
+
+def explained(
+    found: Blocks,
+    followed: Followed,
+    segments: Segments,
+    whitening: Float[Array, "outputs outputs"],
+    at_start: Float[Array, "segments samples states columns"],
+    at_end: Float[Array, "segments samples states columns"],
+    reading: Float[Array, "#segments #samples #outputs columns"] | Float[Array, ""],
+) -> Float[Array, "segments samples outputs parameters_and_columns"]:
+    """Whitened outputs that a unit of each free parameter, and then of each force, adds; without what the first state
+    of each simulation could add as well.
+
+    Args:
+        found: the residual's derivatives by what is free already.
+        followed: the motion.
+        segments: the data.
+        whitening: of the outputs.
+        at_start: each force at the start of each sample interval.
+        at_end: and at its end.
+        reading: what goes with each force and is no motion, a change of what the encoders read; or zero.
+    """
+    outputs, end = respond(followed, at_start, at_end)
+    outputs = (outputs + reading) * segments.weight[:, :, None, None]
+    white = jnp.einsum("ij,snjc->snic", whitening, outputs)
+    rows = white.shape[1] * white.shape[2]
+    # Residuals are measured minus simulated. What follows a segment's rows of outputs is its states' prior.
+    columns = -white.reshape(white.shape[0], rows, -1)
+    columns = jnp.pad(columns, ((0, 0), (0, found.residual.shape[1] - rows), (0, 0)))
+    before = where(segments.joined[:, None, None], jnp.roll(end, 1, axis=0), 0.0)
+    extended = replace(
+        found,
+        by_parameter=jnp.concatenate([found.by_parameter, columns], axis=2),
+        before_by_parameter=jnp.concatenate([found.before_by_parameter, before], axis=2),
+    )
+    projected = -project(extended, segments.joined)[:, :rows]
+    return projected.reshape(*white.shape[:3], -1)
