@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     start = float(getattr(effect, name))
     both = [eqx.tree_at(lambda e: getattr(e, name), effect, jnp.asarray(start + sign * size)) for sign in (0.0, 1.0)]
     slope = (simulated(found, both[1]) - simulated(found, both[0])) / size
-    forces = regressors(found.model, [effect], followed, found.problem.segments)
+    forces = jax.tree.map(jnp.asarray, regressors(found.model, [effect], followed, found.problem.segments))
     column = [p.split(".")[1] for p in strength_paths(effect)].index(name)
     outputs, _ = respond(followed, forces.at_start, forces.at_end)
     answer = np.asarray(outputs + forces.reading)[..., column]
