@@ -1,5 +1,6 @@
 """How well the data determine each parameter, also where the model is not quite right."""
 
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -78,35 +79,41 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
         return Uncertainty({}, empty, empty, empty)
     regression = linearised(fit) if regression is None else regression
     found = covariance(regression)
-    through_drive = torque_noise_covariance(fit, regression, found.unit) if torque_noise else None
+    if torque_noise:
+        found = _described(found, torque_noise_covariance(fit, regression, found.unit))
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
     known = fit.model.parameters()
     estimates = {
-        path: _estimate(
-            path, float(known[path][0]), known[path][1], found, through_drive, i, float(slopes[i]), free.logarithmic[i]
-        )
+        path: _estimate(path, float(known[path][0]), known[path][1], found, i, float(slopes[i]), free.logarithmic[i])
         for i, path in enumerate(free.paths)
     }
     spread = np.sqrt(np.diag(found.robust))
     return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
 
 
+def _described(found: Covariance, other: Float[np.ndarray, "parameters parameters"] | None) -> Covariance:
+    """The covariance with longer intervals where noise of the torque, of which two or three numbers are known, makes
+    them so."""
+    if other is None:
+        return found
+    reach = stdtrit(found.degrees_of_freedom, 0.975) * np.sqrt(np.diag(found.robust))
+    longer = NORMAL_95 * np.sqrt(np.diag(other)) > reach
+    stretch = np.where(longer, np.sqrt(np.diag(other) / np.diag(found.robust)), 1.0)
+    return replace(
+        found,
+        robust=found.robust * np.outer(stretch, stretch),
+        degrees_of_freedom=np.where(longer, np.inf, found.degrees_of_freedom),
+    )
+
+
 def _estimate(
-    path: str,
-    value: float,
-    info: ParameterInfo,
-    found: Covariance,
-    through_drive: Float[np.ndarray, "parameters parameters"] | None,
-    i: int,
-    slope: float,
-    logarithmic: bool,
+    path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
 ) -> Estimate:
     freedom = float(found.degrees_of_freedom[i])
     robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
-    described = 0.0 if through_drive is None else float(np.sqrt(through_drive[i, i]))
     # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
-    error = max(robust, classical, described)
-    reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * max(classical, described))
+    error = max(robust, classical)
+    reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * classical)
     if logarithmic:
         factor = float(np.exp(min(reach, 700.0)))
         interval = (value / factor, value * factor)

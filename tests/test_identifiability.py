@@ -147,7 +147,7 @@ def test_a_parameter_that_ran_to_zero(drive: Fit):
     ],
 )
 def test_bounds(value: float, bounds: tuple[float, float], start: float, stopped: bool):
-    info = ParameterInfo("1", "", "", bounds, "base")
+    info = ParameterInfo(unit="1", doc="", source="", bounds=bounds, plausible=(0.0, np.inf), role="base")
     assert (at_bound("K", value, info, start=start) is not None) is stopped
 
 
