@@ -11,9 +11,11 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# The first example of a property compiles, so a time limit per example says nothing. The same
+# The first example of a property compiles, so time limits say nothing. The same
 # examples every time: the gate passes or fails by the code alone.
-hypothesis.settings.register_profile("gate", deadline=None, derandomize=True)
+hypothesis.settings.register_profile(
+    "gate", deadline=None, derandomize=True, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
 hypothesis.settings.load_profile("gate")
 
 SHARED = Path(__file__).parents[2] / "shared"
