@@ -65,9 +65,13 @@ class FourierSeries(eqx.Module):
             t = jnp.arange(float(samples.size)) * (2 * jnp.pi / samples.size)
             slope = wave.derivative()
             curvature = slope.derivative()
+            # A top lies within a step of some sample. Where the bend vanishes Newton would leap to where a phase has
+            # no digits left, and the harmonics would no longer belong together.
+            step = 2 * jnp.pi / samples.size
             for _ in range(3):
                 bend = curvature(t)
-                t = t - jnp.where(bend == 0.0, 0.0, slope(t) / jnp.where(bend == 0.0, 1.0, bend))
+                leap = jnp.where(bend == 0.0, 0.0, slope(t) / jnp.where(bend == 0.0, 1.0, bend))
+                t = t - jnp.clip(leap, -step, step)
             # The slope is zero there: how the instant moves does not matter. Newton may leave a flat top for a dip.
             tops = jnp.concatenate([wave(jax.lax.stop_gradient(t)), samples])
             return jnp.max(jnp.abs(tops))
