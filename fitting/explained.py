@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.arrow import project
@@ -48,3 +49,10 @@ def explained(
     )
     projected = -project(extended, segments.joined)[:, :rows]
     return projected.reshape(*white.shape[:3], -1)
+
+
+def solved(gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Least squares; directions without information do not move."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    return scale[:, None] * (inverse @ (scale[:, None] * gradient))

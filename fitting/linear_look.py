@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimate import Fit
-from fitting.explained import explained
+from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem, linearise
 from hdjax import Model
@@ -214,10 +214,3 @@ def left_after(found: Products, step: Float[np.ndarray, " columns"]) -> Float[np
     """Squares of the outputs' errors after a step, added up."""
     against = np.sum(found.gradient, axis=0) @ step
     return np.sum(found.square, axis=0) - against - against.T + np.sum(found.gram, axis=0) @ step @ step
-
-
-def solved(gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Least squares; directions without information do not move."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    inverse = np.linalg.pinv(gram * np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    return scale[:, None] * (inverse @ (scale[:, None] * gradient))

@@ -18,7 +18,7 @@ from scipy.fft import prev_fast_len
 
 from fitting.estimate import STEP_ANGLE, Fit, suggested_substeps
 from fitting.experiment import Segments, scales
-from fitting.explained import explained
+from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
 from fitting.regressors import Regressors, regressors
@@ -267,12 +267,8 @@ def _null_gains(fitted: _Score, unseen: _Score, nuisance: list[int], own: list[i
 
 def _solve(gram: np.ndarray, gradient: np.ndarray, chosen: list[int]) -> np.ndarray:
     """Least squares over the chosen columns; zero for the others."""
-    part = gram[np.ix_(chosen, chosen)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(part), 1e-300))
-    scaled = part * np.outer(scale, scale)
     solution = np.zeros_like(gradient)
-    inverse = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True)
-    solution[chosen] = scale[:, None] * (inverse @ (scale[:, None] * gradient[chosen]))
+    solution[chosen] = solved(gram[np.ix_(chosen, chosen)], gradient[chosen])
     return solution
 
 

@@ -2,8 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import median_filter
-from scipy.signal import find_peaks
 
 from fitting.estimate import Fit
 
@@ -23,6 +21,10 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
         fit: a fit.
         most: how many lines at most.
     """
+    # Loaded here, where effects are looked for: a plain fit does without.
+    from scipy.ndimage import median_filter
+    from scipy.signal import find_peaks
+
     series = _longest(fit)
     count = series.shape[0]
     if count < 4 * _NEIGHBOURS:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import nnls
-from scipy.stats import kstest
 
 from fitting.estimate import Fit
 from fitting.followed import Followed, follow
@@ -119,6 +118,9 @@ def _variances(
     for _ in range(_REWEIGHTINGS):
         found, _ = nnls(shapes / level[:, None], power / level)
         level = np.maximum(shapes @ found, 1e-6 * power.mean())
+    # Loaded here: it takes as long as jax, and other commands do without.
+    from scipy.stats import kstest
+
     # Of the right spectrum, the periodogram is an exponential variable.
     adequate = kstest(1.0 - np.exp(-power / level), "uniform").pvalue > _REFUSED
     return found if adequate and found[-1] > 0.0 else None
