@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, scales
 from fitting.free import base_paths, effect_paths, strength_paths
@@ -26,11 +27,18 @@ _WORTH_A_REFIT = 0.2
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
 # Nor is one that explains less than this share of what the best one does.
-_SHARE_OF_BEST = 0.03
+_SHARE_OF_BEST = 0.25
 # Families whose likeliest form is refitted inside the equations in each round.
 _FAMILIES = 5
 # Further forms of the best one's family that compete with it there.
 _FORMS = 3
+# A form with fewer parameters goes first where it explains at least this share of what its family's best one does.
+_NEARLY = 0.95
+# Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
+# at least this share of what it does,
+_POSSIBLE_TIE = 0.5
+# and whose first fit comes as close as this share of its gain.
+_NEAR_TIE = 0.1
 
 
 class Setting(eqx.Module):
@@ -124,7 +132,15 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
     return _judged(training, data, hold, setting)
 
 
-def challenge(models: Sequence[Model], data: Data, hold: Hold, setting: Setting, *, champion: Trial) -> Trial | None:
+def challenge(
+    models: Sequence[Model],
+    data: Data,
+    hold: Hold,
+    setting: Setting,
+    *,
+    champion: Trial,
+    give_up_above: float = np.inf,
+) -> Trial | None:
     """The best fit of several starts, if it explains the training data at least as well as the model that it is to
     replace.
 
@@ -134,8 +150,9 @@ def challenge(models: Sequence[Model], data: Data, hold: Hold, setting: Setting,
         hold: what the torque does between samples.
         setting: how the data are cut.
         champion: the model to replace.
+        give_up_above: a lower objective that it must reach.
     """
-    limit = champion.training.objective + LEAST_GAIN
+    limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
     fits = [_trained(m, data, hold, setting, champion.training.covariance, give_up_above=limit) for m in models]
     best = min(fits, key=lambda found: found.objective)
     return _judged(best, data, hold, setting) if best.objective <= limit else None
@@ -207,19 +224,25 @@ def look(
     refitted: dict[str, Trial] = {}
     worth = _worth_a_refit(screened)
 
-    def refit(leads: Sequence[Lead]) -> None:
+    def refit(leads: Sequence[Lead], give_up_above: float = np.inf) -> None:
         for lead in leads:
             progress(f"refitting with {lead.effect.name}")
-            trial = _try_lead(before, lead, data, setting)
+            trial = _try_lead(before, lead, data, setting, give_up_above)
             if trial is not None and np.isfinite(trial.held_out.objective):
                 refitted[lead.effect.name] = trial
 
     first = _first_of_each_family(worth)[:_FAMILIES]
-    refit(first)
-    if refitted:
-        best = min(refitted, key=lambda name: refitted[name].held_out.objective)
-        family = next(lead.effect.family for lead in worth if lead.effect.name == best)
-        refit([lead for lead in worth if lead.effect.family == family and lead not in first][:_FORMS])
+    refit(first[:1])
+    leader = refitted.get(first[0].effect.name) if first else None
+    if leader is not None and leaves_white_noise(leader.training):
+        gain = before.training.objective - leader.training.objective
+        refit(_possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gain)
+    else:
+        refit(first[1:])
+        if refitted:
+            best = min(refitted, key=lambda name: refitted[name].held_out.objective)
+            family = next(lead.effect.family for lead in worth if lead.effect.name == best)
+            refit([lead for lead in worth if lead.effect.family == family and lead not in first][:_FORMS])
     found: list[Verdict] = []
     for lead in screened.leads:
         trial = refitted.get(lead.effect.name)
@@ -245,8 +268,24 @@ def _worth_a_refit(screened: Screen) -> list[Lead]:
 
 
 def _first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
-    first = {lead.effect.family: lead for lead in reversed(leads)}
-    return sorted(first.values(), key=lambda lead: -lead.gain)
+    """The likeliest form of each family, likeliest first; the simplest of those that explain nearly as much."""
+    families: dict[str, list[Lead]] = {}
+    for lead in leads:
+        families.setdefault(lead.effect.family, []).append(lead)
+    return [_simplest([a for a in forms if a.gain >= _NEARLY * forms[0].gain]) for forms in families.values()]
+
+
+def _simplest(leads: Sequence[Lead]) -> Lead:
+    return min(leads, key=lambda lead: (len(effect_paths(lead.effect)), -lead.gain))
+
+
+def _possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:
+    """What may explain as much as the first of all, which leaves nothing but noise: other families, and forms of its
+    own one that to first order explain more."""
+    leader = first[0]
+    others = [lead for lead in first[1:] if lead.gain >= _POSSIBLE_TIE * leader.gain]
+    forms = [a for a in leads if a.effect.family == leader.effect.family and a.gain > leader.gain and a is not leader]
+    return others + forms[:_FORMS]
 
 
 def _supported(verdict: Verdict) -> bool:
@@ -278,7 +317,7 @@ def _determined_first(verdicts: list[Verdict]) -> list[Verdict]:
     return verdicts
 
 
-def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial | None:
+def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
     """Refit with the effect, from the first-order estimate and from what is typical."""
     model = before.model
     known = model.parameters()
@@ -291,7 +330,7 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting) -> Trial 
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
     typical = lead.effect.typical(scales(before.training.stretches, model))
     starts = [first, *(model.with_effects(effect) for effect in typical)]
-    return challenge(starts, data, before.hold, setting, champion=before)
+    return challenge(starts, data, before.hold, setting, champion=before, give_up_above=give_up_above)
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:

@@ -405,7 +405,7 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
     piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
     held = eqx.tree_at(lambda p: p.active, found.problem, _zeros_like(found.problem.active))
     swing = jnp.asarray(np.asarray(scales(found.stretches).x))
-    total, samples = np.zeros(found.covariance.shape), 0.0
+    total, samples, freedom = np.zeros(found.covariance.shape), 0.0, 0.0
     # A piece is the head of a segment; segments that begin later have other heads.
     for offset in range(0, length - piece + 1, piece):
         shifted = [Stretch(s.experiment, s.start + offset, s.stop) for s in found.stretches if len(s) >= offset + piece]
@@ -423,8 +423,21 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
             part = _weighed(part, covariance, swing)
             unknowns, _, covariance, _, _ = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
         total, samples = total + np.asarray(covariance) * head.sum(), samples + float(head.sum())
-    rows = piece * total.shape[0]
-    return jnp.asarray(total / samples * (rows / (rows - len(found.model.motion_states))))
+        freedom += _states_freedom(part, unknowns)
+    rows = samples * total.shape[0]
+    return jnp.asarray(total / samples * (rows / (rows - freedom)))
+
+
+def _states_freedom(problem: Problem, unknowns: Unknowns) -> float:
+    """How many numbers the initial states have fitted to the outputs; a state that its prior holds counts in part."""
+    by_state = np.asarray(linearise(problem, unknowns).by_state)
+    outputs = by_state[:, : problem.segments.measured[0].size]
+    measured, all_rows = (np.einsum("sri,srj->sij", rows, rows) for rows in (outputs, by_state))
+    scale = np.sqrt(np.einsum("sii->si", all_rows))
+    scale = np.where(scale > 0, scale, 1.0)
+    units = scale[:, :, None] * scale[:, None, :]
+    inverse = np.linalg.pinv(all_rows / units, rcond=1e-12, hermitian=True)
+    return float(np.einsum("sij,sji->", inverse, measured / units))
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:
