@@ -27,6 +27,7 @@ from fitting.estimate import (
     needed_substeps,
     segment_length,
 )
+from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
 from fitting.outliers import with_weights
@@ -72,6 +73,7 @@ class Loop(eqx.Module):
         dropped: effects that a later one made superfluous.
         doubted: effects that were found, but that a learned torque contradicts.
         unknown: the learned torque, where the catalogue does not explain what is missing.
+        evidence: what each effect of the final model does, and what the data say of it.
         noise: covariance of the measurement noise of the outputs.
         residual_before: diagnostics of what the base model leaves over.
         residual_after: likewise of the final model.
@@ -90,6 +92,7 @@ class Loop(eqx.Module):
     dropped: tuple[str, ...] = eqx.field(static=True)
     doubted: tuple[str, ...] = eqx.field(static=True)
     unknown: Unknown | None
+    evidence: tuple[Evidence, ...]
     noise: Float[Array, "outputs outputs"]
     residual_before: ResidualDiagnostics
     residual_after: ResidualDiagnostics
@@ -162,6 +165,9 @@ def close_loop(
     if unknown is not None:
         findings = (*findings, _unknown_finding(unknown, trusted is base, data, setting, before, after, noise))
     clock.lap("free runs")
+    progress("asking the data for each effect")
+    seen = evidence(current.training)
+    clock.lap("evidence")
     return Loop(
         decision=decision,
         before=before,
@@ -171,6 +177,7 @@ def close_loop(
         dropped=dropped,
         doubted=tuple(e.name for e in named.model.effects if trusted is not named),
         unknown=unknown,
+        evidence=seen,
         noise=noise,
         residual_before=diagnose(base.training),
         residual_after=diagnose(current.training),

@@ -6,6 +6,7 @@ import math
 import os
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +15,7 @@ import numpy as np
 import plotly.graph_objects as go
 import polars as pl
 import pytest
+from browser import shown
 from scipy import stats
 
 import rig
@@ -208,6 +210,22 @@ def test_the_page_loads_nothing(page: str):
     assert not re.search(r"""(src|href|action)\s*=\s*["']?\s*(https?:)?//""", page)
     assert not re.search(r"@import|url\(", page)
     assert "default-src 'none'" in page
+
+
+@pytest.mark.parametrize("kind", ["loop", "fitted"])
+def test_a_browser_draws_every_picture_offline(kind: str, request: pytest.FixtureRequest, tmp_path: Path):
+    outcome = request.getfixturevalue(kind)
+    write_page(tmp_path, outcome)
+    document, console = shown(tmp_path / "report.html")
+    assert console == []
+    assert not re.search(r"""(src=|<link)[^>]*//""", document[document.index("<body") :])
+    places = re.findall(r'<div class="plot[^"]*" id="([^"]+)"', document)
+    pictures = plots(outcome, units={}) if kind == "loop" else fit_plots(outcome, units={})
+    assert sorted(places) == sorted(p.key for p in pictures)
+    drawn = [document[a:b] for a, b in pairwise([*(document.index(f'id="{p}"') for p in places), len(document)])]
+    assert all("main-svg" in picture for picture in drawn)
+    # What stayed text has made no element, and nothing has run.
+    assert HOSTILE not in document
 
 
 def test_hostile_names_stay_text(page: str):

@@ -1,5 +1,6 @@
 """Pictures of a fit or a closed loop, as plotly figures in plain dictionaries. Statistics are computed elsewhere."""
 
+from fitting.plots.evidence import evidence_plot as evidence_plot
 from fitting.plots.gallery import fit_plots as fit_plots
 from fitting.plots.gallery import plots as plots
 from fitting.plots.learned_torque import learned_torque as learned_torque

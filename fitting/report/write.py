@@ -10,14 +10,15 @@ from fitting import findings
 from fitting.close_loop import Loop
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly
-from fitting.plots import Plot, fit_plots, learned_torque, plots
+from fitting.plots import Plot, evidence_plot, fit_plots, learned_torque, plots
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
 from fitting.report.posterior import DRAWS_FILE, draws_table
 from fitting.report.text import report_text
-from fitting.report.unknown import curve_of
+from fitting.report.unknown import curve_of, unit_in_log
 from fitting.rig import Rig
+from hdjax.effects.learned import UNITS
 
 
 def write_report(
@@ -94,6 +95,9 @@ def _of_rig(rig: Rig) -> dict[str, Any]:
 def _pictures(outcome: Outcome, report: Mapping[str, Any]) -> list[Plot]:
     if isinstance(outcome, Loop):
         found = plots(outcome, units=report["units"])
+        quantities = {"torque": "N m", "error": "rad"} | UNITS
+        told = {name: unit_in_log(unit, outcome, report["units"]) for name, unit in quantities.items()}
+        found += [evidence_plot(seen, units=told) for seen in outcome.evidence]
         curve, told = curve_of(outcome), report["unknown"]
         if curve is not None:
             found.append(learned_torque(curve, unit=told["units"]["torque"], units=told["units"]))

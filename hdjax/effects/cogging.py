@@ -20,6 +20,7 @@ class Cogging(MotorSideEffect):
     family: ClassVar[str] = "cogging"
     name: ClassVar[str] = "cogging"
     orders: ClassVar[tuple[int, ...]] = (1, 2, 4)
+    drawn_against: ClassVar[str | None] = "theta_m"
 
     cos_1: Scalar = parameter(0.0, unit="N m", doc="cosine, order 1", source=SOURCE, role="strength")
     sin_1: Scalar = parameter(0.0, unit="N m", doc="sine, order 1", source=SOURCE, role="strength")
@@ -50,6 +51,7 @@ class SingleOrderCogging(MotorSideEffect):
 
     family: ClassVar[str] = "cogging"
     name: ClassVar[str] = "single_order_cogging"
+    drawn_against: ClassVar[str | None] = "theta_m"
 
     cosine: Scalar = parameter(0.0, unit="N m", doc="cosine", source=SOURCE, role="strength")
     sine: Scalar = parameter(0.0, unit="N m", doc="sine", source=SOURCE, role="strength")

@@ -20,6 +20,7 @@ class Creep(MeshTorqueEffect):
     family: ClassVar[str] = "creep"
     name: ClassVar[str] = "creep"
     states: ClassVar[tuple[str, ...]] = ("z",)
+    drawn_against: ClassVar[str | None] = None
 
     share: Scalar = parameter(
         0.0,

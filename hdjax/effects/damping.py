@@ -15,6 +15,7 @@ class QuadraticDamping(MeshTorqueEffect):
 
     family: ClassVar[str] = "nonlinear_damping"
     name: ClassVar[str] = "quadratic_damping"
+    drawn_against: ClassVar[str | None] = "v"
 
     c2: Scalar = parameter(0.0, unit="N m s^2/rad^2", doc="quadratic damping", source="EFFECTS", role="strength")
 
@@ -31,6 +32,7 @@ class CubicDamping(MeshTorqueEffect):
 
     family: ClassVar[str] = "nonlinear_damping"
     name: ClassVar[str] = "cubic_damping"
+    drawn_against: ClassVar[str | None] = "v"
 
     c3: Scalar = parameter(0.0, unit="N m s^3/rad^3", doc="cubic damping", source="EFFECTS", role="strength")
 
@@ -47,6 +49,7 @@ class DisplacementDamping(MeshTorqueEffect):
 
     family: ClassVar[str] = "nonlinear_damping"
     name: ClassVar[str] = "displacement_damping"
+    drawn_against: ClassVar[str | None] = "v"
 
     c_x: Scalar = parameter(
         0.0,

@@ -96,6 +96,8 @@ class Effect(eqx.Module):
         needs_motor: whether it needs the motor's and load's own motion, which a reduced log lacks.
         needs_time: whether it depends on the time since the log's start.
         needs_temperature: whether it depends on the drive's temperature.
+        drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
+            single one shows it.
     """
 
     family: ClassVar[str]
@@ -104,6 +106,7 @@ class Effect(eqx.Module):
     needs_motor: ClassVar[bool] = False
     needs_time: ClassVar[bool] = False
     needs_temperature: ClassVar[bool] = False
+    drawn_against: ClassVar[str | None] = None
 
     @classmethod
     @abc.abstractmethod
@@ -142,6 +145,7 @@ class MotorSideEffect(Effect):
     """Adds a torque to the motor's equation."""
 
     needs_motor: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = "omega_m"
 
     @abc.abstractmethod
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
@@ -152,6 +156,7 @@ class LoadSideEffect(Effect):
     """Adds a torque to the load's equation."""
 
     needs_motor: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = "omega_l"
 
     @abc.abstractmethod
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
@@ -167,6 +172,8 @@ class MeshTorqueEffect(Effect):
 
     On a reduced drive, whose inertia is not known, the torque is an acceleration: stiffness is omega_0^2.
     """
+
+    drawn_against: ClassVar[str | None] = "x"
 
     @abc.abstractmethod
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:

@@ -15,6 +15,7 @@ class CoulombFriction(MeshTorqueEffect):
 
     family: ClassVar[str] = "coulomb_friction"
     name: ClassVar[str] = "coulomb_friction"
+    drawn_against: ClassVar[str | None] = "v"
 
     T_c: Scalar = parameter(
         0.0,
@@ -43,6 +44,7 @@ class LoadDependentFriction(MeshTorqueEffect):
 
     family: ClassVar[str] = "coulomb_friction"
     name: ClassVar[str] = "load_dependent_friction"
+    drawn_against: ClassVar[str | None] = "v"
 
     T_c: Scalar = parameter(
         0.0,

@@ -20,6 +20,7 @@ class GravityLoad(LoadSideEffect):
 
     family: ClassVar[str] = "gravity_load"
     name: ClassVar[str] = "gravity_load"
+    drawn_against: ClassVar[str | None] = "theta_l"
 
     sine: Scalar = parameter(0.0, unit="N m", doc="m g r cos(phi)", source="EFFECTS", role="strength")
     cosine: Scalar = parameter(0.0, unit="N m", doc="m g r sin(phi)", source="EFFECTS", role="strength")
@@ -44,6 +45,7 @@ class ConstantLoad(LoadSideEffect):
 
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "constant_load"
+    drawn_against: ClassVar[str | None] = None
 
     constant: Scalar = parameter(0.0, unit="N m", doc="along +theta_l", source="EFFECTS", role="strength")
 
@@ -65,6 +67,7 @@ class LoadDisturbance(LoadSideEffect):
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "load_disturbance"
     needs_time: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = None
 
     constant: Scalar = parameter(0.0, unit="N m", doc="constant part", source="EFFECTS", role="strength")
     cosine: Scalar = parameter(0.0, unit="N m", doc="cosine", source="EFFECTS", role="strength")
@@ -89,6 +92,7 @@ class TwoLineDisturbance(LoadSideEffect):
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "two_line_disturbance"
     needs_time: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = None
 
     constant: Scalar = parameter(0.0, unit="N m", doc="constant part", source="EFFECTS", role="strength")
     cos_1: Scalar = parameter(0.0, unit="N m", doc="cosine, first line", source="EFFECTS", role="strength")

@@ -23,6 +23,7 @@ class PositionDependentStiffness(MeshTorqueEffect):
     family: ClassVar[str] = "position_dependent_stiffness"
     name: ClassVar[str] = "position_dependent_stiffness"
     needs_motor: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = "theta_m"
 
     cosine: Scalar = parameter(
         0.0,
@@ -63,6 +64,7 @@ class PositionDependentMotorFriction(MotorSideEffect):
 
     family: ClassVar[str] = "position_dependent_friction"
     name: ClassVar[str] = "position_dependent_motor_friction"
+    drawn_against: ClassVar[str | None] = "theta_m"
 
     T_c: Scalar = parameter(
         0.0,
@@ -96,6 +98,7 @@ class PositionDependentMeshFriction(MeshTorqueEffect):
     family: ClassVar[str] = "position_dependent_friction"
     name: ClassVar[str] = "position_dependent_mesh_friction"
     needs_motor: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = "theta_m"
 
     T_c: Scalar = parameter(
         0.0,

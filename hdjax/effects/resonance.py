@@ -24,6 +24,7 @@ class ExtraResonance(LoadSideEffect):
     family: ClassVar[str] = "extra_resonance"
     name: ClassVar[str] = "extra_resonance"
     states: ClassVar[tuple[str, ...]] = ("twist", "omega")
+    drawn_against: ClassVar[str | None] = None
 
     mass_ratio: Scalar = parameter(0.0, unit="1", doc="J_3 / J_l", bounds=(0.0, 1.0), role="strength")
     omega_3: Scalar = parameter(

@@ -45,6 +45,7 @@ class ThermalDamping(MeshTorqueEffect):
     family: ClassVar[str] = "temperature"
     name: ClassVar[str] = "thermal_damping"
     needs_temperature: ClassVar[bool] = True
+    drawn_against: ClassVar[str | None] = "v"
 
     kappa: Scalar = parameter(0.0, unit="1/K", doc="decay of the damping per kelvin", source=_WOLF, role="strength")
     T_0: Scalar = parameter(293.15, unit="K", doc="temperature at which B_sp is meant", bounds=(0.0, 1e4))

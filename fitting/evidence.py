@@ -1,0 +1,175 @@
+"""What an effect does along the fitted motion, and what the data say that it does where no law is assumed."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimate import Fit
+from fitting.explained import solved
+from fitting.linear_look import Look, look_along, products, push
+from hdjax import Drive, Model
+from hdjax.effects import (
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+    SensorEffect,
+)
+from hdjax.effects.learned import ANGLES, LEARNED, LearnedTorque
+
+# Values of the variable at which the data are asked, in each direction.
+_PLACES = 14
+# This part of the samples, on each side, tells what the effect does at one of them.
+_NEARBY = 500
+# Instants of the motion that are drawn.
+_INSTANTS = 1500
+
+
+class Evidence(eqx.Module):
+    """What one effect does, against the quantity that shows it best.
+
+    Attributes:
+        effect: its name.
+        quantity: "torque" [N m], or "error" [rad] of the gear or an encoder.
+        variable: what it is drawn against; angles within one turn.
+        at: the variable at instants of the motion.
+        does: what the effect does at these instants.
+        places: where the data were asked, one row for each direction of the motion; none for errors.
+        told: the torque that the data call for there, with everything else as fitted.
+        std: its standard error, as if the residual were white.
+    """
+
+    effect: str = eqx.field(static=True)
+    quantity: str = eqx.field(static=True)
+    variable: str = eqx.field(static=True)
+    at: Float[np.ndarray, " instants"]
+    does: Float[np.ndarray, " instants"]
+    places: Float[np.ndarray, "directions places"]
+    told: Float[np.ndarray, "directions places"]
+    std: Float[np.ndarray, "directions places"]
+
+
+def evidence(fit: Fit) -> tuple[Evidence, ...]:
+    """The evidence of each effect that one quantity of the motion shows.
+
+    Args:
+        fit: of the model with the effects.
+    """
+    drawn = [e for e in fit.model.effects if e.drawn_against is not None and not isinstance(e, LearnedTorque)]
+    if not drawn:
+        return ()
+    look = look_along(fit)
+    return tuple(found for found in (_evidence(look, effect) for effect in drawn) if found is not None)
+
+
+def _evidence(look: Look, effect: Effect) -> Evidence | None:
+    assert effect.drawn_against is not None
+    value = np.array(getattr(look.motion, effect.drawn_against))
+    does = np.asarray(_done(look.model, effect.name, look.motion, look.followed.states))
+    weight = np.asarray(look.problem.segments.weight)
+    # The last knot of a segment is the first one of the next.
+    kept = (np.pad(weight, ((0, 0), (0, 1))) > 0) & np.isfinite(value) & np.isfinite(does)
+    if effect.drawn_against in ANGLES and np.ptp(value[kept]) > 2 * np.pi:
+        value = np.mod(value, 2 * np.pi)
+    if not np.ptp(value[kept]) > 0:
+        return None
+    some = np.flatnonzero(kept)
+    some = some[np.unique(np.linspace(0, some.size - 1, min(_INSTANTS, some.size)).astype(int))]
+    at, done = value.reshape(-1)[some], does.reshape(-1)[some]
+    form = _place(effect)
+    if form is None:
+        nothing = np.zeros((0, _PLACES))
+        return Evidence(effect.name, "error", effect.drawn_against, at, done, nothing, nothing, nothing)
+    places, told, std = _told(look, form, value, does, kept, _directions(effect, look.motion))
+    return Evidence(effect.name, "torque", effect.drawn_against, at, done, places, told, std)
+
+
+def _place(effect: Effect) -> type[LearnedTorque] | None:
+    """The learned torque that acts where an effect does; None where that is no torque."""
+    kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
+    return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
+
+
+def _directions(effect: Effect, motion: Motion) -> np.ndarray:
+    """The sign of what an effect with memory, or of sliding, may differ by; zero where it can't."""
+    v = np.asarray(motion.v)
+    memory_of_twist = bool(effect.states) and effect.drawn_against == "x"
+    slides = effect.family == "position_dependent_friction"
+    if not (memory_of_twist or slides):
+        return np.zeros_like(v)
+    speed = v if motion.omega_m is None or memory_of_twist else np.asarray(motion.omega_m)
+    return np.where(speed >= 0, 1.0, -1.0)
+
+
+@eqx.filter_jit
+def _done(model: Model, name: str, motion: Motion, states: Array) -> Array:
+    """What the effect does at each knot: its torque, or its error."""
+    effect = model.effect(name)
+    names = model.state_names
+    own = [names.index(f"{name}.{s}") for s in effect.states]
+
+    def at(motion: Motion, state: Array) -> Array:
+        if isinstance(effect, MeshTorqueEffect | MotorSideEffect | LoadSideEffect):
+            # A model has the drive that its effects need.
+            return effect.torque(motion, model.drive, state[jnp.asarray(own, dtype=int)])  # pyright: ignore[reportArgumentType]
+        assert isinstance(model.drive, Drive) and motion.theta_m is not None and motion.theta_l is not None
+        if isinstance(effect, MeshGeometryEffect):
+            return effect.error(motion.theta_m)
+        assert isinstance(effect, SensorEffect)
+        theta_m, theta_l = effect.reading(motion.theta_m, motion.theta_l)
+        return (theta_m - motion.theta_m) / model.drive.N - (theta_l - motion.theta_l)
+
+    return jax.vmap(jax.vmap(at))(motion, states)
+
+
+def _told(
+    look: Look,
+    form: type[LearnedTorque],
+    value: Float[np.ndarray, "segments knots"],
+    does: Float[np.ndarray, "segments knots"],
+    kept: np.ndarray,
+    direction: Float[np.ndarray, "segments knots"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least squares for a torque that is added to the effect's: a broken line through as many places, for each
+    direction, with everything else as fitted."""
+    signs = np.unique(direction[kept])
+    places, hats, middle = [], [], []
+    for sign in signs:
+        there = kept & (direction == sign)
+        nodes = np.unique(np.quantile(value[there], np.linspace(0.01, 0.99, _PLACES)))
+        nodes = np.pad(nodes, (0, _PLACES - nodes.size), constant_values=np.nan)
+        places.append(nodes)
+        middle.append(_nearby(value[there], does[there], nodes))
+        hats.append(_hats(value, nodes) * there[..., None])
+    found = products(look, push(look, form), np.concatenate(hats, axis=-1))
+    own = slice(len(look.problem.free.paths), None)
+    # The error is whitened: an equal sum over the outputs is the likelihood.
+    gram = np.einsum("siipq->pq", found.gram[..., own, own])
+    gradient = np.einsum("siip->p", found.gradient[..., own])
+    added = solved(gram, gradient[:, None])[:, 0]
+    variance = np.diag(solved(gram, np.eye(len(gram))))
+    shape = (signs.size, _PLACES)
+    return np.stack(places), np.stack(middle) + added.reshape(shape), np.sqrt(variance).reshape(shape)
+
+
+def _nearby(value: np.ndarray, does: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """What the effect does at each node, on average over the samples that come closest."""
+    order = np.argsort(value)
+    middle = np.searchsorted(value[order], nodes)
+    reach = max(1, value.size // _NEARBY)
+    return np.array([np.mean(does[order][max(0, m - reach) : m + reach]) for m in middle])
+
+
+def _hats(value: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Broken lines that are one at one node and zero at the others; constant beyond the ends. None for a missing
+    node."""
+    there = np.isfinite(nodes)
+    unit = np.eye(int(there.sum()))
+    known = np.stack([np.interp(value, nodes[there], row) for row in unit], axis=-1)
+    found = np.zeros((*value.shape, nodes.size))
+    found[..., there] = known
+    return found

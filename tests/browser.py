@@ -1,0 +1,33 @@
+"""A page as a real browser shows it, without a network."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# Offline, with time that passes as fast as the scripts allow.
+_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--virtual-time-budget=20000",
+    "--enable-logging=stderr",
+    "--dump-dom",
+)
+
+
+def shown(page: Path) -> tuple[str, list[str]]:
+    """A page's document after its scripts have run, and what they wrote on the console; skips without a browser."""
+    browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip("needs a Chromium or Chrome, which is absent here")
+    profile = f"--user-data-dir={page.parent / 'profile'}"
+    done = subprocess.run(
+        [browser, *_FLAGS, profile, page.as_uri()], capture_output=True, text=True, timeout=120, check=True
+    )
+    return done.stdout, re.findall(r"CONSOLE[:(]\d+\)?\] (.*)", done.stderr)

@@ -1,0 +1,64 @@
+"""What the data are said to call for is the law that was hidden, also where the fitted one is wrong."""
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.evidence import Evidence, evidence
+from fitting.experiment import Stretch
+from hdjax.effects import Effect
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.friction import CoulombFriction
+
+T_C, V_0 = 150.0, 1.0
+
+
+def fitted(effect: Effect, *, hold_parameters: bool = False) -> Fit:
+    experiment = rig.reduced_experiment(1600, noise=1e-3, rms=40.0, friction=(T_C, V_0))
+    paths = ("mu", "omega_0", f"{effect.name}.{'T_c' if isinstance(effect, CoulombFriction) else 'bias'}")
+    return fit(
+        rig.reduced_model().with_effects(effect),
+        [Stretch(experiment, 0, 1600)],
+        paths,
+        horizon=128,
+        substeps=4,
+        hold_parameters=hold_parameters,
+    )
+
+
+def law(found: Evidence) -> np.ndarray:
+    return T_C * np.tanh(found.places / V_0)
+
+
+def test_the_data_lie_on_the_right_law():
+    (found,) = evidence(fitted(CoulombFriction(T_c=100.0, v_0=V_0)))
+    assert (found.variable, found.quantity) == ("v", "torque")
+    assert np.all(np.diff(found.places) > 0)
+    np.testing.assert_allclose(found.does, T_C * np.tanh(found.at / V_0), atol=0.02 * T_C)
+    assert np.all(found.std < 0.1 * T_C)
+    np.testing.assert_array_less(np.abs(found.told - law(found)), 4.5 * found.std)
+
+
+def test_the_data_contradict_a_law_of_the_wrong_size():
+    (found,) = evidence(fitted(CoulombFriction(T_c=0.8 * T_C, v_0=V_0), hold_parameters=True))
+    far = np.abs(found.places) > 3 * V_0
+    wrong = 0.8 * T_C * np.tanh(found.places / V_0)
+    # A fifth of the torque is much for a first-order look, which still takes the data's side.
+    assert np.all(np.abs(found.told - law(found))[far] < 0.3 * np.abs(wrong - law(found))[far])
+
+
+def test_no_picture_of_what_no_quantity_shows():
+    assert evidence(fitted(TorqueBias(bias=0.1))) == ()
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_hats_add_up_to_one_and_straight_lines_to_themselves(direction: float):
+    from fitting.evidence import _hats
+
+    nodes = np.array([-1.0, -0.2, 0.5, 2.0, np.nan])
+    value = direction * np.linspace(-0.9, 0.9, 7)[None]
+    hats = _hats(value, nodes)
+    np.testing.assert_allclose(hats.sum(axis=-1), 1.0)
+    np.testing.assert_allclose(hats[..., :4] @ nodes[:4], value, atol=1e-12)
+    assert not np.any(hats[..., 4])
