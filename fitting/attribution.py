@@ -26,6 +26,8 @@ LEAST_GAIN = 1e-3
 _WORTH_A_REFIT = 0.2
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
+# Iterations after which another hold of the torque must explain more.
+_HOLD_STEPS = 8
 # Nor is one that explains less than this share of what the best one does.
 _SHARE_OF_BEST = 0.25
 # Families whose likeliest form is refitted inside the equations in each round.
@@ -166,6 +168,8 @@ def _trained(
     covariance: Float[Array, "outputs outputs"] | None,
     *,
     give_up_above: float = np.inf,
+    states: Float[Array, "segments states"] | None = None,
+    max_steps: int = _TRIAL_STEPS,
 ) -> Fit:
     paths = base_paths(model)
     for effect in model.effects:
@@ -179,7 +183,9 @@ def _trained(
         substeps=setting.substeps,
         count=setting.count,
         covariance=covariance,
-        max_steps=_TRIAL_STEPS,
+        max_steps=max_steps,
+        states=states,
+        retry_states=states is None,
         give_up_above=give_up_above,
     )
 
@@ -253,7 +259,7 @@ def look(
         if hold == before.hold:
             continue
         progress(f"refitting with a {hold} torque")
-        trial = challenge([before.model], data, hold, setting, champion=before)
+        trial = _try_hold(before, data, hold, setting)
         gain = -np.inf if trial is None else before.held_out.objective - trial.held_out.objective
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
@@ -331,6 +337,16 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
     typical = lead.effect.typical(scales(before.training.stretches, model))
     starts = [first, *(model.with_effects(effect) for effect in typical)]
     return challenge(starts, data, before.hold, setting, champion=before, give_up_above=give_up_above)
+
+
+def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:
+    """Refit under another hold. It acts on the same motion, so that a few steps from the present fit tell whether it
+    is worth more."""
+    states = before.training.unknowns.states
+    near = _trained(before.model, data, hold, setting, before.training.covariance, states=states, max_steps=_HOLD_STEPS)
+    if near.objective > before.training.objective + LEAST_GAIN:
+        return None
+    return challenge([near.model], data, hold, setting, champion=before)
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:

@@ -102,6 +102,7 @@ def fit(
     hold_parameters: bool = False,
     count: int | None = None,
     states: Float[Array, "segments states"] | None = None,
+    retry_states: bool = True,
     give_up_above: float = np.inf,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
@@ -127,6 +128,7 @@ def fit(
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         count: number of segments, see [`fitting.experiment.cut`][].
         states: initial states of the segments to start from; from their first samples where not given.
+        retry_states: whether segments that stand out are begun anew, since they may have ended in a wrong minimum.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
 
     Returns:
@@ -156,7 +158,7 @@ def fit(
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, swing)
         unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
-        if turn == 0 and horizon <= _LONGEST_RETRY * length:
+        if turn == 0 and retry_states and horizon <= _LONGEST_RETRY * length:
             unknowns, changed = _retry_states(problem, unknowns)
             if changed:
                 unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[1])

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from fitting.estimate import Fit
 from fitting.explained import solved
 from fitting.linear_look import Look, look_along, products, push
+from fitting.regressors import place_of
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,
@@ -19,7 +20,7 @@ from hdjax.effects import (
     MotorSideEffect,
     SensorEffect,
 )
-from hdjax.effects.learned import ANGLES, LEARNED, LearnedTorque
+from hdjax.effects.learned import ANGLES, LearnedTorque
 
 # Values of the variable at which the data are asked, in each direction.
 _PLACES = 14
@@ -80,18 +81,12 @@ def _evidence(look: Look, effect: Effect) -> Evidence | None:
     some = np.flatnonzero(kept)
     some = some[np.unique(np.linspace(0, some.size - 1, min(_INSTANTS, some.size)).astype(int))]
     at, done = value.reshape(-1)[some], does.reshape(-1)[some]
-    form = _place(effect)
+    form = place_of(effect)
     if form is None:
         nothing = np.zeros((0, _PLACES))
         return Evidence(effect.name, "error", effect.drawn_against, at, done, nothing, nothing, nothing)
     places, told, std = _told(look, form, value, does, kept, _directions(effect, look.motion))
     return Evidence(effect.name, "torque", effect.drawn_against, at, done, places, told, std)
-
-
-def _place(effect: Effect) -> type[LearnedTorque] | None:
-    """The learned torque that acts where an effect does; None where that is no torque."""
-    kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
-    return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
 
 
 def _directions(effect: Effect, motion: Motion) -> np.ndarray:

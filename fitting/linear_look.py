@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from fitting.estimate import Fit
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
+from fitting.regressors import unit_torque
 from fitting.residual import Blocks, Problem, linearise
 from hdjax import Model
 from hdjax.effects import Motion
@@ -89,18 +90,7 @@ def _motion(model: Model, states: Float[Array, "segments knots states"]) -> Moti
 
 def push(look: Look, form: type[LearnedTorque]) -> Float[Array, "segments knots states"]:
     """What a unit of torque at the form's place adds to the state's rates, at each knot."""
-    probe = form(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,))
-    return _push(look.model.with_effects(probe), probe.name, look.followed.states)
-
-
-@eqx.filter_jit
-def _push(model: Model, name: str, states: Array) -> Array:
-    zero = jnp.zeros(())
-
-    def rates(strength: Array, state: Array) -> Array:
-        return model.replace({f"{name}.c_0": strength}).rates(state, zero, zero)
-
-    return jax.vmap(jax.vmap(lambda state: jax.jacfwd(rates)(zero, state)))(states)
+    return unit_torque(look.model, form, look.followed.states)
 
 
 def parameter_torques(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,11 +18,11 @@ from hdjax.effects import (
     Conditions,
     Effect,
     LoadSideEffect,
-    MeshGeometryEffect,
     MeshTorqueEffect,
     Motion,
     MotorSideEffect,
 )
+from hdjax.effects.learned import LEARNED, LearnedTorque
 from hdjax.program_cache import jit_kept
 from hdjax.signals import polynomial
 from hdjax.where import where
@@ -49,26 +50,104 @@ class Regressors(eqx.Module):
     reading: Float[Array, "segments samples outputs columns"]
 
 
-def regressors(model: Model, proposals: Sequence[Effect], followed: Followed, segments: Segments) -> Regressors:
+class Along(eqx.Module):
+    """A motion, as effects look at it.
+
+    Attributes:
+        model: whose motion it is.
+        followed: its states.
+        segments: the data that it belongs to.
+        at_knots: the motion at each knot.
+        between: the motion at the nodes of each interval.
+        goes_on: whether a segment goes on where the one before it ends in time, joined or not.
+    """
+
+    model: Model
+    followed: Followed
+    segments: Segments
+    at_knots: Motion
+    between: Motion
+    goes_on: Bool[Array, " segments"]
+
+
+def along(model: Model, followed: Followed, segments: Segments) -> Along:
+    """The motion of a model as effects look at it.
+
+    Args:
+        model: at the solution.
+        followed: its states.
+        segments: the data that it belongs to.
+    """
+    at_knots, between = _motions(model, followed, segments)
+    return Along(model, followed, segments, at_knots, between, jnp.asarray(continues(segments)))
+
+
+@jit_kept
+def _motions(model: Model, followed: Followed, segments: Segments) -> tuple[Motion, Motion]:
+    time = segments.torque.knots[:, segments.halo :]
+    width = jnp.diff(time)
+    at_knots = jax.vmap(jax.vmap(model.motion))(
+        followed.states, Conditions(time, _at_knots(segments.temperature, width))
+    )
+    late = jnp.asarray(_PART) * width[..., None]
+    warmth = segments.temperature
+    warmth = None if warmth is None else polynomial(warmth.coefficients[..., None, :], late)
+    conditions = Conditions(time[:, :-1, None] + late, warmth)
+    return at_knots, jax.vmap(jax.vmap(jax.vmap(model.motion)))(followed.between, conditions)
+
+
+def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
     """The regressors of proposals of one form along a motion.
 
     Args:
-        model: whose motion it is.
+        seen: the motion.
         proposals: effects of one and the same form, at zero strength.
-        followed: the motion.
-        segments: the data that it belongs to.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *proposals)
-    if isinstance(stacked, MeshTorqueEffect | MotorSideEffect | LoadSideEffect):
-        # A torque is the same whatever other torques there are: one program for all models that the loop comes by.
-        model = replace(model, effects=tuple(e for e in model.effects if isinstance(e, MeshGeometryEffect)))
-    found = _regressors(model, stacked, followed, segments, jnp.asarray(continues(segments)))
-    return jax.tree.map(lambda a: _finite(np.asarray(a)), found)
+    place = place_of(stacked)
+    takes_inertia = (
+        isinstance(stacked, LoadSideEffect) and type(stacked).inertia_taken is not LoadSideEffect.inertia_taken
+    )
+    if place is None or takes_inertia:
+        found = _regressors(seen.model, stacked, seen.followed, seen.segments, seen.at_knots, seen.goes_on)
+        return jax.tree.map(lambda a: _finite(np.asarray(a)), found)
+    # A torque is the same whatever other effects there are: one program for all models that the loop comes by.
+    bare = replace(seen.model, effects=())
+    width = jnp.diff(seen.segments.torque.knots[:, seen.segments.halo :])
+    torque = _finite(np.asarray(_torques(bare, stacked, seen.at_knots, seen.between, width, seen.goes_on)))
+    acting = np.asarray(unit_torque(seen.model, place, seen.followed.between))
+    mean = 0.5 * np.einsum("k,snki,snkp->snip", WEIGHTS, acting, torque, optimize=True)
+    rise = 1.5 * np.einsum("k,snki,snkp->snip", WEIGHTS * NODES, acting, torque, optimize=True)
+    nothing = np.zeros((*seen.segments.measured.shape, torque.shape[-1]))
+    return Regressors(*map(jnp.asarray, (mean - rise, mean + rise, nothing)))
+
+
+def place_of(effect: Effect) -> type[LearnedTorque] | None:
+    """The learned torque that acts where an effect does; None where that is no torque."""
+    kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
+    return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
+
+
+def unit_torque(model: Model, place: type[LearnedTorque], states: Float[Array, "*many states"]) -> Array:
+    """What a unit of torque at a place adds to the rates of each of many states."""
+    probe = place(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,))
+    return _unit_torque(model.with_effects(probe), probe.name, states)
+
+
+@eqx.filter_jit
+def _unit_torque(model: Model, name: str, states: Array) -> Array:
+    zero = jnp.zeros(())
+
+    def rates(strength: Array, state: Array) -> Array:
+        return model.replace({f"{name}.c_0": strength}).rates(state, zero, zero)
+
+    flat = states.reshape(-1, states.shape[-1])
+    return jax.vmap(lambda state: jax.jacfwd(rates)(zero, state))(flat).reshape(states.shape)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
     """An effect that runs away along the motion explains nothing."""
-    lost = ~np.isfinite(values).all(axis=(0, 1, 2))
+    lost = ~np.isfinite(values).all(axis=tuple(range(values.ndim - 1)))
     return np.where(lost, 0.0, values) if lost.any() else values
 
 
@@ -80,15 +159,58 @@ def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
     return np.append(False, np.abs(late) < 0.5 * step)
 
 
+def _torque_columns(
+    bare: Model,
+    stacked: Effect,
+    at_knots: Motion,
+    between: Motion,
+    width: Float[Array, "segments samples"],
+    goes_on: Bool[Array, " segments"],
+) -> Float[Array, "segments samples nodes columns"]:
+    """Derivatives of the torque by each strength of each proposal, at the nodes."""
+
+    def of(effect: Effect) -> Array:
+        extended = bare.with_effects(effect)
+        paths = strength_paths(effect)
+        own = jnp.zeros((*width.shape, NODES.size, 0))
+        if effect.states:
+            own = _own_between(*_own_states(effect, at_knots, width, goes_on))
+
+        def torque(strengths: Array) -> Array:
+            changed = extended.replace(dict(zip(paths, strengths, strict=True))).effect(effect.name)
+            assert isinstance(changed, MeshTorqueEffect | MotorSideEffect | LoadSideEffect)
+            at = jax.vmap(jax.vmap(jax.vmap(lambda motion, state: changed.torque(motion, bare.drive, state))))  # pyright: ignore[reportArgumentType]
+            return jnp.broadcast_to(at(between, own), own.shape[:-1])
+
+        return jax.jacfwd(torque)(jnp.stack([extended.get(p) for p in paths]))
+
+    found = jax.vmap(of, out_axes=-1)(stacked)
+    return _side_by_side(found)
+
+
+def _side_by_side(found: Array) -> Array:
+    """From (..., strengths, proposals) to one axis, a proposal's strengths side by side."""
+    return jnp.swapaxes(found, -1, -2).reshape(*found.shape[:-2], -1)
+
+
+# Programs of little work for each form: compiling them well would take longer than what that saves.
+_QUICKLY_MADE: Any = {"compiler_options": {"xla_backend_optimization_level": 1}}
+_torques = jit_kept(_torque_columns, **_QUICKLY_MADE)
+
+
 def _looked_along(
-    model: Model, stacked: Effect, followed: Followed, segments: Segments, goes_on: Bool[Array, " segments"]
+    model: Model,
+    stacked: Effect,
+    followed: Followed,
+    segments: Segments,
+    at_knots: Motion,
+    goes_on: Bool[Array, " segments"],
 ) -> Regressors:
-    kept = len(model.state_names)
-    others = followed.states.shape[-1] - kept
-    states, between = followed.states[..., :kept], followed.between[..., :kept]
+    states, between = followed.states, followed.between
+    width = jnp.diff(segments.torque.knots[:, segments.halo :])
 
     def of(effect: Effect) -> Regressors:
-        own = _own_states(model, effect, states, segments, goes_on) if effect.states else None
+        own = _own_states(effect, at_knots, width, goes_on) if effect.states else None
         paths = strength_paths(effect)
         extended = model.with_effects(effect)
 
@@ -97,19 +219,15 @@ def _looked_along(
             return _rates_and_reading(changed, states, between, own, segments)
 
         rates, reading = jax.jacfwd(looked_at)(jnp.stack([extended.get(p) for p in paths]))
-        # Rates of states that the model was looked at without do not depend on the effect.
-        rates = jnp.pad(rates, ((0, 0), (0, 0), (0, 0), (0, others), (0, 0)))
         mean = 0.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS), rates)
         rise = 1.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS * NODES), rates)
         return Regressors(mean - rise, mean + rise, reading)
 
     found = jax.vmap(of, out_axes=-1)(stacked)
-    # From (..., strengths, proposals) to one axis, a proposal's strengths side by side.
-    return jax.tree.map(lambda a: jnp.swapaxes(a, -1, -2).reshape(*a.shape[:-2], -1), found)
+    return jax.tree.map(_side_by_side, found)
 
 
-# A program of little work for each form: compiling it well would take longer than what that saves.
-_regressors = jit_kept(_looked_along, compiler_options={"xla_backend_optimization_level": 1})
+_regressors = jit_kept(_looked_along, **_QUICKLY_MADE)
 
 
 def _rates_and_reading(
@@ -122,11 +240,8 @@ def _rates_and_reading(
     """Rates of the given states, at the nodes of each interval, and the outputs at the samples."""
     kept, samples = states.shape[-1], states[:, :-1]
     if own is not None:
-        start, end = own
-        part = jnp.asarray(_PART)[..., None]
-        start_to_end = start[:, :, None] * (1.0 - part) + end[:, :, None] * part
-        between = jnp.concatenate([between, start_to_end], axis=-1)
-        samples = jnp.concatenate([samples, start], axis=-1)
+        between = jnp.concatenate([between, _own_between(*own)], axis=-1)
+        samples = jnp.concatenate([samples, own[0]], axis=-1)
     halo = segments.halo
     acting = jax.vmap(model.actuate)(segments.torque)
     acting = PiecewisePolynomial(acting.knots[:, halo:], acting.coefficients[:, halo:])
@@ -142,17 +257,16 @@ def _rates_and_reading(
     return rates[..., :kept], jax.vmap(jax.vmap(model.outputs))(samples)
 
 
+def _own_between(start: Array, end: Array) -> Array:
+    """An effect's own states at the nodes, in a straight line between both ends of an interval."""
+    part = jnp.asarray(_PART)[..., None]
+    return start[:, :, None] * (1.0 - part) + end[:, :, None] * part
+
+
 def _own_states(
-    model: Model,
-    effect: Effect,
-    states: Float[Array, "segments knots states"],
-    segments: Segments,
-    goes_on: Bool[Array, " segments"],
+    effect: Effect, motion: Motion, width: Float[Array, "segments samples"], goes_on: Bool[Array, " segments"]
 ) -> tuple[Array, Array]:
     """An effect's own states at both ends of each interval: settled at each log's start, then driven by the motion."""
-    time = segments.torque.knots[:, segments.halo :]
-    width = jnp.diff(time)
-    motion = jax.vmap(jax.vmap(model.motion))(states, Conditions(time, _at_knots(segments.temperature, width)))
 
     def rate(own: Array, before: Motion, after: Motion, passed: float) -> Array:
         between = jax.tree.map(lambda a, b: (1.0 - passed) * a + passed * b, before, after)

@@ -21,10 +21,10 @@ from fitting.experiment import Segments, scales
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
-from fitting.regressors import Regressors, regressors
+from fitting.regressors import Along, Regressors, along, regressors
 from fitting.residual import Blocks, linearise
 from fitting.spectral_lines import spectral_lines
-from hdjax import Model, TwoInertiaModel
+from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.program_cache import jit_kept
 
@@ -151,7 +151,7 @@ def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[
     drawn = jnp.asarray(surrogates(fit, seed))
     rows = float(np.sum(segments.weight)) * residual.shape[-1]
     already = slopes.size
-    for own, forces in _batches(fit.model, proposals, followed, segments):
+    for own, forces in _batches(along(fit.model, followed, segments), proposals):
         products = _inner_products(found, followed, segments, whitening, forces, residual, drawn)
         gram, gradient, against = (np.asarray(a) for a in products)
         yield (
@@ -165,16 +165,14 @@ def _on_host(tree):
     return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)) if eqx.is_array(a) else a, tree)
 
 
-def _batches(
-    model: Model, proposals: Sequence[Effect], followed: Followed, segments: Segments
-) -> Iterator[tuple[dict[int, list[int]], Regressors]]:
+def _batches(seen: Along, proposals: Sequence[Effect]) -> Iterator[tuple[dict[int, list[int]], Regressors]]:
     """Regressors of the proposals, as many as go into one program; the columns of each, by its place in the list."""
     own: dict[int, list[int]] = {}
     waiting: list[Regressors] = []
     taken, index = 0, 0
     for form in dict.fromkeys(type(p) for p in proposals):
         same = [p for p in proposals if type(p) is form]
-        found = regressors(model, same, followed, segments)
+        found = regressors(seen, same)
         strengths = len(strength_paths(same[0]))
         for i in range(len(same)):
             if waiting and taken + strengths > _COLUMNS:

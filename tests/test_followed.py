@@ -13,7 +13,7 @@ from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.followed import Followed, follow, respond
 from fitting.free import base_paths, strength_paths
-from fitting.regressors import regressors
+from fitting.regressors import along, regressors
 from fitting.residual import simulate_segments
 from hdjax.effects import Effect
 from hdjax.effects.actuation import InputDelay, TorqueBias
@@ -68,7 +68,7 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     start = float(getattr(effect, name))
     both = [eqx.tree_at(lambda e: getattr(e, name), effect, jnp.asarray(start + sign * size)) for sign in (0.0, 1.0)]
     slope = (simulated(found, both[1]) - simulated(found, both[0])) / size
-    forces = jax.tree.map(jnp.asarray, regressors(found.model, [effect], followed, found.problem.segments))
+    forces = jax.tree.map(jnp.asarray, regressors(along(found.model, followed, found.problem.segments), [effect]))
     column = [p.split(".")[1] for p in strength_paths(effect)].index(name)
     outputs, _ = respond(followed, forces.at_start, forces.at_end)
     answer = np.asarray(outputs + forces.reading)[..., column]
