@@ -1,0 +1,44 @@
+"""What a design is measured by: a number of a case, with gradients."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from hdjax.design.case import Case
+
+
+class Measure(eqx.Module):
+    """A pure, differentiable function of a [`Case`][]; its fields say where it looks.
+
+    A case that has no such number (no steady motion is found, say) gives NaN: a search turns back from there.
+    """
+
+    name: eqx.AbstractClassVar[str]
+    unit: eqx.AbstractClassVar[str]
+    says: eqx.AbstractClassVar[str]
+
+    @abc.abstractmethod
+    def __call__(self, case: Case) -> Float[Array, ""]:
+        """The number, in `unit`."""
+
+    def refuse(self, case: Case) -> None:  # noqa: B027 (most measures take any case)
+        """Say why a case can't be measured.
+
+        Raises:
+            ValueError: where it can't.
+        """
+
+
+class SpeedRange(Measure):
+    """A measure over forcing frequencies, or motor speeds, from `slow` to `fast`."""
+
+    slow: eqx.AbstractVar[float]
+    fast: eqx.AbstractVar[float]
+
+    def refuse(self, case: Case) -> None:
+        if not 0.0 < self.slow < self.fast:
+            raise ValueError(
+                f"`{self.name}` must have 0 < slow < fast, but runs from {self.slow} to {self.fast} rad/s"
+            )
