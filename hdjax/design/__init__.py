@@ -13,6 +13,7 @@ from hdjax.design.optimise import optimise as optimise
 from hdjax.design.robustness import Draws as Draws
 from hdjax.design.study import Limit as Limit
 from hdjax.design.study import Maker as Maker
+from hdjax.design.study import Replaced as Replaced
 from hdjax.design.study import Study as Study
 from hdjax.design.study import Term as Term
 from hdjax.design.variables import Variable as Variable

@@ -48,7 +48,7 @@ class Case(eqx.Module):
         return self.model.drive
 
     def parameters(self) -> dict[str, tuple[Array, ParameterInfo]]:
-        """All that a design can choose, by dotted path: the model's parameters, and the torques' as `forcing.symbol`."""
+        """All that a design can choose by dotted path: the model's parameters, and the torques' as `forcing.symbol`."""
         own = {f"{FORCING}.{n}": (getattr(self.excitation, n), i) for n, i in own_parameters(self.excitation)}
         return self.model.parameters() | own
 
@@ -67,4 +67,5 @@ class Case(eqx.Module):
         for name, value in torques.items():
             excitation = eqx.tree_at(lambda e, n=name: getattr(e, n), excitation, jnp.asarray(value, dtype=float))
         model = self.model.replace({p: v for p, v in values.items() if not p.startswith(f"{FORCING}.")})
+        assert isinstance(model, TwoInertiaModel)
         return Case(model, excitation)

@@ -3,12 +3,13 @@
 import itertools
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import qmc
 
 from hdjax.design.optimise import KEPT, Optimum
-from hdjax.design.study import Study, appraise
+from hdjax.design.study import LANES, Study, appraise
 from hdjax.design.variables import values
 
 _STEP = 1e-3
@@ -51,7 +52,7 @@ class Confirmation(eqx.Module):
 
 
 def confirm(
-    study: Study, optimum: Optimum, *, width: float = 0.1, points: int = 9, seed: int = 0, lanes: int = 8
+    study: Study, optimum: Optimum, *, width: float = 0.1, points: int = 9, seed: int = 0, lanes: int = LANES
 ) -> Confirmation:
     """Sweep the designs around an optimum.
 
@@ -85,14 +86,14 @@ def confirm(
         objective=objective,
         feasible=feasible,
         shape=shape,
-        best={p: float(v) for p, v in values(study.variables, designs[best]).items()} if found else {},
+        best={p: float(v) for p, v in values(study.variables, jnp.asarray(designs[best])).items()} if found else {},
         best_objective=float(allowed[best]),
         gain=(optimum.objective - float(allowed[best])) / size if found else -np.inf,
         gradient_error=gradient_error(study, optimum.shares, lanes=lanes),
     )
 
 
-def gradient_error(study: Study, shares: Float[np.ndarray, " variables"], *, lanes: int = 8) -> float:
+def gradient_error(study: Study, shares: Float[np.ndarray, " variables"], *, lanes: int = LANES) -> float:
     """Largest difference between gradients and differences of fourth order, relative to the row's largest slope.
 
     At a design, and at one beside it: at an optimum a gradient may be zero, and agree for that reason.

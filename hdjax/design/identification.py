@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.design.case import Case
-from hdjax.design.measure import Measure
+from hdjax.design.measure import Measure, number
 from hdjax.dynamics import ReducedModel
 from hdjax.signals import PiecewisePolynomial
 from hdjax.simulate import march
@@ -65,7 +65,7 @@ class LogMeasure(Measure):
             raise ValueError(f"`{self.name}` plans a log of the base model, but there is {case.model.effects[0].name}")
         if not (self.rate > 0.0 and self.duration > 0.0):
             raise ValueError(
-                f"`{self.name}` must have positive rate and duration, but has {self.rate} Hz and {self.duration} s"
+                f"`{self.name}` must have positive rate and duration, but has {self.rate:g} Hz and {self.duration:g} s"
             )
         if self.rate < 3.0 * float(case.drive.omega_0) / (2.0 * jnp.pi):
             raise ValueError(f"`{self.name}` must sample three times a natural period at least; raise rate")
@@ -104,15 +104,15 @@ class IdentificationTime(LogMeasure):
     says: ClassVar[str] = "shortest log that determines alpha to a relative standard error"
     rate: float
     duration: float
-    noise: float
-    relative_error: float = 0.05
+    noise: Array = number()
+    relative_error: Array = number(0.05)
 
     def refuse(self, case: Case) -> None:
         super().refuse(case)
         if not (self.noise > 0.0 and self.relative_error > 0.0):
             raise ValueError(
                 "`identification_time` must have positive noise and relative_error, but has "
-                f"{self.noise} rad and {self.relative_error}"
+                f"{self.noise:g} rad and {self.relative_error:g}"
             )
 
     def __call__(self, case: Case) -> Array:
@@ -122,7 +122,7 @@ class IdentificationTime(LogMeasure):
         before, after = standard[k - 1], standard[k]
         share = before / where(before > after, before - after, 1.0)
         # The k-th entry holds k + 1 samples.
-        within = (k + jnp.clip(share, 0.0, 1.0)) / self.rate
+        within = (jnp.astype(k, float) + jnp.clip(share, 0.0, 1.0)) / self.rate
         beyond = standard.size / self.rate * jnp.exp(2.0 * standard[-1])
         return where(jnp.any(enough), within, beyond)
 

@@ -1,12 +1,20 @@
 """What a design is measured by: a number of a case, with gradients."""
 
 import abc
-from typing import ClassVar
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from hdjax.design.case import Case
+from hdjax.parameters import as_scalar
+
+
+def number(default: float | None = None) -> Any:
+    """Declare a number of a measure. It is data: another number needs no other program."""
+    if default is None:
+        return eqx.field(converter=as_scalar)
+    return eqx.field(converter=as_scalar, default=default)
 
 
 class Measure(eqx.Module):
@@ -34,11 +42,11 @@ class Measure(eqx.Module):
 class SpeedRange(Measure):
     """A measure over forcing frequencies, or motor speeds, from `slow` to `fast`."""
 
-    slow: eqx.AbstractVar[float]
-    fast: eqx.AbstractVar[float]
+    slow: eqx.AbstractVar[Array]
+    fast: eqx.AbstractVar[Array]
 
     def refuse(self, case: Case) -> None:
         if not 0.0 < self.slow < self.fast:
             raise ValueError(
-                f"`{self.name}` must have 0 < slow < fast, but runs from {self.slow} to {self.fast} rad/s"
+                f"`{self.name}` must have 0 < slow < fast, but runs from {self.slow:g} to {self.fast:g} rad/s"
             )

@@ -10,13 +10,14 @@ import enum
 from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize, nnls
 from scipy.stats import qmc
 
 from hdjax.design.lockstep import in_lockstep
-from hdjax.design.study import Study, appraise
+from hdjax.design.study import LANES, Study, appraise
 from hdjax.design.variables import values
 
 KEPT = 1e-6
@@ -54,8 +55,8 @@ class Optimum(eqx.Module):
         at_bound: the variables that lie at a bound, by path: `"low"` or `"high"`.
         bound_multipliers: of those, how much the objective would fall for one unit of the variable beyond the bound.
         multipliers: by label of the limits that hold it, how much the objective would fall for one unit more.
-        gradient: size of what is left of the objective's gradient, by shares of the ranges, relative to the gradient
-            (or, where that is small, to the objective).
+        gradient: size of what bounds and limits leave of the objective's gradient, by shares of the ranges, relative to
+            the gradient or, where that is larger, the objective.
         asked: designs that were appraised on the way.
     """
 
@@ -107,6 +108,7 @@ def optimise(
     starts: int | Float[np.ndarray, "starts variables"] = 4,
     *,
     seed: int = 0,
+    lanes: int = LANES,
     progress: Callable[[int], None] = _silent,
 ) -> Optimised:
     """The design with the smallest objective that keeps all limits.
@@ -115,6 +117,7 @@ def optimise(
         study: what is asked.
         starts: how many, or shares of the ranges to start from.
         seed: of the starts.
+        lanes: designs that are worked out side by side.
         progress: told how many designs have been appraised.
 
     Raises:
@@ -122,13 +125,12 @@ def optimise(
     """
     study.refuse()
     begin = drawn_starts(len(study.variables), starts, seed) if isinstance(starts, int) else starts
-    lanes = len(begin)
     first = appraise(study, begin, lanes=lanes)
-    exist = np.isfinite(first.rows).all(axis=1) & np.isfinite(first.slopes).all(axis=(1, 2))
+    exist = np.all(np.isfinite(first.rows), axis=1) & np.all(np.isfinite(first.slopes), axis=(1, 2))
     if not exist.any():
         raise ValueError("at no start do all measures exist: no steady motion is found there, or no equilibrium")
     scale = float(np.median(np.abs(first.rows[exist, 0]))) or 1.0
-    asked = [lanes]
+    asked = [len(begin)]
 
     def answers(points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         found = appraise(study, points, lanes=lanes)
@@ -136,14 +138,16 @@ def optimise(
         progress(sum(asked))
         return list(zip(found.rows, found.slopes, strict=True))
 
-    ends = in_lockstep(
-        lanes,
-        lambda i, ask: _search(begin[i], ask, scale) if exist[i] else (begin[i], 1),
-        answers,
-    )
+    def search(i: int, ask: Callable) -> tuple[np.ndarray, int]:
+        return _search(begin[i], ask, scale) if bool(exist[i]) else (begin[i], 1)
+
+    ends = in_lockstep(len(begin), search, answers)
     shares, counts = np.stack([e[0] for e in ends]), [e[1] for e in ends]
     last = appraise(study, shares, lanes=lanes)
-    found = tuple(_judged(study, shares[i], last.rows[i], last.slopes[i], last.parts[i], counts[i]) for i in range(lanes))
+    found = tuple(
+        _judged(study, shares[i], last.rows[i], last.slopes[i], last.parts[i], counts[i], scale)
+        for i in range(len(begin))
+    )
     feasible = [end for end in found if end.feasible]
     best = (
         min(feasible, key=lambda end: end.objective)
@@ -211,10 +215,10 @@ def _existing(slopes: np.ndarray) -> np.ndarray:
 
 
 def _judged(
-    study: Study, shares: np.ndarray, rows: np.ndarray, slopes: np.ndarray, parts: np.ndarray, asked: int
+    study: Study, shares: np.ndarray, rows: np.ndarray, slopes: np.ndarray, parts: np.ndarray, asked: int, scale: float
 ) -> Optimum:
     """An end with all that can be said of it."""
-    chosen = {path: float(v) for path, v in values(study.variables, shares).items()}
+    chosen = {path: float(v) for path, v in values(study.variables, jnp.asarray(shares)).items()}
     labels = [part.label for part in (*study.terms, *study.limits)]
     if not (np.isfinite(rows).all() and np.isfinite(slopes).all()):
         nothing: dict[str, float] = {}
@@ -230,14 +234,16 @@ def _judged(
     out = np.concatenate([-box[low], box[high], slopes[1:][active]])
     multipliers, _ = nnls(out.T, -slopes[0]) if len(out) else (np.zeros(0), 0.0)
     left = slopes[0] + multipliers @ out if len(out) else slopes[0]
-    size = max(float(np.linalg.norm(slopes[0])), abs(float(rows[0])), 1e-300)
+    # An objective may be zero where it is least; what it is elsewhere tells a small slope from a large one.
+    size = max(float(np.linalg.norm(slopes[0])) if len(out) else 0.0, abs(float(rows[0])), 1e-2 * scale)
     gradient = float(np.linalg.norm(left)) / size
     if max(excess.values(), default=0.0) > KEPT:
         outcome = Outcome.infeasible
     else:
         outcome = Outcome.optimum if gradient < _STATIONARY else Outcome.stalled
-    paths = np.array([v.path for v in study.variables])
-    ends = [*paths[low], *paths[high]]
+    paths = [v.path for v in study.variables]
+    at_low, at_high = ([p for p, there in zip(paths, side, strict=True) if there] for side in (low, high))
+    ends = [*at_low, *at_high]
     by_share = {path: float(m) for path, m in zip(ends, multipliers, strict=False)}
     held = [limit for i, limit in enumerate(study.limits) if active[i]]
     return Optimum(
@@ -248,10 +254,10 @@ def _judged(
         excess=excess,
         measures=dict(zip(labels, parts.mean(axis=0).tolist(), strict=True)),
         draws={label: parts[:, i] for i, label in enumerate(labels)},
-        at_bound={**dict.fromkeys(map(str, paths[low]), "low"), **dict.fromkeys(map(str, paths[high]), "high")},
+        at_bound=dict.fromkeys(at_low, "low") | dict.fromkeys(at_high, "high"),
         bound_multipliers={path: m / _unit(study, path, shares) for path, m in by_share.items()},
         multipliers={
-            limit.label: float(m) / limit.scale for limit, m in zip(held, multipliers[len(ends) :], strict=True)
+            limit.label: float(m) / float(limit.scale) for limit, m in zip(held, multipliers[len(ends) :], strict=True)
         },
         gradient=gradient,
         asked=asked,
@@ -259,8 +265,5 @@ def _judged(
 
 
 def _unit(study: Study, path: str, shares: np.ndarray) -> float:
-    """What a full range of a variable is worth at a design, at the rate at which it changes there."""
-    i, variable = next((i, v) for i, v in enumerate(study.variables) if v.path == path)
-    if variable.spacing == "log":
-        return float(variable.value(shares[i])) * float(np.log(variable.high / variable.low))
-    return variable.high - variable.low
+    """How fast a variable changes with its share at a design."""
+    return next(float(v.rate(jnp.asarray(shares[i]))) for i, v in enumerate(study.variables) if v.path == path)

@@ -1,5 +1,7 @@
 """Measures of the steady response, by harmonic balance."""
 
+import abc
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -8,12 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.design.case import Case
-from hdjax.design.measure import SpeedRange
+from hdjax.design.measure import SpeedRange, number
 from hdjax.design.steady import Range, balanced, followed, largest_swing, motions_at, with_system
 from hdjax.drive import restoring
 from hdjax.effects import ActuatorEffect, LoadSideEffect
 from hdjax.response.continuation import Branch, folds
-from hdjax.response.harmonic_balance import SteadyState
+from hdjax.response.harmonic_balance import BalancedMotion, SteadyState
 from hdjax.where import where
 
 
@@ -23,8 +25,16 @@ class ResponseMeasure(SpeedRange):
     rotating: eqx.AbstractVar[bool]
 
     @property
-    def _range(self) -> Range:
-        return Range(self.slow, self.fast, self.rotating)
+    def looked_at(self) -> Range:
+        """Where motions are searched for."""
+        return Range(self.slow, self.fast)
+
+    @abc.abstractmethod
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        """The measure, from the branches from either end of `looked_at`."""
+
+    def __call__(self, case: Case) -> Array:
+        return responses(case, [self])[0]
 
     def refuse(self, case: Case) -> None:
         super().refuse(case)
@@ -38,6 +48,19 @@ class ResponseMeasure(SpeedRange):
             raise ValueError(f"`{self.name}` needs a kinematic error where the motor rotates, but there is none")
 
 
+def responses(case: Case, measures: Sequence[ResponseMeasure]) -> list[Array]:
+    """Several measures of a case whose steady motions are searched for together."""
+    found: dict[int, Array] = {}
+    for rotating in (False, True):
+        own = {i: m for i, m in enumerate(measures) if m.rotating == rotating}
+        if not own:
+            continue
+        system = balanced(case, rotating=rotating)
+        searched = followed(system, [m.looked_at for m in own.values()])
+        found |= {i: m.of(case, system, branches) for (i, m), branches in zip(own.items(), searched, strict=True)}
+    return [found[i] for i in range(len(measures))]
+
+
 class PeakError(ResponseMeasure):
     """Largest swing of the dynamic error about its mean over a range of speeds [rad].
 
@@ -48,14 +71,12 @@ class PeakError(ResponseMeasure):
     name: ClassVar[str] = "peak_error"
     unit: ClassVar[str] = "rad"
     says: ClassVar[str] = "largest swing of the dynamic error between slow and fast"
-    slow: float
-    fast: float
+    slow: Array = number()
+    fast: Array = number()
     rotating: bool = False
 
-    def __call__(self, case: Case) -> Array:
-        looked_at = self._range
-        system = balanced(case, rotating=self.rotating, harmonics=looked_at.harmonics)
-        return largest_swing(system, looked_at)[0]
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        return largest_swing(system, self.looked_at, branches)[0]
 
 
 class MeshTorque(ResponseMeasure):
@@ -64,14 +85,12 @@ class MeshTorque(ResponseMeasure):
     name: ClassVar[str] = "mesh_torque"
     unit: ClassVar[str] = "N m"
     says: ClassVar[str] = "elastic mesh torque at the largest swing between slow and fast"
-    slow: float
-    fast: float
+    slow: Array = number()
+    fast: Array = number()
     rotating: bool = False
 
-    def __call__(self, case: Case) -> Array:
-        looked_at = self._range
-        system = balanced(case, rotating=self.rotating, harmonics=looked_at.harmonics)
-        return case.drive.K * restoring(largest_swing(system, looked_at)[0], case.drive.alpha)
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        return case.drive.K * restoring(largest_swing(system, self.looked_at, branches)[0], case.drive.alpha)
 
 
 class Loss(ResponseMeasure):
@@ -84,17 +103,15 @@ class Loss(ResponseMeasure):
     name: ClassVar[str] = "loss"
     unit: ClassVar[str] = "W"
     says: ClassVar[str] = "mean power lost between slow and fast"
-    slow: float
-    fast: float
+    slow: Array = number()
+    fast: Array = number()
     rotating: bool = False
     speeds: int = 32
 
-    def __call__(self, case: Case) -> Array:
-        looked_at = self._range
-        system = balanced(case, rotating=self.rotating, harmonics=looked_at.harmonics)
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
         width = (self.fast - self.slow) / self.speeds
         at = self.slow + width * (jnp.arange(float(self.speeds)) + 0.5)
-        motions, found = motions_at(system, looked_at, at)
+        motions, found = motions_at(system, branches, at)
         power = jax.vmap(lambda m: power_in(case, m, rotating=self.rotating))(motions)
         mean = jnp.sum(where(found, power, 0.0)) / jnp.maximum(jnp.sum(where(found, 1.0, 0.0)), 1.0)
         # A speed next to a fold may lack its motion; a range of which half lacks them is not known.
@@ -124,26 +141,27 @@ class FoldDistance(ResponseMeasure):
     name: ClassVar[str] = "fold_distance"
     unit: ClassVar[str] = "1"
     says: ClassVar[str] = "logarithmic distance of the nearest fold from slow and fast, negative between them"
-    slow: float
-    fast: float
+    slow: Array = number()
+    fast: Array = number()
     rotating: bool = False
-    reach: float = 2.0
+    reach: Array = number(2.0)
 
-    def __call__(self, case: Case) -> Array:
-        wide = Range(self.slow / self.reach, self.fast * self.reach, self.rotating)
-        system = balanced(case, rotating=self.rotating, harmonics=wide.harmonics)
+    @property
+    def looked_at(self) -> Range:
+        return Range(self.slow / self.reach, self.fast * self.reach)
 
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
         def of_one(branch: Branch) -> Array:
             found = folds(with_system(branch, system))
             value = where(found.exists, found.value, 1.0)
             distance = outside(value, self.slow, self.fast)
             return jnp.min(where(found.exists, distance, jnp.inf))
 
-        nearest = jnp.min(jax.vmap(of_one)(followed(system, wide)))
+        nearest = jnp.min(jax.vmap(of_one)(branches))
         far = jnp.log(self.reach)
         return where(nearest < far, nearest, far)
 
 
-def outside(value: Array, slow: float, fast: float) -> Array:
+def outside(value: Array, slow: Array, fast: Array) -> Array:
     """Logarithmic distance of frequencies from a range; negative inside it."""
     return jnp.maximum(jnp.log(slow / value), jnp.log(value / fast))

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from hdjax.design.case import Case
 from hdjax.design.closed_measures import static_twist
-from hdjax.design.measure import Measure
+from hdjax.design.measure import Measure, number
 from hdjax.dynamics import Model, ReducedModel
 from hdjax.effects import ActuatorEffect
 from hdjax.signals import PiecewisePolynomial
@@ -38,14 +38,14 @@ class SettlingTime(Measure):
     name: ClassVar[str] = "settling_time"
     unit: ClassVar[str] = "s"
     says: ClassVar[str] = "time until the swing after the release of a torque stays within a band"
-    torque: float
-    band: float
+    torque: Array = number()
+    band: Array = number()
     turns: int = 100
 
     def refuse(self, case: Case) -> None:
         if not (self.torque != 0.0 and self.band > 0.0):
             raise ValueError(
-                f"`settling_time` must have a torque and a positive band, but has {self.torque} N m and {self.band} rad"
+                f"`settling_time` must have a torque and a positive band, but has {self.torque:g} and {self.band:g}"
             )
         if any(isinstance(e, ActuatorEffect) for e in case.model.effects):
             raise ValueError("`settling_time` can't carry an effect on the logged torque: nothing drives the motor")
@@ -61,7 +61,7 @@ class SettlingTime(Measure):
             return drive.K * (0.5 * x**2 + 0.25 * drive.alpha * x**4)
 
         energy = elastic(x) + 0.5 * v**2 / drive.c
-        above = jnp.log(energy / elastic(jnp.asarray(self.band)) + _NOTHING)
+        above = jnp.log(energy / elastic(self.band) + _NOTHING)
         inside = jax.nn.sigmoid(above / _SOFTNESS)
         settled = jnp.sum(0.5 * (inside[1:] + inside[:-1])) * (time[1] - time[0])
         later = duration * above[0] / (above[0] - above[-1])

@@ -7,9 +7,12 @@ equations, which has their first derivatives exactly (the implicit function theo
 amount that depends on how many speeds are looked at, and would not see a peak between two of them.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hdjax.design.case import Case
@@ -20,6 +23,7 @@ from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance
 from hdjax.response.resonance import peak
 from hdjax.where import where
 
+HARMONICS = 5
 _MARGIN = 1e-6
 _CORRECTIONS = 4
 _SOLVED = 1e-7
@@ -31,22 +35,24 @@ class Range(eqx.Module):
     Attributes:
         slow: lowest [rad/s].
         fast: highest [rad/s].
-        rotating: the motor turns at that speed and its kinematic error excites it; the torques are left out.
-        harmonics: of the motion.
         rows: motions looked at along the branch.
         steps: of the continuation, at most.
     """
 
-    slow: float
-    fast: float
-    rotating: bool = False
-    harmonics: int = 5
+    slow: Array
+    fast: Array
     rows: int = 60
     steps: int = 120
 
 
-def balanced(case: Case, *, rotating: bool, harmonics: int) -> BalancedMotion:
-    """The balance of a case; without effects that of the dynamic error alone, which is the same motion and cheaper."""
+def balanced(case: Case, *, rotating: bool, harmonics: int = HARMONICS) -> BalancedMotion:
+    """The balance of a case; without effects that of the dynamic error alone, which is the same motion and cheaper.
+
+    Args:
+        case: drive and torques.
+        rotating: the motor turns at the speeds looked at and its kinematic error excites it; the torques are left out.
+        harmonics: of the motion.
+    """
     torque, load = case.excitation.amplitude, case.excitation.load_amplitude
     if rotating:
         return balance(case.model, None, harmonics=harmonics, rotating=True)
@@ -58,19 +64,24 @@ def balanced(case: Case, *, rotating: bool, harmonics: int) -> BalancedMotion:
     return balance(ReducedModel(reduced), forcing, harmonics=harmonics)
 
 
-def followed(system: BalancedMotion, looked_at: Range) -> Branch:
-    """The branches from the slow end and from the fast end, as two lanes; their system is that of each lane."""
+def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
+    """For each range the branches from its slow end and from its fast end, as two lanes.
+
+    All are lanes of one search: it is what takes longest to compile.
+    """
     still = jax.lax.stop_gradient(system)
-    low, high = looked_at.slow * (1.0 - _MARGIN), looked_at.fast * (1.0 + _MARGIN)
 
     def of_one(start: Array, end: Array) -> Branch:
-        branch = follow(still, "omega", start, end, points=looked_at.rows, steps=looked_at.steps)
+        low, high = jnp.minimum(start, end) * (1.0 - _MARGIN), jnp.maximum(start, end) * (1.0 + _MARGIN)
+        branch = follow(still, "omega", start, end, points=ranges[0].rows, steps=ranges[0].steps)
         inside = jnp.cumsum(where((branch.omega < low) | (branch.omega > high), 1, 0)) == 0
         branch = eqx.tree_at(lambda b: b.valid, branch, branch.valid & inside)
         return jax.lax.stop_gradient(branch)
 
-    ends = jnp.array([looked_at.slow, looked_at.fast])
-    return jax.vmap(of_one)(ends, ends[::-1])
+    starts, ends = zip(*((r.slow, r.fast) for r in ranges), strict=True)
+    found = jax.vmap(of_one)(jnp.stack([*starts, *ends]), jnp.stack([*ends, *starts]))
+    lanes = [np.array([i, i + len(ranges)]) for i in range(len(ranges))]
+    return [jax.tree.map(lambda a, pair=pair: a[pair], found) for pair in lanes]
 
 
 def with_system(branch: Branch, system: BalancedMotion) -> Branch:
@@ -92,7 +103,7 @@ def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> S
     return system.steady_state(found, omega, jnp.max(jnp.abs(left)) < _SOLVED)
 
 
-def largest_swing(system: BalancedMotion, looked_at: Range) -> tuple[Float[Array, ""], SteadyState]:
+def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) -> tuple[Float[Array, ""], SteadyState]:
     """The largest swing of all steady motions found in a range, stable or not, and the motion; NaN where none is.
 
     The middle branch between two folds is smaller than the one above it, so that it is never the largest.
@@ -114,7 +125,7 @@ def largest_swing(system: BalancedMotion, looked_at: Range) -> tuple[Float[Array
         usable = jnp.stack([within, ~(within & inside), jnp.asarray(True), jnp.asarray(True)])
         return where(usable & branch.valid[picked[0]], sizes, -1.0), motions
 
-    sizes, motions = jax.vmap(of_one)(followed(system, looked_at))
+    sizes, motions = jax.vmap(of_one)(branches)
     motions = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), motions)
     best = jnp.argmax(sizes.reshape(-1))
     size = sizes.reshape(-1)[best]
@@ -122,24 +133,25 @@ def largest_swing(system: BalancedMotion, looked_at: Range) -> tuple[Float[Array
 
 
 def motions_at(
-    system: BalancedMotion, looked_at: Range, speeds: Float[Array, " speeds"]
+    system: BalancedMotion, branches: Branch, speeds: Float[Array, " speeds"]
 ) -> tuple[SteadyState, Bool[Array, " speeds"]]:
     """At each speed the largest of the steady motions found, and whether there is one.
 
     Args:
         system: of the case.
-        looked_at: a range that holds the speeds.
+        branches: of a range that holds the speeds, see [`followed`][].
         speeds: [rad/s].
     """
-    branches = followed(system, looked_at)
     still = jax.lax.stop_gradient(system)
 
     def crossings(branch: Branch) -> tuple[Array, Array, Array]:
         """Size of each segment that crosses each speed, and the unknowns of both of its ends."""
         size = jnp.linalg.norm(branch.unknowns, axis=1)
         start, end = branch.omega[:-1, None], branch.omega[1:, None]
-        crossed = ((start - speeds) * (end - speeds) <= 0.0) & (branch.valid[:-1] & branch.valid[1:])[:, None]
-        share = where(crossed, (speeds - start) / where(end == start, 1.0, end - start), 0.0)
+        crossed = ((start - speeds[None]) * (end - speeds[None]) <= 0.0) & (branch.valid[:-1] & branch.valid[1:])[
+            :, None
+        ]
+        share = where(crossed, (speeds[None] - start) / where(end == start, 1.0, end - start), 0.0)
         return where(crossed, jnp.maximum(size[:-1], size[1:])[:, None], -1.0), share, branch.unknowns
 
     sizes, shares, unknowns = jax.vmap(crossings)(branches)

@@ -11,10 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdjax.design.case import Case
-from hdjax.design.measure import Measure
+from hdjax.design.measure import Measure, number
+from hdjax.design.response_measures import ResponseMeasure, responses
 from hdjax.design.robustness import CRITERIA, Criterion, Draws, worst_share
 from hdjax.design.variables import Variable, values
 from hdjax.program_cache import jit_kept
+from hdjax.where import where
+
+LANES = 4
+"""Designs that are worked out side by side by default: always as many, so that one program serves all."""
 
 
 class Maker(eqx.Module):
@@ -43,7 +48,7 @@ class Term(eqx.Module):
 
     label: str = eqx.field(static=True)
     measure: Measure
-    weight: float = 1.0
+    weight: Array = number(1.0)
 
 
 class Limit(eqx.Module):
@@ -58,13 +63,13 @@ class Limit(eqx.Module):
 
     label: str = eqx.field(static=True)
     measure: Measure
-    bound: float
+    bound: Array = number()
     least: bool = eqx.field(static=True, default=False)
 
     @property
-    def scale(self) -> float:
+    def scale(self) -> Array:
         """Size of the bound; 1 for a bound of zero."""
-        return abs(self.bound) or 1.0
+        return where(self.bound == 0.0, 1.0, jnp.abs(self.bound))
 
     def excess(self, value: Array) -> Array:
         """How far a value is beyond the bound, in units of `scale`; positive where it is not kept."""
@@ -86,7 +91,7 @@ class Study(eqx.Module):
     """
 
     case: Case
-    variables: tuple[Variable, ...] = eqx.field(static=True)
+    variables: tuple[Variable, ...]
     terms: tuple[Term, ...]
     limits: tuple[Limit, ...] = ()
     draws: Draws | None = None
@@ -124,7 +129,10 @@ class Study(eqx.Module):
 
     def measured(self, case: Case) -> Float[Array, " parts"]:
         """All measures of a case: the terms', then the limits'."""
-        return jnp.stack([part.measure(case) for part in (*self.terms, *self.limits)])
+        measures = [part.measure for part in (*self.terms, *self.limits)]
+        steady = [m for m in measures if isinstance(m, ResponseMeasure)]
+        found = iter(responses(case, steady))
+        return jnp.stack([next(found) if isinstance(m, ResponseMeasure) else m(case) for m in measures])
 
     def rows(self, measured: Float[Array, " parts"]) -> Float[Array, " rows"]:
         """Objective and the excess over each limit."""
@@ -161,7 +169,7 @@ class Appraisals:
     parts: Float[np.ndarray, "designs draws parts"]
 
 
-def appraise(study: Study, shares: Float[np.ndarray, "designs variables"], *, lanes: int = 8) -> Appraisals:
+def appraise(study: Study, shares: Float[np.ndarray, "designs variables"], *, lanes: int = LANES) -> Appraisals:
     """Objective, constraints and their gradients of many designs, `lanes` of them at a time by one program."""
     found = []
     for start in range(0, len(shares), lanes):

@@ -1,19 +1,20 @@
 """What a design may choose, each between two bounds."""
 
-import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Literal, get_args
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from hdjax.parameters import as_scalar
 
 Spacing = Literal["linear", "log"]
 SPACINGS: tuple[Spacing, ...] = get_args(Spacing)
 
 
-@dataclasses.dataclass(frozen=True)
-class Variable:
+class Variable(eqx.Module):
     """One number that a design may choose.
 
     Attributes:
@@ -24,30 +25,35 @@ class Variable:
         spacing: the scale on which it is searched, which is a matter of the search and not of the answer.
     """
 
-    path: str
-    low: float
-    high: float
-    spacing: Spacing = "linear"
+    path: str = eqx.field(static=True)
+    low: Array = eqx.field(converter=as_scalar)
+    high: Array = eqx.field(converter=as_scalar)
+    spacing: Spacing = eqx.field(static=True, default="linear")
 
-    def __post_init__(self):
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
-            raise ValueError(f"`{self.path}` must have a range that rises, but it runs from {self.low} to {self.high}")
+    def __check_init__(self):
+        low, high = float(self.low), float(self.high)
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise ValueError(f"`{self.path}` must have a range that rises, but it runs from {low:g} to {high:g}")
         if self.spacing not in SPACINGS:
             raise ValueError(f"`{self.path}` must have a spacing of {SPACINGS}, but has {self.spacing!r}")
-        if self.spacing == "log" and self.low <= 0.0:
-            raise ValueError(f"`{self.path}` must start above zero for a log spacing, but starts at {self.low}")
+        if self.spacing == "log" and low <= 0.0:
+            raise ValueError(f"`{self.path}` must start above zero for a log spacing, but starts at {low:g}")
 
     def value(self, share: Array) -> Array:
         """The value at a share of the range, 0 at `low` and 1 at `high`."""
         if self.spacing == "log":
-            return self.low * jnp.exp(share * math.log(self.high / self.low))
+            return self.low * jnp.exp(share * jnp.log(self.high / self.low))
         return self.low + share * (self.high - self.low)
 
-    def share(self, value: float) -> float:
+    def share(self, value: float) -> Array:
         """The share of the range at which a value lies."""
         if self.spacing == "log":
-            return math.log(value / self.low) / math.log(self.high / self.low)
+            return jnp.log(value / self.low) / jnp.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
+
+    def rate(self, share: Array) -> Array:
+        """How fast the value changes with the share."""
+        return self.value(share) * jnp.log(self.high / self.low) if self.spacing == "log" else self.high - self.low
 
 
 def values(variables: Sequence[Variable], shares: Float[Array, " variables"]) -> dict[str, Array]:
