@@ -8,7 +8,7 @@ from fitting.drawn_drives import drawn_from_report, fitted_model, spread_around
 from fitting.model_file import read_model
 from fitting.toml_sections import Sections
 from hdjax import PRESETS, TwoInertiaModel
-from hdjax.design import MEASURES, Case, Draws, Excitation, Limit, Maker, Measure, Replaced, Study, Term, Variable
+from hdjax.design import MEASURES, Case, Draws, Excitation, Limit, Measure, Replaced, Study, Term, Variable
 from hdjax.design.catalogue_gear import SIZE, CatalogueGear
 from hdjax.design.robustness import CRITERIA
 from hdjax.design.variables import SPACINGS
@@ -82,7 +82,9 @@ def _model(file: Sections) -> TwoInertiaModel:
     if "model" in drive:
         model = read_model(file.path.parent / str(drive["model"])).model
         if not isinstance(model, TwoInertiaModel):
-            raise file.refuse("[drive] model is a reduced model, which has no inertias to design; give one of both angles")
+            raise file.refuse(
+                "[drive] model is a reduced model, which has no inertias to design; give one of both angles"
+            )
     elif "report" in robust:
         model = fitted_model(file.path.parent / str(robust["report"]))
     else:
@@ -95,7 +97,9 @@ def _model(file: Sections) -> TwoInertiaModel:
         if name not in BY_NAME:
             raise file.refuse(f"[effects.{name}] is no effect; there are {', '.join(BY_NAME)}")
         table = file.table(f"effects.{name}", values)
-        fields = {f.name: f.metadata["parameter"] for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata}
+        fields = {
+            f.name: f.metadata["parameter"] for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata
+        }
         file.known(f"effects.{name}", table, fields)
         numbers = {k: file.number(f"effects.{name}", k, v) for k, v in table.items()}
         changed = changed.with_effects(BY_NAME[name](**numbers))
@@ -127,7 +131,8 @@ def _variables(file: Sections) -> tuple[Variable, ...]:
             if key not in table:
                 raise file.refuse(f"[{where}] must have `{key}`")
         spacing = file.one_of(where, "spacing", table.get("spacing", "linear"), SPACINGS)
-        found.append(Variable(name, *(file.number(where, key, table[key]) for key in ("from", "to")), spacing))
+        low, high = (file.number(where, key, table[key]) for key in ("from", "to"))
+        found.append(Variable(name, low, high, spacing))
     if not found:
         raise file.refuse('[variables] must name what may be chosen, such as "B_sp" = { from = 0.1, to = 10.0 }')
     return tuple(found)
@@ -206,9 +211,8 @@ def _search(file: Sections) -> Search:
     table = file.section("search")
     file.known("search", table, [f.name for f in dataclasses.fields(Search)])
     least = {"starts": 1, "points": 2, "seed": 0}
-    found = {k: file.count("search", k, v, least[k]) for k, v in table.items() if k in least}
-    if "width" in table:
-        found["width"] = file.number("search", "width", table["width"])
-        if not 0.0 < found["width"] <= 1.0:
-            raise file.refuse(f"[search] width must be above 0 and at most 1, but is {found['width']:g}")
-    return Search(**found)
+    counts = {k: file.count("search", k, v, least[k]) for k, v in table.items() if k in least}
+    width = file.number("search", "width", table.get("width", Search.width))
+    if not 0.0 < width <= 1.0:
+        raise file.refuse(f"[search] width must be above 0 and at most 1, but is {width:g}")
+    return Search(**counts, width=width)

@@ -12,7 +12,7 @@ from scipy.stats import qmc
 
 from fitting.errors import DataError, InputError
 from fitting.model_file import read_model
-from fitting.report import DRAWS_FILE
+from fitting.report.posterior import DRAWS_FILE
 from hdjax import TwoInertiaModel
 from hdjax.design import Draws
 
@@ -39,7 +39,9 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         account = report["after"] if report["after"]["parameters"] else report["before"]
         estimates = {p: e for p, e in account["parameters"].items() if p not in hold}
-        spreads = {p: (float(e["value"]), float(e["std"] or np.inf), bool(e["identifiable"])) for p, e in estimates.items()}
+        spreads = {
+            p: (float(e["value"]), float(e["std"] or np.inf), bool(e["identifiable"])) for p, e in estimates.items()
+        }
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder}: no report.json of `hdjax fit` ({error}); give the folder of a report") from error
     if not spreads:
@@ -81,7 +83,11 @@ def _correlation(account: Mapping[str, Any], paths: tuple[str, ...]) -> np.ndarr
 
 
 def _normal(
-    spreads: Mapping[str, tuple[float, float, bool]], correlation: np.ndarray, positive: np.ndarray, count: int, seed: int
+    spreads: Mapping[str, tuple[float, float, bool]],
+    correlation: np.ndarray,
+    positive: np.ndarray,
+    count: int,
+    seed: int,
 ) -> np.ndarray:
     """Draws of a normal law that fill it evenly."""
     values, stds = (np.array(column) for column in zip(*((v, s) for v, s, _ in spreads.values()), strict=True))

@@ -10,6 +10,7 @@ from hdjax.design.case import Case
 from hdjax.design.measure import Measure, SpeedRange, number
 from hdjax.design.response_measures import outside
 from hdjax.drive import Drive, restoring
+from hdjax.parameters import Scalar
 from hdjax.where import where
 
 _STEPS = 40
@@ -21,13 +22,13 @@ class StaticTwist(Measure):
     name: ClassVar[str] = "static_twist"
     unit: ClassVar[str] = "rad"
     says: ClassVar[str] = "twist under a steady torque"
-    torque: Array = number()
+    torque: Scalar = number()
 
     def __call__(self, case: Case) -> Array:
         return static_twist(case.drive, self.torque)
 
 
-def static_twist(drive: Drive, torque: Array) -> Array:
+def static_twist(drive: Drive, torque: Scalar) -> Array:
     """Root of `K (x + alpha x^3) = torque` next to zero, with gradients; NaN where there is none."""
     still = jax.lax.stop_gradient(drive)
 
@@ -49,8 +50,8 @@ class MotorTorque(Measure):
     name: ClassVar[str] = "motor_torque"
     unit: ClassVar[str] = "N m"
     says: ClassVar[str] = "motor torque for a load acceleration against a load torque"
-    acceleration: Array = number()
-    load_torque: Array = number(0.0)
+    acceleration: Scalar = number()
+    load_torque: Scalar = number(0.0)
 
     def __call__(self, case: Case) -> Array:
         d, a = case.drive, self.acceleration
@@ -63,7 +64,7 @@ class MotorSpeed(Measure):
     name: ClassVar[str] = "motor_speed"
     unit: ClassVar[str] = "rad/s"
     says: ClassVar[str] = "motor speed at a load speed"
-    load_speed: Array = number()
+    load_speed: Scalar = number()
 
     def __call__(self, case: Case) -> Array:
         return case.drive.N * self.load_speed
@@ -79,9 +80,9 @@ class ResonanceDistance(SpeedRange):
     name: ClassVar[str] = "resonance_distance"
     unit: ClassVar[str] = "1"
     says: ClassVar[str] = "logarithmic distance of the resonance from order times slow to order times fast"
-    slow: Array = number()
-    fast: Array = number()
-    order: Array = number(1.0)
+    slow: Scalar = number()
+    fast: Scalar = number()
+    order: Scalar = number(1.0)
     held: bool = False
     at_load: bool = False
 

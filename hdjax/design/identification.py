@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from hdjax.design.case import Case
 from hdjax.design.measure import Measure, number
 from hdjax.dynamics import ReducedModel
+from hdjax.parameters import Scalar
 from hdjax.signals import PiecewisePolynomial
 from hdjax.simulate import march
 from hdjax.where import where
@@ -104,8 +105,8 @@ class IdentificationTime(LogMeasure):
     says: ClassVar[str] = "shortest log that determines alpha to a relative standard error"
     rate: float
     duration: float
-    noise: Array = number()
-    relative_error: Array = number(0.05)
+    noise: Scalar = number()
+    relative_error: Scalar = number(0.05)
 
     def refuse(self, case: Case) -> None:
         super().refuse(case)

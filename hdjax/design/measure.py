@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from hdjax.design.case import Case
-from hdjax.parameters import as_scalar
+from hdjax.parameters import Scalar, as_scalar
 
 
 def number(default: float | None = None) -> Any:
@@ -42,8 +42,8 @@ class Measure(eqx.Module):
 class SpeedRange(Measure):
     """A measure over forcing frequencies, or motor speeds, from `slow` to `fast`."""
 
-    slow: eqx.AbstractVar[Array]
-    fast: eqx.AbstractVar[Array]
+    slow: eqx.AbstractVar[Scalar]
+    fast: eqx.AbstractVar[Scalar]
 
     def refuse(self, case: Case) -> None:
         if not 0.0 < self.slow < self.fast:

@@ -14,6 +14,7 @@ from hdjax.design.measure import SpeedRange, number
 from hdjax.design.steady import Range, balanced, followed, largest_swing, motions_at, with_system
 from hdjax.drive import restoring
 from hdjax.effects import ActuatorEffect, LoadSideEffect
+from hdjax.parameters import Scalar
 from hdjax.response.continuation import Branch, folds
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState
 from hdjax.where import where
@@ -71,8 +72,8 @@ class PeakError(ResponseMeasure):
     name: ClassVar[str] = "peak_error"
     unit: ClassVar[str] = "rad"
     says: ClassVar[str] = "largest swing of the dynamic error between slow and fast"
-    slow: Array = number()
-    fast: Array = number()
+    slow: Scalar = number()
+    fast: Scalar = number()
     rotating: bool = False
 
     def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
@@ -85,8 +86,8 @@ class MeshTorque(ResponseMeasure):
     name: ClassVar[str] = "mesh_torque"
     unit: ClassVar[str] = "N m"
     says: ClassVar[str] = "elastic mesh torque at the largest swing between slow and fast"
-    slow: Array = number()
-    fast: Array = number()
+    slow: Scalar = number()
+    fast: Scalar = number()
     rotating: bool = False
 
     def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
@@ -103,8 +104,8 @@ class Loss(ResponseMeasure):
     name: ClassVar[str] = "loss"
     unit: ClassVar[str] = "W"
     says: ClassVar[str] = "mean power lost between slow and fast"
-    slow: Array = number()
-    fast: Array = number()
+    slow: Scalar = number()
+    fast: Scalar = number()
     rotating: bool = False
     speeds: int = 32
 
@@ -141,10 +142,10 @@ class FoldDistance(ResponseMeasure):
     name: ClassVar[str] = "fold_distance"
     unit: ClassVar[str] = "1"
     says: ClassVar[str] = "logarithmic distance of the nearest fold from slow and fast, negative between them"
-    slow: Array = number()
-    fast: Array = number()
+    slow: Scalar = number()
+    fast: Scalar = number()
     rotating: bool = False
-    reach: Array = number(2.0)
+    reach: Scalar = number(2.0)
 
     @property
     def looked_at(self) -> Range:

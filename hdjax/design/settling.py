@@ -12,6 +12,7 @@ from hdjax.design.closed_measures import static_twist
 from hdjax.design.measure import Measure, number
 from hdjax.dynamics import Model, ReducedModel
 from hdjax.effects import ActuatorEffect
+from hdjax.parameters import Scalar
 from hdjax.signals import PiecewisePolynomial
 from hdjax.simulate import march
 from hdjax.where import where
@@ -38,8 +39,8 @@ class SettlingTime(Measure):
     name: ClassVar[str] = "settling_time"
     unit: ClassVar[str] = "s"
     says: ClassVar[str] = "time until the swing after the release of a torque stays within a band"
-    torque: Array = number()
-    band: Array = number()
+    torque: Scalar = number()
+    band: Scalar = number()
     turns: int = 100
 
     def refuse(self, case: Case) -> None:

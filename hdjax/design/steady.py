@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from hdjax.design.case import Case
 from hdjax.dynamics import ReducedModel
 from hdjax.fourier import FourierSeries, harmonic_series
+from hdjax.parameters import Scalar
 from hdjax.response.continuation import Branch, follow
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState, balance
 from hdjax.response.resonance import peak
@@ -39,8 +40,8 @@ class Range(eqx.Module):
         steps: of the continuation, at most.
     """
 
-    slow: Array
-    fast: Array
+    slow: Scalar
+    fast: Scalar
     rows: int = 60
     steps: int = 120
 

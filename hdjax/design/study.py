@@ -15,6 +15,7 @@ from hdjax.design.measure import Measure, number
 from hdjax.design.response_measures import ResponseMeasure, responses
 from hdjax.design.robustness import CRITERIA, Criterion, Draws, worst_share
 from hdjax.design.variables import Variable, values
+from hdjax.parameters import Scalar
 from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
@@ -48,7 +49,7 @@ class Term(eqx.Module):
 
     label: str = eqx.field(static=True)
     measure: Measure
-    weight: Array = number(1.0)
+    weight: Scalar = number(1.0)
 
 
 class Limit(eqx.Module):
@@ -63,7 +64,7 @@ class Limit(eqx.Module):
 
     label: str = eqx.field(static=True)
     measure: Measure
-    bound: Array = number()
+    bound: Scalar = number()
     least: bool = eqx.field(static=True, default=False)
 
     @property

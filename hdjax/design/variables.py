@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hdjax.parameters import as_scalar
+from hdjax.parameters import Scalar, as_scalar
 
 Spacing = Literal["linear", "log"]
 SPACINGS: tuple[Spacing, ...] = get_args(Spacing)
@@ -26,8 +26,8 @@ class Variable(eqx.Module):
     """
 
     path: str = eqx.field(static=True)
-    low: Array = eqx.field(converter=as_scalar)
-    high: Array = eqx.field(converter=as_scalar)
+    low: Scalar = eqx.field(converter=as_scalar)
+    high: Scalar = eqx.field(converter=as_scalar)
     spacing: Spacing = eqx.field(static=True, default="linear")
 
     def __check_init__(self):
@@ -39,7 +39,7 @@ class Variable(eqx.Module):
         if self.spacing == "log" and low <= 0.0:
             raise ValueError(f"`{self.path}` must start above zero for a log spacing, but starts at {low:g}")
 
-    def value(self, share: Array) -> Array:
+    def value(self, share: Array | np.ndarray) -> Array:
         """The value at a share of the range, 0 at `low` and 1 at `high`."""
         if self.spacing == "log":
             return self.low * jnp.exp(share * jnp.log(self.high / self.low))
