@@ -28,10 +28,13 @@ def design(spec: Path, /, *, out: Path, plot: bool = True) -> None:
     from fitting.design_file import read_design_file
     from fitting.design_report import design_dict, design_text
     from hdjax.design import confirm, optimise
+    from hdjax.design.study import LANES
 
     require_folder(out)
     asked = read_design_file(spec)
     study, search = asked.study, asked.search
+    # Beside many draws, designs side by side only wait for the slowest.
+    lanes = max(1, min(search.starts, LANES, 64 // (1 if study.draws is None else len(study.draws.values))))
     console = Console(stderr=True)
     with console.status("compiling") as status:
         try:
@@ -39,12 +42,13 @@ def design(spec: Path, /, *, out: Path, plot: bool = True) -> None:
                 study,
                 search.starts,
                 seed=search.seed,
+                lanes=lanes,
                 progress=lambda count: status.update(f"searching: {count} designs appraised"),
             )
         except ValueError as error:
             raise DataError(f"{spec}: {error}; change the ranges in [variables]") from error
         status.update("sweeping around the optimum")
-        proof = confirm(study, found.best, width=search.width, points=search.points, seed=search.seed)
+        proof = confirm(study, found.best, width=search.width, points=search.points, seed=search.seed, lanes=lanes)
     files: dict[Path, str | bytes] = {
         out / "design.json": json.dumps(design_dict(study, found, proof), indent=1, allow_nan=False) + "\n"
     }

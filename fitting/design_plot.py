@@ -6,11 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fitting.formatting import pretty_unit
 from hdjax.design import Confirmation, Optimised, Study
 from hdjax.design.robustness import exact_worst_share
 
 # Okabe and Ito's colours, which colour-blind readers tell apart, also in grey print.
-_LINE, _MARK, _BAD = "#0072B2", "#D55E00", "#999999"
+_LINE, _MARK = "#0072B2", "#D55E00"
 
 
 def summary(study: Study, found: Optimised, proof: Confirmation) -> bytes:
@@ -45,7 +46,8 @@ def _values(study: Study, shares: np.ndarray, i: int) -> np.ndarray:
 def _label(study: Study, i: int) -> str:
     path = study.variables[i].path
     known = study.case.parameters()
-    return f"{path} [{known[path][1].unit}]" if path in known else path
+    unit = pretty_unit(known[path][1].unit) if path in known else ""
+    return f"{path} [{unit}]" if unit else path
 
 
 def _map(axes: Axes, study: Study, found: Optimised, proof: Confirmation, figure: Figure) -> None:
@@ -81,7 +83,6 @@ def _curve(axes: Axes, study: Study, found: Optimised, proof: Confirmation, i: i
     else:
         shown = np.isfinite(objective)
         axes.plot(at[shown], objective[shown], ".", color=_LINE, ms=4, label="sweep")
-        axes.plot(at[~shown], np.full((~shown).sum(), np.nan), ".", color=_BAD)
     best = found.best
     if np.isfinite(best.objective):
         axes.plot(_values(study, best.shares[None], i), best.objective, "*", color=_MARK, ms=14, label="optimum")
@@ -92,12 +93,17 @@ def _curve(axes: Axes, study: Study, found: Optimised, proof: Confirmation, i: i
 
 def _scales(axes: Axes, study: Study, i: int, j: int | None) -> None:
     axes.set_xlabel(_label(study, i))
-    if study.variables[i].spacing == "log":
+    if _wide(study, i, axes.get_xlim()):
         axes.set_xscale("log")
     if j is not None:
         axes.set_ylabel(_label(study, j))
-        if study.variables[j].spacing == "log":
+        if _wide(study, j, axes.get_ylim()):
             axes.set_yscale("log")
+
+
+def _wide(study: Study, i: int, limits: tuple[float, float]) -> bool:
+    """Whether a logarithmic scale has a power of ten to mark."""
+    return study.variables[i].spacing == "log" and limits[0] > 0.0 and limits[1] > 10.0 * limits[0]
 
 
 def _draws(axes: Axes, study: Study, draws: dict[str, np.ndarray]) -> None:

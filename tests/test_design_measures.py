@@ -156,7 +156,7 @@ def test_the_shortest_log_is_the_one_whose_scipy_covariance_reaches_the_error():
     """Sensitivities by differences of scipy's motion under the held torque, and the whole least squares' covariance."""
     at = case(1e5, amplitude=0.4, omega=420.0)
     found, slopes, differences = value_and_slopes(PLAN, at, ("forcing.amplitude", "forcing.omega"))
-    np.testing.assert_allclose(slopes, differences, rtol=1e-4)
+    np.testing.assert_allclose(slopes, differences, rtol=1e-5)
     time = np.arange(601) / 2000.0
     torque = 0.4 * np.cos(420.0 * time)
 

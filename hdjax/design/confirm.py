@@ -12,7 +12,7 @@ from hdjax.design.optimise import KEPT, Optimum
 from hdjax.design.study import LANES, Study, appraise
 from hdjax.design.variables import values
 
-_STEP = 1e-3
+_STEP = 2e-4
 _GRIDDED = 3
 _SAMPLE = 256
 

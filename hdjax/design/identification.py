@@ -10,7 +10,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hdjax.design.case import Case
 from hdjax.design.measure import Measure, number
@@ -20,6 +20,7 @@ from hdjax.signals import PiecewisePolynomial
 from hdjax.simulate import march
 from hdjax.where import where
 
+_HALVINGS = 50
 OTHERS = ("alpha", "K", "B_sp")
 
 
@@ -73,7 +74,7 @@ class LogMeasure(Measure):
 
 
 class LargestTwist(LogMeasure):
-    """Largest dynamic error of a planned log, at its samples [rad]."""
+    """Largest dynamic error of a planned log [rad]."""
 
     name: ClassVar[str] = "largest_twist"
     unit: ClassVar[str] = "rad"
@@ -82,7 +83,13 @@ class LargestTwist(LogMeasure):
     duration: float
 
     def __call__(self, case: Case) -> Array:
-        return jnp.max(jnp.abs(self.log.errors(case, jnp.zeros(2))))
+        sizes = jnp.abs(self.log.errors(case, jnp.zeros(2)))
+        # The top of the parabola through the largest sample and its neighbours: it passes from one sample to the next
+        # without a kink.
+        k = jnp.clip(jnp.argmax(sizes), 1, sizes.size - 2)
+        before, top, after = sizes[k - 1], sizes[k], sizes[k + 1]
+        bend = before - 2.0 * top + after
+        return top - where(bend < 0.0, 0.125 * (after - before) ** 2 / where(bend < 0.0, bend, 1.0), 0.0)
 
 
 class IdentificationTime(LogMeasure):
@@ -119,11 +126,8 @@ class IdentificationTime(LogMeasure):
     def __call__(self, case: Case) -> Array:
         standard = jnp.log(self.standard_errors(case) / self.relative_error)
         enough = standard <= 0.0
-        k = jnp.maximum(jnp.argmax(enough), 1)
-        before, after = standard[k - 1], standard[k]
-        share = before / where(before > after, before - after, 1.0)
         # The k-th entry holds k + 1 samples.
-        within = (jnp.astype(k, float) + jnp.clip(share, 0.0, 1.0)) / self.rate
+        within = (first_below_zero(standard, enough) + 1.0) / self.rate
         beyond = standard.size / self.rate * jnp.exp(2.0 * standard[-1])
         return where(jnp.any(enough), within, beyond)
 
@@ -144,6 +148,40 @@ class IdentificationTime(LogMeasure):
         own = information[:, 0, 0] - jnp.sum(shared * _solved(imitable, shared), axis=1)
         # Before the motion bends nothing is known of alpha, and rounding may leave less than nothing.
         return 1.0 / jnp.sqrt(jnp.maximum(own, 1e-12))
+
+
+def first_below_zero(values: Float[Array, " n"], below: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Where a sampled function first falls below zero, in samples, by cubic interpolation.
+
+    Straight lines would give a slope that jumps from sample to sample, and with it the gradient.
+
+    Args:
+        values: at the samples.
+        below: where they are below zero.
+    """
+    k = jnp.clip(jnp.argmax(below), 2, values.size - 2)
+    y = values[k + jnp.arange(-2, 2)]
+    before, after, start, end = y[1], y[2], 0.5 * (y[2] - y[0]), 0.5 * (y[3] - y[1])
+
+    def cubic(s: Array, y: tuple[Array, Array, Array, Array]) -> Array:
+        before, after, start, end = y
+        steep = after - before
+        return before + s * (start + s * (3.0 * steep - 2.0 * start - end + s * (start + end - 2.0 * steep)))
+
+    live = (before, after, start, end)
+    still = jax.lax.stop_gradient(live)
+
+    def halved(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        above = cubic(middle, still) > 0.0
+        return where(above, middle, low), where(above, high, middle)
+
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halved, (jnp.zeros(()), jnp.ones(())))
+    s = 0.5 * (low + high)
+    slope = jax.grad(cubic)(s, still)
+    found = s - cubic(s, live) / where(slope < 0.0, slope, -1.0)
+    return jnp.astype(k, float) - 1.0 + found
 
 
 def _solved(matrices: Float[Array, "n p p"], sides: Float[Array, "n p"]) -> Float[Array, "n p"]:
