@@ -103,7 +103,7 @@ def _scales(axes: Axes, study: Study, i: int, j: int | None) -> None:
 
 def _wide(study: Study, i: int, limits: tuple[float, float]) -> bool:
     """Whether a logarithmic scale has a power of ten to mark."""
-    return study.variables[i].spacing == "log" and limits[0] > 0.0 and limits[1] > 10.0 * limits[0]
+    return study.variables[i].spacing == "log" and bool(limits[0] > 0.0 and limits[1] > 10.0 * limits[0])
 
 
 def _draws(axes: Axes, study: Study, draws: dict[str, np.ndarray]) -> None:

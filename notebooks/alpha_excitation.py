@@ -16,6 +16,7 @@
 # %%
 import dataclasses
 
+import equinox as eqx
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -86,7 +87,7 @@ for label, chosen, colour in (
     ("optimum", best.values, "#D55E00"),
     ("a tenth of the torque, at omega_0", {"forcing.amplitude": 0.1 * amplitude, "forcing.omega": OMEGA_0}, "#0072B2"),
 ):
-    errors = np.asarray(jax.jit(time.standard_errors)(study.case.replace(chosen)))
+    errors = np.asarray(eqx.filter_jit(time.standard_errors)(study.case.replace(chosen)))
     right.loglog(
         (np.arange(errors.size) + 1) / PLAN["rate"], 100.0 * np.minimum(errors, 1e3), color=colour, label=label
     )
