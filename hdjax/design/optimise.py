@@ -258,7 +258,9 @@ def _judged(
         at_bound=dict.fromkeys(at_low, "low") | dict.fromkeys(at_high, "high"),
         bound_multipliers={path: m / _unit(study, path, shares) for path, m in by_share.items()},
         multipliers={
-            limit.label: float(m) / float(limit.scale) for limit, m in zip(held, multipliers[len(ends) :], strict=True)
+            limit.label: float(m) / float(limit.scale)
+            for limit, m in zip(held, multipliers[len(ends) :], strict=True)
+            if m > 0.0
         },
         gradient=gradient,
         asked=asked,
