@@ -26,6 +26,7 @@ from hdjax.where import where
 
 HARMONICS = 5
 _MARGIN = 1e-6
+_ANOTHER = 1e-3
 _CORRECTIONS = 4
 _SOLVED = 1e-7
 
@@ -105,7 +106,9 @@ def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> S
 
 
 def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) -> tuple[Float[Array, ""], SteadyState]:
-    """The largest swing of all steady motions found in a range, stable or not, and the motion; NaN where none is.
+    """The largest swing of all steady motions found in a range, stable or not, and the motion.
+
+    NaN where neither branch could be followed to the other end, so that the peak may have been missed.
 
     The middle branch between two folds is smaller than the one above it, so that it is never the largest.
     """
@@ -121,16 +124,17 @@ def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) ->
         at_rows = jax.vmap(lambda i: solved_once_more(system, branch.unknowns[i], branch.omega[i]))(picked)
         motions = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), top.steady_state, at_rows)
         sizes = jax.vmap(lambda m: swing(m.x))(motions)
-        # A row near the peak stands in only where the peak was not located: it would be a hair smaller.
-        inside = (picked[0] > 0) & (picked[0] < last)
-        usable = jnp.stack([within, ~(within & inside), jnp.asarray(True), jnp.asarray(True)])
+        # The largest row stands in where the peak was not located, or is another one's: the peak is that of the mean
+        # square. Near the same peak it is a hair smaller, and passes from row to row.
+        same = within & (picked[0] > 0) & (picked[0] < last) & (sizes[1] < (1.0 + _ANOTHER) * sizes[0])
+        usable = jnp.stack([within, ~same, jnp.asarray(True), jnp.asarray(True)])
         return where(usable & branch.valid[picked[0]], sizes, -1.0), motions
 
     sizes, motions = jax.vmap(of_one)(branches)
     motions = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), motions)
     best = jnp.argmax(sizes.reshape(-1))
     size = sizes.reshape(-1)[best]
-    return where(size >= 0.0, size, jnp.nan), jax.tree.map(lambda a: a[best], motions)
+    return where((size >= 0.0) & jnp.any(branches.complete), size, jnp.nan), jax.tree.map(lambda a: a[best], motions)
 
 
 def motions_at(
@@ -166,6 +170,6 @@ def motions_at(
         for _ in range(_CORRECTIONS):
             u = u - jnp.linalg.solve(jax.jacfwd(still.residual)(u, omega), still.residual(u, omega))
         motion = solved_once_more(system, u, omega)
-        return motion, motion.converged & (sizes[lane, row, column] >= 0.0)
+        return motion, motion.converged & (sizes[lane, row, column] >= 0.0) & jnp.any(branches.complete)
 
     return jax.vmap(at)(jnp.arange(speeds.size), best, speeds)
