@@ -14,6 +14,7 @@ from fitting.drawn_drives import drawn_from_report, spread_around
 from fitting.errors import DataError
 from fitting.model_file import StoredModel, to_json
 from hdjax import TwoInertiaModel, hdc_40_050
+from hdjax.design import MEASURES
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -193,3 +194,12 @@ def test_a_spread_is_relative_and_of_the_value():
     np.testing.assert_allclose(draws.mean(axis=0), [100.0, -2.0], rtol=0.01)
     np.testing.assert_allclose(draws.std(axis=0), [10.0, 0.4], rtol=0.05)
     assert (draws[:, 1] < 0.0).all()
+
+
+def test_the_example_of_the_documentation_is_understood(tmp_path: Path):
+    page = (Path(__file__).parents[1] / "docs" / "design.md").read_text(encoding="utf-8")
+    asked = read_design_file(written(tmp_path, page.split("```toml")[1].split("```")[0]))
+    assert [v.path for v in asked.study.variables] == ["size", "N"]
+    assert [limit.label for limit in asked.study.limits] == ["motor_speed"] and asked.search.starts == 8
+    for name in MEASURES:
+        assert f"| `{name}` |" in page
