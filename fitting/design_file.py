@@ -110,7 +110,7 @@ def _model(file: Sections) -> TwoInertiaModel:
 def _within(file: Sections, section: str, key: str, value: object, info: ParameterInfo) -> float:
     """A number inside a parameter's bounds."""
     found, (low, high) = file.number(section, key, value), info.bounds
-    if not (low < found < high or (found == low and key == "B_sp")):
+    if not low < found < high:
         raise file.refuse(f"[{section}] {key} must be between {low:g} and {high:g}, but is {found:g}")
     return found
 

@@ -54,9 +54,14 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
             )
     paths = tuple(spreads)
     if (folder / DRAWS_FILE).exists():
-        table = pl.read_parquet(folder / DRAWS_FILE)
+        try:
+            table = pl.read_parquet(folder / DRAWS_FILE).select(paths)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise InputError(
+                f"{folder / DRAWS_FILE}: not the draws of {', '.join(paths)} ({error}); fit again"
+            ) from error
         rows = np.linspace(0, table.height - 1, min(count, table.height)).round().astype(int)
-        return Draws(paths, jnp.asarray(table.select(paths).to_numpy()[rows]))
+        return Draws(paths, jnp.asarray(table.to_numpy()[rows]))
     positive = np.array([model.parameters()[p][1].positive for p in paths])
     return Draws(paths, jnp.asarray(_normal(spreads, _correlation(account, paths), positive, count, seed)))
 

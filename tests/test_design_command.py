@@ -108,6 +108,14 @@ BAD = {
     "half a start": (GOOD.replace("starts = 2", "starts = 2.5"), "starts must be a whole number"),
     "wide": (GOOD + "width = 2.0\n", "width must be above 0 and at most 1"),
     "criterion": (GOOD.replace("share = 0.25", 'criterion = "best"'), "criterion must be one of expected, worst"),
+    "a range beyond physics": (
+        GOOD.replace('N = { from = 30, to = 160, spacing = "log" }', "N = { from = -30, to = 160 }"),
+        "`N` must stay between 0",
+    ),
+    "no damping": (
+        GOOD.replace("B_sp = 5.0", "B_sp = 0.0").replace('"static_twist"', '"settling_time"\nband = 1e-5'),
+        "`settling_time` needs damping",
+    ),
     "no torque": (
         GOOD.replace('measure = "static_twist"\ntorque = 20.0', 'measure = "peak_error"\nslow = 1.0\nfast = 2.0'),
         "`peak_error` needs a torque",

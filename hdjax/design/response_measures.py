@@ -40,6 +40,8 @@ class ResponseMeasure(SpeedRange):
     def refuse(self, case: Case) -> None:
         super().refuse(case)
         rotating = self.rotating
+        if not case.drive.mu > 0.0:
+            raise ValueError(f"`{self.name}` needs damping, but B_sp is {case.drive.B_sp:g}: no motion would be steady")
         for effect in case.model.effects:
             if effect.states or isinstance(effect, ActuatorEffect) or (rotating and isinstance(effect, LoadSideEffect)):
                 raise ValueError(f"`{self.name}` rests on harmonic balance, which can't carry the effect {effect.name}")

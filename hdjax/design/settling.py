@@ -48,6 +48,8 @@ class SettlingTime(Measure):
             raise ValueError(
                 f"`settling_time` must have a torque and a positive band, but has {self.torque:g} and {self.band:g}"
             )
+        if not (case.drive.mu > 0.0 or case.model.effects):
+            raise ValueError(f"`settling_time` needs damping, but B_sp is {case.drive.B_sp:g}: it would swing for ever")
         if any(isinstance(e, ActuatorEffect) for e in case.model.effects):
             raise ValueError("`settling_time` can't carry an effect on the logged torque: nothing drives the motor")
 

@@ -117,8 +117,15 @@ class Study(eqx.Module):
         """Say why the study can't be done, before minutes of work.
 
         Raises:
-            ValueError: where a path, a draw or a measure does not fit the drive.
+            ValueError: where a path, a range, a draw or a measure does not fit the drive.
         """
+        known = self.case.parameters()
+        for v in self.variables:
+            low, high = known[v.path][1].bounds if v.path in known else (-jnp.inf, jnp.inf)
+            if not low <= float(v.low) < float(v.high) <= high:
+                raise ValueError(
+                    f"`{v.path}` must stay between {low:g} and {high:g}, but its range is {v.low:g} to {v.high:g}"
+                )
         middle = self.made(jnp.full(len(self.variables), 0.5), None if self.draws is None else self.draws.values[0])
         for part in (*self.terms, *self.limits):
             part.measure.refuse(middle)
