@@ -11,7 +11,7 @@ import pytest
 from fitting.command_line import main
 from fitting.design_file import read_design_file
 from fitting.drawn_drives import drawn_from_report, spread_around
-from fitting.errors import DataError
+from fitting.errors import DataError, InputError
 from fitting.model_file import StoredModel, to_json
 from hdjax import TwoInertiaModel, hdc_40_050
 from hdjax.design import MEASURES
@@ -170,6 +170,13 @@ def test_draws_of_the_sampler_go_before_the_normal_law(tmp_path: Path):
     )
     table.write_parquet(folder / "posterior.parquet")
     np.testing.assert_allclose(np.asarray(drawn_from_report(folder, 3).values)[:, 0], [0.0, 4.0, 8.0])
+
+
+def test_draws_of_something_else_are_refused(tmp_path: Path):
+    folder = report(tmp_path)
+    pl.DataFrame({"mu": [1.0]}).write_parquet(folder / "posterior.parquet")
+    with pytest.raises(InputError, match="not the draws of K, B_sp, alpha"):
+        drawn_from_report(folder, 3)
 
 
 def test_what_the_log_does_not_tell_is_not_drawn(tmp_path: Path):
