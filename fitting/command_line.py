@@ -1,4 +1,5 @@
-"""The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds`."""
+"""The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds |
+design`."""
 
 # ruff: noqa: E402
 
@@ -23,6 +24,7 @@ from rich.progress import MofNCompleteColumn, Progress
 
 from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
+from fitting.design_commands import design
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.experiment import Stretch
@@ -57,6 +59,7 @@ app = cyclopts.App(
 app.command(amplitudes)
 app.command(seed_tables)
 app.command(speeds)
+app.command(design)
 
 Logs = Annotated[
     list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")

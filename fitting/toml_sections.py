@@ -1,0 +1,63 @@
+"""Sections of a TOML file and their keys, refused in one sentence where they make no sense."""
+
+import tomllib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.errors import InputError
+
+
+class Sections:
+    """A TOML file's tables, each read by name; every refusal names the file, the section and the key."""
+
+    def __init__(self, path: Path, names: Collection[str]):
+        self.path = path
+        try:
+            self._content = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path}: the file can't be read ({error.strerror}); check the path") from error
+        except ValueError as error:
+            raise InputError(f"{path}: not a TOML file ({error})") from error
+        self.known("", self._content, names)
+
+    def section(self, name: str) -> dict[str, Any]:
+        """A table of the file; empty where it is absent."""
+        return self.table(name, self._content.get(name, {}))
+
+    def refuse(self, message: str) -> InputError:
+        """The error that says so of this file."""
+        return InputError(f"{self.path}: {message}")
+
+    def table(self, name: str, value: object) -> dict[str, Any]:
+        """A value that must be a table."""
+        if not isinstance(value, dict):
+            raise self.refuse(f"[{name}] must be a table, but is {value!r}")
+        return value
+
+    def known(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> None:
+        """Refuse keys that mean nothing."""
+        for key in table:
+            if key not in names:
+                where = f"[{section}] {key}" if section else f"[{key}]"
+                raise self.refuse(f"{where} is not known here; there are {', '.join(names)}")
+
+    def number(self, section: str, key: str, value: object) -> float:
+        """A finite number."""
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise self.refuse(f"[{section}] {key} must be a number, but is {value!r}")
+        return float(value)
+
+    def count(self, section: str, key: str, value: object, least: int = 1) -> int:
+        """A whole number, at least `least`."""
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise self.refuse(f"[{section}] {key} must be a whole number from {least} on, but is {value!r}")
+        return value
+
+    def one_of(self, section: str, key: str, value: object, names: Collection[str]) -> Any:
+        """One of several words."""
+        if value not in names:
+            raise self.refuse(f"[{section}] {key} must be one of {', '.join(names)}, but is {value!r}")
+        return value

@@ -1,0 +1,170 @@
+"""Measures of the steady response, by harmonic balance."""
+
+import abc
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from hdjax.design.case import Case
+from hdjax.design.measure import SpeedRange, number
+from hdjax.design.steady import Range, balanced, followed, largest_swing, motions_at, with_system
+from hdjax.drive import restoring
+from hdjax.effects import ActuatorEffect, LoadSideEffect
+from hdjax.parameters import Scalar
+from hdjax.response.continuation import Branch, folds
+from hdjax.response.harmonic_balance import BalancedMotion, SteadyState
+from hdjax.where import where
+
+
+class ResponseMeasure(SpeedRange):
+    """A measure of the steady motions over a range of forcing frequencies, or of motor speeds where `rotating`."""
+
+    rotating: eqx.AbstractVar[bool]
+
+    @property
+    def looked_at(self) -> Range:
+        """Where motions are searched for."""
+        return Range(self.slow, self.fast)
+
+    @abc.abstractmethod
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        """The measure, from the branches from either end of `looked_at`."""
+
+    def __call__(self, case: Case) -> Array:
+        return responses(case, [self])[0]
+
+    def refuse(self, case: Case) -> None:
+        super().refuse(case)
+        rotating = self.rotating
+        if not case.drive.mu > 0.0:
+            raise ValueError(f"`{self.name}` needs damping, but B_sp is {case.drive.B_sp:g}: no motion would be steady")
+        for effect in case.model.effects:
+            if effect.states or isinstance(effect, ActuatorEffect) or (rotating and isinstance(effect, LoadSideEffect)):
+                raise ValueError(f"`{self.name}` rests on harmonic balance, which can't carry the effect {effect.name}")
+        if not rotating and not (case.excitation.amplitude != 0.0 or case.excitation.load_amplitude != 0.0):
+            raise ValueError(f"`{self.name}` needs a torque: forcing.amplitude and forcing.load_amplitude are zero")
+        if rotating and not any(e.family == "kinematic_error" for e in case.model.effects):
+            raise ValueError(f"`{self.name}` needs a kinematic error where the motor rotates, but there is none")
+
+
+def responses(case: Case, measures: Sequence[ResponseMeasure]) -> list[Array]:
+    """Several measures of a case whose steady motions are searched for together."""
+    found: dict[int, Array] = {}
+    for rotating in (False, True):
+        own = {i: m for i, m in enumerate(measures) if m.rotating == rotating}
+        if not own:
+            continue
+        system = balanced(case, rotating=rotating)
+        searched = followed(system, [m.looked_at for m in own.values()])
+        found |= {i: m.of(case, system, branches) for (i, m), branches in zip(own.items(), searched, strict=True)}
+    return [found[i] for i in range(len(measures))]
+
+
+class PeakError(ResponseMeasure):
+    """Largest swing of the dynamic error about its mean over a range of speeds [rad].
+
+    All motions found from either end of the range count, so that a design is safe whichever the drive settles to.
+    Detached branches are not found.
+    """
+
+    name: ClassVar[str] = "peak_error"
+    unit: ClassVar[str] = "rad"
+    says: ClassVar[str] = "largest swing of the dynamic error between slow and fast"
+    slow: Scalar = number()
+    fast: Scalar = number()
+    rotating: bool = False
+
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        return largest_swing(system, self.looked_at, branches)[0]
+
+
+class MeshTorque(ResponseMeasure):
+    """Elastic torque in the mesh at that largest swing, `K f(x)` [N m], to be held below the gear's rating."""
+
+    name: ClassVar[str] = "mesh_torque"
+    unit: ClassVar[str] = "N m"
+    says: ClassVar[str] = "elastic mesh torque at the largest swing between slow and fast"
+    slow: Scalar = number()
+    fast: Scalar = number()
+    rotating: bool = False
+
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        return case.drive.K * restoring(largest_swing(system, self.looked_at, branches)[0], case.drive.alpha)
+
+
+class Loss(ResponseMeasure):
+    """Mean power that the drive takes up between slow and fast, over speeds evenly spread [W].
+
+    In a steady motion all power that goes in is lost, so that it is counted where it enters. Of motions that coexist
+    the largest counts.
+    """
+
+    name: ClassVar[str] = "loss"
+    unit: ClassVar[str] = "W"
+    says: ClassVar[str] = "mean power lost between slow and fast"
+    slow: Scalar = number()
+    fast: Scalar = number()
+    rotating: bool = False
+    speeds: int = 32
+
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        width = (self.fast - self.slow) / self.speeds
+        at = self.slow + width * (jnp.arange(float(self.speeds)) + 0.5)
+        motions, found = motions_at(system, branches, at)
+        power = jax.vmap(lambda m: power_in(case, m, rotating=self.rotating))(motions)
+        mean = jnp.sum(where(found, power, 0.0)) / jnp.maximum(jnp.sum(where(found, 1.0, 0.0)), 1.0)
+        # A speed next to a fold may lack its motion; a range of which half lacks them is not known.
+        return where(jnp.mean(where(found, 1.0, 0.0)) > 0.5, mean, jnp.nan)
+
+
+def power_in(case: Case, motion: SteadyState, *, rotating: bool) -> Array:
+    """Mean power of the torques on a steady motion [W]."""
+    series, torques = motion.motion, case.excitation
+    if rotating:
+        return motion.mean_torque * series.omega
+    x = series.sine[0, 0]
+    if not case.model.effects:
+        push = case.drive.error_forcing(torques.amplitude, torques.load_amplitude)
+        return 0.5 * series.omega * x * push / case.drive.c
+    load = series.sine[1, 0]
+    return 0.5 * series.omega * (torques.amplitude * case.drive.N * (x + load) + torques.load_amplitude * load)
+
+
+class FoldDistance(ResponseMeasure):
+    """How far the folds, at which the response jumps, are from the range of speeds: `|log(fold/speed)|` of the nearest.
+
+    Negative inside the range, zero at its ends. Where the branches have no fold within `reach` times the range it is
+    `log(reach)`, with no gradient.
+    """
+
+    name: ClassVar[str] = "fold_distance"
+    unit: ClassVar[str] = "1"
+    says: ClassVar[str] = "logarithmic distance of the nearest fold from slow and fast, negative between them"
+    slow: Scalar = number()
+    fast: Scalar = number()
+    rotating: bool = False
+    reach: Scalar = number(2.0)
+
+    @property
+    def looked_at(self) -> Range:
+        return Range(self.slow / self.reach, self.fast * self.reach)
+
+    def of(self, case: Case, system: BalancedMotion, branches: Branch) -> Array:
+        def of_one(branch: Branch) -> Array:
+            found = folds(with_system(branch, system))
+            value = where(found.exists, found.value, 1.0)
+            distance = outside(value, self.slow, self.fast)
+            return jnp.min(where(found.exists, distance, jnp.inf))
+
+        nearest = jnp.min(jax.vmap(of_one)(branches))
+        far = jnp.log(self.reach)
+        return where(nearest < far, nearest, far)
+
+
+def outside(value: Array, slow: Array, fast: Array) -> Array:
+    """Logarithmic distance of frequencies from a range; negative inside it."""
+    return jnp.maximum(jnp.log(slow / value), jnp.log(value / fast))
