@@ -267,6 +267,29 @@ def look(
     return Round(before, screened, tuple(verdicts), bool(verdicts) and _supported(verdicts[0]))
 
 
+def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tuple[Round, Trial]:
+    """The round and its winner, or a simpler form of the same family that explains as much once the solver's steps
+    follow both: a richer form may have made up for steps that were too long.
+
+    Args:
+        this: the round, judged with longer steps.
+        found: its winner, fitted again with the steps of `setting`.
+        data: the stretches.
+        setting: how they are cut.
+    """
+    for verdict in this.verdicts[1:]:
+        rival = verdict.trial
+        if rival is None or verdict.family != this.winner.family or _size(verdict) >= _size(this.winner):
+            continue
+        if verdict.gain < _NEARLY * this.winner.gain:
+            continue
+        simpler = attempt(rival.model, data, found.hold, setting, start=found)
+        if simpler.held_out.objective <= found.held_out.objective + LEAST_GAIN:
+            verdicts = (verdict, *(v for v in this.verdicts if v is not verdict))
+            return Round(this.before, this.screen, verdicts, this.accepted), simpler
+    return this, found
+
+
 def _worth_a_refit(screened: Screen) -> list[Lead]:
     """Leads that may be more than chance and explain a share of what the best one does, best first."""
     least = max(0.25 * LEAST_GAIN, _SHARE_OF_BEST * screened.leads[0].gain) if screened.leads else 0.0
@@ -282,7 +305,8 @@ def _first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
 
 
 def _simplest(leads: Sequence[Lead]) -> Lead:
-    return min(leads, key=lambda lead: (len(effect_paths(lead.effect)), -lead.gain))
+    """The one with the fewest parameters and states of its own."""
+    return min(leads, key=lambda lead: (len(effect_paths(lead.effect)) + len(lead.effect.states), -lead.gain))
 
 
 def _possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:

@@ -17,6 +17,7 @@ from fitting.attribution import (
     attempt,
     halo_for,
     look,
+    simpler_form,
 )
 from fitting.base_fit import base_fit, leaves_white_noise
 from fitting.clock import Clock
@@ -227,18 +228,22 @@ def _add_effects(
             seed=seed + len(rounds),
             progress=progress,
         )
-        rounds.append(this)
         if not this.accepted:
+            rounds.append(this)
             break
         assert this.winner.trial is not None
         current = this.winner.trial
         found += 1
-        progress(f"found {this.winner.name}")
         substeps = needed_substeps(current.training)
         # A new effect may turn sharper corners than the steps so far resolve; and what a trial has not quite reached
         # the next look would take for a further effect.
+        finer = substeps > setting.substeps
         setting = Setting(setting.horizon, setting.halo, max(substeps, setting.substeps), setting.count)
         current = attempt(current.model, data, current.hold, setting, start=current)
+        if finer:
+            this, current = simpler_form(this, current, data, setting)
+        rounds.append(this)
+        progress(f"found {this.winner.name}")
     dropped = []
     for name in [e.name for e in current.model.effects[:-1]]:
         without = attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
