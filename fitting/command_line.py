@@ -25,13 +25,15 @@ from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.experiment import Stretch
+from fitting.experiment import Experiment, Stretch
+from fitting.experiment_options import ExperimentLimits, stated_limits
 from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.next_experiment import experiment_for_alpha, experiment_for_ties
 from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
@@ -65,7 +67,17 @@ DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias
 
 
 @app.command
-def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False, seed: int = 0) -> None:
+def fit(
+    logs: Logs,
+    /,
+    *,
+    drive: DriveOption,
+    out: Path,
+    posterior: bool = False,
+    seed: int = 0,
+    next_experiment: bool = False,
+    limits: ExperimentLimits = ExperimentLimits(),
+) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
     Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
@@ -82,7 +94,12 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False
         `posterior`.
     seed
         Of the draws.
+    next_experiment
+        Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
+        and write it to next_experiment.csv.
     """
+    if next_experiment and any(path.is_dir() for path in logs):
+        raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
     if posterior:
         _check_posterior(logs)
     if any(path.is_dir() for path in logs):
@@ -93,7 +110,8 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False
     if read[0].kind == "quasi-static":
         _fit_quasi_static(read, drive_file, out)
     else:
-        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None)
+        wanted = limits if next_experiment else None
+        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None, wanted)
 
 
 def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
@@ -115,12 +133,16 @@ def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -
     print(f"Report: {paths['report.html']}")
 
 
-def _fit_drive(rig: Rig, out: Path, seed: int | None) -> None:
+def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
+    stated = None if limits is None else stated_limits(limits, _logs_of(rig))
     with _progress() as progress:
         fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, seed=seed, progress=progress)
+        proposed = None
+        if stated is not None:
+            proposed = experiment_for_alpha(fitted, rig.experiments[fitted.hold], stated, progress=progress)
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
-    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
-    print(fit_text(fitted, rig=rig))
+    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(fit_text(fitted, rig=rig, next_experiment=proposed))
     print(f"Report: {paths['report.html']}")
 
 
@@ -152,32 +174,51 @@ def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
 
 
 @app.command(name="close-loop")
-def close_loop_command(logs: Logs, /, *, drive: DriveOption, out: Path, max_effects: int = 3, seed: int = 0) -> None:
+def close_loop_command(
+    logs: Logs,
+    /,
+    *,
+    drive: DriveOption,
+    out: Path,
+    max_effects: int = 3,
+    seed: int = 0,
+    next_experiment: bool = True,
+    limits: ExperimentLimits = ExperimentLimits(),
+) -> None:
     """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
 
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json.
+        Folder for report.html, report.json and model.json, and next_experiment.csv where explanations are tied.
     max_effects
         Effects to add at most.
     seed
         Of the surrogates behind the p-values.
+    next_experiment
+        Where explanations are tied, look for the motor torque that would tell them apart within limits (a minute).
     """
     if max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
-    _close_loop(read_rig(logs, drive), out, max_effects, seed)
+    _close_loop(read_rig(logs, drive), out, max_effects, seed, limits if next_experiment else None)
 
 
-def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int) -> None:
+def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None) -> None:
+    stated = None if limits is None else stated_limits(limits, _logs_of(rig))
     with _progress() as progress:
         loop = close_loop(
             rig.model, rig.experiments, hold=rig.hold, max_effects=max_effects, seed=seed, progress=progress
         )
+        proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
-    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored))
-    print(loop_text(loop, rig=rig))
+    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(loop_text(loop, rig=rig, next_experiment=proposed))
     print(f"Report: {paths['report.html']}")
+
+
+def _logs_of(rig: Rig) -> tuple[Experiment, ...]:
+    """The logs, under whichever hold."""
+    return next(iter(rig.experiments.values()))
 
 
 @app.command
@@ -320,7 +361,7 @@ def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
     out.mkdir(parents=True, exist_ok=True)
     logs, drive = write_demo_logs(out, seed=seed)
     print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
-    _close_loop(read_rig(logs, drive), out, max_effects=3, seed=seed)
+    _close_loop(read_rig(logs, drive), out, max_effects=3, seed=seed, limits=ExperimentLimits())
 
 
 def _write_table(path: Path, columns: dict[str, np.ndarray]) -> None:

@@ -152,9 +152,10 @@ def is_smooth(explanation: Explanation, starts: Sequence[Excitation], bench: Ben
 
 
 def _stage(explanations: Sequence[Explanation], excitation: Excitation, bench: Bench, both_ways: bool) -> _Stage:
-    by_hold: dict[Hold, Signals] = {
-        hold: signals(excitation, hold=hold, bench=bench) for hold in {e.hold for e in explanations}
-    }
+    by_hold: dict[Hold, Signals] = {}
+    for explanation in explanations:
+        if explanation.hold not in by_hold:
+            by_hold[explanation.hold] = signals(excitation, hold=explanation.hold, bench=bench)
     return _Stage(tuple(explanations), excitation, tuple(by_hold[e.hold] for e in explanations), bench, both_ways)
 
 
