@@ -29,11 +29,11 @@ from hdjax.simulate import march
 _ARRIVED, _NOTHING = 1e-2, 1e-2
 _STEPS = 6
 _HALVINGS = 3
-# Largest step of a free parameter, whose unit is of order one.
+# Largest step of a parameter that moves by its logarithm.
 _LONGEST = 1.0
 # A simulation that runs away, or whose derivatives do, is this far off in units of the noise.
 _LOST = 1e15
-# A free parameter that could move by more than three of its units within the noise is no further sought.
+# A parameter that could change by more than a factor of twenty within the noise is not sought any further.
 _DAMPING = 0.1
 # Directions of the unknowns that the outputs hardly see.
 _BLIND = 1e-10
@@ -245,17 +245,18 @@ def refit(
         bench: how it is simulated.
         begin: unknowns to start from; the rival's own where not given.
     """
-    unknowns, parameters = start(rival) if begin is None else begin, len(rival.free.paths)
+    unknowns = start(rival) if begin is None else begin
+    logarithmic = np.append(rival.free.logarithmic, np.zeros(len(rival.model.motion_states))) > 0
     response = respond(rival, unknowns, command, signals=signals, bench=bench)
     if not (target.usable and response.usable):
         return Refit(unknowns, response, np.full(target.outputs.size, np.nan))
     for _ in range(_STEPS):
         error = target.outputs - response.outputs
-        step, left = _solved(response.by_unknown, error, parameters)
+        step, left = _solved(response.by_unknown, error, logarithmic)
         gained = float(error @ error - left @ left)
         if gained <= _ARRIVED * float(left @ left) + _NOTHING:
             break
-        size = min(1.0, _LONGEST / max(float(np.max(np.abs(step[:parameters]), initial=0.0)), 1e-300))
+        size = min(1.0, _LONGEST / max(float(np.max(np.abs(step[logarithmic]), initial=0.0)), 1e-300))
         for _ in range(_HALVINGS):
             tried = respond(rival, unknowns + size * step, command, signals=signals, bench=bench)
             after = target.outputs - tried.outputs
@@ -265,14 +266,14 @@ def refit(
         else:
             break
         unknowns, response = unknowns + size * step, tried
-    return Refit(unknowns, response, _solved(response.by_unknown, target.outputs - response.outputs, parameters)[1])
+    return Refit(unknowns, response, _solved(response.by_unknown, target.outputs - response.outputs, logarithmic)[1])
 
 
-def _solved(columns: np.ndarray, error: np.ndarray, parameters: int) -> tuple[np.ndarray, np.ndarray]:
+def _solved(columns: np.ndarray, error: np.ndarray, logarithmic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The least-squares step, damped in what noise would hide anyway, and what stays after it."""
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-150)
     scaled = columns / size
-    damping = np.where(np.arange(size.size) < parameters, _DAMPING / size**2, 0.0)
+    damping = np.where(logarithmic, _DAMPING / size**2, 0.0)
     values, vectors = np.linalg.eigh(scaled.T @ scaled + np.diag(np.minimum(damping, 1.0)))
     inverse = np.where(values > _BLIND, 1.0 / np.maximum(values, _BLIND), 0.0)
     step = vectors @ (inverse * (vectors.T @ (scaled.T @ error)))
