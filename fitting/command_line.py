@@ -26,7 +26,7 @@ from fitting.demonstration import write_demo_logs
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.experiment import Experiment, Stretch
-from fitting.experiment_options import ExperimentLimits, stated_limits
+from fitting.experiment_options import ExperimentLimits, stated_limits, wanted
 from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
@@ -98,7 +98,8 @@ def fit(
         Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
         and write it to next_experiment.csv.
     """
-    if next_experiment and any(path.is_dir() for path in logs):
+    asked = wanted(limits, next_experiment)
+    if asked is not None and any(path.is_dir() for path in logs):
         raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
     if posterior:
         _check_posterior(logs)
@@ -108,10 +109,11 @@ def fit(
     drive_file = read_drive_file(drive)
     read = ready_logs(logs, drive_file)
     if read[0].kind == "quasi-static":
+        if asked is not None:
+            raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
         _fit_quasi_static(read, drive_file, out)
     else:
-        wanted = limits if next_experiment else None
-        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None, wanted)
+        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None, asked)
 
 
 def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
@@ -143,6 +145,8 @@ def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits |
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
     paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
     print(fit_text(fitted, rig=rig, next_experiment=proposed))
+    if limits is not None and proposed is None:
+        print("No next experiment: alpha is known from these logs, or no command within the limits keeps to them.")
     print(f"Report: {paths['report.html']}")
 
 
@@ -200,7 +204,8 @@ def close_loop_command(
     """
     if max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
-    _close_loop(read_rig(logs, drive), out, max_effects, seed, limits if next_experiment else None)
+    asked = wanted(limits, next_experiment)
+    _close_loop(read_rig(logs, drive), out, max_effects, seed, asked)
 
 
 def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None) -> None:

@@ -2,7 +2,7 @@
 88-28) with gradients through the simulator, from several commands that benches use.
 
 What is made as large as possible is the logarithm of the least divergence of the first explanation from any of its
-rivals, within the limits of torque, speed and travel under all of them.
+rivals, within the limits of torque, speed, travel and twist under all of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ _BEST_STARTS = 2
 _ITERATIONS = 15
 # An improvement of the logarithm by less is none.
 _TOLERANCE = 1e-2
-# Parts of the command in each of which the largest torque, speed and way are kept within the limits.
+# Parts of the command in each of which the largest torque, speed, way and twist are kept within the limits.
 _PARTS = 12
 # What a squared multiple of the limit above one costs where starts are compared.
 _BEYOND = 10.0
@@ -44,7 +44,7 @@ class Evaluation(eqx.Module):
         own: what each explanation answers.
         forward: each rival refitted to what the first explanation makes.
         backward: the first explanation refitted to what each rival makes; nothing where that is not asked.
-        over: torque, speed and way, in units of their limits, where they are largest in each part of the command.
+        over: torque, speed, way and twist where they are largest in each part of the command, in units of the limits.
         over_slopes: their derivatives by the coefficients.
     """
 
@@ -194,10 +194,10 @@ def evaluate(stage: _Stage, coefficients: Float[np.ndarray, " shapes"], near: Ev
 def _over(
     stage: _Stage, coefficients: Float[np.ndarray, " shapes"], own: Sequence[Response]
 ) -> tuple[Float[np.ndarray, " places"], Float[np.ndarray, "places shapes"]]:
-    """Torque, speed and way where they are largest in each part of the command, and their derivatives."""
+    """Torque, speed, way and twist where they are largest in each part of the command, and their derivatives."""
     shapes = stage.excitation.shapes
-    values = np.concatenate([(shapes @ coefficients)[:, None], *(r.motor for r in own)], axis=1)
-    slopes = np.concatenate([shapes[:, None, :], *(r.motor_by_command for r in own)], axis=1)
+    values = np.concatenate([(shapes @ coefficients)[:, None], *(r.motion for r in own)], axis=1)
+    slopes = np.concatenate([shapes[:, None, :], *(r.motion_by_command for r in own)], axis=1)
     places = [
         part[np.argmax(np.abs(values[part]), axis=0)] for part in np.array_split(np.arange(values.shape[0]), _PARTS)
     ]

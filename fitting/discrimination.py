@@ -69,7 +69,7 @@ class Bench(eqx.Module):
     Attributes:
         motor_angle: where the motor rests at the start [rad].
         noise: covariance of the measurement noise of the outputs.
-        limits: in whose units motor speed and travel are told.
+        limits: in whose units the motion is told.
         halo: intervals of no torque before the start, for delays.
         substeps: solver steps in a sample interval.
         temperature: of the drive [K], where an effect depends on it.
@@ -97,15 +97,16 @@ class Response(eqx.Module):
         outputs: in units of the noise.
         by_unknown: derivative with respect to what a refit may change: free parameters, then the first motion state.
         by_command: derivative with respect to the command's coefficients.
-        motor: motor speed and the output's way from the start, in units of the limits; nothing for a reduced drive.
-        motor_by_command: derivative likewise.
+        motion: motor speed and the output's way from the start (of a drive alone), then the dynamic error; in units of
+            the limits.
+        motion_by_command: derivative likewise.
     """
 
     outputs: Float[np.ndarray, " rows"]
     by_unknown: Float[np.ndarray, "rows unknowns"]
     by_command: Float[np.ndarray, "rows shapes"]
-    motor: Float[np.ndarray, "samples quantities"]
-    motor_by_command: Float[np.ndarray, "samples quantities shapes"]
+    motion: Float[np.ndarray, "samples quantities"]
+    motion_by_command: Float[np.ndarray, "samples quantities shapes"]
 
     @property
     def usable(self) -> bool:
@@ -168,26 +169,27 @@ def respond(
     if drive:
         rest[0], rest[1] = bench.motor_angle, bench.motor_angle / float(model.drive.N)
     warm = any(e.needs_temperature for e in model.effects)
-    units = [bench.limits.speed, bench.limits.travel * float(model.drive.N)] if drive else []
+    limits = bench.limits
+    units = [limits.speed, limits.travel * float(model.drive.N)] if drive else []
     found = _respond(
         model,
         of.free,
         signals,
         jnp.asarray(rest),
         whitening(bench.noise),
-        jnp.asarray(np.array(units)),
+        jnp.asarray(np.array([*units, limits.twist])),
         jnp.asarray(np.asarray(bench.temperature if warm and bench.temperature is not None else 0.0)),
         jnp.asarray(np.concatenate([unknowns, command])),
         jnp.asarray(np.asarray(bench.substeps)),
         bench.halo,
     )
-    outputs, motor, columns, motor_columns = (np.asarray(a) for a in found)
+    outputs, motion, columns, motion_columns = (np.asarray(a) for a in found)
     return Response(
         outputs.ravel(),
         columns[..., : unknowns.size].reshape(outputs.size, -1),
         columns[..., unknowns.size :].reshape(outputs.size, -1),
-        motor,
-        motor_columns[..., unknowns.size :],
+        motion,
+        motion_columns[..., unknowns.size :],
     )
 
 
@@ -215,15 +217,15 @@ def _respond(
         warmth = PiecewisePolynomial(acting.knots, steady)
         state = drive.settled(rest + entries[own : own + motions])
         states, _ = march(drive, acting, None, state, solver=dfx.Tsit5(), substeps=substeps, temperature=warmth)
-        outputs = jax.vmap(drive.outputs)(states) @ white.T
-        moved = jnp.stack([states[:, 2], states[:, 0] - rest[0]], axis=1) if units.size else states[:, :0]
-        return outputs, moved / units[None, :]
+        outputs = jax.vmap(drive.outputs)(states)
+        moved = [states[:, 2], states[:, 0] - rest[0]] if units.size > 1 else []
+        return outputs @ white.T, jnp.stack([*moved, outputs[:, -1]], axis=1) / units[None, :]
 
     def along(tangent: Array):
         return jax.jvp(simulated, (at,), (tangent,))
 
-    (outputs, motor), (columns, motor_columns) = jax.vmap(along, out_axes=(None, -1))(jnp.eye(at.size))
-    return outputs, motor, columns, motor_columns
+    (outputs, motion), (columns, motion_columns) = jax.vmap(along, out_axes=(None, -1))(jnp.eye(at.size))
+    return outputs, motion, columns, motion_columns
 
 
 def refit(

@@ -29,6 +29,7 @@ class Limits(eqx.Module):
         torque: largest motor torque [N m], or forcing of a reduced drive.
         speed: largest motor speed [rad/s]; infinite for a reduced drive.
         travel: how far the output may turn from where it starts [rad]; infinite for a reduced drive.
+        twist: largest dynamic error [rad]; infinite where nobody states one.
         duration: of the command [s].
         time_step: sampling interval [s].
     """
@@ -36,6 +37,7 @@ class Limits(eqx.Module):
     torque: float
     speed: float
     travel: float
+    twist: float
     duration: float
     time_step: float
 
@@ -90,6 +92,7 @@ def reached(stretches: Sequence[Stretch], *, most_samples: int) -> Limits:
         torque=torque,
         speed=np.inf if free else speed,
         travel=np.inf if free else travel,
+        twist=np.inf,
         duration=min(longest, most_samples) * step,
         time_step=step,
     )

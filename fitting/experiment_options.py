@@ -23,7 +23,26 @@ class ExperimentLimits:
     largest_travel: Annotated[
         float | None, Parameter(help="Of the next experiment: how far the output may turn from its start [rad].")
     ] = None
+    largest_twist: Annotated[
+        float | None, Parameter(help="Of the next experiment: dynamic error [rad]; none where not given.")
+    ] = None
     duration: Annotated[float | None, Parameter(help="Of the next experiment [s].")] = None
+
+
+def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits | None:
+    """The limits where a next experiment is wanted, None where not.
+
+    Raises:
+        InputError: where limits are stated for an experiment that nobody wants.
+    """
+    if next_experiment:
+        return options
+    if options != ExperimentLimits():
+        raise InputError(
+            "--largest-torque, --largest-speed, --largest-travel, --largest-twist and --duration are limits of the next "
+            "experiment; add --next-experiment"
+        )
+    return None
 
 
 def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) -> dict[str, float]:
@@ -40,6 +59,7 @@ def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) 
         "torque": ("--largest-torque", options.largest_torque),
         "speed": ("--largest-speed", options.largest_speed),
         "travel": ("--largest-travel", options.largest_travel),
+        "twist": ("--largest-twist", options.largest_twist),
         "duration": ("--duration", options.duration),
     }
     drive = experiments[0].motor_angle is not None

@@ -22,7 +22,7 @@ from fitting.experiment import Experiment, Stretch, scales, segment_count
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
-from hdjax import Hold, Model, sampled
+from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000
 """Longest command that can be designed."""
@@ -390,7 +390,7 @@ def _proposal(
         found=found.name,
         motor_angle=bench.motor_angle,
         dynamic_error=_outputs(own.outputs, bench)[:, -1],
-        motor_speed=own.motor[:, 0] * bench.limits.speed if own.motor.size else None,
+        motor_speed=own.motion[:, 0] * bench.limits.speed if isinstance(found.model, TwoInertiaModel) else None,
         noise=float(np.sqrt(np.asarray(bench.noise)[-1, -1])),
         separations=separations,
         precision=precision,

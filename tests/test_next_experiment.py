@@ -4,27 +4,40 @@ differences, its limits in simulation."""
 import csv
 import dataclasses
 import io
-import json
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 
 import rig
 from fitting import discrimination
+from fitting.close_loop import close_loop
 from fitting.command_search import Candidate, search
 from fitting.discrimination import Bench, Explanation, explanation, refit, respond, signals, start
 from fitting.estimate import fit
 from fitting.excitation import Limits, excitations, reached
-from fitting.experiment import Experiment, Stretch, split
-from fitting.next_experiment import NextExperiment, Precision, Separation
+from fitting.experiment import Experiment, Stretch, experiment_from_log, split
+from fitting.fit_only import fit_only
+from fitting.next_experiment import (
+    NextExperiment,
+    Precision,
+    Separation,
+    experiment_for_alpha,
+    experiment_for_ties,
+    tied,
+)
+from fitting.plots import next_experiment_plot
+from fitting.report import write_report
 from fitting.report.proposal import command_table, proposal_dict
-from hdjax import sampled, simulate
-from hdjax.effects.friction import StribeckMotorFriction
+from fitting.uncertainty import uncertainty
+from hdjax import Hold, sampled, simulate
+from hdjax.effects.friction import MotorFriction, StribeckMotorFriction
 
 NOISE = jnp.diag(jnp.asarray([(rig.MOTOR_NOISE / rig.N) ** 2, 9 * rig.LOAD_NOISE**2]))
 NOISE_STD = np.sqrt(np.diag(np.asarray(NOISE)))
-LIMITS = Limits(torque=0.5, speed=30.0, travel=0.3, duration=0.4, time_step=rig.STEP)
+LIMITS = Limits(torque=0.5, speed=30.0, travel=0.3, twist=np.inf, duration=0.4, time_step=rig.STEP)
 BENCH = Bench(0.0, NOISE, LIMITS, halo=2, substeps=2, temperature=None)
 _DRAWS = 16
 PATHS = ("K", "alpha", "B_sp")
@@ -92,7 +105,7 @@ def test_the_response_is_that_of_the_simulator(rivals: tuple[Explanation, Explan
     white = np.asarray(motion.outputs) / NOISE_STD
     # Fixed steps of a fifth-order solver: a thousandth of the noise.
     np.testing.assert_allclose(own.outputs.reshape(-1, 2), white, atol=1e-2)
-    np.testing.assert_allclose(own.motor[:, 0] * LIMITS.speed, np.asarray(motion.states)[:, 2], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(own.motion[:, 0] * LIMITS.speed, np.asarray(motion.states)[:, 2], rtol=1e-6, atol=1e-6)
 
 
 def test_gradient_of_the_separation(rivals: tuple[Explanation, Explanation], monkeypatch: pytest.MonkeyPatch):
@@ -227,16 +240,15 @@ UNITS = {"dynamic_error": "rad", "forcing": "N m"}
     ],
 )
 def test_what_is_said_of_a_tie(ratios, words):
-    told = proposal_dict(proposed(**ratios), UNITS)
+    told = proposal_dict(proposed(**ratios), UNITS, logs_reach=1e-5)
     assert told is not None
     (sentence,) = told["says"]
     assert all(w in sentence for w in words), sentence
-    json.dumps(told, allow_nan=False)
 
 
 @pytest.mark.parametrize(("fitted", "torque"), [(50.0, None), (0.5, 0.5 * np.cbrt(1.959964 * 2.0 / 0.5))])
 def test_what_is_said_of_alpha(fitted: float, torque: float | None):
-    told = proposal_dict(proposed(Precision(fitted, 40.0, 2.0, np.ones(5), "rad^-2")), UNITS)
+    told = proposal_dict(proposed(Precision(fitted, 40.0, 2.0, np.ones(5), "rad^-2")), UNITS, logs_reach=1e-5)
     assert told is not None and told["question"] == "alpha"
     assert "from 40 rad^-2 on the logs to 2 rad^-2" in told["says"][0]
     assert told["alpha"]["visible"] == pytest.approx(3.92, rel=1e-3)
@@ -250,3 +262,73 @@ def test_the_command_is_a_table():
     assert rows[0] == ["time", "motor_torque"]
     values = np.array(rows[1:], dtype=float)
     np.testing.assert_allclose(values, np.stack([np.arange(5) * 0.1, np.sin(np.arange(5) * 0.1)], axis=1), rtol=1e-8)
+
+
+def test_a_twist_that_must_not_be_passed(rivals: tuple[Explanation, Explanation], proposal: Candidate):
+    free = np.max(np.abs(proposal.evaluation.own[0].outputs[1::2])) * NOISE_STD[1]
+    least = dataclasses.replace(BENCH, limits=dataclasses.replace(LIMITS, twist=0.5 * float(free)))
+    found = search(rivals, [proposal.excitation], least, progress=lambda message: None)
+    assert found is not None
+    for own in found.evaluation.own:
+        assert np.max(np.abs(own.outputs[1::2])) * NOISE_STD[1] <= 0.5 * free * 1.0001
+    assert found.merit < proposal.merit
+
+
+def test_what_is_drawn():
+    for made in (
+        proposed(on_logs=(0.2, 0.3), proposed=(50.0, 60.0)),
+        proposed(Precision(0.5, 40.0, 2.0, np.ones(5), "rad^-2")),
+        dataclasses.replace(proposed(on_logs=None, proposed=(1.0, 1.0)), motor_speed=None),
+    ):
+        drawn = next_experiment_plot(made, unit="rad", forcing_unit="<b>V</b>")
+        go.Figure(drawn.figure)
+        names = [t["name"] for t in drawn.figure["data"] if t["showlegend"]]
+        assert names == ["against rival" if made.precision is None else "an alpha as large as its standard error"]
+        (command, _, left) = drawn.figure["data"]
+        np.testing.assert_allclose(command["y"], made.command, rtol=1e-5)
+        assert set(left["y"]) == {1.0}
+
+
+@pytest.mark.slow
+def test_a_fit_proposes_what_tells_alpha():
+    """A reduced log too gentle for alpha; the command that is found tells it in a fit of its own."""
+    gentle = rig.reduced_experiment(1200, noise=2e-3, rms=0.5)
+    limits = {"torque": 20.0}
+    hold: Hold = "zero-order"
+    fitted = fit_only(rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0), {hold: (gentle,)}, hold=hold)
+    assert not fitted.account.uncertainty.estimates["alpha"].identifiable
+    found = experiment_for_alpha(fitted, [gentle], limits)
+    assert found is not None and found.precision is not None
+    assert np.max(np.abs(found.command)) <= 20.0 * 1.001
+    assert found.precision.proposed < 0.1 * found.precision.on_logs
+    motion = rig.reduced_motion(found.command, alpha=0.0)
+    log = rig.reduced_log(motion[:, 0], found.command, noise=2e-3)
+    (again,) = (experiment_from_log(log, hold=hold),)
+    refitted = fit(
+        rig.reduced_model(alpha=0.0),
+        [Stretch(again, 0, len(again))],
+        ("mu", "omega_0", "gain", "alpha"),
+        horizon=len(again),
+    )
+    estimate = uncertainty(refitted, torque_noise=False).estimates["alpha"]
+    assert estimate.std_classical == pytest.approx(found.precision.proposed, rel=0.2)
+
+
+@pytest.mark.slow
+def test_a_loop_proposes_what_tells_ties_apart(tmp_path: Path):
+    """Friction on the motor with and without a peak near standstill, on a short log."""
+    log = rig.drive_experiment(2000, motor_friction=(0.01, 1.0), noise=3.0)
+    start_model = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
+    data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (log,)}
+    loop = close_loop(
+        start_model, data, hold="zero-order", max_effects=1, catalogue=(MotorFriction, StribeckMotorFriction)
+    )
+    assert [rival.name for _, rival in tied(loop)] == ["stribeck_motor_friction"]
+    found = experiment_for_ties(loop)
+    assert found is not None
+    (separation,) = found.separations
+    assert separation.on_logs is not None and separation.proposed is not None
+    assert max(separation.proposed) > 20 * max(separation.on_logs)
+    paths = write_report(tmp_path, loop, model_json="{}", next_experiment=found)
+    assert (tmp_path / "next_experiment.csv").read_text() == command_table(found)
+    assert "The next experiment" in paths["report.html"].read_text(encoding="utf-8")

@@ -73,7 +73,7 @@ def report_dict(
         "unexplained": unexplained(outcome, noise),
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
-        "next_experiment": proposal_dict(next_experiment, units),
+        "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
         "hold": outcome.hold,
         "setting": _setting(outcome),
         "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),

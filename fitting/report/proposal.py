@@ -24,12 +24,15 @@ def command_table(found: NextExperiment) -> str:
     return "\n".join([f"time,{_input(found)}", *rows, ""])
 
 
-def proposal_dict(found: NextExperiment | None, units: Mapping[str, str]) -> dict[str, Any] | None:
+def proposal_dict(
+    found: NextExperiment | None, units: Mapping[str, str], *, logs_reach: float
+) -> dict[str, Any] | None:
     """What a report says of the next experiment; None where there is none.
 
     Args:
         found: the experiment.
         units: of `dynamic_error` and `forcing`.
+        logs_reach: largest dynamic error of the logs.
     """
     if found is None:
         return None
@@ -50,6 +53,7 @@ def proposal_dict(found: NextExperiment | None, units: Mapping[str, str]) -> dic
             "largest_torque": limits.torque,
             "largest_speed": limits.speed,
             "largest_travel": limits.travel,
+            "largest_twist": limits.twist,
             "duration": limits.duration,
             "time_step": limits.time_step,
         },
@@ -58,6 +62,7 @@ def proposal_dict(found: NextExperiment | None, units: Mapping[str, str]) -> dic
             "speed": float(np.max(np.abs(found.motor_speed))) if found.motor_speed is not None else None,
             "dynamic_error": float(np.max(np.abs(found.dynamic_error))),
         },
+        "logs_reach": logs_reach,
         "separations": told,
         "alpha": alpha,
         "says": [alpha["says"]] if alpha else [s["says"] for s in told],
