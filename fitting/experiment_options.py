@@ -39,8 +39,8 @@ def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits
         return options
     if options != ExperimentLimits():
         raise InputError(
-            "--largest-torque, --largest-speed, --largest-travel, --largest-twist and --duration are limits of the next "
-            "experiment; add --next-experiment"
+            "--largest-torque, --largest-speed, --largest-travel, --largest-twist and --duration are limits of the "
+            "next experiment; add --next-experiment"
         )
     return None
 

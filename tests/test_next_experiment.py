@@ -12,7 +12,7 @@ import plotly.graph_objects as go
 import pytest
 
 import rig
-from fitting import discrimination
+from fitting import command_search, discrimination
 from fitting.close_loop import close_loop
 from fitting.command_search import Candidate, search
 from fitting.discrimination import Bench, Explanation, explanation, refit, respond, signals, start
@@ -264,7 +264,10 @@ def test_the_command_is_a_table():
     np.testing.assert_allclose(values, np.stack([np.arange(5) * 0.1, np.sin(np.arange(5) * 0.1)], axis=1), rtol=1e-8)
 
 
-def test_a_twist_that_must_not_be_passed(rivals: tuple[Explanation, Explanation], proposal: Candidate):
+def test_a_twist_that_must_not_be_passed(
+    rivals: tuple[Explanation, Explanation], proposal: Candidate, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(command_search, "_ITERATIONS", 3)
     free = np.max(np.abs(proposal.evaluation.own[0].outputs[1::2])) * NOISE_STD[1]
     least = dataclasses.replace(BENCH, limits=dataclasses.replace(LIMITS, twist=0.5 * float(free)))
     found = search(rivals, [proposal.excitation], least, progress=lambda message: None)
