@@ -146,7 +146,9 @@ def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits |
     paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
     print(fit_text(fitted, rig=rig, next_experiment=proposed))
     if limits is not None and proposed is None:
-        print("No next experiment: alpha is known from these logs, or no command within the limits keeps to them.")
+        print(
+            "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
+        )
     print(f"Report: {paths['report.html']}")
 
 

@@ -35,7 +35,6 @@ _DECIDED = 1e3
 _MOST_RIVALS = 3
 # The alpha against none: this share of the restoring torque at the largest twist of the logs.
 _CUBIC_SHARE = 0.01
-
 # A shape parameter is not left below this share of where its fit began.
 _SHARPEST = 0.03
 
@@ -158,8 +157,12 @@ def experiment_for_ties(
     judge = _Judge(bench, segment_length(loop.setting.horizon), loop.setting.count)
     told = [_on_logs(judge, found, r, pair) for r, pair in zip(rivals, pairs, strict=True)]
     starts = _starts(bench, own, stretches)
-    open_ones = [k for k, ratios in enumerate(told) if not _is_decided(ratios) and is_smooth(rivals[k], starts, bench)]
-    best = search([found, *(rivals[k] for k in open_ones)], starts, bench, progress=progress) if open_ones else None
+    smooth = [k for k, rival in enumerate(rivals) if is_smooth(rival, starts, bench)]
+    if not smooth:
+        return None
+    # Where the logs have decided all, short segments by which a loop judges have missed it; then all are still asked.
+    open_ones = [k for k in smooth if not _is_decided(told[k])] or smooth
+    best = search([found, *(rivals[k] for k in open_ones)], starts, bench, progress=progress)
     if best is None:
         return None
     made = []
@@ -174,8 +177,7 @@ def experiment_for_ties(
 
 
 def _is_decided(ratios: tuple[float, float] | None) -> bool:
-    """Whether simulations as long as the logs tell two explanations apart, whichever is right; short segments, by which
-    a loop judges, may miss that."""
+    """Whether simulations as long as the logs tell two explanations apart, whichever is right."""
     return ratios is not None and min(ratios) > _DECIDED
 
 

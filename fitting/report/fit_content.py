@@ -93,8 +93,6 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
         notes.append("The errors are not Gaussian: look for outliers, clipping or coarse quantisation in the plot.")
     if report["goodness"]["left_out"]:
         notes.append(f"{report['goodness']['left_out']} samples were left out: missing, or wrong on their own.")
-    if not (report["before"]["parameters"]["alpha"]["identifiable"] or report["next_experiment"]):
-        notes.append("`hdjax fit --next-experiment` looks for a command that would tell alpha.")
     response = report["frequency_response"]
     if response and not response["excited"]:
         notes.append("The log does not excite the resonance: what it says of damping rests on little.")

@@ -70,13 +70,16 @@ def proposal_dict(
 
 
 def next_lines(report: Mapping[str, Any]) -> list[str]:
-    """The next experiment in plain sentences; none where there is none.
+    """The next experiment in plain sentences, or how to come by it; nothing where nothing is open.
 
     Args:
         report: from [`fitting.report.report_dict`][].
     """
     proposed = report["next_experiment"]
-    return [*proposed["says"], f"The command is in {proposed['file']}."] if proposed else []
+    if proposed:
+        return [*proposed["says"], f"The command is in {proposed['file']}."]
+    known = report["decision"] != "fit_only" or report["before"]["parameters"]["alpha"]["identifiable"]
+    return [] if known else ["--next-experiment looks for a command that would tell alpha."]
 
 
 def _input(found: NextExperiment) -> str:
