@@ -29,6 +29,8 @@ _BEYOND = 10.0
 _NO_SQUARES = 1e-3
 # A command that a search leaves a little beyond a limit is made smaller, in so many steps.
 _SHRINKS = 10
+# Evaluations that a search remembers, of the latest and of the best.
+_KEPT = 2
 # Amplitudes of each start that are tried.
 _SIZES = (1.0, 0.3)
 _FARTHEST = 5.0
@@ -216,6 +218,9 @@ def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
             near = min(visited, key=lambda e: float(np.sum((e.coefficients - point[:-1]) ** 2)))
             known = evaluate(stage, point[:-1].copy(), near if near.usable else None)
             visited.append(known)
+            # Derivatives of long commands are large: the latest ones and the best ones are enough.
+            best = sorted(visited[:-_KEPT], key=lambda e: -Candidate(stage.excitation, e).merit)
+            visited[:-_KEPT] = best[:_KEPT]
         return known
 
     def limits(point: np.ndarray) -> np.ndarray:
@@ -244,7 +249,7 @@ def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
         options={"maxiter": _ITERATIONS, "ftol": _TOLERANCE},
     )
     ends = sorted((Candidate(stage.excitation, e) for e in visited), key=lambda c: -c.merit)
-    made = (_made_smaller(stage, c.evaluation) for c in ends[:2] if c.evaluation.usable)
+    made = (_made_smaller(stage, c.evaluation) for c in ends[:_KEPT] if c.evaluation.usable)
     return [Candidate(stage.excitation, e) for e in made if e.within]
 
 
