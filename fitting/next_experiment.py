@@ -15,7 +15,7 @@ from fitting.attribution import Trial, Verdict
 from fitting.base_fit import as_followed
 from fitting.close_loop import Loop
 from fitting.command_search import Candidate, is_smooth, search
-from fitting.discrimination import Bench, Explanation, Response, explanation
+from fitting.discrimination import Bench, Explanation, Refit, Response, explanation
 from fitting.estimate import Fit, fit, segment_length, typical_scales, whitening
 from fitting.excitation import Excitation, Limits, excitations, reached
 from fitting.experiment import Experiment, Stretch, scales, segment_count
@@ -49,15 +49,14 @@ class Separation(eqx.Module):
         family: its family.
         on_logs: on the logs that were fitted; None where a free run along them diverged.
         proposed: on the proposed experiment; None where the logs have decided, or where the rival has no derivatives.
-        left: of the dynamic error, what stays between the two on the proposal where the found one is right and the
-            rival has been refitted [rad]; None likewise.
+        gathered: the same two by column as they grow along the proposal, as the search has it; None likewise.
     """
 
     rival: str = eqx.field(static=True)
     family: str = eqx.field(static=True)
     on_logs: tuple[float, float] | None
     proposed: tuple[float, float] | None
-    left: Float[np.ndarray, " samples"] | None
+    gathered: Float[np.ndarray, "samples 2"] | None
 
 
 class Precision(eqx.Module):
@@ -67,14 +66,14 @@ class Precision(eqx.Module):
         fitted: its value in the fit.
         on_logs: standard error on the logs that were fitted.
         proposed: likewise on the proposed experiment, of an alpha that is small.
-        left: of the dynamic error, what an alpha as large as this standard error adds on the proposal [rad].
+        gathered: share of what the proposal knows of alpha, as it grows along it.
         unit: of alpha.
     """
 
     fitted: float
     on_logs: float
     proposed: float
-    left: Float[np.ndarray, " samples"]
+    gathered: Float[np.ndarray, " samples"]
     unit: str = eqx.field(static=True)
 
     @property
@@ -95,7 +94,6 @@ class NextExperiment(eqx.Module):
         motor_angle: where the motor rests at the start [rad].
         dynamic_error: that the found explanation predicts [rad].
         motor_speed: likewise [rad/s]; None for a reduced drive.
-        noise: rms measurement noise of the dynamic error [rad].
         separations: of the found explanation from each rival; none where alpha is the question.
         precision: of alpha, where that is the question.
     """
@@ -108,7 +106,6 @@ class NextExperiment(eqx.Module):
     motor_angle: float
     dynamic_error: Float[np.ndarray, " samples"]
     motor_speed: Float[np.ndarray, " samples"] | None
-    noise: float
     separations: tuple[Separation, ...]
     precision: Precision | None
 
@@ -167,12 +164,13 @@ def experiment_for_ties(
         return None
     made = []
     for k, ((_, verdict), ratios) in enumerate(zip(pairs, told, strict=True)):
-        proposed, left = None, None
+        proposed, gathered = None, None
         if k in open_ones:
             place = open_ones.index(k)
             proposed = _on_proposal(judge, best, found, rivals[k], best.evaluation.own[place + 1])
-            left = _outputs(best.evaluation.forward[place].left, bench)[:, -1]
-        made.append(Separation(verdict.name, verdict.family, ratios, proposed, left))
+            both = best.evaluation.forward[place], best.evaluation.backward[place]
+            gathered = np.stack([0.5 * _gathered(side, best) for side in both], axis=1)
+        made.append(Separation(verdict.name, verdict.family, ratios, proposed, gathered))
     return _proposal(best, bench, found, separations=tuple(made))
 
 
@@ -212,15 +210,15 @@ def experiment_for_alpha(
     bench = _bench(without.model, stretches, limits, noise=fitted.noise, halo=0, substeps=fitted.goodness.substeps)
     starts = _starts(bench, without.model, stretches)
     best = search([with_alpha, without], starts, bench, both_ways=False, progress=progress)
-    if best is None:
+    if best is None or not best.evaluation.forward[0].squares > 0:
         return None
     seen = best.evaluation.forward[0]
-    std = size / np.sqrt(max(seen.squares, 1e-300))
+    std = size / np.sqrt(seen.squares)
     precision = Precision(
         fitted=estimate.value,
         on_logs=estimate.std_classical,
         proposed=std,
-        left=_outputs(seen.left, bench)[:, -1] * std / size,
+        gathered=_gathered(seen, best) / seen.squares,
         unit=estimate.unit,
     )
     return _proposal(best, bench, with_alpha, precision=precision)
@@ -369,6 +367,11 @@ def _simulated(command: Float[np.ndarray, " samples"], truth: Response, hold: Ho
     return Stretch(experiment, 0, time.size)
 
 
+def _gathered(of: Refit, best: Candidate) -> Float[np.ndarray, " samples"]:
+    """What stays after a refit, squared and summed up to each sample."""
+    return np.cumsum(np.sum(of.left.reshape(best.command.size, -1) ** 2, axis=1))
+
+
 def _outputs(white: Float[np.ndarray, " rows"], bench: Bench) -> Float[np.ndarray, "samples outputs"]:
     """Outputs in their own units, from those in units of the noise."""
     colour = np.linalg.inv(np.asarray(whitening(bench.noise)))
@@ -393,7 +396,6 @@ def _proposal(
         motor_angle=bench.motor_angle,
         dynamic_error=_outputs(own.outputs, bench)[:, -1],
         motor_speed=own.motion[:, 0] * bench.limits.speed if isinstance(found.model, TwoInertiaModel) else None,
-        noise=float(np.sqrt(np.asarray(bench.noise)[-1, -1])),
         separations=separations,
         precision=precision,
     )

@@ -210,7 +210,9 @@ def stretch_of(command: np.ndarray, measured: np.ndarray) -> Stretch:
 
 def proposed(precision: Precision | None = None, **ratios) -> NextExperiment:
     time = np.arange(5) * 0.1
-    separations = () if precision else (Separation("rival", "motor_friction", **ratios, left=np.ones(5)),)
+    separations = (
+        () if precision else (Separation("rival", "motor_friction", **ratios, gathered=np.outer(time, [1.0, 2.0])),)
+    )
     return NextExperiment(
         time=time,
         command=np.sin(time),
@@ -220,7 +222,6 @@ def proposed(precision: Precision | None = None, **ratios) -> NextExperiment:
         motor_angle=0.1,
         dynamic_error=1e-5 * time,
         motor_speed=time,
-        noise=1e-6,
         separations=separations,
         precision=precision,
     )
@@ -285,11 +286,13 @@ def test_what_is_drawn():
     ):
         drawn = next_experiment_plot(made, unit="rad", forcing_unit="<b>V</b>")
         go.Figure(drawn.figure)
-        names = [t["name"] for t in drawn.figure["data"] if t["showlegend"]]
-        assert names == ["against rival" if made.precision is None else "an alpha as large as its standard error"]
-        (command, _, left) = drawn.figure["data"]
+        command, motion, *told = drawn.figure["data"]
         np.testing.assert_allclose(command["y"], made.command, rtol=1e-5)
-        assert set(left["y"]) == {1.0}
+        np.testing.assert_allclose(motion["y"], 1e6 * made.dynamic_error if made.motor_speed is None else made.time)
+        assert len(told) == (2 if made.separations else 1)
+        if made.separations:
+            np.testing.assert_allclose(told[1]["y"], 2.0 * made.time)
+            assert told[0]["name"] == "against rival" and told[1]["line"]["dash"] == "dash"
 
 
 @pytest.mark.slow
