@@ -12,7 +12,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from fitting.discrimination import Bench, Explanation, Refit, Response, Signals, refit, respond, signals, start
+from fitting.discrimination import (
+    Bench,
+    Explanation,
+    Refit,
+    Response,
+    Signals,
+    in_own_units,
+    refit,
+    respond,
+    signals,
+    start,
+)
 from fitting.excitation import Excitation
 from hdjax import Hold
 
@@ -151,6 +162,13 @@ def is_smooth(explanation: Explanation, starts: Sequence[Excitation], bench: Ben
     """Whether an explanation has derivatives that a search can use, on at least one of the first commands."""
     stages = (_stage([explanation], excitation, bench, False) for excitation in starts[:_TRIED])
     return any(evaluate(s, s.excitation.coefficients).own[0].usable for s in stages)
+
+
+def largest_twist(of: Explanation, starts: Sequence[Excitation], bench: Bench) -> float:
+    """The largest dynamic error that an explanation makes of any of the commands [rad]."""
+    stages = (_stage([of], excitation, bench, False) for excitation in starts)
+    own = (evaluate(s, s.excitation.coefficients).own[0] for s in stages)
+    return max(float(np.max(np.abs(in_own_units(r.outputs, bench)[:, -1]))) for r in own)
 
 
 def _stage(explanations: Sequence[Explanation], excitation: Excitation, bench: Bench, both_ways: bool) -> _Stage:

@@ -149,6 +149,12 @@ def signals(excitation: Excitation, *, hold: Hold, bench: Bench) -> Signals:
     return Signals(jnp.asarray(knots), jnp.asarray(np.stack(made, axis=-1)))
 
 
+def in_own_units(white: Float[np.ndarray, " rows"], bench: Bench) -> Float[np.ndarray, "samples outputs"]:
+    """Outputs in their own units, from those in units of the noise."""
+    colour = np.linalg.inv(np.asarray(whitening(bench.noise)))
+    return white.reshape(-1, colour.shape[0]) @ colour.T
+
+
 def start(of: Explanation) -> Float[np.ndarray, " unknowns"]:
     """The unknowns of an explanation as it is."""
     return np.concatenate([np.asarray(of.free.pack(of.model)), np.zeros(len(of.model.motion_states))])

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from fitting.attribution import Trial, Verdict
 from fitting.base_fit import as_followed
 from fitting.close_loop import Loop
-from fitting.command_search import Candidate, is_smooth, search
-from fitting.discrimination import Bench, Explanation, Refit, Response, explanation
+from fitting.command_search import Candidate, is_smooth, largest_twist, search
+from fitting.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
 from fitting.estimate import Fit, fit, segment_length, typical_scales, whitening
 from fitting.excitation import Excitation, Limits, excitations, reached
 from fitting.experiment import Experiment, Stretch, scales, segment_count
@@ -33,8 +33,9 @@ _USUAL_SAMPLES = 4096
 _DECIDED = 1e3
 # Rivals that are told apart at once, the closest ones.
 _MOST_RIVALS = 3
-# The alpha against none: this share of the restoring torque at the largest twist of the logs.
-_CUBIC_SHARE = 0.01
+# The alpha against none: this share of the restoring torque at the largest twist of the usual commands; and the share
+# of the noise against which it is sought.
+_CUBIC_SHARE, _QUIET = 0.01, 0.01
 # A shape parameter is not left below this share of where its fit began.
 _SHARPEST = 0.03
 
@@ -201,19 +202,19 @@ def experiment_for_alpha(
     if estimate is None or estimate.identifiable:
         return None
     stretches = tuple(Stretch(e, 0, len(e)) for e in experiments)
-    size = min(_CUBIC_SHARE / scales(stretches).x_max ** 2, estimate.std)
     paths = [p for p in fitted.account.uncertainty.estimates if p != "alpha"]
-    with_alpha, without = (
-        explanation(name, fitted.account.model.replace({"alpha": value}), paths, hold=fitted.hold)
-        for name, value in (("a small alpha", size), ("no alpha", 0.0))
-    )
-    bench = _bench(without.model, stretches, limits, noise=fitted.noise, halo=0, substeps=fitted.goodness.substeps)
+    without = explanation("no alpha", fitted.account.model.replace({"alpha": 0.0}), paths, hold=fitted.hold)
+    # An alpha so small that its square does not count shows against less noise; what noise does is in proportion to it.
+    quiet = fitted.noise * _QUIET**2
+    bench = _bench(without.model, stretches, limits, noise=quiet, halo=0, substeps=fitted.goodness.substeps)
     starts = _starts(bench, without.model, stretches)
-    best = search([with_alpha, without], starts, bench, both_ways=False, progress=progress)
+    size = _CUBIC_SHARE / largest_twist(without, starts, bench) ** 2
+    small = explanation("a small alpha", without.model.replace({"alpha": size}), paths, hold=fitted.hold)
+    best = search([small, without], starts, bench, both_ways=False, progress=progress)
     if best is None or not best.evaluation.forward[0].squares > 0:
         return None
     seen = best.evaluation.forward[0]
-    std = size / np.sqrt(seen.squares)
+    std = size / (_QUIET * np.sqrt(seen.squares))
     precision = Precision(
         fitted=estimate.value,
         on_logs=estimate.std_classical,
@@ -221,7 +222,7 @@ def experiment_for_alpha(
         gathered=_gathered(seen, best) / seen.squares,
         unit=estimate.unit,
     )
-    return _proposal(best, bench, with_alpha, precision=precision)
+    return _proposal(best, bench, small, precision=precision)
 
 
 def _name(loop: Loop) -> str:
@@ -353,7 +354,7 @@ def _on_proposal(
 def _simulated(command: Float[np.ndarray, " samples"], truth: Response, hold: Hold, bench: Bench) -> Stretch:
     """The proposal as a log of what a model makes of it."""
     time = np.arange(command.size) * bench.limits.time_step
-    outputs = _outputs(truth.outputs, bench)
+    outputs = in_own_units(truth.outputs, bench)
     warm = None if bench.temperature is None else sampled(time, np.full(time.size, bench.temperature), hold="linear")
     experiment = Experiment(
         name="the next experiment",
@@ -372,12 +373,6 @@ def _gathered(of: Refit, best: Candidate) -> Float[np.ndarray, " samples"]:
     return np.cumsum(np.sum(of.left.reshape(best.command.size, -1) ** 2, axis=1))
 
 
-def _outputs(white: Float[np.ndarray, " rows"], bench: Bench) -> Float[np.ndarray, "samples outputs"]:
-    """Outputs in their own units, from those in units of the noise."""
-    colour = np.linalg.inv(np.asarray(whitening(bench.noise)))
-    return white.reshape(-1, colour.shape[0]) @ colour.T
-
-
 def _proposal(
     best: Candidate,
     bench: Bench,
@@ -394,7 +389,7 @@ def _proposal(
         begins_like=best.excitation.name,
         found=found.name,
         motor_angle=bench.motor_angle,
-        dynamic_error=_outputs(own.outputs, bench)[:, -1],
+        dynamic_error=in_own_units(own.outputs, bench)[:, -1],
         motor_speed=own.motion[:, 0] * bench.limits.speed if isinstance(found.model, TwoInertiaModel) else None,
         separations=separations,
         precision=precision,
