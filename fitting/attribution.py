@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, scales
-from fitting.free import base_paths, effect_paths, strength_paths
+from fitting.free import fitted_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
 from fitting.uncertainty import uncertainty
 from hdjax import Hold, Model
@@ -171,13 +171,10 @@ def _trained(
     states: Float[Array, "segments states"] | None = None,
     max_steps: int = _TRIAL_STEPS,
 ) -> Fit:
-    paths = base_paths(model)
-    for effect in model.effects:
-        paths += effect_paths(effect)
     return fit(
         model,
         data[hold][0],
-        paths,
+        fitted_paths(model),
         horizon=setting.horizon,
         halo=setting.halo,
         substeps=setting.substeps,

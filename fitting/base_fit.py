@@ -112,7 +112,7 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
             states=best.unknowns.states,
         )
     horizon = short_horizon(best.model, training)
-    segments = cut(_as_followed(best), segment_length(horizon), halo=halo)
+    segments = cut(as_followed(best), segment_length(horizon), halo=halo)
     return fit(
         best.model,
         training,
@@ -141,8 +141,8 @@ def leaves_white_noise(found: Fit) -> bool:
     return bool(statistic < chdtri(lags.size, _FALSE_ALARM))
 
 
-def _as_followed(found: Fit) -> tuple[Stretch, ...]:
-    """The stretches with the outputs that the fit gives in place of the measured ones."""
+def as_followed(found: Fit) -> tuple[Stretch, ...]:
+    """The stretches with the outputs that a fit gives in place of the measured ones."""
     length = found.error.shape[1]
     parts, first = [], 0
     for stretch in found.stretches:

@@ -27,13 +27,15 @@ from fitting.demonstration import write_demo_logs
 from fitting.design_commands import design
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.experiment import Stretch
+from fitting.experiment import Experiment, Stretch
+from fitting.experiment_options import ExperimentLimits, stated_limits, wanted
 from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
 from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.next_experiment import experiment_for_alpha, experiment_for_ties
 from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
@@ -68,7 +70,17 @@ DriveOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias
 
 
 @app.command
-def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False, seed: int = 0) -> None:
+def fit(
+    logs: Logs,
+    /,
+    *,
+    drive: DriveOption,
+    out: Path,
+    posterior: bool = False,
+    seed: int = 0,
+    next_experiment: bool = False,
+    limits: ExperimentLimits = ExperimentLimits(),
+) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
     Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
@@ -85,7 +97,13 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False
         `posterior`.
     seed
         Of the draws.
+    next_experiment
+        Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
+        and write it to next_experiment.csv.
     """
+    asked = wanted(limits, next_experiment)
+    if asked is not None and any(path.is_dir() for path in logs):
+        raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
     if posterior:
         _check_posterior(logs)
     if any(path.is_dir() for path in logs):
@@ -94,9 +112,11 @@ def fit(logs: Logs, /, *, drive: DriveOption, out: Path, posterior: bool = False
     drive_file = read_drive_file(drive)
     read = ready_logs(logs, drive_file)
     if read[0].kind == "quasi-static":
+        if asked is not None:
+            raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
         _fit_quasi_static(read, drive_file, out)
     else:
-        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None)
+        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None, asked)
 
 
 def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
@@ -118,12 +138,20 @@ def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -
     print(f"Report: {paths['report.html']}")
 
 
-def _fit_drive(rig: Rig, out: Path, seed: int | None) -> None:
+def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
+    stated = None if limits is None else stated_limits(limits, _logs_of(rig))
     with _progress() as progress:
         fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, seed=seed, progress=progress)
+        proposed = None
+        if stated is not None:
+            proposed = experiment_for_alpha(fitted, rig.experiments[fitted.hold], stated, progress=progress)
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
-    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored))
-    print(fit_text(fitted, rig=rig))
+    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(fit_text(fitted, rig=rig, next_experiment=proposed))
+    if limits is not None and proposed is None:
+        print(
+            "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
+        )
     print(f"Report: {paths['report.html']}")
 
 
@@ -155,32 +183,52 @@ def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
 
 
 @app.command(name="close-loop")
-def close_loop_command(logs: Logs, /, *, drive: DriveOption, out: Path, max_effects: int = 3, seed: int = 0) -> None:
+def close_loop_command(
+    logs: Logs,
+    /,
+    *,
+    drive: DriveOption,
+    out: Path,
+    max_effects: int = 3,
+    seed: int = 0,
+    next_experiment: bool = True,
+    limits: ExperimentLimits = ExperimentLimits(),
+) -> None:
     """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
 
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json.
+        Folder for report.html, report.json and model.json, and next_experiment.csv where explanations are tied.
     max_effects
         Effects to add at most.
     seed
         Of the surrogates behind the p-values.
+    next_experiment
+        Where explanations are tied, look for the motor torque that would tell them apart within limits (a minute).
     """
     if max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
-    _close_loop(read_rig(logs, drive), out, max_effects, seed)
+    asked = wanted(limits, next_experiment)
+    _close_loop(read_rig(logs, drive), out, max_effects, seed, asked)
 
 
-def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int) -> None:
+def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None) -> None:
+    stated = None if limits is None else stated_limits(limits, _logs_of(rig))
     with _progress() as progress:
         loop = close_loop(
             rig.model, rig.experiments, hold=rig.hold, max_effects=max_effects, seed=seed, progress=progress
         )
+        proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
-    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored))
-    print(loop_text(loop, rig=rig))
+    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(loop_text(loop, rig=rig, next_experiment=proposed))
     print(f"Report: {paths['report.html']}")
+
+
+def _logs_of(rig: Rig) -> tuple[Experiment, ...]:
+    """The logs, under whichever hold."""
+    return next(iter(rig.experiments.values()))
 
 
 @app.command
@@ -323,7 +371,7 @@ def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
     out.mkdir(parents=True, exist_ok=True)
     logs, drive = write_demo_logs(out, seed=seed)
     print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
-    _close_loop(read_rig(logs, drive), out, max_effects=3, seed=seed)
+    _close_loop(read_rig(logs, drive), out, max_effects=3, seed=seed, limits=ExperimentLimits())
 
 
 def _write_table(path: Path, columns: dict[str, np.ndarray]) -> None:

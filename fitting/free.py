@@ -109,6 +109,11 @@ def effect_paths(effect: Effect) -> tuple[str, ...]:
     return tuple(f"{effect.name}.{n}" for n, i in own_parameters(effect) if i.role != "base")
 
 
+def fitted_paths(model: Model) -> tuple[str, ...]:
+    """What is fitted of a drive with its effects."""
+    return sum((effect_paths(effect) for effect in model.effects), base_paths(model))
+
+
 def strength_paths(effect: Effect) -> tuple[str, ...]:
     """Those parameters of an effect whose zero removes it."""
     return tuple(f"{effect.name}.{n}" for n, i in own_parameters(effect) if i.role == "strength")

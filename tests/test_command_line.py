@@ -134,6 +134,7 @@ def test_bad_logs(command: str, columns, code: int, words, tmp_path: Path, capsy
     assert not out.exists()
 
 
+FIT = ("fit", "log.csv", "--drive", "drive.toml", "--out", "out")
 BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "missing log": (("fit", "absent.csv", "--drive", "drive.toml", "--out", "out"), ("absent.csv",)),
     "missing drive file": (("fit", "log.csv", "--drive", "absent.toml", "--out", "out"), ("absent.toml",)),
@@ -198,6 +199,17 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "speed below zero": (("speeds", "--slowest", "-3"), ("--slowest", "-3")),
     "kinematic error that is no number": (("speeds", "--kinematic-error", "nan"), ("--kinematic-error",)),
     "limit of nothing": (("speeds", "--limit", "0"), ("--limit",)),
+    "next experiment of no length": ((*FIT, "--next-experiment", "--duration", "0.001"), ("--duration", "0.1 s")),
+    "next experiment without torque": (("close-loop", *FIT[1:], "--largest-torque", "-1"), ("--largest-torque", "-1")),
+    "next experiment of a folder": (
+        ("fit", ".", *FIT[2:], "--next-experiment"),
+        ("--next-experiment", "name its logs"),
+    ),
+    "speed of a reduced log": (
+        ("fit", "reduced.csv", *FIT[2:], "--next-experiment", "--largest-speed", "3"),
+        ("--largest-speed", "no motor"),
+    ),
+    "limits of no experiment": ((*FIT, "--largest-torque", "1"), ("--largest-torque", "--next-experiment")),
     "tables with an option": (("seed-tables", "--out", "out"), ("--out",)),
 }
 

@@ -12,7 +12,7 @@ class Plot:
 
     Attributes:
         key: unique within a report; a word for an element's id.
-        section: "fit", "left_over", "look" or "found".
+        section: "fit", "left_over", "look", "found" or "next".
         title: what it shows, as plain text.
         caption: how to read it, as plain text.
         figure: for plotly.js, finite numbers and nulls only.

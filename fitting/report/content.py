@@ -12,12 +12,14 @@ from fitting import findings
 from fitting.close_loop import Loop
 from fitting.files import finite
 from fitting.free_run import FreeRun
+from fitting.next_experiment import NextExperiment
 from fitting.report.alternatives import alternatives
 from fitting.report.fit_content import fit_dict, meaning
 from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
 from fitting.report.parameters import account_dict, effect_dict, no_account
 from fitting.report.posterior import posterior_dict
+from fitting.report.proposal import proposal_dict
 from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
 from fitting.report.unknown import unknown_dict
@@ -33,6 +35,7 @@ def report_dict(
     units: Mapping[str, str] | None = None,
     health: Sequence[tuple[str, findings.Finding]] = (),
     name: str = "drive",
+    next_experiment: NextExperiment | None = None,
 ) -> dict[str, Any]:
     """The report as JSON has it: finite numbers and nulls only.
 
@@ -41,6 +44,7 @@ def report_dict(
         units: of `dynamic_error` and, in a reduced log, of `forcing`; SI where not given.
         health: what the health gate said, each finding with its log's name.
         name: the drive's.
+        next_experiment: that would tell more.
     """
     units = {"dynamic_error": "rad", "forcing": "N m"} | dict(units or {})
     noise = float(np.sqrt(np.asarray(outcome.noise)[-1, -1]))
@@ -69,6 +73,7 @@ def report_dict(
         "unexplained": unexplained(outcome, noise),
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
+        "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
         "hold": outcome.hold,
         "setting": _setting(outcome),
         "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),

@@ -7,6 +7,7 @@ from typing import Any
 
 from fitting.formatting import open_interval, p_value, percent, plain
 from fitting.report.posterior import QUANTILES
+from fitting.report.proposal import next_lines
 
 _WIDTH = 100
 _INDENT = "    "
@@ -27,6 +28,7 @@ def fit_lines(report: Mapping[str, Any]) -> list[str]:
         *_section("Derived", _table(_derived_rows(report["before"]["derived"]), left=(0, 5))),
         *_section("Posterior", _posterior(report["posterior"], report["before"]["parameters"])),
         *_section("What this log can't tell", _prose(report["cannot_tell"])),
+        *_section("The next experiment", _prose(next_lines(report))),
         *_section("Correlations above 0.1", _correlations(report["before"]["correlations"])),
         *_section("Goodness", _goodness(report)),
         *_section("Residual", _tests(report["residual_tests"])),

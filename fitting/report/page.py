@@ -15,6 +15,8 @@ from fitting.report.summary import chance
 from fitting.report.tables import changes, parameter_rows
 from fitting.web_page import environment
 
+_SECTIONS = ("fit", "left_over", "look", "found", "next")
+
 
 def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
     """The page: self-contained, reads without a network.
@@ -49,7 +51,9 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
             rows=parameter_rows(report, final),
             changes=changes(report),
             quantiles=QUANTILES,
-            sections={s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found")},
+            sections={
+                s: [p for p in pictures if p.section == s] for s in ("fit", "left_over", "look", "found", "next")
+            },
             plotlyjs=Markup(get_plotlyjs()),
         )
     )

@@ -6,6 +6,7 @@ from typing import Any
 from fitting import formatting
 from fitting.formatting import open_interval, plain
 from fitting.report.fit_text import fit_lines
+from fitting.report.proposal import next_lines
 from fitting.report.summary import chance
 
 
@@ -44,6 +45,7 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"[Alternative: {other['name']}] {kind}. {other['separating_experiment']}")
     for note in report["cannot_tell"]:
         lines.append(f"[Note] {note}")
+    lines += [f"[Next experiment] {sentence}" for sentence in next_lines(report)]
     return lines
 
 

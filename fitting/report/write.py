@@ -10,11 +10,13 @@ from fitting import findings
 from fitting.close_loop import Loop
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly
-from fitting.plots import Plot, evidence_plot, fit_plots, learned_torque, plots
+from fitting.next_experiment import NextExperiment
+from fitting.plots import Plot, evidence_plot, fit_plots, learned_torque, next_experiment_plot, plots
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
 from fitting.report.posterior import DRAWS_FILE, draws_table
+from fitting.report.proposal import COMMAND_FILE, command_table
 from fitting.report.text import report_text
 from fitting.report.unknown import curve_of, unit_in_log
 from fitting.rig import Rig
@@ -29,9 +31,10 @@ def write_report(
     units: Mapping[str, str] | None = None,
     health: Sequence[tuple[str, findings.Finding]] = (),
     name: str = "drive",
+    next_experiment: NextExperiment | None = None,
 ) -> dict[str, Path]:
-    """Write `report.html`, `report.json` and `model.json`, and `posterior.parquet` where draws were made: all of them,
-    whole, or none.
+    """Write `report.html`, `report.json` and `model.json`, `posterior.parquet` where draws were made, and
+    `next_experiment.csv` where one is proposed: all of them, whole, or none.
 
     Args:
         out_dir: folder; made where absent.
@@ -40,26 +43,36 @@ def write_report(
         units: see [`report_dict`][].
         health: see [`report_dict`][].
         name: the drive's.
+        next_experiment: that would tell more.
 
     Returns:
         The files' paths, by name.
     """
-    report = report_dict(outcome, units=units, health=health, name=name)
+    report = report_dict(outcome, units=units, health=health, name=name, next_experiment=next_experiment)
     contents: dict[str, str | bytes] = {
-        "report.html": report_page(report, _pictures(outcome, report)),
+        "report.html": report_page(report, _pictures(outcome, report, next_experiment)),
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "model.json": model_json,
     }
     if isinstance(outcome, FitOnly) and outcome.posterior is not None:
         contents[DRAWS_FILE] = draws_table(outcome.posterior)
+    if next_experiment is not None:
+        contents[COMMAND_FILE] = command_table(next_experiment)
     paths = {file: Path(out_dir) / file for file in contents}
     write_whole({paths[file]: content for file, content in contents.items()})
     return paths
 
 
-def write_loop_report(out_dir: str | os.PathLike[str], loop: Loop, *, rig: Rig, model_json: str) -> dict[str, Path]:
+def write_loop_report(
+    out_dir: str | os.PathLike[str],
+    loop: Loop,
+    *,
+    rig: Rig,
+    model_json: str,
+    next_experiment: NextExperiment | None = None,
+) -> dict[str, Path]:
     """[`write_report`][] of a loop on a rig's logs."""
-    return write_report(out_dir, loop, model_json=model_json, **_of_rig(rig))
+    return write_report(out_dir, loop, model_json=model_json, next_experiment=next_experiment, **_of_rig(rig))
 
 
 def write_fit_report(
@@ -68,19 +81,20 @@ def write_fit_report(
     *,
     rig: Rig,
     model_json: str,
+    next_experiment: NextExperiment | None = None,
 ) -> dict[str, Path]:
     """[`write_report`][] of a fit of a rig's logs."""
-    return write_report(out_dir, fitted, model_json=model_json, **_of_rig(rig))
+    return write_report(out_dir, fitted, model_json=model_json, next_experiment=next_experiment, **_of_rig(rig))
 
 
-def loop_text(loop: Loop, *, rig: Rig) -> str:
+def loop_text(loop: Loop, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
     """[`report_text`][] of a loop on a rig's logs."""
-    return report_text(report_dict(loop, **_of_rig(rig)))
+    return report_text(report_dict(loop, next_experiment=next_experiment, **_of_rig(rig)))
 
 
-def fit_text(fitted: FitOnly, *, rig: Rig) -> str:
+def fit_text(fitted: FitOnly, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
     """[`report_text`][] of a fit of a rig's logs."""
-    return report_text(report_dict(fitted, **_of_rig(rig)))
+    return report_text(report_dict(fitted, next_experiment=next_experiment, **_of_rig(rig)))
 
 
 def _of_rig(rig: Rig) -> dict[str, Any]:
@@ -92,14 +106,17 @@ def _of_rig(rig: Rig) -> dict[str, Any]:
     }
 
 
-def _pictures(outcome: Outcome, report: Mapping[str, Any]) -> list[Plot]:
+def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperiment | None) -> list[Plot]:
+    units, last = report["units"], []
+    if proposed is not None:
+        last.append(next_experiment_plot(proposed, unit=units["dynamic_error"], forcing_unit=units["forcing"]))
     if isinstance(outcome, Loop):
-        found = plots(outcome, units=report["units"])
+        found = plots(outcome, units=units)
         quantities = {"torque": "N m", "error": "rad"} | UNITS
-        told = {name: unit_in_log(unit, outcome, report["units"]) for name, unit in quantities.items()}
-        found += [evidence_plot(seen, units=told) for seen in outcome.evidence]
+        in_log = {name: unit_in_log(unit, outcome, units) for name, unit in quantities.items()}
+        found += [evidence_plot(seen, units=in_log) for seen in outcome.evidence]
         curve, told = curve_of(outcome), report["unknown"]
         if curve is not None:
             found.append(learned_torque(curve, unit=told["units"]["torque"], units=told["units"]))
-        return found
-    return fit_plots(outcome, units=report["units"])
+        return found + last
+    return fit_plots(outcome, units=units) + last
