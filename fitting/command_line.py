@@ -1,4 +1,4 @@
-"""The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds`."""
+"""The command line: `hdjax fit | close-loop | predict | simulate | sweep | demo | amplitudes | seed-tables | speeds`"""
 
 # ruff: noqa: E402
 
@@ -36,6 +36,7 @@ from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
 from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
+from fitting.sweep_commands import sweep
 from hdjax import (
     PRESETS,
     Chirp,
@@ -57,6 +58,7 @@ app = cyclopts.App(
 app.command(amplitudes)
 app.command(seed_tables)
 app.command(speeds)
+app.command(sweep)
 
 Logs = Annotated[
     list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")

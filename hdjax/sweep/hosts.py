@@ -1,0 +1,54 @@
+"""A sweep's chunks on the workers of a Dask cluster."""
+
+import contextlib
+import pickle
+from collections.abc import Iterator
+
+import jax
+
+from hdjax.sweep.answers import Plan
+from hdjax.sweep.request import Case, Request
+from hdjax.sweep.store import Store, required, work
+
+_RETRIES = 3
+
+
+def spread_chunks(
+    kept: Store, case: Case, request: Request, chosen: Plan, chunks: list[int], workers: int, scheduler: str | None
+) -> Iterator[int]:
+    """Have chunks worked out by a cluster; gives each that is done.
+
+    Args:
+        kept: the store, which all workers see under the same path.
+        case: the model and its forcing.
+        request: what is wanted.
+        chosen: how.
+        chunks: those that are not done.
+        workers: processes of a cluster on this machine, where there is no scheduler.
+        scheduler: address of a cluster's scheduler.
+    """
+    distributed = required("distributed")
+    double = bool(jax.config.read("jax_enable_x64"))
+    with contextlib.ExitStack() as stack:
+        address = scheduler
+        if address is None:
+            # Each worker has the machine's cores to itself in turn: one thread, one chunk.
+            cluster = distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
+            )
+            address = stack.enter_context(cluster)
+        client = stack.enter_context(distributed.Client(address))
+        # Bytes: a worker must know the precision before it makes arrays of them.
+        shared = client.scatter((pickle.dumps((kept, case, request, chosen)), double), broadcast=True)
+        # The store remembers what is done, not the scheduler: a later run must ask anew.
+        futures = client.map(_on_worker, chunks, given=shared, pure=False, retries=_RETRIES)
+        for future in distributed.as_completed(futures):
+            yield future.result()
+
+
+def _on_worker(chunk: int, given: tuple[bytes, bool]) -> int:
+    """A worker's process is the sweep's own: its precision is set as that of whoever asked."""
+    task, double = given
+    jax.config.update("jax_enable_x64", double)
+    kept, case, request, chosen = pickle.loads(task)
+    return work(kept, case, request, chosen, chunk)
