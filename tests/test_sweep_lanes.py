@@ -69,9 +69,7 @@ def error(case: str, method, substeps: int) -> float:
 @pytest.mark.parametrize("method", [ABA864, None], ids=["splitting", "Tsit5"])
 def test_lanes_agree_with_scipy(case, method):
     # What is left is the dense look for the largest |x| on SciPy's side, (omega dt)^2 / 8 = 1e-7, and the steps.
-    # Without damping and at resonance the linear drive has no steady motion, and one a hair beside it stands in.
-    beside = method is not None and case == "undamped at resonance"
-    assert error(case, method, 100) < (1e-5 if beside else 1e-6)
+    assert error(case, method, 100) < 1e-6
 
 
 @pytest.mark.parametrize(("method", "factor"), [(STRANG, 3.0), (ABA864, 10.0), (SRKN14, 30.0)])

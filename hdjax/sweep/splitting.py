@@ -19,7 +19,9 @@ from hdjax.sweep.twist import SPRINGS, TwistEquation, twist_equation
 from hdjax.sweep.windows import Windows, largest_between
 from hdjax.where import where
 
-_LEAST_DETUNING = 1e-9
+# Of the linear drive from its resonance, as a part of omega_0^2: its forced motion is at most 1,000 times as large as
+# the twist that the torque would hold, and so are rounding errors.
+_LEAST_DETUNING = 1e-3
 _LEAST_RATE = 1e-3
 
 
@@ -87,13 +89,16 @@ def march_split(
         peaks: whether the largest |x| of each window is looked for.
     """
     equation = twist_equation(model)
-    mu, omega_0 = equation.drive.mu, equation.drive.omega_0
+    mu, square = equation.drive.mu, equation.drive.omega_0**2
     width = duration / windows
     h = width / substeps.astype(width.dtype)
-    motion = _ForcedMotion(equation, forcing)
-    discriminant = omega_0**2 - 0.25 * mu * mu
+    # At an undamped resonance there is no steady motion: a slightly stiffer drive has one, and the kicks make up for it.
+    resonant = jnp.abs(square - forcing.omega**2) + jnp.abs(mu * forcing.omega) < _LEAST_DETUNING * square
+    excess = where(resonant, 2.0 * _LEAST_DETUNING * square, 0.0)
+    motion = _ForcedMotion(equation, forcing, square + excess)
+    discriminant = square + excess - 0.25 * mu * mu
     # Any positive number: it makes the free motion of an oscillating drive a rotation.
-    rate = jnp.sqrt(jnp.maximum(jnp.abs(discriminant), (_LEAST_RATE * omega_0) ** 2))
+    rate = jnp.sqrt(jnp.maximum(jnp.abs(discriminant), _LEAST_RATE**2 * square))
 
     def flow(part: float) -> _Flow:
         return _free_motion(mu, discriminant, rate, part * h)
@@ -108,7 +113,7 @@ def march_split(
         p, q = y.real, y.imag
         for kick, (cosine, sine), free in zip(method.kicks, waves, flows, strict=True):
             x = q + (cosine * phase.real - sine * phase.imag) + motion.still
-            p, q = free(p + (kick * h / rate) * equation.kick(x), q)
+            p, q = free(p + (kick * h / rate) * (excess * x + equation.kick(x)), q)
         return jax.lax.complex(p, q)
 
     def at(y: Array, phase: Array) -> tuple[Array, Array, Array]:
@@ -116,7 +121,7 @@ def march_split(
         p, q = back(y.real, y.imag)
         x, v = motion.given(q, rate * p - 0.5 * mu * q, phase)
         push = motion.push * phase
-        return x, v, push.real + equation.gain * forcing.offset - mu * v - omega_0**2 * x + equation.kick(x)
+        return x, v, push.real + equation.gain * forcing.offset - mu * v - square * x + equation.kick(x)
 
     def start(y: Array, phase: Array) -> Array:
         q, v = motion.own(y.real, y.imag, phase)
@@ -144,19 +149,13 @@ def march_split(
 
 
 class _ForcedMotion:
-    """The steady motion of the linear drive: `still + Re(response exp(i omega t))`."""
+    """The steady motion of a linear drive with a squared natural frequency: `still + Re(response exp(i omega t))`."""
 
-    def __init__(self, equation: TwistEquation, forcing: Harmonic):
-        mu, square = equation.drive.mu, equation.drive.omega_0**2
-        omega, damping = forcing.omega, mu * forcing.omega
-        detuning = square - omega**2
-        # Without damping and at resonance itself there is no steady motion; a hair beside it there is.
-        singular = jnp.abs(detuning) + jnp.abs(damping) < _LEAST_DETUNING * square
-        self.omega = where(singular, omega * (1.0 + _LEAST_DETUNING), omega)
-        detuning = where(singular, -2.0 * _LEAST_DETUNING * square, detuning)
+    def __init__(self, equation: TwistEquation, forcing: Harmonic, square: Array):
+        self.omega = forcing.omega
         size = equation.gain * forcing.amplitude
         self.push = jax.lax.complex(size * jnp.cos(forcing.phase), size * jnp.sin(forcing.phase))
-        self.response = self.push / jax.lax.complex(detuning, damping)
+        self.response = self.push / jax.lax.complex(square - self.omega**2, equation.drive.mu * self.omega)
         self.still = equation.gain * forcing.offset / square
 
     def wave(self, later: Array) -> tuple[Array, Array]:
