@@ -22,7 +22,7 @@ def march_adaptively(
     *,
     windows: int,
     looks: int,
-    tolerance: float,
+    tolerance: Float[Array, ""],
     scale: Float[Array, ""],
 ) -> tuple[Windows, Bool[Array, ""]]:
     """March one drive by diffrax; a lane of a vmapped program.

@@ -67,10 +67,11 @@ def transients(
     tile, block = tile_for(request.design.size, _TILE), _BLOCK
     if route.method == "adaptive":
         tile, block = _ADAPTIVE_BLOCK, _ADAPTIVE_BLOCK
-    fixed = route if route.method == "adaptive" else dataclasses.replace(route, substeps=0)
+    # The looks of adaptive steps shape the program; numbers of steps and tolerances are data.
+    fixed = dataclasses.replace(route, substeps=route.substeps if route.method == "adaptive" else 0, tolerance=0.0)
     wanted = (request.duration, request.periods, request.windows, request.peaks)
-    steps = jnp.asarray(route.substeps, dtype=int)
-    return in_tiles(_Lanes(fixed, *wanted), (case, steps), values, tile=tile, block=block)
+    numbers = jnp.asarray(route.substeps, dtype=int), jnp.asarray(route.tolerance, dtype=float)
+    return in_tiles(_Lanes(fixed, *wanted), (case, *numbers), values, tile=tile, block=block)
 
 
 class _Lanes(eqx.Module):
@@ -83,18 +84,18 @@ class _Lanes(eqx.Module):
     windows: int = eqx.field(static=True)
     peaks: bool = eqx.field(static=True)
 
-    def __call__(self, constants: tuple[Case, Array], values: dict[str, Array]) -> tuple[Windows, Array]:
-        case, substeps = constants
+    def __call__(self, constants: tuple[Case, Array, Array], values: dict[str, Array]) -> tuple[Windows, Array]:
+        case, substeps, tolerance = constants
         dtype = jnp.float32 if self.route.single else jnp.result_type(float)
 
         def lane(values: dict[str, Array]) -> tuple[Windows, Array]:
             own = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, case.at(values))
-            return _motion(own, self, substeps)
+            return _motion(own, self, substeps, tolerance)
 
         return jax.vmap(lane)(values)
 
 
-def _motion(case: Case, wanted: _Lanes, substeps: Array) -> tuple[Windows, Array]:
+def _motion(case: Case, wanted: _Lanes, substeps: Array, tolerance: Array) -> tuple[Windows, Array]:
     """One point's transient from rest."""
     model, route, length = case.model, wanted.route, duration(case, wanted.duration, wanted.periods)
     common = {"windows": wanted.windows, "peaks": wanted.peaks}
@@ -107,7 +108,7 @@ def _motion(case: Case, wanted: _Lanes, substeps: Array) -> tuple[Windows, Array
             length,
             windows=wanted.windows,
             looks=route.substeps,
-            tolerance=route.tolerance,
+            tolerance=tolerance,
             scale=scale,
         )
     if route.method == "tsit5":
