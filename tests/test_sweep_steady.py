@@ -48,7 +48,7 @@ def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
 def test_points_solve_the_harmonic_balance_of_the_drive(effects):
     given, request = case(*effects), request_of(9)
     values = request.design.values(np.arange(request.design.size))
-    found = steady_states(given, request, SteadyRoute(9, True), values)
+    found = steady_states(given, request, SteadyRoute(9, True, 0.0), values)
     # A one-harmonic motion beyond the saddles of a softening spring, or with less damping, has no relative.
     assert found.exists.any(axis=1).all()
     # Samples of a force with corners are not exact.

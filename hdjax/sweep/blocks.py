@@ -29,7 +29,7 @@ def in_tiles(
         program: takes `constants` and a block's values, and gives arrays with one point a row. A function of a module,
             or equal to another one like it: it is compiled once.
         constants: arrays that all points share.
-        values: columns with one point an entry.
+        values: arrays with one point a row.
         tile: a power of two. The last point fills up the last tile.
         block: points that go together on a device, so that they stay in its cache.
     """
@@ -37,7 +37,7 @@ def in_tiles(
     parts = []
     for begin in range(0, count, tile):
         own = {path: v[begin : begin + tile] for path, v in values.items()}
-        filled = {path: jnp.asarray(np.pad(v, (0, tile - len(v)), mode="edge")) for path, v in own.items()}
+        filled = {path: jnp.asarray(_filled(v, tile)) for path, v in own.items()}
         # The same blocks on any number of devices: so the same points give the same bits.
         shared = spread(filled, tile) if tile >= block * len(jax.local_devices()) else filled
         sharding = next(iter(shared.values())).sharding
@@ -54,9 +54,9 @@ def _tile(program: Callable, constants: Any, values: dict[str, Array], mesh: Mes
     arrays, rest = eqx.partition(constants, eqx.is_array)
 
     def local(arrays: Any, values: dict[str, Array]) -> Any:
-        points = next(iter(values.values())).size
+        points = len(next(iter(values.values())))
         size = min(block, points)
-        blocks = jax.tree.map(lambda v: v.reshape(-1, size), values)
+        blocks = jax.tree.map(lambda v: v.reshape(-1, size, *v.shape[1:]), values)
         found = jax.lax.map(lambda v: program(eqx.combine(arrays, rest), v), blocks)
         return jax.tree.map(lambda a: a.reshape(points, *a.shape[2:]), found)
 
@@ -64,6 +64,11 @@ def _tile(program: Callable, constants: Any, values: dict[str, Array], mesh: Mes
         return local(arrays, values)
     places = {"in_specs": (_EVERYWHERE, _LANES), "out_specs": _LANES, "check_vma": False}
     return jax.shard_map(local, mesh=mesh, **places)(arrays, values)
+
+
+def _filled(rows: np.ndarray, tile: int) -> np.ndarray:
+    """Rows of a whole tile, of which the last one is repeated."""
+    return np.pad(rows, [(0, tile - len(rows)), *[(0, 0)] * (rows.ndim - 1)], mode="edge")
 
 
 def tile_for(points: int, most: int) -> int:

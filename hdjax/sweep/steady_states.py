@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -16,19 +17,22 @@ from hdjax.forcing import Harmonic
 from hdjax.sweep.blocks import in_tiles, tile_for
 from hdjax.sweep.choice import Check, drawn_points
 from hdjax.sweep.request import Case, Request
-from hdjax.sweep.steady import MOTIONS, Balanced, amplitude_roots, balance_lanes, symmetric, waves
+from hdjax.sweep.steady import MOTIONS, Balanced, amplitude_roots, balance_lanes, one_harmonic, symmetric, waves
 from hdjax.sweep.twist import has_twist_equation, twist_equation
 
 # A block's Jacobians stay in a core's cache.
 _BLOCK = 128
 _TILE = 32768
 _FEW, _MANY = 6, 40
-_HARMONICS = (3, 5, 7, 9, 13, 17, 25)
-_PILOT_HARMONICS = 17
+# A motion is balanced with few harmonics first, and with more where these leave out too much.
+_LADDER = (5, 11, 25)
+# Of the tolerance, what the harmonics left out may come to by their estimate.
+_SAFETY = 0.3
+_ATTEMPTS = 3
 _REFERENCE = 1e-11
 _LOOKS = 64
 _ALIKE = 1e-6
-_START = "amplitude to start from"
+_START = "series to start from"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,23 +40,30 @@ class SteadyRoute:
     """Harmonic balance.
 
     Attributes:
-        harmonics: the highest order kept.
+        harmonics: the highest order kept of any motion.
         odd: whether the even ones vanish.
+        truncation: how large the largest harmonic left out may be beside the largest one.
     """
 
     harmonics: int
     odd: bool
+    truncation: float
 
     @property
     def description(self) -> str:
         """What a reader is told."""
         kind = "odd harmonics" if self.odd else "harmonics"
-        return f"harmonic balance, {kind} up to {self.harmonics}, by lanes, double precision"
+        return f"harmonic balance by lanes, {kind} up to {self.harmonics} where a motion needs them, double precision"
 
     @property
     def orders(self) -> list[int]:
         """The orders kept, without the mean."""
         return list(range(1, self.harmonics + 1, 2 if self.odd else 1))
+
+    @property
+    def rungs(self) -> list[int]:
+        """Highest orders of the balances that are tried one after the other."""
+        return [*(h for h in _LADDER if h < self.harmonics), self.harmonics]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +77,7 @@ class SteadyStates:
         peak: largest |x| [rad].
         stable: no real multiplier above 1, that is not between two folds; False where there is no motion.
         exists: whether there is a motion.
-        truncation: estimated size of the first harmonic left out over the largest.
+        truncation: estimated size of the largest harmonic left out over the largest kept.
         lost: points of which a motion was not found.
     """
 
@@ -107,17 +118,24 @@ def steady_states(
         values: parameters of the points, by path.
     """
     count = len(next(iter(values.values())))
-    starts, exists = in_tiles(_roots, case, values, tile=tile_for(count, _TILE), block=_TILE)
+    starts, exists = in_tiles(_roots, case, values, tile=tile_for(count, _TILE), block=_BLOCK)
     if not np.isfinite(starts[exists]).all():
         raise ValueError("a steady sweep needs damping, a positive natural frequency and finite values at every point")
     point, motion = np.nonzero(exists)
     own = {path: v[point] for path, v in values.items()}
-    found = _balanced(case, request, route, own, starts[point, motion], _FEW)
-    slow = np.flatnonzero(~found.converged)
-    if slow.size:
-        # Few lanes need many iterations; with the others they would make these wait.
-        again = {path: v[slow] for path, v in own.items()}
-        found = _replaced(found, slow, _balanced(case, request, route, again, starts[point, motion][slow], _MANY))
+    found, waiting = None, np.arange(point.size)
+    series = np.zeros((point.size, 2, 1 if route.odd else 2))
+    series[..., -1] = starts[exists]
+    for harmonics in route.rungs:
+        kept = {path: v[waiting] for path, v in own.items()}
+        rung = _balanced(case, SteadyRoute(harmonics, route.odd, 0.0), kept, series[waiting])
+        found = _widened(rung, route) if found is None else _replaced(found, waiting, _widened(rung, route))
+        # A motion that was not found is looked for again from where it began.
+        series = np.where(found.converged[:, None, None], found.unknowns, _padded(series, found.unknowns.shape[-1]))
+        waiting = waiting[~(rung.converged & (rung.truncation <= route.truncation))]
+        if not waiting.size:
+            break
+    assert found is not None
     return _arranged(found, count, point, motion, route)
 
 
@@ -133,8 +151,8 @@ def _arranged(found: Balanced, count: int, point: np.ndarray, motion: np.ndarray
 
     converged = placed(np.asarray(found.converged), False)
     wanted = placed(np.ones(point.size, dtype=bool), False)
-    cosine, sine = (placed(unknowns[:, first::2][:, -n:], np.nan) for first in (0, 1))
-    mean = placed(np.zeros(point.size) if route.odd else unknowns[:, 0], np.nan)
+    cosine, sine = (placed(unknowns[:, part, -n:], np.nan) for part in (0, 1))
+    mean = placed(np.zeros(point.size) if route.odd else unknowns[:, 0, 0], np.nan)
     peak, truncation = placed(np.asarray(found.peak), np.nan), placed(np.asarray(found.truncation), np.nan)
     exists = converged.copy()
     # Near a fold two starts may end in one motion.
@@ -149,31 +167,56 @@ def _arranged(found: Balanced, count: int, point: np.ndarray, motion: np.ndarray
     return SteadyStates(mean, cosine, sine, peak, stable, exists, truncation, lost)
 
 
-def _balanced(
-    case: Case, request: Request, route: SteadyRoute, values: dict, starts: np.ndarray, iterations: int
-) -> Balanced:
-    tile = tile_for(starts.size, _TILE)
-    return in_tiles(_Balance(route, iterations), case, values | {_START: starts}, tile=tile, block=_BLOCK)
+def _balanced(case: Case, route: SteadyRoute, values: dict, series: np.ndarray) -> Balanced:
+    """A rung of the ladder: motions near series, with all harmonics of a route."""
+    width = len(route.orders) + (not route.odd)
+    starts = _padded(series, width)[..., :width]
+    program = _Balance(route.harmonics, route.odd)
+
+    def solved(rows: Any, iterations: int) -> Balanced:
+        own = {path: v[rows] for path, v in values.items()} | {_START: starts[rows]}
+        tile = tile_for(len(own[_START]), _TILE)
+        return in_tiles(program, (case, jnp.asarray(iterations)), own, tile=tile, block=_BLOCK)
+
+    found = solved(slice(None), _FEW)
+    slow = np.flatnonzero(~found.converged)
+    # Few lanes need many iterations; with the others they would make these wait.
+    return _replaced(found, slow, solved(slow, _MANY)) if slow.size else found
 
 
 class _Balance(eqx.Module):
     """Harmonic balance of a block of starts."""
 
-    route: SteadyRoute = eqx.field(static=True)
-    iterations: int = eqx.field(static=True)
+    harmonics: int = eqx.field(static=True)
+    odd: bool = eqx.field(static=True)
 
-    def __call__(self, case: Case, values: dict[str, Array]) -> Balanced:
+    def __call__(self, constants: tuple[Case, Array], values: dict[str, Array]) -> Balanced:
+        case, iterations = constants
+        start = jnp.moveaxis(values[_START], 0, -1)
         own = {path: v for path, v in values.items() if path != _START}
-        kept = waves(self.route.harmonics, odd=self.route.odd, smooth=not case.model.effects)
-        equation, push, still, omega = _posed_lanes(case, own, values[_START].size)
-        found = balance_lanes(equation, push, still, omega, values[_START], kept, iterations=self.iterations)
-        return eqx.tree_at(lambda b: b.unknowns, found, found.unknowns.T)
+        kept = waves(self.harmonics, odd=self.odd, smooth=not case.model.effects)
+        equation, push, still, omega = _posed_lanes(case, own, start.shape[-1])
+        found = balance_lanes(equation, push, still, omega, start, kept, iterations=iterations)
+        return eqx.tree_at(lambda b: b.unknowns, found, jnp.moveaxis(found.unknowns, -1, 0))
 
 
 def _roots(case: Case, values: dict[str, Array]) -> tuple[Array, Array]:
-    """One-harmonic amplitudes of a block of points."""
-    equation, push, _, omega = _posed_lanes(case, values, next(iter(values.values())).size)
-    return amplitude_roots(equation, push, omega)
+    """Cosine and sine of the one-harmonic motions of a block of points, and which of them exist."""
+    equation, push, _, omega = _posed_lanes(case, values, len(next(iter(values.values()))))
+    amplitudes, exists = amplitude_roots(equation, push, omega)
+    series = jax.vmap(one_harmonic, in_axes=(None, None, 1), out_axes=1)(equation, omega, amplitudes)
+    return jnp.stack(series, axis=-1), exists
+
+
+def _padded(series: np.ndarray, width: int) -> np.ndarray:
+    """Series with as many orders; those that are new are nothing."""
+    return np.pad(series, [(0, 0), (0, 0), (0, max(0, width - series.shape[-1]))])
+
+
+def _widened(found: Balanced, route: SteadyRoute) -> Balanced:
+    """Motions in as many harmonics as a route has."""
+    width = len(route.orders) + (not route.odd)
+    return eqx.tree_at(lambda b: b.unknowns, found, _padded(np.asarray(found.unknowns), width))
 
 
 def _posed_lanes(case: Case, values: dict[str, Array], lanes: int) -> tuple:
@@ -206,21 +249,20 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     values = request.design.values(pilot)
     offset = np.asarray(request.design.values(pilot).get("forcing.offset", case.forcing.offset))  # pyright: ignore
     odd = symmetric(case.model) and not np.any(offset)
-    # One solution with many harmonics tells what fewer would leave out.
-    full = SteadyRoute(_PILOT_HARMONICS, odd)
-    found = steady_states(case, request, full, values)
-    size = np.hypot(found.cosine, found.sine) / found.peak[..., None]
-    needed = [
-        h for h in _HARMONICS if np.nanmax(size[..., np.array(full.orders) > h], initial=0.0) <= request.tolerance
-    ]
-    route = SteadyRoute(min(needed, default=_HARMONICS[-1]), odd)
+    route = SteadyRoute(_LADDER[-1], odd, _SAFETY * request.tolerance)
+    found = steady_states(case, request, route, values)
+    # As many as any of the points takes, and the next more: other points may need them.
+    taken = np.max(np.array(route.orders) * np.any(found.cosine[found.exists] != 0.0, axis=0), initial=1)
+    rung = min(int(np.searchsorted(_LADDER, taken)) + 1, len(_LADDER) - 1)
     others = request.design.values(other)
-    while True:
+    for _ in range(_ATTEMPTS):
+        route = dataclasses.replace(route, harmonics=_LADDER[rung])
         check = _checked(case, steady_states(case, request, route, others), route, others)
-        finer = [h for h in _HARMONICS if h > route.harmonics]
-        if check.error <= request.tolerance or not finer:
-            return route, check
-        route = SteadyRoute(finer[0], odd)
+        if check.error <= request.tolerance:
+            break
+        rung = min(rung + 1, len(_LADDER) - 1)
+        route = dataclasses.replace(route, truncation=0.1 * route.truncation)
+    return route, check
 
 
 def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) -> Check:
