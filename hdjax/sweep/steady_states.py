@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from hdjax.dynamics import Model
 from hdjax.forcing import Harmonic
-from hdjax.sweep.blocks import in_tiles, tile_for
+from hdjax.sweep.blocks import in_tiles
 from hdjax.sweep.choice import Check, drawn_points
 from hdjax.sweep.request import Case, Request
 from hdjax.sweep.steady import MOTIONS, Balanced, amplitude_roots, balance_lanes, one_harmonic, symmetric, waves
@@ -22,7 +22,8 @@ from hdjax.sweep.twist import has_twist_equation, twist_equation
 
 # A block's Jacobians stay in a core's cache.
 _BLOCK = 128
-_TILE = 32768
+_TILE = 16384
+_FEW_BLOCKS = 16
 _FEW, _MANY = 6, 40
 # A motion is balanced with few harmonics first, and with more where these leave out too much.
 _LADDER = (5, 11, 25)
@@ -31,6 +32,7 @@ _SAFETY = 0.3
 _ATTEMPTS = 3
 _REFERENCE = 1e-11
 _LOOKS = 64
+_CHECKED_BLOCK = 64
 _ALIKE = 1e-6
 _START = "series to start from"
 
@@ -118,7 +120,7 @@ def steady_states(
         values: parameters of the points, by path.
     """
     count = len(next(iter(values.values())))
-    starts, exists = in_tiles(_roots, case, values, tile=tile_for(count, _TILE), block=_BLOCK)
+    starts, exists = in_tiles(_roots, case, values, tile=_tile(count), block=_BLOCK)
     if not np.isfinite(starts[exists]).all():
         raise ValueError("a steady sweep needs damping, a positive natural frequency and finite values at every point")
     point, motion = np.nonzero(exists)
@@ -175,13 +177,18 @@ def _balanced(case: Case, route: SteadyRoute, values: dict, series: np.ndarray) 
 
     def solved(rows: Any, iterations: int) -> Balanced:
         own = {path: v[rows] for path, v in values.items()} | {_START: starts[rows]}
-        tile = tile_for(len(own[_START]), _TILE)
+        tile = _tile(len(own[_START]))
         return in_tiles(program, (case, jnp.asarray(iterations)), own, tile=tile, block=_BLOCK)
 
     found = solved(slice(None), _FEW)
     slow = np.flatnonzero(~found.converged)
     # Few lanes need many iterations; with the others they would make these wait.
     return _replaced(found, slow, solved(slow, _MANY)) if slow.size else found
+
+
+def _tile(rows: int) -> int:
+    """One of two shapes of program: a third would take longer to compile than it saves."""
+    return _TILE if rows > _FEW_BLOCKS * _BLOCK else _BLOCK
 
 
 class _Balance(eqx.Module):
@@ -267,45 +274,52 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
 
 def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) -> Check:
     point, motion = np.nonzero(found.exists)
-    orders = np.array(route.orders, dtype=float)
-    rows = [getattr(found, name)[point, motion] for name in ("mean", "cosine", "sine", "peak")]
-    own = {path: jnp.asarray(v[point]) for path, v in values.items()}
-    errors, reached = (np.asarray(a) for a in _one_period(case, own, *map(jnp.asarray, (*rows, orders))))
+    # As many orders as there can be: one program for all routes.
+    orders = np.arange(1 if route.odd else 0, _LADDER[-1] + 1, 2 if route.odd else 1)
+    series = np.stack([found.cosine[point, motion], found.sine[point, motion]], axis=1)
+    if not route.odd:
+        mean = found.mean[point, motion]
+        series = np.concatenate([np.stack([mean, np.zeros_like(mean)], axis=1)[..., None], series], axis=-1)
+    own = {path: v[point] for path, v in values.items()} | {_START: _padded(series, orders.size)}
+    constants = case, jnp.asarray(orders.astype(float))
+    errors, reached = in_tiles(_one_period, constants, own, tile=_CHECKED_BLOCK, block=_CHECKED_BLOCK)
     reference = f"one period by adaptive Dopri8 of diffrax at rtol {_REFERENCE:g}"
     good = errors[reached]
     error, median = (float(np.max(good)), float(np.median(good))) if good.size else (math.nan, math.nan)
     return Check(int(point.size), int(np.sum(~reached)), error, median, reference)
 
 
-@eqx.filter_jit
-def _one_period(case: Case, values: dict, mean: Array, cosine: Array, sine: Array, peak: Array, orders: Array):
-    """How far a motion that starts on each series has left it within a period, and whether it was integrated."""
+def _one_period(constants: tuple[Case, Array], values: dict[str, Array]) -> tuple[Array, Array]:
+    """How far motions that start on their series have left them within a period, as a part of their size, and whether
+    they were integrated."""
+    case, orders = constants
+    at = jnp.linspace(0.0, 2 * np.pi, _LOOKS + 1)
+    waves = jnp.stack([jnp.cos(orders[:, None] * at[None, :]), jnp.sin(orders[:, None] * at[None, :])])
 
-    def one(values: dict, mean: Array, cosine: Array, sine: Array, peak: Array) -> tuple[Array, Array]:
+    def one(values: dict[str, Array]) -> tuple[Array, Array]:
+        series = values.pop(_START)
         equation, push, still, omega = _posed(case.at(values))
-        # In radians of the forcing, so that lanes step alike.
-        start = jnp.stack([mean + jnp.sum(cosine), jnp.sum(orders * sine)])
+        x = jnp.einsum("pk,pkt->t", series, waves)
+        size = jnp.max(jnp.abs(x))
 
         def field(angle, y: Array, _: object) -> Array:
+            # In radians of the forcing, so that lanes step alike.
             outside = push * jnp.cos(angle) + still
             return jnp.stack([y[1], equation.acceleration(y[0], omega * y[1], outside) / omega**2])
 
-        at = jnp.linspace(0.0, 2 * np.pi, _LOOKS + 1)
         solution = dfx.diffeqsolve(
             dfx.ODETerm(field),
             dfx.Dopri8(),
             0.0,
             2 * np.pi,
             None,
-            start,
+            jnp.stack([x[0], jnp.sum(orders * series[1])]),
             saveat=dfx.SaveAt(ts=at),
-            stepsize_controller=dfx.PIDController(rtol=_REFERENCE, atol=_REFERENCE * peak),
+            stepsize_controller=dfx.PIDController(rtol=_REFERENCE, atol=_REFERENCE * size),
             max_steps=100_000,
             throw=False,
         )
-        angles = orders[:, None] * at[None, :]
-        series = mean + cosine @ jnp.cos(angles) + sine @ jnp.sin(angles)
-        x = jnp.asarray(solution.ys)[:, 0]
-        return jnp.max(jnp.abs(x - series)) / peak, solution.result == dfx.RESULTS.successful
+        left = jnp.max(jnp.abs(jnp.asarray(solution.ys)[:, 0] - x)) / size
+        return left, solution.result == dfx.RESULTS.successful
 
-    return jax.vmap(one)(values, mean, cosine, sine, peak)
+    return jax.vmap(one)(values)
