@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +23,18 @@ from hdjax.sweep.transients import Route
 for name in ("xarray", "zarr", "distributed"):
     pytest.importorskip(name, reason=f"needs the extra `sweep`: {name} is not installed")
 
-CHUNK, CHUNKS = 64, 12
+CHUNK, CHUNKS = 64, 32
 CASE = Case(ReducedModel(ReducedDrive(mu=0.1, omega_0=1.0, alpha=0.5)), Harmonic(0.3, 1.0))
 CLIENT = """
 import sys, jax
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[1])
+from distributed import Client
 from test_sweep_store import CASE, slow_request
 from hdjax.sweep import sweep
 if __name__ == "__main__":
+    with Client(sys.argv[3]) as client:
+        client.wait_for_workers(int(sys.argv[4]))
     sweep(CASE.model, CASE.forcing, slow_request(), store=sys.argv[2], scheduler=sys.argv[3])
 """
 
@@ -40,14 +44,15 @@ def steady_request() -> Request:
 
 
 def slow_request() -> Request:
+    """Many short steps: a program that is soon compiled and then works for a fraction of a second on each chunk."""
     design = Design({"forcing.omega": np.linspace(0.5, 2.0, CHUNK * CHUNKS)})
-    return Request(design, "transient", ("peak", "trace"), duration=500.0, windows=8)
+    return Request(design, "transient", ("final",), duration=500.0, windows=1)
 
 
 def begun(folder: Path) -> Store:
     """A store of slow chunks, without the search for a route."""
     store = Store(folder, CASE, slow_request(), chunk=CHUNK)
-    store.begin(Plan(Route("adaptive", 20, tolerance=1e-8), Check(0, 0, 0.0, 0.0, "none")))
+    store.begin(Plan(Route("strang", 20_000), Check(0, 0, 0.0, 0.0, "none")))
     return store
 
 
@@ -91,52 +96,57 @@ def started(*arguments: str) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, *arguments], **quiet)
 
 
-def wait_for(what, seconds: float = 240.0) -> None:
+def wait_for(what: Callable[[], bool], *needed: subprocess.Popen, seconds: float = 240.0) -> None:
     end = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < end, "waited in vain"
+        assert all(process.poll() is None for process in needed), "a process has ended by itself"
         time.sleep(0.02)
+
+
+def marks(store: Store) -> dict[str, tuple[int, int]]:
+    """By chunk: the process that worked it out, and when [ns]."""
+    found = [p for p in (store.path / "finished").iterdir() if p.name.isdigit()]
+    return {p.name: (int(p.read_text().split()[-1]), p.stat().st_mtime_ns) for p in found}
 
 
 def test_killed_workers_and_a_killed_client_leave_the_same_bits(tmp_path):
     store, address_file = begun(tmp_path / "store"), tmp_path / "scheduler.json"
-    module = "distributed.cli.dask_"
-    scheduler = started(
-        "-m", module + "scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(address_file)
-    )
-    processes = [scheduler]
+    module, joins = "distributed.cli.dask_", ("--scheduler-file", str(address_file))
+    processes = [started("-m", module + "scheduler", "--port", "0", "--no-dashboard", *joins)]
+    worker = ("-m", module + "worker", *joins, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--preload", "hdjax")
+    processes += [started(*worker) for _ in range(2)]
+    _, first, second = processes
     try:
-        wait_for(address_file.exists)
-        joins = ("-m", module + "worker", "--scheduler-file", str(address_file), "--nthreads", "1")
-        workers = [started(*joins, "--no-nanny", "--no-dashboard") for _ in range(2)]
-        processes += workers
-        time.sleep(0.5)
+        wait_for(address_file.exists, *processes)
         address = json.loads(address_file.read_text())["address"]
         ask = ("-c", CLIENT, str(Path(__file__).parent), str(tmp_path / "store"), address)
-        client = started(*ask)
+        client = started(*ask, "2")
         processes.append(client)
-        wait_for(lambda: store.finished().sum() >= 2)
-        workers[0].send_signal(signal.SIGKILL)
-        wait_for(lambda: store.finished().sum() >= 4)
+        # Both are at work.
+        wait_for(lambda: {pid for pid, _ in marks(store).values()} == {first.pid, second.pid}, *processes)
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+        killed = len(marks(store))
+        wait_for(lambda: len(marks(store)) >= killed + 3, second, client)
         client.send_signal(signal.SIGKILL)
         client.wait()
-        assert not store.finished().all()
-        marks = {p: p.stat().st_mtime_ns for p in (store.path / "finished").iterdir() if p.name.isdigit()}
-        client = started(*ask)
+        # What the other worker is at may still be finished.
+        time.sleep(1.0)
+        left = marks(store)
+        assert killed < len(left) < store.chunks
+        client = started(*ask, "1")
         processes.append(client)
         assert client.wait(timeout=240) == 0
     finally:
         for process in processes:
             process.kill()
             process.wait()
-    assert store.finished().all()
-    assert all(p.stat().st_mtime_ns == then for p, then in marks.items())
-    whole = {name: [] for name in store.read()}
+    done = marks(store)
+    assert store.finished().all() and left.items() <= done.items()
     plan = store.plan
     assert plan is not None
-    for chunk in range(store.chunks):
-        values = slow_request().design.values(store.points(chunk))
-        for name, rows in answers(CASE, slow_request(), plan, values).items():
-            whole[name].append(rows)
+    own = [slow_request().design.values(store.points(chunk)) for chunk in range(store.chunks)]
+    undisturbed = [answers(CASE, slow_request(), plan, values) for values in own]
     for name, rows in store.read().items():
-        assert rows.tobytes() == np.concatenate(whole[name]).tobytes()
+        assert rows.tobytes() == np.concatenate([found[name] for found in undisturbed]).tobytes()

@@ -7,6 +7,7 @@ folder, which they must see under the same path.
 
 import json
 import os
+import platform
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -93,12 +94,12 @@ class Store:
         return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self._request.design.size))
 
     def write(self, chunk: int, found: dict[str, np.ndarray]) -> None:
-        """Keep a chunk, and mark it."""
+        """Keep a chunk, and mark it with who worked it out: host and process."""
         group = required("zarr").open_group(self.path / "data", mode="r+")
         points = self.points(chunk)
         for name, values in found.items():
             group[name][points[0] : points[-1] + 1] = values
-        _write(self.path / _MARKS / str(chunk), "")
+        _write(self.path / _MARKS / str(chunk), f"{platform.node()} {os.getpid()}")
 
     def read(self) -> dict[str, np.ndarray]:
         """All variables, one point a row."""
