@@ -21,12 +21,13 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from hdjax import Harmonic, ReducedDrive, ReducedModel
-from hdjax.sweep.choice import choose, drawn_points
-from hdjax.sweep.design import Design, drawn, spread_values
+from hdjax.sweep.cheapest_route import choose
+from hdjax.sweep.check import drawn_points
+from hdjax.sweep.points import Points, drawn, spread_values
 from hdjax.sweep.request import Case, Request
 from hdjax.sweep.splitting import ABA864
 from hdjax.sweep.steady_states import choose_steady, steady_states
-from hdjax.sweep.transients import Route, transients
+from hdjax.sweep.transients import TransientRoute, transients
 
 DURATION, TOLERANCE = 1.0, 1e-6
 FORCING = 10.0 / (50 * 5.26e-4)  # the seed's 10 N m as an acceleration of the dynamic error [rad/s^2]
@@ -201,24 +202,24 @@ def best_of(runs: dict[str, Callable[[], object]], repeats: int) -> dict[str, fl
     return best
 
 
-def designed(drives: int, alpha: float = ALPHA) -> Request:
+def requested(drives: int, alpha: float = ALPHA) -> Request:
     sample = drawn(RANGES | {"alpha": (0.0, alpha, "linear")}, drives, seed=1)
-    return Request(Design(sample=sample), "transient", ("final",), duration=DURATION, windows=1, tolerance=TOLERANCE)
+    return Request(Points(sample=sample), "transient", ("final",), duration=DURATION, windows=1, tolerance=TOLERANCE)
 
 
 def transient_benchmark(drives: int, alpha: float, repeats: int, folder: Path) -> None:
     case = Case(ReducedModel(ReducedDrive(mu=1.0, omega_0=400.0, alpha=0.0)), Harmonic(FORCING, 400.0))
-    request = designed(drives, alpha)
+    request = requested(drives, alpha)
     print(f"-- alpha up to {alpha:g} rad^-2")
     start = time.perf_counter()
     route, check = choose(case, request)
     print(f"hdjax: {route.description}; chosen and checked in {time.perf_counter() - start:.1f} s (compilation in it)")
     print(f"  error against {check.reference}: {check.error:.1e} at most, {check.median:.1e} in the median")
     assert check.error <= TOLERANCE
-    columns = request.design.values(np.arange(drives))
+    columns = request.points.values(np.arange(drives))
     runs: dict[str, Callable[[], object]] = {"hdjax": lambda: transients(case, request, route, columns)}
-    few = request.design.values(np.concatenate(drawn_points(request)))
-    exact, _ = transients(case, request, Route("adaptive", 256), few)
+    few = request.points.values(np.concatenate(drawn_points(request)))
+    exact, _ = transients(case, request, TransientRoute("adaptive", 256), few)
     truth, size = exact.x[:, -1], exact.peak.max(axis=1)
     print(f"  alpha x^2 in the sample: up to {np.max(few['alpha'] * size**2):.2f}")
     library = compiled(folder)
@@ -268,9 +269,9 @@ def scaling(sizes: list[int]) -> None:
     case = Case(ReducedModel(ReducedDrive(mu=1.0, omega_0=400.0, alpha=0.0)), Harmonic(FORCING, 400.0))
     route = None
     for drives in sizes:
-        request = designed(drives)
+        request = requested(drives)
         route = route or choose(case, request)[0]
-        columns = request.design.values(np.arange(drives))
+        columns = request.points.values(np.arange(drives))
         best = best_of({"run": lambda c=columns, r=request, o=route: transients(case, r, o, c)}, 4)["run"]
         held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"{drives:>8} drives: {best / drives * 1e6:.2f} us a drive; {held:.0f} MiB held at most so far")
@@ -281,14 +282,14 @@ def steady_benchmark(points: int) -> None:
     case = Case(ReducedModel(ReducedDrive(mu=0.1, omega_0=1.0, alpha=0.5)), Harmonic(0.3, 1.0))
     drives = max(1, points // 1000)
     sample = drawn({"mu": (0.03, 0.3, "log"), "alpha": (0.0, 1.0, "linear")}, drives, seed=1)
-    request = Request(Design({"forcing.omega": spread_values(0.3, 2.5, points // drives)}, sample))
+    request = Request(Points({"forcing.omega": spread_values(0.3, 2.5, points // drives)}, sample))
     start = time.perf_counter()
     route, check = choose_steady(case, request)
     chosen = time.perf_counter() - start
     print(f"steady: {route.description}; chosen and checked in {chosen:.1f} s, error {check.error:.1e}")
-    size, begin, several, lost = request.design.size, time.perf_counter(), 0, 0
+    size, begin, several, lost = request.points.size, time.perf_counter(), 0, 0
     for first in range(0, size, 65536):
-        found = steady_states(case, request, route, request.design.values(np.arange(first, min(first + 65536, size))))
+        found = steady_states(case, request, route, request.points.values(np.arange(first, min(first + 65536, size))))
         several, lost = several + int(np.sum(found.exists.sum(axis=1) > 1)), lost + int(found.lost.sum())
     seconds = time.perf_counter() - begin
     print(f"  {size} points in {seconds:.1f} s; {several} with several motions, {lost} with one that was not found")

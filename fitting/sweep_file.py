@@ -12,14 +12,14 @@ from fitting.errors import InputError
 from fitting.model_file import read_model
 from hdjax import PRESETS, Harmonic, Model, TwoInertiaModel
 from hdjax.effects import BY_NAME
-from hdjax.sweep import Design, Request, drawn, spread_values
-from hdjax.sweep.design import RULES
+from hdjax.sweep import Points, Request, drawn, spread_values
+from hdjax.sweep.points import RULES
 from hdjax.sweep.request import OUTPUTS
 
 _SECTIONS = ("drive", "effects", "forcing", "axes", "sample", "sweep")
 _FORCING = ("amplitude", "omega", "phase", "offset")
 _RANGE = ("from", "to", "points", "spacing")
-_SWEEP = tuple(f.name for f in dataclasses.fields(Request) if f.name != "design")
+_SWEEP = tuple(f.name for f in dataclasses.fields(Request) if f.name != "points")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,8 +55,8 @@ def read_sweep_file(path: Path) -> SweepFile:
         model = _model(path, sections["drive"], sections["effects"])
         forcing = _forcing(path, sections["forcing"])
         settings = _settings(path, sections["sweep"])
-        design = Design(_axes(path, sections["axes"]), _sample(path, sections["sample"]))
-        return SweepFile(model, forcing, Request(design, **settings))
+        points = Points(_axes(path, sections["axes"]), _sample(path, sections["sample"]))
+        return SweepFile(model, forcing, Request(points, **settings))
     except (TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise

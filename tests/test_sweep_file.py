@@ -5,7 +5,7 @@ import pytest
 
 from fitting.errors import InputError
 from fitting.sweep_file import read_sweep_file
-from hdjax.sweep.design import Design, drawn
+from hdjax.sweep.points import Points, drawn
 
 GOOD = """
 [drive]
@@ -36,13 +36,13 @@ def written(tmp_path, text):
     return path
 
 
-def test_a_sweep_file_is_a_model_a_forcing_and_a_design(tmp_path):
+def test_a_sweep_file_is_a_model_a_forcing_and_points(tmp_path):
     found = read_sweep_file(written(tmp_path, GOOD))
     assert float(found.model.drive.alpha) == 50.0 and float(found.model.get("quadratic_stiffness.k2")) == 0.5
     assert float(found.forcing.amplitude) == 2.0 and found.request.tolerance == 1e-5
-    assert found.request.design.shape == {"K": 4, "forcing.omega": 2, "sample": 5}
-    np.testing.assert_allclose(found.request.design.axes["K"], 6e3 * 1.5 ** (np.arange(4) / 3))
-    assert np.all(np.abs(found.request.design.sample["quadratic_stiffness.k2"]) <= 1.0)
+    assert found.request.points.shape == {"K": 4, "forcing.omega": 2, "sample": 5}
+    np.testing.assert_allclose(found.request.points.axes["K"], 6e3 * 1.5 ** (np.arange(4) / 3))
+    assert np.all(np.abs(found.request.points.sample["quadratic_stiffness.k2"]) <= 1.0)
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_a_drawn_sample_fills_its_ranges(rule):
 
 
 def test_points_count_with_the_last_dimension_fastest():
-    design = Design({"K": np.array([1.0, 2.0]), "J_l": np.array([3.0, 4.0, 5.0])}, {"alpha": np.array([6.0, 7.0])})
-    found = design.values(np.arange(design.size))
+    points = Points({"K": np.array([1.0, 2.0]), "J_l": np.array([3.0, 4.0, 5.0])}, {"alpha": np.array([6.0, 7.0])})
+    found = points.values(np.arange(points.size))
     grid = np.meshgrid([1.0, 2.0], [3.0, 4.0, 5.0], [6.0, 7.0], indexing="ij")
     for name, values in zip(("K", "J_l", "alpha"), grid, strict=True):
         np.testing.assert_array_equal(found[name], values.reshape(-1))

@@ -9,12 +9,12 @@ from scipy.integrate import solve_ivp
 
 from hdjax import Drive, Harmonic, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME
-from hdjax.sweep.choice import choose
-from hdjax.sweep.design import Design
+from hdjax.sweep.cheapest_route import choose
+from hdjax.sweep.points import Points
 from hdjax.sweep.request import Case, Request
+from hdjax.sweep.runge_kutta import march_steps
 from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split
-from hdjax.sweep.stepping import march_steps
-from hdjax.sweep.transients import Route, transients
+from hdjax.sweep.transients import TransientRoute, transients
 from hdjax.sweep.windows import Windows, largest_between
 
 DURATION, WINDOWS = 40.0, 4
@@ -106,8 +106,8 @@ def drive_case(*effects, alpha: float = 20.0) -> Case:
 
 
 def requested(tolerance: float, outputs=("final",)) -> Request:
-    design = Design({"K": np.linspace(6e3, 8e3, 4), "forcing.omega": np.linspace(300.0, 450.0, 20)})
-    return Request(design, "transient", outputs, duration=0.1, windows=2, tolerance=tolerance)
+    points = Points({"K": np.linspace(6e3, 8e3, 4), "forcing.omega": np.linspace(300.0, 450.0, 20)})
+    return Request(points, "transient", outputs, duration=0.1, windows=2, tolerance=tolerance)
 
 
 @pytest.mark.parametrize(
@@ -130,9 +130,9 @@ def test_the_cheapest_route_keeps_the_tolerance(case, tolerance, method):
 
 def test_two_inertias_by_splitting_are_two_inertias_by_adaptive_steps():
     case, request = drive_case(BY_NAME["quadratic_stiffness"](k2=2.0)), requested(1e-6)
-    values = request.design.values(np.arange(70))
-    exact, reached = transients(case, request, Route("adaptive", 40), values)
-    found, _ = transients(case, request, Route("aba864", 100), values)
+    values = request.points.values(np.arange(70))
+    exact, reached = transients(case, request, TransientRoute("adaptive", 40), values)
+    found, _ = transients(case, request, TransientRoute("aba864", 100), values)
     assert reached.all() and exact.x.shape == (70, 2)
     # The tolerance of the reference is 1e-11 a step.
     np.testing.assert_allclose(found.x, exact.x, rtol=0.0, atol=1e-8 * np.abs(exact.x).max())

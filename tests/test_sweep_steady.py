@@ -8,12 +8,12 @@ import pytest
 from hdjax import Harmonic, ReducedDrive, ReducedModel, harmonic_series
 from hdjax.effects import BY_NAME
 from hdjax.response.harmonic_balance import balance, solve
-from hdjax.sweep.answers import answers, plan, variables
-from hdjax.sweep.design import Design
+from hdjax.sweep.balance import amplitude_roots
+from hdjax.sweep.outputs import answers, plan, variables
+from hdjax.sweep.points import Points
 from hdjax.sweep.request import Case, Request
-from hdjax.sweep.steady import amplitude_roots
 from hdjax.sweep.steady_states import SteadyRoute, choose_steady, steady_states
-from hdjax.sweep.twist import twist_equation
+from hdjax.sweep.twist_equation import twist_equation
 
 AMPLITUDE = 0.3
 
@@ -24,7 +24,7 @@ def case(*effects) -> Case:
 
 def request_of(points: int) -> Request:
     alphas = np.array([-0.02, 0.0, 0.5, 1.0])
-    return Request(Design({"alpha": alphas, "forcing.omega": np.linspace(0.4, 2.2, points)}), outputs=("harmonics",))
+    return Request(Points({"alpha": alphas, "forcing.omega": np.linspace(0.4, 2.2, points)}), outputs=("harmonics",))
 
 
 def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
@@ -47,13 +47,13 @@ def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
 @pytest.mark.parametrize("effects", [(), (BY_NAME["quadratic_damping"](c2=0.1),)], ids=["cubic", "damped by the rate"])
 def test_points_solve_the_harmonic_balance_of_the_drive(effects):
     given, request = case(*effects), request_of(9)
-    values = request.design.values(np.arange(request.design.size))
+    values = request.points.values(np.arange(request.points.size))
     found = steady_states(given, request, SteadyRoute(9, True, 0.0), values)
     # A one-harmonic motion beyond the saddles of a softening spring, or with less damping, has no relative.
     assert found.exists.any(axis=1).all()
     # Samples of a force with corners are not exact.
     tolerance = 1e-3 if effects else 1e-9
-    for i in range(0, request.design.size, 4):
+    for i in range(0, request.points.size, 4):
         model = given.model.replace({"alpha": values["alpha"][i]})
         one = solve(balance(model, harmonic_series(1.0, AMPLITUDE), harmonics=9), values["forcing.omega"][i])
         assert bool(one.converged)
@@ -67,16 +67,16 @@ def test_the_motion_between_the_folds_is_unstable_and_the_series_is_the_motion()
     given, request = case(), request_of(150)
     route, check = choose_steady(given, request)
     assert 0.0 < check.error <= request.tolerance
-    found = steady_states(given, request, route, request.design.values(np.arange(request.design.size)))
+    found = steady_states(given, request, route, request.points.values(np.arange(request.points.size)))
     several = found.exists.sum(axis=1) == 3
     assert several.sum() > 10
     assert not found.stable[several, 1].any() and found.stable[several][:, [0, 2]].all()
 
 
 def test_phases_turn_with_the_forcing():
-    request = Request(Design({"forcing.phase": np.array([0.0, 0.7]), "forcing.omega": np.array([0.6, 1.9])}))
-    request = Request(request.design, outputs=("harmonics",))
-    found = answers(case(), request, plan(case(), request), request.design.values(np.arange(4)))
+    request = Request(Points({"forcing.phase": np.array([0.0, 0.7]), "forcing.omega": np.array([0.6, 1.9])}))
+    request = Request(request.points, outputs=("harmonics",))
+    found = answers(case(), request, plan(case(), request), request.points.values(np.arange(4)))
     assert {v.name for v in variables(request)} == set(found)
     phase, there = found["harmonic_phase"].reshape(2, 2, 3, -1), ~np.isnan(found["mean"]).reshape(2, 2, 3)[0]
     turned = np.exp(1j * (phase[1] - phase[0]))[there]

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from hdjax import Harmonic, ReducedDrive, ReducedModel
-from hdjax.sweep import Design, Request, sweep
-from hdjax.sweep.answers import Plan, answers
-from hdjax.sweep.choice import Check
+from hdjax.sweep import Points, Request, sweep
+from hdjax.sweep.check import Check
+from hdjax.sweep.outputs import Plan, answers
 from hdjax.sweep.request import Case, digest
 from hdjax.sweep.store import Store
-from hdjax.sweep.transients import Route
+from hdjax.sweep.transients import TransientRoute
 
 for name in ("xarray", "zarr", "distributed"):
     pytest.importorskip(name, reason=f"needs the extra `sweep`: {name} is not installed")
@@ -40,19 +40,19 @@ if __name__ == "__main__":
 
 
 def steady_request() -> Request:
-    return Request(Design({"alpha": np.array([0.0, 0.5]), "forcing.omega": np.linspace(0.5, 2.0, 40)}))
+    return Request(Points({"alpha": np.array([0.0, 0.5]), "forcing.omega": np.linspace(0.5, 2.0, 40)}))
 
 
 def slow_request() -> Request:
     """Many short steps: a program that is soon compiled and then works for a fraction of a second on each chunk."""
-    design = Design({"forcing.omega": np.linspace(0.5, 2.0, CHUNK * CHUNKS)})
-    return Request(design, "transient", ("final",), duration=500.0, windows=1)
+    points = Points({"forcing.omega": np.linspace(0.5, 2.0, CHUNK * CHUNKS)})
+    return Request(points, "transient", ("final",), duration=500.0, windows=1)
 
 
 def begun(folder: Path) -> Store:
     """A store of slow chunks, without the search for a route."""
     store = Store(folder, CASE, slow_request(), chunk=CHUNK)
-    store.begin(Plan(Route("strang", 20_000), Check(0, 0, 0.0, 0.0, "none")))
+    store.begin(Plan(TransientRoute("strang", 10_000), Check(0, 0, 0.0, 0.0, "none")))
     return store
 
 
@@ -71,10 +71,10 @@ def test_a_sweep_has_names_units_and_the_points_own_values():
 
 
 def test_a_settled_transient_has_the_steady_peak_and_a_settling_time():
-    design = Design({"forcing.omega": np.array([0.4, 0.6, 1.9])})
-    request = Request(design, "transient", ("peak", "settling_time", "trace"), periods=40.0, windows=40)
+    points = Points({"forcing.omega": np.array([0.4, 0.6, 1.9])})
+    request = Request(points, "transient", ("peak", "settling_time", "trace"), periods=40.0, windows=40)
     found = sweep(CASE.model, CASE.forcing, request)
-    steady = sweep(CASE.model, CASE.forcing, Request(design, outputs=("peak",)))
+    steady = sweep(CASE.model, CASE.forcing, Request(points, outputs=("peak",)))
     assert found.x.dims == ("forcing.omega", "window") and found.tolerance_kept
     # exp(-mu t / 2) falls to the band of 2 % of the transient's own size in about 80 s; from rest it is of the order
     # of the motion.
@@ -146,7 +146,7 @@ def test_killed_workers_and_a_killed_client_leave_the_same_bits(tmp_path):
     assert store.finished().all() and left.items() <= done.items()
     plan = store.plan
     assert plan is not None
-    own = [slow_request().design.values(store.points(chunk)) for chunk in range(store.chunks)]
+    own = [slow_request().points.values(store.points(chunk)) for chunk in range(store.chunks)]
     undisturbed = [answers(CASE, slow_request(), plan, values) for values in own]
     for name, rows in store.read().items():
         assert rows.tobytes() == np.concatenate([found[name] for found in undisturbed]).tobytes()

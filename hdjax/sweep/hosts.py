@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import jax
 
-from hdjax.sweep.answers import Plan
+from hdjax.sweep.outputs import Plan
 from hdjax.sweep.request import Case, Request
 from hdjax.sweep.store import Store, required, work
 

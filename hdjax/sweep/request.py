@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hdjax.dynamics import Model
-from hdjax.sweep.design import Design
+from hdjax.sweep.points import Points
 
 Response = Literal["steady", "transient"]
 OUTPUTS: dict[Response, tuple[str, ...]] = {
@@ -28,11 +28,11 @@ _ALGORITHMS = 1  # raised when the same request would be answered otherwise
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is wanted of every point of a design.
+    """What is wanted of every point.
 
     Attributes:
-        design: the points. Parameters go by their dotted paths: those of the model (`K`, `backlash.b`), and those of
-            the forcing behind `forcing.` (`forcing.omega`).
+        points: by their parameters' dotted paths: those of the model (`K`, `backlash.b`), and those of the forcing
+            behind `forcing.` (`forcing.omega`).
         response: `"steady"` for the periodic motions under a harmonic forcing, all that relate to the one-harmonic
             ones; `"transient"` for the motion from rest.
         outputs: some of [`OUTPUTS`][] of that response.
@@ -45,7 +45,7 @@ class Request:
         seed: of the samples on which the route is chosen and checked.
     """
 
-    design: Design
+    points: Points
     response: Response = "steady"
     outputs: tuple[str, ...] = ("amplitude", "peak")
     duration: float | None = None
@@ -100,14 +100,14 @@ class Case(eqx.Module):
             forcing = eqx.tree_at(lambda f: [getattr(f, name) for name in outside], forcing, list(outside.values()))
         return Case(self.model.replace(own) if own else self.model, forcing)
 
-    def require(self, design: Design) -> None:
-        """Refuse a design of parameters that the case has not.
+    def require(self, points: Points) -> None:
+        """Refuse points of parameters that the case has not.
 
         Raises:
             ValueError: that names the parameter and what there is.
         """
         known = [*self.model.parameters(), *(FORCING + name for name in vars(self.forcing))]
-        for path in design.paths:
+        for path in points.paths:
             if path not in known:
                 raise ValueError(f"`{path}` is no parameter of this sweep; there are {', '.join(known)}")
 
@@ -123,10 +123,10 @@ def digest(case: Case, request: Request) -> str:
     """A name for what is asked: the same question has the same name, any other another one."""
     texts: list[Any] = [version("hdjax"), _ALGORITHMS, jax.config.read("jax_enable_x64")]
     for field in dataclasses.fields(request):
-        if field.name != "design":
+        if field.name != "points":
             texts.append([field.name, getattr(request, field.name)])
     for kind in ("axes", "sample"):
-        for name, column in getattr(request.design, kind).items():
+        for name, column in getattr(request.points, kind).items():
             texts.append([kind, name, hashlib.sha256(np.ascontiguousarray(column, dtype=float).tobytes()).hexdigest()])
     texts.append([type(case.model).__name__, *(e.name for e in case.model.effects), type(case.forcing).__name__])
     leaves = jax.tree_util.tree_leaves_with_path(case)

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from hdjax.dynamics import Model
-from hdjax.sweep.answers import Plan, answers, extra_dims, plan, variables
-from hdjax.sweep.design import SAMPLE
 from hdjax.sweep.hosts import spread_chunks
+from hdjax.sweep.outputs import Plan, answers, extra_dims, plan, variables
+from hdjax.sweep.points import SAMPLE
 from hdjax.sweep.request import Case, Request, digest
 from hdjax.sweep.store import Store, required, work
 
@@ -51,7 +51,7 @@ def sweep(
         progress: told how many points of how many are done.
 
     Returns:
-        An xarray.Dataset with a dimension for each axis of the design (and `sample`). Its attributes name the route,
+        An xarray.Dataset with a dimension for each axis (and `sample`). Its attributes name the route,
         the check on a drawn sample and what it cost.
 
     Raises:
@@ -60,7 +60,7 @@ def sweep(
     """
     required("xarray")
     case = Case(model, forcing)
-    case.require(request.design)
+    case.require(request.points)
     begin = time.perf_counter()
     if store is None:
         if workers or scheduler:
@@ -96,8 +96,8 @@ def _fill(
     progress: Callable[[int, int], None],
 ) -> None:
     waiting = [int(c) for c in np.flatnonzero(~kept.finished())]
-    done = request.design.size - sum(kept.points(c).size for c in waiting)
-    progress(done, request.design.size)
+    done = request.points.size - sum(kept.points(c).size for c in waiting)
+    progress(done, request.points.size)
     if not waiting:
         return
     if workers or scheduler:
@@ -106,16 +106,16 @@ def _fill(
         chunks = (work(kept, case, request, chosen, chunk) for chunk in waiting)
     for chunk in chunks:
         done += kept.points(chunk).size
-        progress(done, request.design.size)
+        progress(done, request.points.size)
 
 
 def _in_memory(
     case: Case, request: Request, chosen: Plan, chunk: int, progress: Callable[[int, int], None]
 ) -> dict[str, np.ndarray]:
-    size, parts = request.design.size, []
+    size, parts = request.points.size, []
     for begin in range(0, size, chunk):
         points = np.arange(begin, min(begin + chunk, size))
-        parts.append(answers(case, request, chosen, request.design.values(points)))
+        parts.append(answers(case, request, chosen, request.points.values(points)))
         progress(min(begin + chunk, size), size)
     return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
@@ -126,25 +126,25 @@ def _chunk_points(request: Request, chosen: Plan, memory: int) -> int:
     widest = max(math.prod(lengths[d] for d in v.dims) for v in variables(request))
     # A transient holds twist, rate and peak of every window; a steady motion all its harmonics and their matrix's rows.
     held = 3 * request.windows if request.response == "transient" else 6 * len(lengths) + 6 * lengths["harmonic"]
-    most = memory // (8 * _COPIES * (widest + held + len(request.design.paths)))
+    most = memory // (8 * _COPIES * (widest + held + len(request.points.paths)))
     return 1 << max(6, min(int(most), _LARGEST_CHUNK).bit_length() - 1)
 
 
 def dataset(case: Case, request: Request, chosen: Plan, found: dict[str, np.ndarray], *, seconds: float) -> Any:
     """The result with named coordinates and units."""
     xarray = required("xarray")
-    shape, design = request.design.shape, request.design
+    shape, points = request.points.shape, request.points
     extra = extra_dims(request, chosen)
     coordinates: dict[str, Any] = {
-        name: ((name,), values, {"units": case.unit(name)}) for name, values in design.axes.items()
+        name: ((name,), values, {"units": case.unit(name)}) for name, values in points.axes.items()
     }
-    coordinates |= {name: ((SAMPLE,), column, {"units": case.unit(name)}) for name, column in design.sample.items()}
+    coordinates |= {name: ((SAMPLE,), column, {"units": case.unit(name)}) for name, column in points.sample.items()}
     data = {}
     for v in variables(request):
         values = found[v.name].reshape(*shape.values(), *found[v.name].shape[1:])
         data[v.name] = ((*shape, *v.dims), values, {"units": v.unit, "long_name": v.doc})
         coordinates |= {d: ((d,), extra[d], {"long_name": _MEANINGS[d]}) for d in v.dims}
-    if "motions" in data and "forcing.omega" in design.axes:
+    if "motions" in data and "forcing.omega" in points.axes:
         data["fold"] = _folds(data["motions"])
     if request.duration is not None and "window" in coordinates:
         coordinates["time"] = (("window",), extra["window"] * request.duration, {"units": "s"})
@@ -159,7 +159,7 @@ def dataset(case: Case, request: Request, chosen: Plan, found: dict[str, np.ndar
         "unfinished_by_reference": check.unfinished,
         "tolerance": request.tolerance,
         "tolerance_kept": int(check.error <= request.tolerance),
-        "points": design.size,
+        "points": points.size,
         "seconds": seconds,
     }
     return xarray.Dataset(data, coordinates, attributes)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from hdjax.dynamics import Model
 from hdjax.forcing import Harmonic
-from hdjax.sweep.twist import SPRINGS, TwistEquation, twist_equation
+from hdjax.sweep.twist_equation import SPRINGS, TwistEquation, twist_equation
 from hdjax.sweep.windows import Windows, largest_between
 from hdjax.where import where
 
@@ -92,7 +92,7 @@ def march_split(
     mu, square = equation.drive.mu, equation.drive.omega_0**2
     width = duration / windows
     h = width / substeps.astype(width.dtype)
-    # At an undamped resonance there is no steady motion: a slightly stiffer drive has one, and the kicks make up for it.
+    # At an undamped resonance there is no steady motion; a stiffer drive has one, and the kicks make up for it.
     resonant = jnp.abs(square - forcing.omega**2) + jnp.abs(mu * forcing.omega) < _LEAST_DETUNING * square
     excess = where(resonant, 2.0 * _LEAST_DETUNING * square, 0.0)
     motion = _ForcedMotion(equation, forcing, square + excess)

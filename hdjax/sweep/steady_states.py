@@ -14,11 +14,11 @@ from jaxtyping import Array, Bool, Float
 
 from hdjax.dynamics import Model
 from hdjax.forcing import Harmonic
-from hdjax.sweep.blocks import in_tiles
-from hdjax.sweep.choice import Check, drawn_points
+from hdjax.sweep.balance import MOTIONS, Balanced, amplitude_roots, balance_lanes, one_harmonic, symmetric, waves
+from hdjax.sweep.check import Check, drawn_points
 from hdjax.sweep.request import Case, Request
-from hdjax.sweep.steady import MOTIONS, Balanced, amplitude_roots, balance_lanes, one_harmonic, symmetric, waves
-from hdjax.sweep.twist import has_twist_equation, twist_equation
+from hdjax.sweep.tiles import in_tiles
+from hdjax.sweep.twist_equation import has_twist_equation, twist_equation
 
 # A block's Jacobians stay in a core's cache.
 _BLOCK = 128
@@ -253,15 +253,15 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     """
     require_balanced(case.model, case.forcing)
     pilot, other = drawn_points(request)
-    values = request.design.values(pilot)
-    offset = np.asarray(request.design.values(pilot).get("forcing.offset", case.forcing.offset))  # pyright: ignore
+    values = request.points.values(pilot)
+    offset = np.asarray(request.points.values(pilot).get("forcing.offset", case.forcing.offset))  # pyright: ignore
     odd = symmetric(case.model) and not np.any(offset)
     route = SteadyRoute(_LADDER[-1], odd, _SAFETY * request.tolerance)
     found = steady_states(case, request, route, values)
     # As many as any of the points takes, and the next more: other points may need them.
     taken = np.max(np.array(route.orders) * np.any(found.cosine[found.exists] != 0.0, axis=0), initial=1)
     rung = min(int(np.searchsorted(_LADDER, taken)) + 1, len(_LADDER) - 1)
-    others = request.design.values(other)
+    others = request.points.values(other)
     for _ in range(_ATTEMPTS):
         route = dataclasses.replace(route, harmonics=_LADDER[rung])
         check = _checked(case, steady_states(case, request, route, others), route, others)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from hdjax.sweep.answers import Plan, answers, extra_dims, variables
+from hdjax.sweep.outputs import Plan, answers, extra_dims, variables
 from hdjax.sweep.request import Case, Request, digest
 
 _PLAN = "plan.json"
@@ -52,13 +52,13 @@ class Store:
     @property
     def chunks(self) -> int:
         """How many there are."""
-        return -(-self._request.design.size // self.chunk)
+        return -(-self._request.points.size // self.chunk)
 
     def begin(self, plan: Plan) -> None:
         """Make the arrays; the plan is written last and says that they are there."""
         zarr = required("zarr")
         group = zarr.open_group(self.path / "data", mode="w")
-        points = self._request.design.size
+        points = self._request.points.size
         lengths = {name: len(coordinate) for name, coordinate in extra_dims(self._request, plan).items()}
         for variable in variables(self._request):
             behind = tuple(lengths[d] for d in variable.dims)
@@ -71,7 +71,7 @@ class Store:
                 attributes={"units": variable.unit, "long_name": variable.doc},
                 dimension_names=("point", *variable.dims),
             )
-        for name, column in self._request.design.values(np.arange(points)).items():
+        for name, column in self._request.points.values(np.arange(points)).items():
             group.create_array(name, data=column, chunks=(min(points, 1 << 20),), dimension_names=("point",))
         (self.path / _MARKS).mkdir(exist_ok=True)
         _write(self.path / _PLAN, json.dumps(plan.as_dict() | {"chunk": self.chunk}, allow_nan=False))
@@ -91,7 +91,7 @@ class Store:
 
     def points(self, chunk: int) -> np.ndarray:
         """The points of a chunk."""
-        return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self._request.design.size))
+        return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self._request.points.size))
 
     def write(self, chunk: int, found: dict[str, np.ndarray]) -> None:
         """Keep a chunk, and mark it with who worked it out: host and process."""
@@ -110,7 +110,7 @@ class Store:
 def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) -> int:
     """Work out a chunk and keep it, unless it was kept: the worker that did it may have died before it said so."""
     if not kept.has(chunk):
-        kept.write(chunk, answers(case, request, chosen, request.design.values(kept.points(chunk))))
+        kept.write(chunk, answers(case, request, chosen, request.points.values(kept.points(chunk))))
     return chunk
 
 

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hdjax.sweep.adaptive import march_adaptively
-from hdjax.sweep.blocks import in_tiles, tile_for
 from hdjax.sweep.request import Case, Request, duration
+from hdjax.sweep.runge_kutta import march_adaptively, march_steps
 from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split
-from hdjax.sweep.stepping import march_steps
+from hdjax.sweep.tiles import in_tiles, tile_for
 from hdjax.sweep.windows import Windows
 
 Method = Literal["strang", "aba864", "srkn14", "tsit5", "adaptive"]
@@ -27,7 +26,7 @@ _TILE = 16384
 
 
 @dataclasses.dataclass(frozen=True)
-class Route:
+class TransientRoute:
     """How transients are worked out.
 
     Attributes:
@@ -53,7 +52,7 @@ class Route:
 
 
 def transients(
-    case: Case, request: Request, route: Route, values: Mapping[str, Float[np.ndarray, " points"]]
+    case: Case, request: Request, route: TransientRoute, values: Mapping[str, Float[np.ndarray, " points"]]
 ) -> tuple[Windows, Bool[np.ndarray, " points"]]:
     """The motions of points, by rows, and which of them reached their end.
 
@@ -64,7 +63,7 @@ def transients(
         values: parameters of the points, by path.
     """
     # One shape of program for pilots and chunks: compiling another takes longer than the lanes that fill this one.
-    tile, block = tile_for(request.design.size, _TILE), _BLOCK
+    tile, block = tile_for(request.points.size, _TILE), _BLOCK
     if route.method == "adaptive":
         tile, block = _ADAPTIVE_BLOCK, _ADAPTIVE_BLOCK
     # The looks of adaptive steps shape the program; numbers of steps and tolerances are data.
@@ -75,10 +74,10 @@ def transients(
 
 
 class _Lanes(eqx.Module):
-    """Transients of a block of points: what of a request shapes the program. Other designs and other numbers of steps
+    """Transients of a block of points: what of a request shapes the program. Other values and other numbers of steps
     share it."""
 
-    route: Route = eqx.field(static=True)
+    route: TransientRoute = eqx.field(static=True)
     duration: float | None = eqx.field(static=True)
     periods: float | None = eqx.field(static=True)
     windows: int = eqx.field(static=True)

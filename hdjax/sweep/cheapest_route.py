@@ -6,15 +6,13 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
+from hdjax.sweep.check import Check, drawn_points
 from hdjax.sweep.request import Case, Request, duration
 from hdjax.sweep.splitting import splits
-from hdjax.sweep.transients import Method, Route, transients
+from hdjax.sweep.transients import Method, TransientRoute, transients
 from hdjax.sweep.windows import Windows
 
-SAMPLED = 64
-"""Points that a route is chosen on, and as many others that it is checked on."""
 _REFERENCE = 1e-11
 # What a step costs beside a Strang step in double precision, measured on a CPU.
 _COST = {"strang": 1.0, "aba864": 3.0, "srkn14": 6.0, "tsit5": 6.0}
@@ -29,26 +27,7 @@ _SINGLE_FROM = 1e-4
 _ATTEMPTS = 4
 
 
-@dataclasses.dataclass(frozen=True)
-class Check:
-    """A route against the reference on points that it was not chosen on.
-
-    Attributes:
-        points: how many were drawn.
-        unfinished: how many of them the reference could not integrate.
-        error: largest error, as a part of each motion's largest |x|.
-        median: the median over the points.
-        reference: what the reference was.
-    """
-
-    points: int
-    unfinished: int
-    error: float
-    median: float
-    reference: str
-
-
-def choose(case: Case, request: Request) -> tuple[Route, Check]:
+def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
     """Choose and check a route for transients.
 
     Args:
@@ -56,8 +35,10 @@ def choose(case: Case, request: Request) -> tuple[Route, Check]:
         request: what is wanted.
     """
     pilot, other = drawn_points(request)
-    reference = Route("adaptive", _looks(case, request, pilot), tolerance=min(_REFERENCE, 1e-3 * request.tolerance))
-    values, others = request.design.values(pilot), request.design.values(other)
+    reference = TransientRoute(
+        "adaptive", _looks(case, request, pilot), tolerance=min(_REFERENCE, 1e-3 * request.tolerance)
+    )
+    values, others = request.points.values(pilot), request.points.values(other)
     route = _cheapest(case, request, values, transients(case, request, reference, values))
     truth = transients(case, request, reference, others)
     for _ in range(_ATTEMPTS):
@@ -79,27 +60,15 @@ def choose(case: Case, request: Request) -> tuple[Route, Check]:
     return route, check
 
 
-def drawn_points(request: Request) -> tuple[Int[np.ndarray, " pilot"], Int[np.ndarray, " check"]]:
-    """Points to choose a route on, and others to check it on; the same where the sweep has too few."""
-    random = np.random.default_rng(request.seed)
-    size = request.design.size
-    if size <= 2 * SAMPLED:
-        every = np.arange(size)
-        return every[:: -(-size // SAMPLED)], every[-SAMPLED:]
-    found = np.unique(random.integers(0, size, 4 * SAMPLED))
-    random.shuffle(found)
-    return found[:SAMPLED], found[SAMPLED : 2 * SAMPLED]
-
-
-def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, np.ndarray]) -> Route:
+def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, np.ndarray]) -> TransientRoute:
     """The cheapest route within half the tolerance on the pilot."""
     turns = _turns_per_window(case, request, values)
     split = splits(case.model, case.forcing)
     singles = (True, False) if split and request.tolerance >= _SINGLE_FROM else (False,)
     for single in singles:
 
-        def needed(method: Method, most: float, single: bool = single) -> Route | None:
-            return _fewest_steps(case, request, Route(method, 1, single), values, truth, turns, most)
+        def needed(method: Method, most: float, single: bool = single) -> TransientRoute | None:
+            return _fewest_steps(case, request, TransientRoute(method, 1, single), values, truth, turns, most)
 
         if not split:
             found = needed("tsit5", math.inf)
@@ -112,12 +81,12 @@ def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, 
                 found = needed(other, most) or found
         if found is not None:
             return found
-    return Route("adaptive", _looks_for(turns), tolerance=0.01 * request.tolerance)
+    return TransientRoute("adaptive", _looks_for(turns), tolerance=0.01 * request.tolerance)
 
 
 def _fewest_steps(
-    case: Case, request: Request, route: Route, values: dict, truth: tuple, turns: float, most: float
-) -> Route | None:
+    case: Case, request: Request, route: TransientRoute, values: dict, truth: tuple, turns: float, most: float
+) -> TransientRoute | None:
     """The route with as few steps as the pilot allows, or none where more steps don't help or cost more than others."""
     substeps, least, rises = max(1, math.ceil(turns)), math.inf, 0
     while substeps <= min(most, max(1.0, turns) * _MOST_STEPS_PER_TURN) and rises < 3:
@@ -158,7 +127,7 @@ def _turns_per_window(case: Case, request: Request, values: dict) -> float:
 
 
 def _looks(case: Case, request: Request, points: np.ndarray) -> int:
-    return _looks_for(_turns_per_window(case, request, request.design.values(points)))
+    return _looks_for(_turns_per_window(case, request, request.points.values(points)))
 
 
 def _looks_for(turns: float) -> int:

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hdjax.dynamics import Model
 from hdjax.effects import Effect
 from hdjax.effects.stiffness import QuadraticStiffness
-from hdjax.sweep.twist import TwistEquation
+from hdjax.sweep.twist_equation import TwistEquation
 from hdjax.sweep.windows import largest_between
 from hdjax.where import where
 
@@ -66,13 +66,13 @@ class Waves(NamedTuple):
 
     def coefficients(self, a: Float[Array, "samples lanes"]) -> Float[Array, "2 harmonics lanes"]:
         """Cosine and sine coefficients of what was sampled."""
-        rows = (self.weights * self.values / self.push.size).reshape(-1, self.push.size)
+        rows = jnp.asarray((self.weights * self.values / self.push.size).reshape(-1, self.push.size))
         return (rows @ a).reshape(2, self.orders.size, -1)
 
     def at_samples(self, u: Float[Array, "2 harmonics lanes"]) -> tuple[Array, Array]:
         """A series and its derivative by the phase at the samples."""
         flat = u.reshape(-1, u.shape[-1])
-        values, slopes = (t.reshape(-1, self.push.size).T for t in (self.values, self.slopes))
+        values, slopes = (jnp.asarray(t.reshape(-1, self.push.size).T) for t in (self.values, self.slopes))
         return values @ flat, slopes @ flat
 
     def product(self, factor: Float[Array, "samples lanes"]) -> Float[Array, "2 harmonics 2 harmonics lanes"]:
@@ -281,7 +281,7 @@ def _peak(u: Array, kept: Waves) -> Array:
     cosine, sine = np.cos(k * angles), np.sin(k * angles)
     flat = u.reshape(-1, u.shape[-1])
     tables = ((cosine, sine), (-k * sine, k * cosine), (-k * k * cosine, -k * k * sine))
-    x, v, a = (np.concatenate(table).T @ flat for table in tables)
+    x, v, a = (jnp.asarray(np.concatenate(table).T) @ flat for table in tables)
     starts, ends = ((x[part], v[part], a[part]) for part in (slice(None, -1), slice(1, None)))
     return jnp.max(largest_between(starts, ends, jnp.full_like(x[1:], angles[1])), axis=0)
 

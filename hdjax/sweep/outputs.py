@@ -4,14 +4,16 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from hdjax.sweep.choice import Check, choose
+from hdjax.sweep.balance import MOTIONS
+from hdjax.sweep.cheapest_route import choose
+from hdjax.sweep.check import Check
 from hdjax.sweep.request import Case, Request, duration
-from hdjax.sweep.steady import MOTIONS
 from hdjax.sweep.steady_states import SteadyRoute, choose_steady, steady_states
-from hdjax.sweep.transients import Route, transients
+from hdjax.sweep.transients import TransientRoute, transients
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Variable:
         name: of the variable.
         unit: SI unit.
         doc: one line that says what it is.
-        dims: dimensions behind those of the design.
+        dims: dimensions behind those of the points.
         kind: NumPy's type.
     """
 
@@ -42,7 +44,7 @@ class Plan:
         check: the route against the reference.
     """
 
-    route: Route | SteadyRoute
+    route: TransientRoute | SteadyRoute
     check: Check
 
     def as_dict(self) -> dict[str, Any]:
@@ -52,7 +54,7 @@ class Plan:
     @staticmethod
     def from_dict(content: Mapping[str, Any], request: Request) -> "Plan":
         """The plan from a JSON file."""
-        kind = SteadyRoute if request.response == "steady" else Route
+        kind = SteadyRoute if request.response == "steady" else TransientRoute
         return Plan(kind(**content["route"]), Check(**content["check"]))
 
 
@@ -95,7 +97,7 @@ def variables(request: Request) -> tuple[Variable, ...]:
 
 
 def extra_dims(request: Request, plan: Plan) -> dict[str, np.ndarray]:
-    """Coordinates of the dimensions behind those of the design."""
+    """Coordinates of the dimensions behind those of the points."""
     if isinstance(plan.route, SteadyRoute):
         return {"motion": np.arange(1, MOTIONS + 1), "harmonic": np.array(plan.route.orders)}
     return {"window": np.arange(1, request.windows + 1) / request.windows}
@@ -131,18 +133,11 @@ def _steady(case: Case, request: Request, plan: Plan, values: Mapping[str, np.nd
 
 
 def _transient(case: Case, request: Request, plan: Plan, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    assert isinstance(plan.route, Route)
+    assert isinstance(plan.route, TransientRoute)
     found, reached = transients(case, request, plan.route, values)
     x, v, peak = (np.where(reached[:, None], a, np.nan) for a in (found.x, found.v, found.peak))
-    length = _durations(case, request, values)
+    length = jax.vmap(lambda v: duration(case.at(v), request.duration, request.periods))(dict(values))
     out = np.abs(peak - peak[:, -1:]) > request.band * peak[:, -1:]
     last = np.where(out.any(axis=1), request.windows - np.argmax(out[:, ::-1], axis=1), 0)
-    settled = np.where(reached, last * length / request.windows, np.nan)
+    settled = np.where(reached, last * np.asarray(length) / request.windows, np.nan)
     return {"peak": peak.max(axis=1), "settling_time": settled, "x": x, "x_end": x[:, -1], "v_end": v[:, -1]}
-
-
-def _durations(case: Case, request: Request, values: Mapping[str, np.ndarray]) -> np.ndarray:
-    omega = values.get("forcing.omega")
-    if request.periods is not None and omega is not None:
-        return request.periods * 2 * np.pi / omega
-    return np.full(len(next(iter(values.values()))), float(duration(case, request.duration, request.periods)))

@@ -16,7 +16,7 @@ SAMPLE = "sample"
 
 
 @dataclasses.dataclass(frozen=True)
-class Design:
+class Points:
     """Points of a sweep: every combination of the axes' values, with every row of the sample.
 
     Attributes:
