@@ -97,7 +97,8 @@ def _text(result) -> str:
         )
     if "motions" in result:
         several, lost = int((result.motions > 1).sum()), int(result.lost.sum())
-        lines.append(f"{several} points have several steady motions; at {lost} one was not found, mostly at a fold")
+        missing = f"; at {lost} one was not found, mostly at a fold" if lost else ""
+        lines.append(f"{several} points have several steady motions{missing}")
     for name in ("peak", "amplitude", "settling_time"):
         if name in result and np.isfinite(result[name]).any():
             lines.append(

@@ -78,8 +78,11 @@ def _model(path: Path, drive: dict[str, Any], effects: dict[str, Any]) -> Model:
         if name not in BY_NAME:
             raise InputError(f"{path}: [effects.{name}] is no effect; there are {', '.join(BY_NAME)}")
         table = _table(path, f"effects.{name}", values)
-        own_names = [f.name for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata]
-        _known(path, f"effects.{name}", table, own_names)
+        fields = [f for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata]
+        _known(path, f"effects.{name}", table, [f.name for f in fields])
+        for f in fields:
+            if f.default is dataclasses.MISSING and f.name not in table:
+                raise InputError(f"{path}: [effects.{name}] must have `{f.name}`")
         numbers = {k: _number(path, f"[effects.{name}] {k}", v) for k, v in table.items()}
         model = model.with_effects(BY_NAME[name](**numbers))
     return model

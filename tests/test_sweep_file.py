@@ -58,6 +58,7 @@ def test_a_sweep_file_is_a_model_a_forcing_and_points(tmp_path):
         ("from = 6e3", "from = -1.0", "must run from above zero for spacing log"),
         ("[300.0, 350.0]", "[]", "`forcing.omega` must be a list of finite numbers"),
         ('"sobol"', '"dice"', r"\[sample\] rule must be one of"),
+        ("[effects.quadratic_stiffness]\nk2 = 0.5", "[effects.dahl]", r"\[effects.dahl\] must have `yield_twist`"),
         ("[effects.quadratic_stiffness]", "[effects.rust]", r"\[effects.rust\] is no effect"),
         ('"steady"', '"later"', r"\[sweep\] response must be one of"),
         ('["amplitude"]', '["trace"]', "`outputs` of a steady response must be among"),

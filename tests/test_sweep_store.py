@@ -90,6 +90,26 @@ def test_a_finished_chunk_is_never_worked_out_again(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == [digest(CASE, steady_request())] == [first.request]
 
 
+@pytest.mark.parametrize(
+    ("column", "settings", "words"),
+    [
+        ("kappa", {}, "`kappa` is no parameter of this sweep; there are mu, omega_0"),
+        ("omega_0", {}, "`omega_0` must lie between 0 and 1e\\+09, but runs from -1 to 1"),
+        ("forcing.omega", {}, "`forcing.omega` must lie between 0 and inf"),
+        (
+            "forcing.omega",
+            {"response": "transient", "outputs": ("peak",), "periods": 3.0},
+            "must lie between 0 and inf",
+        ),
+        ("mu", {}, "needs damping"),
+    ],
+)
+def test_points_that_make_no_sense_are_refused(column, settings, words):
+    request = Request(Points({column: np.array([-1.0, 0.0, 1.0])}), **settings)
+    with pytest.raises(ValueError, match=words):
+        sweep(CASE.model, CASE.forcing, request)
+
+
 def started(*arguments: str) -> subprocess.Popen:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu"}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}

@@ -37,7 +37,10 @@ def spread_chunks(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
             )
             address = stack.enter_context(cluster)
-        client = stack.enter_context(distributed.Client(address))
+        try:
+            client = stack.enter_context(distributed.Client(address))
+        except OSError as error:
+            raise ValueError(f"no Dask scheduler answers at {address}") from error
         # Bytes: a worker must know the precision before it makes arrays of them.
         shared = client.scatter((pickle.dumps((kept, case, request, chosen)), double), broadcast=True)
         # The store remembers what is done, not the scheduler: a later run must ask anew.

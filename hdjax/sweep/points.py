@@ -57,6 +57,10 @@ class Points:
         """The parameters that vary."""
         return (*self.axes, *self.sample)
 
+    def column(self, path: str) -> Float[np.ndarray, " values"] | None:
+        """All values that a parameter takes; none where it does not vary."""
+        return self.axes.get(path, self.sample.get(path))
+
     def values(self, points: Int[np.ndarray, " points"]) -> dict[str, Float[np.ndarray, " points"]]:
         """The parameters' values at points, which are counted with the last dimension fastest."""
         index = dict(zip(self.shape, np.unravel_index(points, tuple(self.shape.values())), strict=True))

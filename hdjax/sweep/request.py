@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import Any, Literal, get_args
@@ -100,16 +101,28 @@ class Case(eqx.Module):
             forcing = eqx.tree_at(lambda f: [getattr(f, name) for name in outside], forcing, list(outside.values()))
         return Case(self.model.replace(own) if own else self.model, forcing)
 
-    def require(self, points: Points) -> None:
-        """Refuse points of parameters that the case has not.
+    def require(self, request: Request) -> None:
+        """Refuse a request that the case can't answer.
 
         Raises:
-            ValueError: that names the parameter and what there is.
+            ValueError: that names the parameter and what is wrong with it.
         """
-        known = [*self.model.parameters(), *(FORCING + name for name in vars(self.forcing))]
+        points, parameters = request.points, self.model.parameters()
+        known = [*parameters, *(FORCING + name for name in vars(self.forcing))]
         for path in points.paths:
             if path not in known:
                 raise ValueError(f"`{path}` is no parameter of this sweep; there are {', '.join(known)}")
+        # The drive's own; an effect may be swept from its absence, which is the end of its parameter's interval.
+        limits = {path: info.bounds for path, (_, info) in parameters.items() if "." not in path}
+        if request.response == "steady" or request.periods is not None:
+            limits[FORCING + "omega"] = (0.0, math.inf)
+        for path, (low, high) in limits.items():
+            values = points.column(path)
+            if path in parameters and values is None:
+                values = np.atleast_1d(parameters[path][0])
+            if values is not None and not np.all((values > low) & (values < high)):
+                span = f"{np.min(values):g} to {np.max(values):g}"
+                raise ValueError(f"`{path}` must lie between {low:g} and {high:g}, but runs from {span}")
 
     def unit(self, path: str) -> str:
         """Unit of a parameter; a reduced drive's forcing has the unit of its log."""

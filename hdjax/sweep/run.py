@@ -60,7 +60,7 @@ def sweep(
     """
     required("xarray")
     case = Case(model, forcing)
-    case.require(request.points)
+    case.require(request)
     begin = time.perf_counter()
     if store is None:
         if workers or scheduler:

@@ -282,7 +282,8 @@ def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) 
         series = np.concatenate([np.stack([mean, np.zeros_like(mean)], axis=1)[..., None], series], axis=-1)
     own = {path: v[point] for path, v in values.items()} | {_START: _padded(series, orders.size)}
     constants = case, jnp.asarray(orders.astype(float))
-    errors, reached = in_tiles(_one_period, constants, own, tile=_CHECKED_BLOCK, block=_CHECKED_BLOCK)
+    block = {"tile": _CHECKED_BLOCK, "block": _CHECKED_BLOCK}
+    errors, reached = in_tiles(_one_period, constants, own, **block, checked=True)
     reference = f"one period by adaptive Dopri8 of diffrax at rtol {_REFERENCE:g}"
     good = errors[reached]
     error, median = (float(np.max(good)), float(np.median(good))) if good.size else (math.nan, math.nan)

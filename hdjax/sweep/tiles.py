@@ -22,6 +22,7 @@ def in_tiles(
     *,
     tile: int,
     block: int,
+    checked: bool = False,
 ) -> Any:
     """Run a program over points, `tile` of them at a time: one shape of program for any number.
 
@@ -32,7 +33,10 @@ def in_tiles(
         values: arrays with one point a row.
         tile: a power of two. The last point fills up the last tile.
         block: points that go together on a device, so that they stay in its cache.
+        checked: whether the program checks itself by a call of Python, as those of diffrax do: it can't be kept between
+            processes then, and to try would take a second trace.
     """
+    run = _checked_tile if checked else _tile
     count = len(next(iter(values.values())))
     parts = []
     for begin in range(0, count, tile):
@@ -43,14 +47,13 @@ def in_tiles(
         sharding = next(iter(shared.values())).sharding
         mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
         assert mesh is None or isinstance(mesh, Mesh)
-        parts.append(_tile(program, constants, shared, mesh, block))
+        parts.append(run(program, constants, shared, mesh, block))
     # What runs while the next tile is sent off is fetched last.
     rows = [jax.tree.map(np.asarray, part) for part in parts]
     return jax.tree.map(lambda *r: np.concatenate(r)[:count], *rows)
 
 
-@jit_lanes
-def _tile(program: Callable, constants: Any, values: dict[str, Array], mesh: Mesh | None, block: int) -> Any:
+def _each_block(program: Callable, constants: Any, values: dict[str, Array], mesh: Mesh | None, block: int) -> Any:
     arrays, rest = eqx.partition(constants, eqx.is_array)
 
     def local(arrays: Any, values: dict[str, Array]) -> Any:
@@ -64,6 +67,9 @@ def _tile(program: Callable, constants: Any, values: dict[str, Array], mesh: Mes
         return local(arrays, values)
     places = {"in_specs": (_EVERYWHERE, _LANES), "out_specs": _LANES, "check_vma": False}
     return jax.shard_map(local, mesh=mesh, **places)(arrays, values)
+
+
+_tile, _checked_tile = jit_lanes(_each_block), eqx.filter_jit(_each_block)
 
 
 def _filled(rows: np.ndarray, tile: int) -> np.ndarray:

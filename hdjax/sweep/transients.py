@@ -64,13 +64,13 @@ def transients(
     """
     # One shape of program for pilots and chunks: compiling another takes longer than the lanes that fill this one.
     tile, block = tile_for(request.points.size, _TILE), _BLOCK
-    if route.method == "adaptive":
+    if adaptive := route.method == "adaptive":
         tile, block = _ADAPTIVE_BLOCK, _ADAPTIVE_BLOCK
     # The looks of adaptive steps shape the program; numbers of steps and tolerances are data.
-    fixed = dataclasses.replace(route, substeps=route.substeps if route.method == "adaptive" else 0, tolerance=0.0)
+    fixed = dataclasses.replace(route, substeps=route.substeps if adaptive else 0, tolerance=0.0)
     wanted = (request.duration, request.periods, request.windows, request.peaks)
     numbers = jnp.asarray(route.substeps, dtype=int), jnp.asarray(route.tolerance, dtype=float)
-    return in_tiles(_Lanes(fixed, *wanted), (case, *numbers), values, tile=tile, block=block)
+    return in_tiles(_Lanes(fixed, *wanted), (case, *numbers), values, tile=tile, block=block, checked=adaptive)
 
 
 class _Lanes(eqx.Module):
