@@ -283,9 +283,7 @@ def scaling(sizes: list[int]) -> None:
         runs = {"run": lambda c=columns, r=request, o=route: transients(case, r, o, c)}
         best, busy = (times["run"] / drives * 1e6 for times in best_of(runs, 4))
         held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(
-            f"{drives:>8} drives: {best:.2f} us a drive, {busy:.2f} us of processors; {held:.0f} MiB held at most so far"
-        )
+        print(f"{drives:>8} drives: {best:.2f} us a drive, {busy:.2f} us of processors; {held:.0f} MiB at most so far")
 
 
 def steady_benchmark(points: int) -> None:

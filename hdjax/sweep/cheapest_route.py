@@ -41,7 +41,7 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
     values, others = request.points.values(pilot), request.points.values(other)
     route = _cheapest(case, request, values, transients(case, request, reference, values))
     truth = transients(case, request, reference, others)
-    for _ in range(_ATTEMPTS):
+    for attempts in range(_ATTEMPTS, 0, -1):
         errors, unfinished = _errors(transients(case, request, route, others), truth)
         check = Check(
             other.size,
@@ -50,7 +50,7 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
             float(np.median(errors)) if errors.size else 0.0,
             reference.description,
         )
-        if check.error <= request.tolerance:
+        if check.error <= request.tolerance or attempts == 1:
             break
         if route.method == "adaptive":
             route = dataclasses.replace(route, tolerance=0.1 * route.tolerance)

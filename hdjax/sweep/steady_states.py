@@ -262,10 +262,10 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     taken = np.max(np.array(route.orders) * np.any(found.cosine[found.exists] != 0.0, axis=0), initial=1)
     rung = min(int(np.searchsorted(_LADDER, taken)) + 1, len(_LADDER) - 1)
     others = request.points.values(other)
-    for _ in range(_ATTEMPTS):
+    for attempts in range(_ATTEMPTS, 0, -1):
         route = dataclasses.replace(route, harmonics=_LADDER[rung])
         check = _checked(case, steady_states(case, request, route, others), route, others)
-        if check.error <= request.tolerance:
+        if check.error <= request.tolerance or attempts == 1:
             break
         rung = min(rung + 1, len(_LADDER) - 1)
         route = dataclasses.replace(route, truncation=0.1 * route.truncation)
