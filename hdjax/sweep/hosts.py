@@ -3,6 +3,7 @@
 import contextlib
 import pickle
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 
@@ -11,6 +12,9 @@ from hdjax.sweep.request import Case, Request
 from hdjax.sweep.store import Store, required, work
 
 _RETRIES = 3
+_EVERYWHERE = ("jax_enable_x64",)
+# What makes sense on this machine alone.
+_HERE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
 def spread_chunks(
@@ -28,7 +32,8 @@ def spread_chunks(
         scheduler: address of a cluster's scheduler.
     """
     distributed = required("distributed")
-    double = bool(jax.config.read("jax_enable_x64"))
+    names = _EVERYWHERE if scheduler else (*_EVERYWHERE, *_HERE)
+    settings = {name: jax.config.read(name) for name in names}
     with contextlib.ExitStack() as stack:
         address = scheduler
         if address is None:
@@ -42,16 +47,17 @@ def spread_chunks(
         except OSError as error:
             raise ValueError(f"no Dask scheduler answers at {address}") from error
         # Bytes: a worker must know the precision before it makes arrays of them.
-        shared = client.scatter((pickle.dumps((kept, case, request, chosen)), double), broadcast=True)
+        shared = client.scatter((pickle.dumps((kept, case, request, chosen)), settings), broadcast=True)
         # The store remembers what is done, not the scheduler: a later run must ask anew.
         futures = client.map(_on_worker, chunks, given=shared, pure=False, retries=_RETRIES)
         for future in distributed.as_completed(futures):
             yield future.result()
 
 
-def _on_worker(chunk: int, given: tuple[bytes, bool]) -> int:
-    """A worker's process is the sweep's own: its precision is set as that of whoever asked."""
-    task, double = given
-    jax.config.update("jax_enable_x64", double)
+def _on_worker(chunk: int, given: tuple[bytes, dict[str, Any]]) -> int:
+    """A worker's process is the sweep's own: JAX's settings are those of whoever asked."""
+    task, settings = given
+    for name, value in settings.items():
+        jax.config.update(name, value)
     kept, case, request, chosen = pickle.loads(task)
     return work(kept, case, request, chosen, chunk)
