@@ -10,8 +10,6 @@ from rich.progress import MofNCompleteColumn, Progress
 from fitting.errors import InputError
 from fitting.files import write_whole
 from fitting.response_commands import require_folder
-from fitting.sweep_file import read_sweep_file
-from fitting.sweep_plot import summary
 
 _MEBIBYTE = 1 << 20
 
@@ -42,9 +40,12 @@ def sweep(
     require_folder(out)
     if workers < 0 or memory < 1:
         raise InputError(f"--workers must be 0 or more and --memory above 0, but are {workers} and {memory}")
-    asked = read_sweep_file(spec)
+    # Here: the other commands start without what this one alone needs.
+    from fitting.sweep_file import read_sweep_file
+    from fitting.sweep_plot import summary
     from hdjax.sweep import sweep as run
 
+    asked = read_sweep_file(spec)
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     try:

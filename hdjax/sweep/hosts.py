@@ -33,7 +33,7 @@ def spread_chunks(
     """
     distributed = required("distributed")
     names = _EVERYWHERE if scheduler else (*_EVERYWHERE, *_HERE)
-    settings = {name: jax.config.read(name) for name in names}
+    settings = {name: getattr(jax.config, name) for name in names}
     with contextlib.ExitStack() as stack:
         address = scheduler
         if address is None:
