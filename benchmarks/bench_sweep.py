@@ -298,7 +298,7 @@ def steady_benchmark(points: int) -> None:
     print(f"steady: {route.description}; chosen and checked in {chosen:.1f} s, error {check.error:.1e}")
     size, begin, several, lost = request.points.size, (time.perf_counter(), time.process_time()), 0, 0
     for first in range(0, size, 65536):
-        found = steady_states(case, request, route, request.points.values(np.arange(first, min(first + 65536, size))))
+        found = steady_states(case, route, request.points.values(np.arange(first, min(first + 65536, size))))
         several, lost = several + int(np.sum(found.exists.sum(axis=1) > 1)), lost + int(found.lost.sum())
     seconds, busy = time.perf_counter() - begin[0], time.process_time() - begin[1]
     print(f"  {size} points in {seconds:.1f} s, {busy:.1f} s of processors (compilation of the wide programs in it)")

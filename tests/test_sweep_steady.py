@@ -48,7 +48,7 @@ def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
 def test_points_solve_the_harmonic_balance_of_the_drive(effects):
     given, request = case(*effects), request_of(9)
     values = request.points.values(np.arange(request.points.size))
-    found = steady_states(given, request, SteadyRoute(9, True, 0.0), values)
+    found = steady_states(given, SteadyRoute(9, True, 0.0), values)
     # A one-harmonic motion beyond the saddles of a softening spring, or with less damping, has no relative.
     assert found.exists.any(axis=1).all()
     # Samples of a force with corners are not exact.
@@ -67,7 +67,7 @@ def test_the_motion_between_the_folds_is_unstable_and_the_series_is_the_motion()
     given, request = case(), request_of(150)
     route, check = choose_steady(given, request)
     assert 0.0 < check.error <= request.tolerance
-    found = steady_states(given, request, route, request.points.values(np.arange(request.points.size)))
+    found = steady_states(given, route, request.points.values(np.arange(request.points.size)))
     several = found.exists.sum(axis=1) == 3
     assert several.sum() > 10
     assert not found.stable[several, 1].any() and found.stable[several][:, [0, 2]].all()

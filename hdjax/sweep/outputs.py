@@ -113,7 +113,7 @@ def answers(
 
 def _steady(case: Case, request: Request, plan: Plan, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     assert isinstance(plan.route, SteadyRoute)
-    found = steady_states(case, request, plan.route, values)
+    found = steady_states(case, plan.route, values)
     size = np.hypot(found.cosine, found.sine)
     # The series counts its phase from that of the forcing.
     behind = np.asarray(values.get("forcing.phase", case.forcing.phase))  # pyright: ignore[reportFunctionMemberAccess]

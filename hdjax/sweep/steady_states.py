@@ -108,14 +108,11 @@ def require_balanced(model: Model, forcing: object) -> None:
         )
 
 
-def steady_states(
-    case: Case, request: Request, route: SteadyRoute, values: Mapping[str, Float[np.ndarray, " points"]]
-) -> SteadyStates:
+def steady_states(case: Case, route: SteadyRoute, values: Mapping[str, Float[np.ndarray, " points"]]) -> SteadyStates:
     """The steady motions of points.
 
     Args:
         case: the model and its forcing.
-        request: what is wanted.
         route: how.
         values: parameters of the points, by path.
     """
@@ -257,14 +254,14 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     offset = np.asarray(request.points.values(pilot).get("forcing.offset", case.forcing.offset))  # pyright: ignore
     odd = symmetric(case.model) and not np.any(offset)
     route = SteadyRoute(_LADDER[-1], odd, _SAFETY * request.tolerance)
-    found = steady_states(case, request, route, values)
+    found = steady_states(case, route, values)
     # As many as any of the points takes, and the next more: other points may need them.
     taken = np.max(np.array(route.orders) * np.any(found.cosine[found.exists] != 0.0, axis=0), initial=1)
     rung = min(int(np.searchsorted(_LADDER, taken)) + 1, len(_LADDER) - 1)
     others = request.points.values(other)
     for attempts in range(_ATTEMPTS, 0, -1):
         route = dataclasses.replace(route, harmonics=_LADDER[rung])
-        check = _checked(case, steady_states(case, request, route, others), route, others)
+        check = _checked(case, steady_states(case, route, others), route, others)
         if check.error <= request.tolerance or attempts == 1:
             break
         rung = min(rung + 1, len(_LADDER) - 1)
