@@ -1,5 +1,5 @@
-"""The command line: `hdjax fit | close-loop | predict | simulate | demo | amplitudes | seed-tables | speeds |
-design`."""
+"""The command line: `hdjax fit | close-loop | predict | simulate | sweep | design | demo | amplitudes | seed-tables |
+speeds`."""
 
 # ruff: noqa: E402
 
@@ -40,6 +40,7 @@ from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
 from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
+from fitting.sweep_commands import sweep
 from hdjax import (
     PRESETS,
     Chirp,
@@ -61,6 +62,7 @@ app = cyclopts.App(
 app.command(amplitudes)
 app.command(seed_tables)
 app.command(speeds)
+app.command(sweep)
 app.command(design)
 
 Logs = Annotated[

@@ -31,6 +31,7 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _Program = Callable[[list[Any]], Any]
 
+_held: list[dict[Hashable, _Program | None]] = []
 _SUFFIX = ".program"
 # Calls out of a program, and those that mean the same in every process: a Python callback is an address in this one.
 _CALL = re.compile(r"custom_call @\"?([\w.]+)")
@@ -48,6 +49,7 @@ def jit_kept(function: Callable[_Arguments, _Result], **options: Any) -> Callabl
     """
     plain = eqx.filter_jit(function, **options)
     programs: dict[Hashable, _Program | None] = {}
+    _held.append(programs)
 
     @functools.wraps(function)
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
@@ -62,6 +64,12 @@ def jit_kept(function: Callable[_Arguments, _Result], **options: Any) -> Callabl
         return plain(*args, **kwargs) if program is None else program(_arrays(leaves))
 
     return call
+
+
+def forget() -> None:
+    """Let go of the programs that this process holds, as `jax.clear_caches` does of JAX's own; kept ones stay kept."""
+    for programs in _held:
+        programs.clear()
 
 
 def _folder() -> Path | None:

@@ -1,0 +1,138 @@
+"""The store of a sweep: finished chunks on disk, so that a run that was killed goes on where it stopped.
+
+A folder holds one zarr group for each request, named by the request's digest. A chunk of points is one zarr chunk of
+each variable; a mark of its own says that it is whole, and is written last. Workers on other hosts write to the same
+folder, which they must see under the same path.
+"""
+
+import json
+import os
+import platform
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from hdjax.sweep.outputs import Plan, answers, extra_dims, variables
+from hdjax.sweep.request import Case, Request, digest
+
+_PLAN = "plan.json"
+_MARKS = "finished"
+_EXTRA = "this needs the extra `sweep`; install hdjax[sweep]"
+
+
+class Store:
+    """A request's group in a store.
+
+    Attributes:
+        path: of the group.
+        chunk: points in a chunk.
+    """
+
+    def __init__(self, folder: Path, case: Case, request: Request, *, chunk: int):
+        self.path = Path(folder) / digest(case, request)
+        self._request = request
+        # A store that was begun keeps its chunks.
+        self.chunk = int(self._read().get("chunk", chunk))
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            return json.loads((self.path / _PLAN).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+
+    @property
+    def plan(self) -> Plan | None:
+        """The plan of a store that was begun."""
+        content = self._read()
+        return Plan.from_dict(content, self._request) if content else None
+
+    @property
+    def chunks(self) -> int:
+        """How many there are."""
+        return -(-self._request.points.size // self.chunk)
+
+    def begin(self, plan: Plan) -> None:
+        """Make the arrays; the plan is written last and says that they are there."""
+        zarr = required("zarr")
+        group = zarr.open_group(self.path / "data", mode="w")
+        points = self._request.points.size
+        lengths = {name: len(coordinate) for name, coordinate in extra_dims(self._request, plan).items()}
+        for variable in variables(self._request):
+            behind = tuple(lengths[d] for d in variable.dims)
+            group.create_array(
+                variable.name,
+                shape=(points, *behind),
+                chunks=(self.chunk, *behind),
+                dtype=variable.kind,
+                fill_value=np.nan if variable.kind == "float64" else 0,
+                attributes={"units": variable.unit, "long_name": variable.doc},
+                dimension_names=("point", *variable.dims),
+            )
+        for name, column in self._request.points.values(np.arange(points)).items():
+            group.create_array(name, data=column, chunks=(min(points, 1 << 20),), dimension_names=("point",))
+        (self.path / _MARKS).mkdir(exist_ok=True)
+        _write(self.path / _PLAN, json.dumps(plan.as_dict() | {"chunk": self.chunk}, allow_nan=False))
+
+    def finished(self) -> Bool[np.ndarray, " chunks"]:
+        """Which chunks are whole."""
+        marks = np.zeros(self.chunks, dtype=bool)
+        if (self.path / _MARKS).is_dir():
+            for mark in (self.path / _MARKS).iterdir():
+                if mark.name.isdigit():
+                    marks[int(mark.name)] = True
+        return marks
+
+    def has(self, chunk: int) -> bool:
+        """Whether a chunk is whole."""
+        return (self.path / _MARKS / str(chunk)).exists()
+
+    def points(self, chunk: int) -> np.ndarray:
+        """The points of a chunk."""
+        return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self._request.points.size))
+
+    def write(self, chunk: int, found: dict[str, np.ndarray]) -> None:
+        """Keep a chunk, and mark it with who worked it out: host and process."""
+        group = required("zarr").open_group(self.path / "data", mode="r+")
+        points = self.points(chunk)
+        for name, values in found.items():
+            group[name][points[0] : points[-1] + 1] = values
+        _write(self.path / _MARKS / str(chunk), f"{platform.node()} {os.getpid()}")
+
+    def read(self) -> dict[str, np.ndarray]:
+        """All variables, one point a row."""
+        group = required("zarr").open_group(self.path / "data", mode="r")
+        return {v.name: group[v.name][:] for v in variables(self._request)}
+
+
+def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) -> int:
+    """Work out a chunk and keep it, unless it was kept: the worker that did it may have died before it said so."""
+    if not kept.has(chunk):
+        kept.write(chunk, answers(case, request, chosen, request.points.values(kept.points(chunk))))
+    return chunk
+
+
+def required(name: str) -> Any:
+    """A library of the extra `sweep`.
+
+    Raises:
+        ImportError: where it is absent.
+    """
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(f"{name} is not installed: {_EXTRA}") from error
+
+
+def _write(path: Path, text: str) -> None:
+    """A small file, whole or not at all."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(name, path)

@@ -1,0 +1,64 @@
+"""The dynamic error's own equation, for every drive on which nothing acts but the mesh."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive, restoring
+from hdjax.dynamics import Model
+from hdjax.effects import Effect, MeshTorqueEffect, Motion
+from hdjax.effects.backlash import Backlash
+from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, ThreeSlopeStiffness
+
+SPRINGS: tuple[type[Effect], ...] = (QuadraticStiffness, QuinticStiffness, ThreeSlopeStiffness, Backlash)
+"""Effects whose torque depends on the twist alone."""
+
+
+class TwistEquation(eqx.Module):
+    """`x'' = gain T_m - mu x' - omega_0^2 (x + alpha x^3) - per_torque (effects' torque)`.
+
+    Two inertias between which nothing acts but the mesh obey it exactly.
+
+    Attributes:
+        drive: gives mu, omega_0 and alpha.
+        effects: torques through the mesh, without memory.
+        gain: acceleration of x per unit of forcing.
+        per_torque: acceleration of x per unit of mesh torque.
+    """
+
+    drive: Drive | ReducedDrive
+    effects: tuple[MeshTorqueEffect, ...]
+    gain: Float[Array, "*lanes"]
+    per_torque: Float[Array, "*lanes"]
+
+    def kick(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Acceleration by what the spring adds to its linear part, where all effects are [`SPRINGS`][]."""
+        return -(self.drive.omega_0**2 * (self.drive.alpha * x) * (x * x) + self._beside(x, jnp.zeros_like(x)))
+
+    def acceleration(
+        self, x: Float[Array, "..."], v: Float[Array, "..."], push: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """x'' under an acceleration `push` from outside."""
+        spring = self.drive.omega_0**2 * restoring(x, self.drive.alpha)
+        return push - self.drive.mu * v - spring - self._beside(x, v)
+
+    def _beside(self, x: Array, v: Array) -> Array:
+        """Deceleration by the effects."""
+        total = jnp.zeros_like(x)
+        for effect in self.effects:
+            total = total + self.per_torque * effect.torque(Motion(x=x, v=v), self.drive, jnp.zeros(0, x.dtype))
+        return total
+
+
+def has_twist_equation(model: Model) -> bool:
+    """Whether a model moves by [`TwistEquation`][]."""
+    return all(isinstance(e, MeshTorqueEffect) and not e.states for e in model.effects)
+
+
+def twist_equation(model: Model) -> TwistEquation:
+    """The equation of the dynamic error of a model that [`has_twist_equation`][]."""
+    drive = model.drive
+    effects = tuple(e for e in model.effects if isinstance(e, MeshTorqueEffect))
+    if isinstance(drive, Drive):
+        return TwistEquation(drive, effects, 1.0 / (drive.N * drive.J_m), drive.c)
+    return TwistEquation(drive, effects, drive.gain, jnp.ones_like(drive.gain))

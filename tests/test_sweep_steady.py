@@ -1,0 +1,94 @@
+"""Steady states of many points against polynomial roots and against harmonic balance of one drive."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hdjax import Harmonic, ReducedDrive, ReducedModel, harmonic_series
+from hdjax.effects import BY_NAME
+from hdjax.response.harmonic_balance import balance, solve
+from hdjax.sweep.balance import amplitude_roots
+from hdjax.sweep.outputs import answers, plan, variables
+from hdjax.sweep.points import Points
+from hdjax.sweep.request import Case, Request
+from hdjax.sweep.steady_states import SteadyRoute, choose_steady, steady_states
+from hdjax.sweep.twist_equation import twist_equation
+
+AMPLITUDE = 0.3
+
+
+def case(*effects) -> Case:
+    return Case(ReducedModel(ReducedDrive(mu=0.1, omega_0=1.0, alpha=0.5)).with_effects(*effects), Harmonic(0.3, 1.0))
+
+
+def request_of(points: int) -> Request:
+    alphas = np.array([-0.02, 0.0, 0.5, 1.0])
+    return Request(Points({"alpha": alphas, "forcing.omega": np.linspace(0.4, 2.2, points)}), outputs=("harmonics",))
+
+
+def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
+    random = np.random.default_rng(0)
+    n = 400
+    mu, alpha, omega = random.uniform(0.01, 0.3, n), random.uniform(-0.1, 1.0, n), random.uniform(0.5, 2.0, n)
+    alpha[:10] = 0.0
+    model = case().model
+    drive = (jnp.asarray(mu), jnp.ones(n), jnp.asarray(alpha), jnp.ones(n))
+    lanes = eqx.tree_at(lambda m: (m.drive.mu, m.drive.omega_0, m.drive.alpha, m.drive.gain), model, drive)
+    found, exists = amplitude_roots(twist_equation(lanes), jnp.full(n, AMPLITUDE), jnp.asarray(omega))
+    assert set(np.sum(np.asarray(exists), axis=1).tolist()) == {1, 3}
+    for i in range(n):
+        c, d = 0.75 * alpha[i], 1.0 - omega[i] ** 2
+        z = np.roots([c * c, 2 * c * d, d * d + (mu[i] * omega[i]) ** 2, -(AMPLITUDE**2)])
+        true = np.sort(np.sqrt(z.real[np.abs(z.imag) < 1e-7 * np.abs(z)]))
+        np.testing.assert_allclose(np.asarray(found[i])[np.asarray(exists[i])], true, rtol=1e-6)
+
+
+@pytest.mark.parametrize("effects", [(), (BY_NAME["quadratic_damping"](c2=0.1),)], ids=["cubic", "damped by the rate"])
+def test_points_solve_the_harmonic_balance_of_the_drive(effects):
+    given, request = case(*effects), request_of(9)
+    values = request.points.values(np.arange(request.points.size))
+    found = steady_states(given, SteadyRoute(9, True, 0.0), values)
+    # A one-harmonic motion beyond the saddles of a softening spring, or with less damping, has no relative.
+    assert found.exists.any(axis=1).all()
+    # Samples of a force with corners are not exact.
+    tolerance = 1e-3 if effects else 1e-9
+    for i in range(0, request.points.size, 4):
+        model = given.model.replace({"alpha": values["alpha"][i]})
+        one = solve(balance(model, harmonic_series(1.0, AMPLITUDE), harmonics=9), values["forcing.omega"][i])
+        assert bool(one.converged)
+        true = np.asarray(one.x.cosine)[::2]
+        # That solver finds one of the motions.
+        nearest = np.nanmin(np.max(np.abs(found.cosine[i] - true), axis=-1))
+        assert nearest < tolerance
+
+
+def test_the_motion_between_the_folds_is_unstable_and_the_series_is_the_motion():
+    given, request = case(), request_of(150)
+    route, check = choose_steady(given, request)
+    assert 0.0 < check.error <= request.tolerance
+    found = steady_states(given, route, request.points.values(np.arange(request.points.size)))
+    several = found.exists.sum(axis=1) == 3
+    assert several.sum() > 10
+    assert not found.stable[several, 1].any() and found.stable[several][:, [0, 2]].all()
+
+
+def test_phases_turn_with_the_forcing():
+    request = Request(Points({"forcing.phase": np.array([0.0, 0.7]), "forcing.omega": np.array([0.6, 1.9])}))
+    request = Request(request.points, outputs=("harmonics",))
+    found = answers(case(), request, plan(case(), request), request.points.values(np.arange(4)))
+    assert {v.name for v in variables(request)} == set(found)
+    phase, there = found["harmonic_phase"].reshape(2, 2, 3, -1), ~np.isnan(found["mean"]).reshape(2, 2, 3)[0]
+    turned = np.exp(1j * (phase[1] - phase[0]))[there]
+    orders = np.arange(1, 2 * turned.shape[-1], 2)
+    np.testing.assert_allclose(turned, np.exp(0.7j * orders)[None] * np.ones_like(turned), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["bouc_wen", "input_delay"])
+def test_what_balance_can_not_carry_is_refused(name):
+    from hdjax.effects.catalogue import BY_NAME as forms
+    from hdjax.effects.effect import Scales
+
+    effect = forms[name].proposals(Scales(1e-3, 1e-3, 0.1, 1.0, 1.0, 1e-3))[0]
+    with pytest.raises(ValueError, match=name):
+        choose_steady(case(effect), request_of(3))
