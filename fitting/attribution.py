@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, scales
-from fitting.free import fitted_paths, strength_paths
+from fitting.free import effect_paths, fitted_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
 from fitting.uncertainty import uncertainty
 from hdjax import Hold, Model
