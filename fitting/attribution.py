@@ -12,7 +12,7 @@ from fitting.experiment import Stretch, scales
 from fitting.free import effect_paths, fitted_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
 from fitting.uncertainty import uncertainty
-from hdjax import Hold, Model
+from hdjax import Hold, Model, ReducedModel
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
 
@@ -155,8 +155,17 @@ def challenge(
         give_up_above: a lower objective that it must reach.
     """
     limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
-    fits = [_trained(m, data, hold, setting, champion.training.covariance, give_up_above=limit) for m in models]
-    best = min(fits, key=lambda found: found.objective)
+    covariance = champion.training.covariance
+    if len(models) > 1:
+        # One pass each tells the best start; that one alone is followed to the end.
+        tries = [_trained(m, data, hold, setting, covariance, give_up_above=-np.inf) for m in models]
+        begun = min(tries, key=lambda found: found.objective)
+        if begun.objective > limit:
+            return None
+        states = begun.unknowns.states
+        best = _trained(begun.model, data, hold, setting, begun.covariance, give_up_above=limit, states=states)
+    else:
+        best = _trained(models[0], data, hold, setting, covariance, give_up_above=limit)
     return _judged(best, data, hold, setting) if best.objective <= limit else None
 
 
@@ -415,14 +424,24 @@ def _p_worse(difference: np.ndarray) -> float:
 
 
 def _simplest_first(verdicts: list[Verdict]) -> list[Verdict]:
-    """Among competitors that can't be told apart, the one with the fewest parameters leads."""
+    """Among competitors that can't be told apart, one with plausible values and the fewest parameters leads."""
     tied = [v for v in verdicts if v.trial is not None and not v.separable]
     if len(tied) < 2:
         return verdicts
     best_gain = max(v.gain for v in tied)
     close = [v for v in tied if v.gain > best_gain - max(LEAST_GAIN, 0.02 * best_gain)]
-    leader = min(close, key=lambda v: (_size(v), -v.gain))
+    leader = min(close, key=lambda v: (_beyond_real_drives(v), _size(v), -v.gain))
     return [leader] + [v for v in verdicts if v is not leader]
+
+
+def _beyond_real_drives(verdict: Verdict) -> bool:
+    """Whether a parameter of the effect is larger than real drives show; a reduced log's units are its own."""
+    assert verdict.trial is not None
+    model = verdict.trial.model
+    if isinstance(model, ReducedModel):
+        return False
+    own = [known for path, known in model.parameters().items() if path.startswith(f"{verdict.name}.")]
+    return any(info.implausibly_large(float(value)) for value, info in own)
 
 
 def _size(verdict: Verdict) -> int:

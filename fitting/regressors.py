@@ -119,7 +119,8 @@ def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
     mean = 0.5 * np.einsum("k,snki,snkp->snip", WEIGHTS, acting, torque, optimize=True)
     rise = 1.5 * np.einsum("k,snki,snkp->snip", WEIGHTS * NODES, acting, torque, optimize=True)
     nothing = np.zeros((*seen.segments.measured.shape, torque.shape[-1]))
-    return Regressors(*map(jnp.asarray, (mean - rise, mean + rise, nothing)))
+    found = Regressors(*map(jnp.asarray, (mean - rise, mean + rise, nothing)))
+    return jax.tree.map(np.asarray, found)
 
 
 def place_of(effect: Effect) -> type[LearnedTorque] | None:

@@ -36,12 +36,15 @@ from fitting.report import (
     separating_experiment,
     write_report,
 )
+from fitting.report.limits import parameter_note
 from fitting.starting_values import starting_models
-from fitting.uncertainty import Uncertainty
+from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects import FAMILIES
 from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.backlash import Backlash
 from hdjax.effects.friction import MotorFriction
+from hdjax.parameters import own_parameters
 
 HOSTILE = "<script>alert(1)</script>"
 HOLD: Hold = "zero-order"
@@ -212,16 +215,26 @@ def test_the_page_loads_nothing(page: str):
     assert "default-src 'none'" in page
 
 
+@pytest.mark.parametrize(("gap", "said"), [(2e-4, False), (1e-3, True)])
+def test_a_value_beyond_real_drives_is_told(loop: Loop, gap: float, said: bool):
+    info = dict(own_parameters(Backlash(b=gap)))["b"]
+    b = Estimate("backlash.b", gap, 1e-6, 1e-6, (gap - 2e-6, gap + 2e-6), "rad", True)
+    note = parameter_note(b, loop.after.identifiability, info)
+    assert (note is not None and "real drives show up to 290 µrad" in note) == said
+    assert parameter_note(b, loop.after.identifiability) is None
+
+
 @pytest.mark.parametrize("kind", ["loop", "fitted"])
 def test_a_browser_draws_every_picture_offline(kind: str, request: pytest.FixtureRequest, tmp_path: Path):
     outcome = request.getfixturevalue(kind)
     write_page(tmp_path, outcome)
     document, console = shown(tmp_path / "report.html")
     assert console == []
-    assert not re.search(r"""(src=|<link)[^>]*//""", document[document.index("<body") :])
+    assert not re.search(r"(src=|<link)[^>]*//", re.sub("<script.*?</script>", "", document, flags=re.DOTALL))
     places = re.findall(r'<div class="plot[^"]*" id="([^"]+)"', document)
     pictures = plots(outcome, units={}) if kind == "loop" else fit_plots(outcome, units={})
-    assert sorted(places) == sorted(p.key for p in pictures)
+    evidence = ["evidence-motor-friction"] if kind == "loop" else []
+    assert sorted(places) == sorted([p.key for p in pictures] + evidence)
     drawn = [document[a:b] for a, b in pairwise([*(document.index(f'id="{p}"') for p in places), len(document)])]
     assert all("main-svg" in picture for picture in drawn)
     # What stayed text has made no element, and nothing has run.

@@ -10,6 +10,7 @@ from fitting.identifiability import Identifiability
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from fitting.uncertainty import Estimate
+from hdjax.parameters import ParameterInfo
 
 # Beyond it two parameters are told as one combination.
 _CORRELATED = 0.9
@@ -17,18 +18,25 @@ _MOST_CORRELATIONS = 8
 _DAMPING = ("B_sp", "mu")
 
 
-def parameter_note(estimate: Estimate, found: Identifiability) -> str | None:
+def parameter_note(estimate: Estimate, found: Identifiability, info: ParameterInfo | None = None) -> str | None:
     """What must be said beside a parameter; None where its number speaks for itself.
 
     Args:
         estimate: of the parameter.
         found: what the logs can't tell.
+        info: what is known of the parameter; None where its unit is the log's own.
     """
     note = found.note(estimate.path)
     if note is None and estimate.path in _DAMPING and estimate.value < 0:
         return (
             f"{estimate.path} is negative: such a drive would feed energy; look for a delay or a wrong hold of the "
             "torque."
+        )
+    if note is None and info is not None and info.implausibly_large(estimate.value):
+        most = formatting.quantity(info.plausible[1], estimate.unit)
+        return (
+            f"{estimate.path} is {formatting.quantity(estimate.value, estimate.unit)}, where real drives show up to "
+            f"{most}: look at the log's units, or for what else could stand behind it."
         )
     return note
 

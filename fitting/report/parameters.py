@@ -49,7 +49,9 @@ def no_account() -> dict[str, Any]:
 
 def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start: Model | None = None) -> dict[str, Any]:
     estimate = account.uncertainty.estimates[path]
-    note = parameter_note(estimate, account.identifiability)
+    info = account.model.parameters()[path][1]
+    known = None if isinstance(account.model, ReducedModel) else info
+    note = parameter_note(estimate, account.identifiability, known)
     return {
         "value": estimate.value,
         "std": estimate.std,
@@ -58,7 +60,7 @@ def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start:
         "unit": _unit_in_log(estimate.unit, path, account.model, units),
         "identifiable": estimate.identifiable,
         "std_classical": estimate.std_classical,
-        "description": account.model.parameters()[path][1].doc,
+        "description": info.doc,
         "percent": _percent(estimate.value, estimate.std),
         "start": None if start is None else float(start.get(path)),
         "at_bound": path in account.identifiability.bounds,
