@@ -122,7 +122,7 @@ def fit(
         length: samples in a segment; see [`segment_length`][] where not given.
         halo: intervals of torque before each segment, for delays.
         substeps: solver steps in a sample interval; from the natural frequency where not given.
-        max_steps: iterations of each pass at most.
+        max_steps: iterations of each pass at most; with twice as many in all, no further pass begins.
         covariance: of the outputs' errors to start the weighing with.
         reweigh: whether to weigh by what is left over; with False the given covariance is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
@@ -164,7 +164,8 @@ def fit(
                 unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[1])
         before, objective = objective, _half_log_determinant(covariance)
         converged, steps = bool(success), steps + int(taken)
-        if not np.isfinite(objective) or abs(before - objective) < 1e-4 or objective > give_up_above:
+        settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
+        if settled or objective > give_up_above or steps >= 2 * max_steps:
             break
     assert error is not None
     # By way of the host: what is computed with the model alone need not run on every device.
