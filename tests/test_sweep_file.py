@@ -53,7 +53,7 @@ def test_a_sweep_file_is_a_model_a_forcing_and_points(tmp_path):
         ("alpha = 50.0", "alpha = true", r"\[drive\] alpha must be a number, but is True"),
         ("alpha = 50.0", "mass = 1.0", r"\[drive\] mass is not known here"),
         ("amplitude = 2.0", "torque = 2.0", r"\[forcing\] torque is not known here"),
-        ("points = 4", "points = 4.5", r"\[axes.K\] points must be a whole number above 0, but is 4.5"),
+        ("points = 4", "points = 4.5", r"\[axes.K\] points must be a whole number from 1 on, but is 4.5"),
         ("from = 6e3, ", "", r"\[axes.K\] must have `from`"),
         ("from = 6e3", "from = -1.0", "must run from above zero for spacing log"),
         ("[300.0, 350.0]", "[]", "`forcing.omega` must be a list of finite numbers"),
