@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
 
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit
@@ -128,9 +127,10 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
         data: the stretches.
         hold: what the torque does between samples.
         setting: how the data are cut.
-        start: a trial whose error covariance weighs the outputs at the start.
+        start: a trial near by, whose error covariance weighs the outputs at the start; of a model with the same states
+            it supplies those too.
     """
-    training = _trained(model, data, hold, setting, None if start is None else start.training.covariance)
+    training = _trained(model, data, hold, setting, None if start is None else start.training)
     return _judged(training, data, hold, setting)
 
 
@@ -155,17 +155,18 @@ def challenge(
         give_up_above: a lower objective that it must reach.
     """
     limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
-    covariance = champion.training.covariance
+
+    def begun(model: Model, give_up_above: float) -> Fit:
+        return _trained(model, data, hold, setting, champion.training, give_up_above=give_up_above, retry_states=True)
+
     if len(models) > 1:
         # One pass each tells the best start; that one alone is followed to the end.
-        tries = [_trained(m, data, hold, setting, covariance, give_up_above=-np.inf) for m in models]
-        begun = min(tries, key=lambda found: found.objective)
-        if begun.objective > limit:
+        first = min((begun(m, -np.inf) for m in models), key=lambda found: found.objective)
+        if first.objective > limit:
             return None
-        states = begun.unknowns.states
-        best = _trained(begun.model, data, hold, setting, begun.covariance, give_up_above=limit, states=states)
+        best = _trained(first.model, data, hold, setting, first, give_up_above=limit)
     else:
-        best = _trained(models[0], data, hold, setting, covariance, give_up_above=limit)
+        best = begun(models[0], limit)
     return _judged(best, data, hold, setting) if best.objective <= limit else None
 
 
@@ -174,12 +175,14 @@ def _trained(
     data: Data,
     hold: Hold,
     setting: Setting,
-    covariance: Float[Array, "outputs outputs"] | None,
+    near: Fit | None,
     *,
     give_up_above: float = np.inf,
-    states: Float[Array, "segments states"] | None = None,
+    retry_states: bool = False,
     max_steps: int = _TRIAL_STEPS,
 ) -> Fit:
+    """A fit that starts with the covariance of one near by, and from its states where the model has the same."""
+    same = near is not None and near.model.state_names == model.state_names
     return fit(
         model,
         data[hold][0],
@@ -188,10 +191,10 @@ def _trained(
         halo=setting.halo,
         substeps=setting.substeps,
         count=setting.count,
-        covariance=covariance,
+        covariance=None if near is None else near.covariance,
         max_steps=max_steps,
-        states=states,
-        retry_states=states is None,
+        states=near.unknowns.states if near is not None and same else None,
+        retry_states=retry_states or not same,
         give_up_above=give_up_above,
     )
 
@@ -372,8 +375,7 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
 def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:
     """Refit under another hold. It acts on the same motion, so that a few steps from the present fit tell whether it
     is worth more."""
-    states = before.training.unknowns.states
-    near = _trained(before.model, data, hold, setting, before.training.covariance, states=states, max_steps=_HOLD_STEPS)
+    near = _trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS)
     if near.objective > before.training.objective + LEAST_GAIN:
         return None
     return challenge([near.model], data, hold, setting, champion=before)
