@@ -82,6 +82,8 @@ def fit(
     seed: int = 0,
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
+    workers: int = 0,
+    scheduler: str | None = None,
 ) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
@@ -102,14 +104,22 @@ def fit(
     next_experiment
         Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
         and write it to next_experiment.csv.
+    workers
+        Of a folder: processes on this machine that share its logs; threads where 0.
+    scheduler
+        Of a folder: address of a Dask scheduler whose workers do it, for instance tcp://10.0.0.1:8786.
     """
     asked = wanted(limits, next_experiment)
+    if (workers or scheduler) and not any(path.is_dir() for path in logs):
+        raise InputError(f"{logs[0]}: --workers and --scheduler are for a folder of logs; give the folder")
+    if workers < 0:
+        raise InputError(f"--workers must be 0 or more, but is {workers}")
     if asked is not None and any(path.is_dir() for path in logs):
         raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
     if posterior:
         _check_posterior(logs)
     if any(path.is_dir() for path in logs):
-        _fit_fleet(logs, drive, out)
+        _fit_fleet(logs, drive, out, workers, scheduler)
         return
     drive_file = read_drive_file(drive)
     read = ready_logs(logs, drive_file)
@@ -167,7 +177,7 @@ def _check_posterior(logs: list[Path]) -> None:
         raise InputError(f"--posterior: {error}") from error
 
 
-def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
+def _fit_fleet(folders: list[Path], drive: Path, out: Path, workers: int, scheduler: str | None) -> None:
     if len(folders) > 1:
         raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
     read_drive_file(drive)
@@ -176,7 +186,12 @@ def _fit_fleet(folders: list[Path], drive: Path, out: Path) -> None:
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("logs", total=None)
         table = fit_fleet(
-            folders[0], drive, out, progress=lambda done, total: bar.update(task, completed=done, total=total)
+            folders[0],
+            drive,
+            out,
+            workers=workers,
+            scheduler=scheduler,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     print(fleet_text(table))
     print(f"Table: {out / 'fleet.parquet'}")

@@ -1,8 +1,8 @@
 """Many logs, each of a drive of its own: one table of fits, whatever becomes of the single log.
 
-Logs are fitted side by side in threads; logs of similar length share compiled programs. Each finished fit is kept in a
-file named after what it was made from, so that a run that was cut off goes on where it stopped, and a log that has
-changed since is fitted anew.
+Logs are fitted side by side, in threads or on a cluster; logs of similar length share compiled programs. Each finished
+fit is kept in a file named after what it was made from, so that a run that was cut off goes on where it stopped, and a
+log that has changed since is fitted anew.
 """
 
 import hashlib
@@ -10,7 +10,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.metadata import version
 from io import BytesIO
@@ -28,6 +28,7 @@ from fitting.formatting import in_log_words
 from fitting.log_table import LOG_SUFFIXES
 from fitting.rig import Rig, read_rig
 from hdjax import SimulationError
+from hdjax.cluster import on_cluster
 
 State = Literal["fitted", "refused", "failed"]
 Row = dict[str, Any]
@@ -63,7 +64,8 @@ def fit_fleet(
     drive: Path,
     out: Path,
     *,
-    workers: int | None = None,
+    workers: int = 0,
+    scheduler: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> pl.DataFrame:
     """Fit the base model to each log below a folder on its own, and write `fleet.parquet`.
@@ -72,7 +74,9 @@ def fit_fleet(
         folder: holds the logs.
         drive: drive file of the logs; a `drive.toml` beside a log goes before it.
         out: folder for the table and for what is needed to go on after an interruption.
-        workers: fits at a time; as many as there are cores where not given.
+        workers: processes of a cluster on this machine; 0 for threads of this process, one for each core.
+        scheduler: address of a Dask scheduler whose workers do it, in place of `workers`; logs and `out` must be
+            visible to them under the same paths.
         progress: told how many of how many are done.
 
     Returns:
@@ -80,21 +84,22 @@ def fit_fleet(
         what that is from, whether the log tells the parameter, and if not, why.
 
     Raises:
-        InputError: where there are no logs.
+        InputError: where there are no logs, or no cluster.
     """
     logs = find_logs(folder, apart_from=out)
-    # The first one alone: what it compiles serves the others.
-    rows: dict[Path, Row] = {logs[0]: _finished_row(logs[0], folder, drive, out)}
-    progress(1, len(logs))
-    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
-        waiting = {pool.submit(_finished_row, log, folder, drive, out): log for log in logs[1:]}
-        try:
-            for future in as_completed(waiting):
-                rows[waiting[future]] = future.result()
-                progress(len(rows), len(logs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    given = folder.absolute(), drive.absolute(), out.absolute()
+    absolute = {log.absolute(): log for log in logs}
+    if workers or scheduler:
+        finished = on_cluster(_finished_row, list(absolute), given, workers=workers, scheduler=scheduler)
+    else:
+        finished = _in_threads(list(absolute), given)
+    rows: dict[Path, Row] = {}
+    try:
+        for log, row in finished:
+            rows[absolute[log]] = row
+            progress(len(rows), len(logs))
+    except (ImportError, ValueError) as error:
+        raise InputError(f"{folder}: {error}") from error
     table = pl.DataFrame([rows[log] for log in logs], infer_schema_length=None)
     buffer = BytesIO()
     table.write_parquet(buffer)
@@ -102,7 +107,20 @@ def fit_fleet(
     return table
 
 
-def _finished_row(log: Path, folder: Path, drive: Path, out: Path) -> Row:
+def _in_threads(logs: Sequence[Path], given: tuple[Path, Path, Path]) -> Iterator[tuple[Path, Row]]:
+    # The first one alone: what it compiles serves the others.
+    yield logs[0], _finished_row(*given, logs[0])
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        waiting = {pool.submit(_finished_row, *given, log): log for log in logs[1:]}
+        try:
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _finished_row(folder: Path, drive: Path, out: Path, log: Path) -> Row:
     """The row of a log, from an earlier run where it is the same log, drive file and program."""
     own = log.parent / _OWN_DRIVE
     drive = own if own.is_file() else drive

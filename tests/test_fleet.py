@@ -99,11 +99,13 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch
         raise DataError(f"{paths[0]}: no")
 
     monkeypatch.setattr(fitting.fleet, "read_rig", read)
+    # One after the other.
+    monkeypatch.setattr(fitting.fleet.os, "cpu_count", lambda: 1)
     with pytest.raises(KeyboardInterrupt):
-        fit_fleet(tmp_path / "logs", drive, tmp_path / "out", workers=1)
+        fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     assert not (tmp_path / "out" / "fleet.parquet").exists()
     limit = len(logs)
-    table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out", workers=1)
+    table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     assert seen == logs
     assert len(table) == 4
 
@@ -172,3 +174,27 @@ def test_why_a_parameter_is_not_told():
     columns = parameter_columns(account, {"dynamic_error": "V", "forcing": "A"})
     assert columns["alpha_note"] == "alpha is at most 5 1/V^2" and columns["mu_note"] == ""
     assert (columns["alpha_low"], columns["alpha_identifiable"]) == (-3.0, False)
+
+
+def test_a_cluster_makes_the_same_table(tmp_path: Path, drive: Path):
+    pytest.importorskip("distributed", reason="needs the extra `sweep`, which is not installed")
+    for i in range(3):
+        log = tmp_path / "logs" / f"{i}.csv"
+        log.parent.mkdir(exist_ok=True)
+        log.write_text(f"time,dynamic_error\n0,{i}\n", encoding="utf-8")
+    done = []
+    there = fit_fleet(tmp_path / "logs", drive, tmp_path / "a", workers=2, progress=lambda *now: done.append(now))
+    here = fit_fleet(tmp_path / "logs", drive, tmp_path / "b")
+    assert done == [(1, 3), (2, 3), (3, 3)]
+    assert there["state"].to_list() == ["refused"] * 3
+    assert there.drop("seconds").equals(here.drop("seconds"))
+
+
+def test_an_absent_scheduler_is_told(tmp_path: Path, drive: Path):
+    pytest.importorskip("distributed", reason="needs the extra `sweep`, which is not installed")
+    import dask
+
+    write_log(tmp_path / "logs" / "a.csv")
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        with pytest.raises(InputError, match="no Dask scheduler answers at tcp://127.0.0.1:9"):
+            fit_fleet(tmp_path / "logs", drive, tmp_path / "out", scheduler="tcp://127.0.0.1:9")

@@ -2,15 +2,15 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from hdjax.cluster import on_cluster
 from hdjax.dynamics import Model
-from hdjax.sweep.hosts import spread_chunks
 from hdjax.sweep.outputs import Plan, answers, extra_dims, plan, variables
 from hdjax.sweep.points import SAMPLE
 from hdjax.sweep.request import Case, Request, digest
@@ -101,7 +101,8 @@ def _fill(
     if not waiting:
         return
     if workers or scheduler:
-        chunks: Iterator[int] = spread_chunks(kept, case, request, chosen, waiting, workers, scheduler)
+        given = (kept, case, request, chosen)
+        chunks = (chunk for chunk, _ in on_cluster(work, waiting, given, workers=workers, scheduler=scheduler))
     else:
         chunks = (work(kept, case, request, chosen, chunk) for chunk in waiting)
     for chunk in chunks:

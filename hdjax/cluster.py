@@ -1,0 +1,69 @@
+"""Independent tasks on processes of this machine or of many, by Dask. A task that dies with its worker is redone."""
+
+import contextlib
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+
+_RETRIES = 3
+_EVERYWHERE = ("jax_enable_x64",)
+# What makes sense on this machine alone.
+_HERE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+
+
+def on_cluster(
+    function: Callable[..., Any], items: Sequence[Any], given: tuple, *, workers: int, scheduler: str | None
+) -> Iterator[tuple[Any, Any]]:
+    """Call `function(*given, item)` for every item on a cluster; gives each item with its result, as they come.
+
+    Args:
+        function: a function of a module, whose tasks may be done more than once.
+        items: what differs between the tasks.
+        given: what they share.
+        workers: processes of a cluster on this machine, where there is no scheduler.
+        scheduler: address of a cluster's scheduler. Its workers have this project installed.
+
+    Raises:
+        ImportError: where Dask is not installed.
+        ValueError: where no scheduler answers.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise ImportError("distributed is not installed: pip install 'hdjax[sweep]'") from error
+    names = _EVERYWHERE if scheduler else (*_EVERYWHERE, *_HERE)
+    settings = {name: getattr(jax.config, name) for name in names}
+    with contextlib.ExitStack() as stack:
+        address = scheduler
+        if address is None:
+            # Each worker has the machine's cores to itself in turn: one thread, one task.
+            address = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                )
+            )
+        try:
+            client = stack.enter_context(distributed.Client(address))
+        except OSError as error:
+            raise ValueError(f"no Dask scheduler answers at {address}") from error
+        # Bytes: a worker must know the precision before it makes arrays of them.
+        shared = client.scatter((pickle.dumps((function, given)), settings), broadcast=True)
+        # What is done is remembered by whoever keeps it, not by the scheduler: a later run must ask anew.
+        futures = client.map(_on_worker, items, given=shared, pure=False, retries=_RETRIES)
+        of = dict(zip((future.key for future in futures), items, strict=True))
+        for future in distributed.as_completed(futures):
+            yield of[future.key], future.result()
+
+
+def _on_worker(item: Any, given: tuple[bytes, dict[str, Any]]) -> Any:
+    """A worker's process is the task's own: JAX's settings are those of whoever asked."""
+    task, settings = given
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    function, shared = pickle.loads(task)
+    return function(*shared, item)
