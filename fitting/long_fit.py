@@ -64,6 +64,7 @@ def _again(found: Fit, model: Model, *, horizon: int, substeps: int, hold_parame
         covariance=found.covariance,
         count=count,
         states=None if hold_parameters else found.unknowns.states,
+        retry_states=hold_parameters,
         max_steps=_STEPS,
         hold_parameters=hold_parameters,
     )
