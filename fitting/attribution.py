@@ -8,8 +8,9 @@ import numpy as np
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, scales
-from fitting.free import effect_paths, fitted_paths, strength_paths
+from fitting.free import fitted_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
+from fitting.shortlist import NEARLY, first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.uncertainty import uncertainty
 from hdjax import Hold, Model, ReducedModel
 from hdjax.effects import Effect
@@ -21,24 +22,11 @@ SIGNIFICANCE = 0.01
 LEAST_GAIN = 1e-3
 """Smallest accepted gain, a tenth of a percent of the error: below it a solver's imperfection counts too."""
 
-# A form that to first order does no better than chance does in this share of cases is not refitted.
-_WORTH_A_REFIT = 0.2
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
 # Iterations after which another hold of the torque must explain more.
 _HOLD_STEPS = 8
-# Nor is one that explains less than this share of what the best one does.
-_SHARE_OF_BEST = 0.25
-# Families whose likeliest form is refitted inside the equations in each round.
-_FAMILIES = 5
-# Further forms of the best one's family that compete with it there.
-_FORMS = 3
-# A form with fewer parameters goes first where it explains at least this share of what its family's best one does.
-_NEARLY = 0.95
-# Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
-# at least this share of what it does,
-_POSSIBLE_TIE = 0.5
-# and whose first fit comes as close as this share of its gain.
+# What can only be tied with the best must come as close as this share of its gain in its first pass.
 _NEAR_TIE = 0.1
 
 
@@ -237,7 +225,7 @@ def look(
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     refitted: dict[str, Trial] = {}
-    worth = _worth_a_refit(screened)
+    worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
 
     def refit(leads: Sequence[Lead], give_up_above: float = np.inf) -> None:
         for lead in leads:
@@ -246,18 +234,18 @@ def look(
             if trial is not None and np.isfinite(trial.held_out.objective):
                 refitted[lead.effect.name] = trial
 
-    first = _first_of_each_family(worth)[:_FAMILIES]
+    first = first_of_each_family(worth)
     refit(first[:1])
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
         gain = before.training.objective - leader.training.objective
-        refit(_possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gain)
+        refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gain)
     else:
         refit(first[1:])
         if refitted:
             best = min(refitted, key=lambda name: refitted[name].held_out.objective)
             family = next(lead.effect.family for lead in worth if lead.effect.name == best)
-            refit([lead for lead in worth if lead.effect.family == family and lead not in first][:_FORMS])
+            refit(further_forms(worth, family, first))
     found: list[Verdict] = []
     for lead in screened.leads:
         trial = refitted.get(lead.effect.name)
@@ -290,41 +278,13 @@ def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tup
         rival = verdict.trial
         if rival is None or verdict.family != this.winner.family or _size(verdict) >= _size(this.winner):
             continue
-        if verdict.gain < _NEARLY * this.winner.gain:
+        if verdict.gain < NEARLY * this.winner.gain:
             continue
         simpler = attempt(rival.model, data, found.hold, setting, start=found)
         if simpler.held_out.objective <= found.held_out.objective + LEAST_GAIN:
             verdicts = (verdict, *(v for v in this.verdicts if v is not verdict))
             return Round(this.before, this.screen, verdicts, this.accepted), simpler
     return this, found
-
-
-def _worth_a_refit(screened: Screen) -> list[Lead]:
-    """Leads that may be more than chance and explain a share of what the best one does, best first."""
-    least = max(0.25 * LEAST_GAIN, _SHARE_OF_BEST * screened.leads[0].gain) if screened.leads else 0.0
-    return [lead for lead in screened.leads if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT]
-
-
-def _first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
-    """The likeliest form of each family, likeliest first; the simplest of those that explain nearly as much."""
-    families: dict[str, list[Lead]] = {}
-    for lead in leads:
-        families.setdefault(lead.effect.family, []).append(lead)
-    return [_simplest([a for a in forms if a.gain >= _NEARLY * forms[0].gain]) for forms in families.values()]
-
-
-def _simplest(leads: Sequence[Lead]) -> Lead:
-    """The one with the fewest parameters and states of its own."""
-    return min(leads, key=lambda lead: (len(effect_paths(lead.effect)) + len(lead.effect.states), -lead.gain))
-
-
-def _possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:
-    """What may explain as much as the first of all, which leaves nothing but noise: other families, and forms of its
-    own one that to first order explain more."""
-    leader = first[0]
-    others = [lead for lead in first[1:] if lead.gain >= _POSSIBLE_TIE * leader.gain]
-    forms = [a for a in leads if a.effect.family == leader.effect.family and a.gain > leader.gain and a is not leader]
-    return others + forms[:_FORMS]
 
 
 def _supported(verdict: Verdict) -> bool:

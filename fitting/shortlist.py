@@ -1,0 +1,61 @@
+"""Which forms are put inside the equations and refitted, from the first look alone."""
+
+from collections.abc import Sequence
+
+from fitting.free import effect_paths
+from fitting.screening import Lead, Screen
+
+NEARLY = 0.95
+"""A form with fewer parameters goes first where it explains at least this share of what its family's best one does."""
+
+# A form that to first order does no better than chance does in this share of cases is not refitted.
+_WORTH_A_REFIT = 0.2
+# Nor is one that explains less than this share of what the best one does.
+_SHARE_OF_BEST = 0.25
+# Families whose likeliest form is refitted inside the equations in each round.
+_FAMILIES = 5
+# Further forms of the best one's family that compete with it there.
+_FORMS = 3
+# Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
+# at least this share of what it does,
+_POSSIBLE_TIE = 0.5
+
+
+def worth_a_refit(screened: Screen, *, least: float) -> list[Lead]:
+    """Leads that may be more than chance and explain a share of what the best one does, best first.
+
+    Args:
+        screened: the first look.
+        least: gain that none may fall below.
+    """
+    if screened.leads:
+        least = max(least, _SHARE_OF_BEST * screened.leads[0].gain)
+    return [lead for lead in screened.leads if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT]
+
+
+def first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
+    """The likeliest form of each family, likeliest first; the simplest of those that explain nearly as much."""
+    families: dict[str, list[Lead]] = {}
+    for lead in leads:
+        families.setdefault(lead.effect.family, []).append(lead)
+    found = [_simplest([a for a in forms if a.gain >= NEARLY * forms[0].gain]) for forms in families.values()]
+    return found[:_FAMILIES]
+
+
+def _simplest(leads: Sequence[Lead]) -> Lead:
+    """The one with the fewest parameters and states of its own."""
+    return min(leads, key=lambda lead: (len(effect_paths(lead.effect)) + len(lead.effect.states), -lead.gain))
+
+
+def possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:
+    """What may explain as much as the first of all, which leaves nothing but noise: other families, and forms of its
+    own one that to first order explain more."""
+    leader = first[0]
+    others = [lead for lead in first[1:] if lead.gain >= _POSSIBLE_TIE * leader.gain]
+    forms = [a for a in leads if a.effect.family == leader.effect.family and a.gain > leader.gain and a is not leader]
+    return others + forms[:_FORMS]
+
+
+def further_forms(leads: Sequence[Lead], family: str, tried: Sequence[Lead]) -> list[Lead]:
+    """The next forms of a family."""
+    return [lead for lead in leads if lead.effect.family == family and lead not in tried][:_FORMS]
