@@ -7,6 +7,8 @@ from typing import Any
 
 import jax
 
+from hdjax.extra import required
+
 _RETRIES = 3
 _EVERYWHERE = ("jax_enable_x64",)
 # What makes sense on this machine alone.
@@ -29,10 +31,7 @@ def on_cluster(
         ImportError: where Dask is not installed.
         ValueError: where no scheduler answers.
     """
-    try:
-        import distributed
-    except ImportError as error:
-        raise ImportError("distributed is not installed: pip install 'hdjax[sweep]'") from error
+    distributed = required("distributed")
     names = _EVERYWHERE if scheduler else (*_EVERYWHERE, *_HERE)
     settings = {name: getattr(jax.config, name) for name in names}
     with contextlib.ExitStack() as stack:
@@ -44,7 +43,7 @@ def on_cluster(
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
-                    dashboard_address=None,  # pyright: ignore[reportArgumentType]
+                    dashboard_address=None,
                 )
             )
         try:

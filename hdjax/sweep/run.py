@@ -11,10 +11,11 @@ import numpy as np
 
 from hdjax.cluster import on_cluster
 from hdjax.dynamics import Model
+from hdjax.extra import required
 from hdjax.sweep.outputs import Plan, answers, extra_dims, plan, variables
 from hdjax.sweep.points import SAMPLE
 from hdjax.sweep.request import Case, Request, digest
-from hdjax.sweep.store import Store, required, work
+from hdjax.sweep.store import Store, work
 
 _MEMORY = 1 << 29
 _LARGEST_CHUNK = 1 << 16

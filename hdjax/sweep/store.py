@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from hdjax.extra import required
 from hdjax.sweep.outputs import Plan, answers, extra_dims, variables
 from hdjax.sweep.request import Case, Request, digest
 
 _PLAN = "plan.json"
 _MARKS = "finished"
-_EXTRA = "this needs the extra `sweep`; install hdjax[sweep]"
 
 
 class Store:
@@ -112,20 +112,6 @@ def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) ->
     if not kept.has(chunk):
         kept.write(chunk, answers(case, request, chosen, request.points.values(kept.points(chunk))))
     return chunk
-
-
-def required(name: str) -> Any:
-    """A library of the extra `sweep`.
-
-    Raises:
-        ImportError: where it is absent.
-    """
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(f"{name} is not installed: {_EXTRA}") from error
 
 
 def _write(path: Path, text: str) -> None:

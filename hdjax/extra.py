@@ -1,0 +1,16 @@
+"""Libraries that only some users need, loaded where they are asked for."""
+
+import importlib
+from typing import Any
+
+
+def required(name: str) -> Any:
+    """A library of the extra `sweep`.
+
+    Raises:
+        ImportError: where it is absent.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ImportError(f"{name} is not installed: this needs the extra `sweep`; install hdjax[sweep]") from error
