@@ -208,7 +208,7 @@ def close_loop_command(
     out: Path,
     max_effects: int = 3,
     seed: int = 0,
-    next_experiment: bool = True,
+    next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
 ) -> None:
     """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
@@ -216,13 +216,14 @@ def close_loop_command(
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json, and next_experiment.csv where explanations are tied.
+        Folder for report.html, report.json and model.json.
     max_effects
         Effects to add at most.
     seed
         Of the surrogates behind the p-values.
     next_experiment
-        Where explanations are tied, look for the motor torque that would tell them apart within limits (a minute).
+        Where explanations are tied, look for the motor torque that would tell them apart within limits (minutes), and
+        write it to next_experiment.csv.
     """
     if max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")

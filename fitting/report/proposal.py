@@ -78,8 +78,11 @@ def next_lines(report: Mapping[str, Any]) -> list[str]:
     proposed = report["next_experiment"]
     if proposed:
         return [*proposed["says"], f"The command is in {proposed['file']}."]
-    known = report["decision"] != "fit_only" or report["before"]["parameters"]["alpha"]["identifiable"]
-    return [] if known else ["--next-experiment looks for a command that would tell alpha."]
+    if report["decision"] == "fit_only":
+        known = report["before"]["parameters"]["alpha"]["identifiable"]
+        return [] if known else ["--next-experiment looks for a command that would tell alpha."]
+    tie = report["decision"] == "effect_found" and any(not other["separable"] for other in report["alternatives"])
+    return ["--next-experiment looks for a command that would tell the tied explanations apart."] if tie else []
 
 
 def _input(found: NextExperiment) -> str:

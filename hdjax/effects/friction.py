@@ -7,6 +7,7 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
 
@@ -128,7 +129,7 @@ class StribeckMotorFriction(MotorSideEffect):
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         omega = motor_rate(motion)
-        level = self.T_c + self.T_excess * jnp.exp(-((omega / self.omega_s) ** 2))
+        level = self.T_c + self.T_excess * exponential(-((omega / self.omega_s) ** 2))
         return -level * smooth_sign(omega, self.transition) - self.b * omega
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.bristle import SETTLING, bristle_rate, slip_rate
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
+from hdjax.elementary import power
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Dhaouadi, Ghorbel, Gandhi 2003; Ruderman"
@@ -53,9 +54,9 @@ class BoucWen(MeshTorqueEffect):
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
         z = state[0] / self.yield_twist
         # |z|^(n-1) has no derivative at 0 where n = 1; the offset is far below any z that matters.
-        power = (z * z + 1e-30) ** (0.5 * (self.n - 1.0))
+        magnitude = power(z * z + 1e-30, 0.5 * (self.n - 1.0))
         bent = self.share * jnp.abs(motion.v) * z + (1.0 - self.share) * motion.v * jnp.abs(z)
-        return (motion.v - power * bent)[None]
+        return (motion.v - magnitude * bent)[None]
 
     def state_scale(self) -> Float[Array, "1"]:
         return self.yield_twist[None]

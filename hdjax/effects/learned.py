@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.elementary import cosine_and_sine
 from hdjax.parameters import Scalar, as_scalar, parameter
 
 FAMILY = "unknown"
@@ -88,7 +89,7 @@ class AngleAxis(Axis):
         return 1 + 2 * self.orders
 
     def functions(self, value: Array) -> Float[Array, " functions"]:
-        cosine, sine = jnp.cos(value), jnp.sin(value)
+        cosine, sine = cosine_and_sine(value)
         turned = [jnp.ones_like(value), jnp.zeros_like(value)]
         found = turned[:1]
         for _ in range(self.orders):

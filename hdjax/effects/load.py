@@ -31,7 +31,7 @@ class GravityLoad(LoadSideEffect):
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         assert motion.theta_l is not None
-        return -self.sine * jnp.sin(motion.theta_l) - self.cosine * jnp.cos(motion.theta_l)
+        return -ripple(motion.theta_l, 1, self.cosine, self.sine)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return {

@@ -9,6 +9,7 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.bristle import SETTLING, bristle_rate
 from hdjax.effects.effect import Effect, Motion, MotorSideEffect, Scales
 from hdjax.effects.friction import motor_rate
+from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
@@ -96,7 +97,7 @@ class LuGreMotorFriction(MotorSideEffect):
         return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
 
     def _level(self, motion: Motion) -> Array:
-        return 1.0 + self.excess * jnp.exp(-((motor_rate(motion) / self.omega_s) ** 2))
+        return 1.0 + self.excess * exponential(-((motor_rate(motion) / self.omega_s) ** 2))
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
         return _bent(self.bend, motion)

@@ -3,12 +3,15 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hdjax.elementary import cosine_and_sine
+
 Angle = Float[Array, "*n"]
 
 
 def ripple(angle: Angle, order: float | int | Array, cosine: Array, sine: Array) -> Angle:
     """`cosine cos(order angle) + sine sin(order angle)`."""
-    return cosine * jnp.cos(order * angle) + sine * jnp.sin(order * angle)
+    along, across = cosine_and_sine(order * angle)
+    return cosine * along + sine * across
 
 
 def ripple_slope(angle: Angle, order: float | int | Array, cosine: Array, sine: Array) -> Angle:
