@@ -24,8 +24,9 @@ LEAST_GAIN = 1e-3
 
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
-# Iterations after which another hold of the torque must explain more.
-_HOLD_STEPS = 8
+# Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
+# one finds the way.
+_HOLD_STEPS = 3
 # What can only be tied with the best must come as close as this share of its gain in its first pass.
 _NEAR_TIE = 0.1
 
@@ -168,6 +169,7 @@ def _trained(
     give_up_above: float = np.inf,
     retry_states: bool = False,
     max_steps: int = _TRIAL_STEPS,
+    reweigh: bool = True,
 ) -> Fit:
     """A fit that starts with the covariance of one near by, and from its states where the model has the same."""
     same = near is not None and near.model.state_names == model.state_names
@@ -181,6 +183,7 @@ def _trained(
         count=setting.count,
         covariance=None if near is None else near.covariance,
         max_steps=max_steps,
+        reweigh=reweigh,
         states=near.unknowns.states if near is not None and same else None,
         retry_states=retry_states or not same,
         give_up_above=give_up_above,
@@ -335,7 +338,7 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
 def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:
     """Refit under another hold. It acts on the same motion, so that a few steps from the present fit tell whether it
     is worth more."""
-    near = _trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS)
+    near = _trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS, reweigh=False)
     if near.objective > before.training.objective + LEAST_GAIN:
         return None
     return challenge([near.model], data, hold, setting, champion=before)

@@ -1,6 +1,6 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -142,7 +142,7 @@ def close_loop(
     progress("finding starting values")
     base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
-    named, rounds, dropped = _add_effects(
+    named, rounds, dropped, without = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
     )
     clock.lap("attribution")
@@ -162,7 +162,9 @@ def close_loop(
     before = after
     if current is not base:
         before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
-    findings = _findings(base, trusted, current, rounds, data, setting, before, after, noise)
+    if current is not named:
+        without = {}
+    findings = _findings(base, trusted, current, rounds, without, data, setting, before, after, noise)
     if unknown is not None:
         findings = (*findings, _unknown_finding(unknown, trusted is base, data, setting, before, after, noise))
     clock.lap("free runs")
@@ -215,8 +217,12 @@ def _add_effects(
     catalogue: Sequence[type[Effect]],
     seed: int,
     progress: Callable[[str], None],
-) -> tuple[Trial, tuple[Round, ...], tuple[str, ...]]:
-    """Add the best effect, refit, look again; then drop what a later effect has made superfluous."""
+) -> tuple[Trial, tuple[Round, ...], tuple[str, ...], dict[str, Trial]]:
+    """Add the best effect, refit, look again; then drop what a later effect has made superfluous.
+
+    Returns the model, the rounds, the names of what was dropped, and the model without each of its effects as far as
+    that was fitted.
+    """
     current, rounds = base, []
     found = 0
     while found < max_effects:
@@ -245,12 +251,19 @@ def _add_effects(
         rounds.append(this)
         progress(f"found {this.winner.name}")
     dropped = []
-    for name in [e.name for e in current.model.effects[:-1]]:
-        without = attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
-        if without.held_out.objective - current.held_out.objective < LEAST_GAIN:
+    without = {}
+    names = [e.name for e in current.model.effects]
+    for name in names[:-1]:
+        poorer = attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
+        if poorer.held_out.objective - current.held_out.objective < LEAST_GAIN:
             dropped.append(name)
-            current = without
-    return current, tuple(rounds), tuple(dropped)
+            current, without = poorer, {}
+        else:
+            without[name] = poorer
+    if not dropped:
+        last = next((this for this in reversed(rounds) if this.accepted), None)
+        without |= {} if last is None else {last.winner.name: last.before}
+    return current, tuple(rounds), tuple(dropped), without
 
 
 def _what_is_unknown(
@@ -295,13 +308,15 @@ def _findings(
     trusted: Trial,
     current: Trial,
     rounds: Sequence[Round],
+    without: Mapping[str, Trial],
     data: Data,
     setting: Setting,
     before: Account,
     after: Account,
     noise: Float[Array, "outputs outputs"],
 ) -> tuple[Finding, ...]:
-    """The accepted effects, each with what the held-out error would be without it."""
+    """The accepted effects, each with what the held-out error would be without it; `without` holds the models without
+    one of them that are fitted already."""
     names = [e.name for e in trusted.model.effects]
     changed_hold = current.hold != base.hold
     found = []
@@ -311,15 +326,16 @@ def _findings(
         if not this.accepted or not (winner.name in names or (is_hold and changed_hold)):
             continue
         if len(current.model.effects) + changed_hold == 1:
-            without = before.validation_rmse
-        elif is_hold:
-            poorer = attempt(current.model, data, base.hold, setting, start=current)
-            without = validation_rmse(poorer.training, *data[poorer.hold], noise=noise, halo=setting.halo)
+            rmse = before.validation_rmse
         else:
-            reduced = current.model.without_effect(winner.name)
-            poorer = attempt(reduced, data, current.hold, setting, start=current)
-            without = validation_rmse(poorer.training, *data[poorer.hold], noise=noise, halo=setting.halo)
-        gain = 1.0 - after.validation_rmse / without
+            poorer = without.get(winner.name)
+            if poorer is None:
+                model, hold = current.model, base.hold
+                if not is_hold:
+                    model, hold = current.model.without_effect(winner.name), current.hold
+                poorer = attempt(model, data, hold, setting, start=current)
+            rmse = validation_rmse(poorer.training, *data[poorer.hold], noise=noise, halo=setting.halo)
+        gain = 1.0 - after.validation_rmse / rmse
         effect = None if is_hold else after.model.effect(winner.name)
         found.append(Finding(effect, winner.name, winner.family, gain, winner.p_value))
     return tuple(sorted(found, key=lambda f: -f.validation_gain))

@@ -17,7 +17,6 @@ from fitting.residual import (
     Problem,
     Unknowns,
     linearise,
-    residual,
     residual_with_blocks,
 )
 from hdjax import Drive, Model, TwoInertiaModel
@@ -150,36 +149,37 @@ def fit(
     problem = Problem(model, free, segments, *unweighed, substeps=substeps)
     problem, unknowns = spread((problem, unknowns), states.shape[0])
     if covariance is None:
-        _, covariance, _ = _evaluate(problem, unknowns)
+        covariance = _evaluate(problem, unknowns).covariance
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = outputs > 1 or states.shape[1] > len(model.motion_states)
-    objective, converged, steps = np.inf, False, 0
-    error = None
+    objective, steps = np.inf, 0
+    solution = None
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, swing)
-        unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
+        solution = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
         if turn == 0 and retry_states and horizon <= _LONGEST_RETRY * length:
-            unknowns, changed = _retry_states(problem, unknowns)
-            if changed:
-                unknowns, error, covariance, success, taken = _solve(problem, unknowns, max_steps, _DAMPING[1])
+            mended = _retry_states(problem, solution)
+            if mended is not None:
+                solution = _solve(problem, mended, max_steps, _DAMPING[1])
+        unknowns, covariance = solution.unknowns, solution.covariance
         before, objective = objective, _half_log_determinant(covariance)
-        converged, steps = bool(success), steps + int(taken)
+        steps += int(solution.steps)
         settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
         if settled or objective > give_up_above or steps >= 2 * max_steps:
             break
-    assert error is not None
+    assert solution is not None
     # By way of the host: what is computed with the model alone need not run on every device.
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=free.unpack(model, values),
         problem=_weighed(problem, covariance, swing) if reweigh else problem,
         unknowns=unknowns,
-        error=error,
+        error=solution.error,
         covariance=covariance,
         objective=objective,
         stretches=tuple(stretches),
         horizon=horizon,
-        converged=converged,
+        converged=bool(solution.success),
         steps=steps,
     )
 
@@ -191,12 +191,37 @@ def _weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
     return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, swing)))
 
 
-def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float):
+class _Solution(eqx.Module):
+    """Where the iteration has come to.
+
+    Attributes:
+        unknowns: the fitted ones.
+        error: measured minus simulated.
+        covariance: of the error.
+        squares: each segment's sum of squares.
+        success: whether the next step promised next to nothing.
+        steps: how many were taken.
+    """
+
+    unknowns: Unknowns
+    error: Float[Array, "segments samples outputs"]
+    covariance: Float[Array, "outputs outputs"]
+    squares: Float[Array, " segments"]
+    success: Array
+    steps: Array
+
+
+def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float) -> _Solution:
     return _compiled_solve(problem, start, *(jnp.asarray(np.asarray(a)) for a in (max_steps, damping)))
 
 
+def _evaluate(problem: Problem, unknowns: Unknowns) -> _Solution:
+    """What there is at the given unknowns, by the program of the fit: its first step looks where it starts."""
+    return _solve(problem, unknowns, 1, _DAMPING[0])
+
+
 @jit_lanes
-def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array):
+def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array) -> _Solution:
     descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
     solution = optx.least_squares(
         residual_with_blocks,
@@ -207,8 +232,10 @@ def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping
         throw=False,
     )
     success = solution.result == optx.RESULTS.successful
-    error = _error_of_rows(problem, solution.state.f_info.residual.rows)
-    return solution.value, error, _covariance(error, problem.segments), success, solution.stats["num_steps"]
+    rows = solution.state.f_info.residual.rows
+    error, squares = _error_of_rows(problem, rows), jnp.sum(rows**2, axis=1)
+    covariance = _covariance(error, problem.segments)
+    return _Solution(solution.value, error, covariance, squares, success, solution.stats["num_steps"])
 
 
 def _error_of_rows(problem: Problem, rows: Array) -> Array:
@@ -218,28 +245,21 @@ def _error_of_rows(problem: Problem, rows: Array) -> Array:
     return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
 
 
-@jit_lanes
-def _evaluate(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array, Array]:
-    """The output error, its covariance, and each segment's sum of squares."""
-    rows, _ = residual(problem, unknowns)
-    error = _error_of_rows(problem, rows)
-    return error, _covariance(error, problem.segments), jnp.sum(rows**2, axis=1)
-
-
-def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]:
-    """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one.
+def _retry_states(problem: Problem, found: _Solution) -> Unknowns | None:
+    """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one; None where
+    none is better.
 
     A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
     segments would dominate the sum of squares. Masking the later samples lets the same compiled program do it.
     """
-    weight = problem.segments.weight
+    weight, unknowns = problem.segments.weight, found.unknowns
     held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
     model = problem.free.unpack(problem.model, unknowns.parameters)
     fresh = Unknowns(unknowns.parameters, initial_states(model, problem.segments))
-    old = np.asarray(_evaluate(problem, unknowns)[2])
+    old = np.asarray(found.squares)
     suspect = old > _OUTLIER * np.median(old[np.asarray(weight).any(axis=1)])
     if not suspect.any():
-        return unknowns, False
+        return None
     length = weight.shape[1]
     for samples in _growing(problem, length):
         masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
@@ -248,11 +268,12 @@ def _retry_states(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, bool]
         )
         # The program of the fit, where all is in the same places.
         part, fresh = spread((part, fresh), weight.shape[0])
-        fresh, *_ = _solve(part, fresh, _RETRY_STEPS, _DAMPING[0])
-    new = np.asarray(_evaluate(problem, fresh)[2])
+        fresh = _solve(part, fresh, _RETRY_STEPS, _DAMPING[0]).unknowns
+    new = np.asarray(_evaluate(problem, fresh).squares)
     better = (new < 0.99 * old) & suspect
-    states = jnp.where(better[:, None], fresh.states, unknowns.states)
-    return Unknowns(unknowns.parameters, states), bool(np.any(better))
+    if not better.any():
+        return None
+    return Unknowns(unknowns.parameters, jnp.where(better[:, None], fresh.states, unknowns.states))
 
 
 def _zeros_like(array: Array) -> Array:
@@ -424,7 +445,8 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
         covariance = found.covariance
         for turn in range(_REWEIGHTINGS):
             part = _weighed(part, covariance, swing)
-            unknowns, _, covariance, _, _ = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
+            solution = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
+            unknowns, covariance = solution.unknowns, solution.covariance
         total, samples = total + np.asarray(covariance) * head.sum(), samples + float(head.sum())
         freedom += _states_freedom(part, unknowns)
     rows = samples * total.shape[0]
@@ -458,10 +480,10 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     columns = None
     if np.isfinite(shift):
         columns = np.asarray(projected(linearise(problem, found.unknowns), problem.segments.joined))
-    error, white_by_error = np.asarray(_evaluate(problem, found.unknowns)[0]), np.asarray(problem.whitening)
+    error, white_by_error = np.asarray(_evaluate(problem, found.unknowns).error), np.asarray(problem.whitening)
     count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:
-        better = np.asarray(_evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns)[0])
+        better = np.asarray(_evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error)
         white = (better - error) @ white_by_error.T
         mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
         moved = 0.0 if columns is None else _standard_errors_moved(columns, white)

@@ -1,5 +1,6 @@
 """Programs of many lanes: compiled for wide vectors, and shared among the devices of this machine."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -22,7 +23,31 @@ _LEAST_LANES = 8
 def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """[`jit_kept`][hdjax.program_cache.jit_kept] for programs whose lanes [`hdjax.simulate.march`][] moves. None can be
     called inside another."""
-    return jit_kept(function, **_WIDE)
+    kept = jit_kept(function, **_WIDE)
+
+    @functools.wraps(function)
+    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        args, kwargs = _together((args, kwargs))
+        return kept(*args, **kwargs)
+
+    return call
+
+
+def _together(tree: _Tree) -> _Tree:
+    """The same arrays, all on the devices that share the lanes: where one of them was left behind, the program would
+    be compiled again."""
+    arrays, rest = eqx.partition(tree, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    mesh = next((a.sharding.mesh for a in leaves if _is_shared(a)), None)
+    if mesh is None:
+        return tree
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    leaves = [a if _is_shared(a) else jax.device_put(np.asarray(a), everywhere) for a in leaves]
+    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+
+
+def _is_shared(array: Any) -> bool:
+    return isinstance(array, jax.Array) and isinstance(array.sharding, NamedSharding)
 
 
 def spread(tree: _Tree, lanes: int) -> _Tree:
