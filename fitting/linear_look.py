@@ -9,10 +9,10 @@ from jaxtyping import Array, Float
 from fitting.estimate import Fit
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
-from fitting.regressors import unit_torque
+from fitting.regressors import conditions_at_knots, motions, unit_pushes
 from fitting.residual import Blocks, Problem, linearise
 from hdjax import Model
-from hdjax.effects import Motion
+from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import LearnedTorque
 from hdjax.where import where
 
@@ -28,6 +28,8 @@ class Look(eqx.Module):
         blocks: its residual and derivatives.
         followed: the motion and its answer to small forces.
         motion: at each knot.
+        conditions: likewise.
+        pushes: what a unit of each thing that effects can add does there to the state's rates, by its name.
         error: whitened output error.
     """
 
@@ -35,6 +37,8 @@ class Look(eqx.Module):
     blocks: Blocks
     followed: Followed
     motion: Motion
+    conditions: Conditions
+    pushes: dict[str, Float[Array, "segments knots states"]]
     error: Float[Array, "segments samples outputs"]
 
     @property
@@ -74,23 +78,21 @@ def look_along(fit: Fit) -> Look:
     """Linearise a fit along its motion."""
     problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
     followed = follow(problem, fit.unknowns)
+    conditions = conditions_at_knots(problem.segments)
     return Look(
         problem,
         linearise(problem, fit.unknowns),
         followed,
-        _motion(fit.model, followed.states),
+        motions(fit.model, followed.states, conditions),
+        conditions,
+        unit_pushes(fit.model, followed.states, conditions),
         jnp.asarray(fit.error) @ fit.problem.whitening.T,
     )
 
 
-@eqx.filter_jit
-def _motion(model: Model, states: Float[Array, "segments knots states"]) -> Motion:
-    return jax.vmap(jax.vmap(model.motion))(states)
-
-
 def push(look: Look, form: type[LearnedTorque]) -> Float[Array, "segments knots states"]:
     """What a unit of torque at the form's place adds to the state's rates, at each knot."""
-    return unit_torque(look.model, form, look.followed.states)
+    return look.pushes[form.name]
 
 
 def parameter_torques(
@@ -100,18 +102,19 @@ def parameter_torques(
 
     Zero for a parameter that acts at another place.
     """
-    return _parameter_torques(look.problem, look.followed.states, push)
+    return _parameter_torques(look.problem, look.followed.states, look.conditions, push)
 
 
 @eqx.filter_jit
-def _parameter_torques(problem: Problem, states: Array, push: Array) -> Array:
+def _parameter_torques(problem: Problem, states: Array, conditions: Conditions, push: Array) -> Array:
     zero = jnp.zeros(())
     vector = problem.free.pack(problem.model)
 
-    def rates(vector: Array, state: Array) -> Array:
-        return problem.free.unpack(problem.model, vector).rates(state, zero, zero)
+    def rates(vector: Array, state: Array, conditions: Conditions) -> Array:
+        return problem.free.unpack(problem.model, vector).rates(state, zero, zero, conditions)
 
-    found = jax.vmap(jax.vmap(lambda state: jax.jacfwd(rates)(vector, state)))(states)
+    find = jax.vmap(jax.vmap(jax.jacfwd(rates), in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
+    found = find(vector, states, conditions)
     square = jnp.sum(push**2, axis=-1)[..., None]
     torque = jnp.einsum("skq,skqp->skp", push, found) / square
     elsewhere = jnp.sum((found - push[..., None] * torque[:, :, None, :]) ** 2, axis=(0, 1, 2))

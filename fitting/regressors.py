@@ -1,8 +1,8 @@
 """What an effect of little strength would do along a motion: a force, or a change of what the encoders read."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -13,16 +13,21 @@ from jaxtyping import Array, Bool, Float
 from fitting.experiment import Segments
 from fitting.followed import NODES, WEIGHTS, Followed
 from fitting.free import strength_paths
-from hdjax import Model, PiecewisePolynomial
+from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
 from hdjax.effects import (
+    ActuatorEffect,
     Conditions,
     Effect,
     LoadSideEffect,
+    MeshGeometryEffect,
     MeshTorqueEffect,
     Motion,
     MotorSideEffect,
+    Scales,
+    SensorEffect,
 )
 from hdjax.effects.learned import LEARNED, LearnedTorque
+from hdjax.parameters import Scalar, own_value, parameter
 from hdjax.program_cache import jit_kept
 from hdjax.signals import polynomial
 from hdjax.where import where
@@ -45,9 +50,9 @@ class Regressors(eqx.Module):
         reading: of the outputs at the samples.
     """
 
-    at_start: Float[Array, "segments samples states columns"]
-    at_end: Float[Array, "segments samples states columns"]
-    reading: Float[Array, "segments samples outputs columns"]
+    at_start: Float[Array | np.ndarray, "segments samples states columns"]
+    at_end: Float[Array | np.ndarray, "segments samples states columns"]
+    reading: Float[Array | np.ndarray, "segments samples outputs columns"]
 
 
 class Along(eqx.Module):
@@ -59,6 +64,7 @@ class Along(eqx.Module):
         segments: the data that it belongs to.
         at_knots: the motion at each knot.
         between: the motion at the nodes of each interval.
+        pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
         goes_on: whether a segment goes on where the one before it ends in time, joined or not.
     """
 
@@ -67,6 +73,7 @@ class Along(eqx.Module):
     segments: Segments
     at_knots: Motion
     between: Motion
+    pushes: dict[str, Float[Array, "segments samples nodes states"]]
     goes_on: Bool[Array, " segments"]
 
 
@@ -78,22 +85,87 @@ def along(model: Model, followed: Followed, segments: Segments) -> Along:
         followed: its states.
         segments: the data that it belongs to.
     """
-    at_knots, between = _motions(model, followed, segments)
-    return Along(model, followed, segments, at_knots, between, jnp.asarray(continues(segments)))
+    conditions = conditions_between(segments)
+    at_knots = motions(model, followed.states, conditions_at_knots(segments))
+    between = motions(model, followed.between, conditions)
+    pushes = unit_pushes(model, followed.between, conditions)
+    return Along(model, followed, segments, at_knots, between, pushes, jnp.asarray(continues(segments)))
 
 
 @jit_kept
-def _motions(model: Model, followed: Followed, segments: Segments) -> tuple[Motion, Motion]:
+def conditions_at_knots(segments: Segments) -> Conditions:
+    """Time and temperature at each knot, the end of the last interval included."""
     time = segments.torque.knots[:, segments.halo :]
-    width = jnp.diff(time)
-    at_knots = jax.vmap(jax.vmap(model.motion))(
-        followed.states, Conditions(time, _at_knots(segments.temperature, width))
-    )
-    late = jnp.asarray(_PART) * width[..., None]
+    return Conditions(time, _at_knots(segments.temperature, jnp.diff(time)))
+
+
+@jit_kept
+def conditions_between(segments: Segments) -> Conditions:
+    """Time and temperature at the nodes of each interval."""
+    time = segments.torque.knots[:, segments.halo :]
+    late = jnp.asarray(_PART) * jnp.diff(time)[..., None]
     warmth = segments.temperature
-    warmth = None if warmth is None else polynomial(warmth.coefficients[..., None, :], late)
-    conditions = Conditions(time[:, :-1, None] + late, warmth)
-    return at_knots, jax.vmap(jax.vmap(jax.vmap(model.motion)))(followed.between, conditions)
+    return Conditions(
+        time[:, :-1, None] + late, None if warmth is None else polynomial(warmth.coefficients[..., None, :], late)
+    )
+
+
+@jit_kept
+def motions(model: Model, states: Float[Array, "*many states"], conditions: Conditions) -> Motion:
+    """The motion that each of many states means."""
+    find = model.motion
+    for _ in states.shape[:-1]:
+        find = jax.vmap(find)
+    return find(states, conditions)
+
+
+class _UnitGeometry(MeshGeometryEffect):
+    """An error of the mesh and a slope of it, each by itself."""
+
+    family: ClassVar[str] = "kinematic_error"
+    name: ClassVar[str] = "unit_geometry"
+
+    e: Scalar = parameter(0.0, unit="rad", doc="the error", role="strength")
+    e_slope: Scalar = parameter(0.0, unit="1", doc="its slope", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return ()
+
+    def error(self, theta_m: Array) -> Array:
+        return self.e
+
+    def slope(self, theta_m: Array) -> Array:
+        return self.e_slope
+
+
+# What effects add beside a torque at one of the places of [`hdjax.effects.learned`][].
+_INPUT, _ERROR, _SLOPE = "input", "error", "slope"
+
+
+@jit_kept
+def unit_pushes(
+    model: Model, states: Float[Array, "*many states"], conditions: Conditions
+) -> dict[str, Float[Array, "*many states"]]:
+    """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
+    of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
+    mesh, and its slope."""
+    whole = isinstance(model, TwoInertiaModel)
+    torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,)) for f in LEARNED if whole or not f.needs_motor]
+    geometry = [_UnitGeometry()] if whole else []
+    probed = model.with_effects(*torques, *geometry)
+    paths = [f"{f.name}.c_0" for f in torques] + [f"{g.name}.{n}" for g in geometry for n in ("e", "e_slope")]
+    names = [f.name for f in torques] + ([_ERROR, _SLOPE] if whole else [])
+
+    def rates(strengths: Array, torque: Array, state: Array, conditions: Conditions) -> Array:
+        changed = probed.replace(dict(zip(paths, strengths, strict=True)))
+        return changed.rates(state, torque, jnp.zeros_like(torque), conditions)
+
+    find = jax.jacfwd(rates, argnums=(0, 1))
+    for _ in states.shape[:-1]:
+        find = jax.vmap(find, in_axes=(None, None, 0, 0))
+    by_strength, by_input = find(jnp.zeros(len(paths)), jnp.zeros(()), states, conditions)
+    return {name: by_strength[..., i] for i, name in enumerate(names)} | {_INPUT: by_input}
 
 
 def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
@@ -104,23 +176,30 @@ def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
         proposals: effects of one and the same form, at zero strength.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *proposals)
-    place = place_of(stacked)
-    takes_inertia = (
-        isinstance(stacked, LoadSideEffect) and type(stacked).inertia_taken is not LoadSideEffect.inertia_taken
-    )
-    if place is None or takes_inertia:
-        found = _regressors(seen.model, stacked, seen.followed, seen.segments, seen.at_knots, seen.goes_on)
-        return jax.tree.map(lambda a: _finite(np.asarray(a)), found)
-    # A torque is the same whatever other effects there are: one program for all models that the loop comes by.
+    # What an effect adds is the same whatever other effects there are: one program for all models that the loop comes
+    # by.
     bare = replace(seen.model, effects=())
-    width = jnp.diff(seen.segments.torque.knots[:, seen.segments.halo :])
-    torque = _finite(np.asarray(_torques(bare, stacked, seen.at_knots, seen.between, width, seen.goes_on)))
-    acting = np.asarray(unit_torque(seen.model, place, seen.followed.between))
-    mean = 0.5 * np.einsum("k,snki,snkp->snip", WEIGHTS, acting, torque, optimize=True)
-    rise = 1.5 * np.einsum("k,snki,snkp->snip", WEIGHTS * NODES, acting, torque, optimize=True)
-    nothing = np.zeros((*seen.segments.measured.shape, torque.shape[-1]))
-    found = Regressors(*map(jnp.asarray, (mean - rise, mean + rise, nothing)))
-    return jax.tree.map(np.asarray, found)
+    segments = seen.segments
+    if isinstance(stacked, SensorEffect):
+        reading = _finite(np.asarray(_reading_columns(bare, stacked, seen.at_knots)))
+        nothing = np.zeros((*segments.measured.shape[:2], seen.followed.states.shape[-1], reading.shape[-1]))
+        return Regressors(nothing, nothing, reading)
+    width = jnp.diff(segments.torque.knots[:, segments.halo :])
+    place = place_of(stacked)
+    if isinstance(stacked, LoadSideEffect) and type(stacked).inertia_taken is not LoadSideEffect.inertia_taken:
+        found = _regressors(seen.model, stacked, seen.followed, segments, seen.at_knots, seen.goes_on)
+        return jax.tree.map(lambda a: _finite(np.asarray(a)), found)
+    if place is not None:
+        added = {place.name: _torques(bare, stacked, seen.at_knots, seen.between, width, seen.goes_on)}
+    elif isinstance(stacked, ActuatorEffect):
+        added = {_INPUT: _inputs(_actuated(seen.model, segments), stacked, segments.halo)}
+    else:
+        assert isinstance(stacked, MeshGeometryEffect)
+        added = dict(zip((_ERROR, _SLOPE), _geometry(stacked, seen.between), strict=True))
+    columns = next(iter(added.values())).shape[-1]
+    lines = [_straight_lines(seen.pushes[n], _padded(_finite(np.asarray(v)))) for n, v in added.items()]
+    at_start, at_end = (np.sum([np.asarray(line[side])[..., :columns] for line in lines], axis=0) for side in (0, 1))
+    return Regressors(at_start, at_end, np.zeros((*segments.measured.shape, columns)))
 
 
 def place_of(effect: Effect) -> type[LearnedTorque] | None:
@@ -129,21 +208,24 @@ def place_of(effect: Effect) -> type[LearnedTorque] | None:
     return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
 
 
-def unit_torque(model: Model, place: type[LearnedTorque], states: Float[Array, "*many states"]) -> Array:
-    """What a unit of torque at a place adds to the rates of each of many states."""
-    probe = place(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,))
-    return _unit_torque(model.with_effects(probe), probe.name, states)
+def _padded(values: np.ndarray) -> Array:
+    """With columns of zeros up to a power of two: few shapes, few programs."""
+    columns = values.shape[-1]
+    wide = 1 << (columns - 1).bit_length()
+    return jnp.asarray(np.concatenate([values, np.zeros((*values.shape[:-1], wide - columns))], axis=-1))
 
 
-@eqx.filter_jit
-def _unit_torque(model: Model, name: str, states: Array) -> Array:
-    zero = jnp.zeros(())
-
-    def rates(strength: Array, state: Array) -> Array:
-        return model.replace({f"{name}.c_0": strength}).rates(state, zero, zero)
-
-    flat = states.reshape(-1, states.shape[-1])
-    return jax.vmap(lambda state: jax.jacfwd(rates)(zero, state))(flat).reshape(states.shape)
+@jit_kept
+def _straight_lines(
+    push: Float[Array, "segments samples nodes states"], values: Float[Array, "segments samples nodes columns"]
+) -> tuple[Float[Array, "segments samples states columns"], Float[Array, "segments samples states columns"]]:
+    """The straight lines with the mean and the first moment of what is pushed; where they start, and where they end."""
+    # Written out: a product of many tiny matrices is slow.
+    mean, rise = jnp.zeros(()), jnp.zeros(())
+    for k, (weight, node) in enumerate(zip(WEIGHTS, NODES, strict=True)):
+        pushed = push[:, :, k, :, None] * values[:, :, k, None, :]
+        mean, rise = mean + 0.5 * weight * pushed, rise + 1.5 * weight * node * pushed
+    return mean - rise, mean + rise
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
@@ -170,23 +252,73 @@ def _torque_columns(
 ) -> Float[Array, "segments samples nodes columns"]:
     """Derivatives of the torque by each strength of each proposal, at the nodes."""
 
-    def of(effect: Effect) -> Array:
-        extended = bare.with_effects(effect)
-        paths = strength_paths(effect)
+    def torque(effect: Effect) -> Array:
+        assert isinstance(effect, MeshTorqueEffect | MotorSideEffect | LoadSideEffect)
         own = jnp.zeros((*width.shape, NODES.size, 0))
         if effect.states:
-            own = _own_between(*_own_states(effect, at_knots, width, goes_on))
+            # At zero strength they don't depend on it.
+            own = _own_between(*_own_states(jax.lax.stop_gradient(effect), at_knots, width, goes_on))
+        at = jax.vmap(jax.vmap(jax.vmap(lambda motion, state: effect.torque(motion, bare.drive, state))))  # pyright: ignore[reportArgumentType]
+        return jnp.broadcast_to(at(between, own), own.shape[:-1])
 
-        def torque(strengths: Array) -> Array:
-            changed = extended.replace(dict(zip(paths, strengths, strict=True))).effect(effect.name)
-            assert isinstance(changed, MeshTorqueEffect | MotorSideEffect | LoadSideEffect)
-            at = jax.vmap(jax.vmap(jax.vmap(lambda motion, state: changed.torque(motion, bare.drive, state))))  # pyright: ignore[reportArgumentType]
-            return jnp.broadcast_to(at(between, own), own.shape[:-1])
+    return _by_strength(stacked, torque)
 
-        return jax.jacfwd(torque)(jnp.stack([extended.get(p) for p in paths]))
 
-    found = jax.vmap(of, out_axes=-1)(stacked)
-    return _side_by_side(found)
+def _by_strength(stacked: Effect, find: Callable[[Effect], Any]) -> Any:
+    """Derivatives of what is found of an effect by each strength of each proposal, as columns."""
+
+    def of(effect: Effect) -> Any:
+        names = [path.split(".")[1] for path in strength_paths(effect)]
+
+        # Not typed: `eqx.tree_at` fills the effect with placeholders.
+        def values(effect):
+            return [own_value(effect, name) for name in names]
+
+        def changed(strengths: Array) -> Any:
+            return find(eqx.tree_at(values, effect, list(strengths)))
+
+        return jax.jacfwd(changed)(jnp.stack(values(effect)))
+
+    return jax.tree.map(_side_by_side, jax.vmap(of, out_axes=-1)(stacked))
+
+
+@jit_kept
+def _actuated(model: Model, segments: Segments) -> PiecewisePolynomial:
+    """The torque as the effects that there are let it act."""
+    return jax.vmap(model.actuate)(segments.torque)
+
+
+def _input_columns(
+    torque: PiecewisePolynomial, stacked: Effect, halo: int
+) -> Float[Array, "segments samples nodes columns"]:
+    """Derivatives of the torque that acts, at the nodes."""
+
+    def acting(effect: Effect) -> Array:
+        assert isinstance(effect, ActuatorEffect)
+        found = jax.vmap(effect.actuate)(torque)
+        late = jnp.asarray(_PART) * jnp.diff(found.knots[:, halo:])[..., None]
+        return polynomial(found.coefficients[:, halo:, None, :], late)
+
+    return _by_strength(stacked, acting)
+
+
+def _geometry_columns(stacked: Effect, between: Motion) -> tuple[Array, Array]:
+    """Derivatives of the mesh's error and of its slope, at the nodes."""
+
+    def geometry(effect: Effect) -> tuple[Array, Array]:
+        assert isinstance(effect, MeshGeometryEffect) and between.theta_m is not None
+        return effect.error(between.theta_m), effect.slope(between.theta_m)
+
+    return _by_strength(stacked, geometry)
+
+
+def _reading_of(bare: Model, stacked: Effect, at_knots: Motion) -> Float[Array, "segments samples outputs columns"]:
+    """Derivatives of the outputs at the samples."""
+    theta_m, theta_l = at_knots.theta_m, at_knots.theta_l
+    assert theta_m is not None and theta_l is not None
+    still = jnp.zeros_like(theta_m)
+    states = jnp.stack([theta_m, theta_l, still, still], axis=-1)[:, :-1]
+    return _by_strength(stacked, lambda effect: jax.vmap(jax.vmap(bare.with_effects(effect).outputs))(states))
 
 
 def _side_by_side(found: Array) -> Array:
@@ -197,6 +329,9 @@ def _side_by_side(found: Array) -> Array:
 # Programs of little work for each form: compiling them well would take longer than what that saves.
 _QUICKLY_MADE: Any = {"compiler_options": {"xla_backend_optimization_level": 1}}
 _torques = jit_kept(_torque_columns, **_QUICKLY_MADE)
+_inputs = jit_kept(_input_columns, **_QUICKLY_MADE)
+_geometry = jit_kept(_geometry_columns, **_QUICKLY_MADE)
+_reading_columns = jit_kept(_reading_of, **_QUICKLY_MADE)
 
 
 def _looked_along(

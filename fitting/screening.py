@@ -206,7 +206,8 @@ def _inner_products(
     residual: Float[Array, "segments samples outputs"],
     surrogates: Float[Array, "draws segments rows"],
 ) -> tuple[Float[Array, "columns columns"], Float[Array, " columns"], Float[Array, "columns draws"]]:
-    explains = explained(found, followed, segments, whitening, forces.at_start, forces.at_end, forces.reading)
+    columns = (jnp.asarray(a) for a in (forces.at_start, forces.at_end, forces.reading))
+    explains = explained(found, followed, segments, whitening, *columns)
     flat = explains.reshape(-1, explains.shape[-1])
     return (
         flat.T @ flat,

@@ -21,6 +21,7 @@ from fitting.followed import Followed, follow
 from fitting.residual import Problem
 from fitting.sandwich import Linearised, Record
 from hdjax import Model
+from hdjax.effects import Conditions
 from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
@@ -154,7 +155,9 @@ def _power(series: np.ndarray) -> np.ndarray:
 def _pushes(model: Model, followed: Followed) -> Float[Array, "segments samples states"]:
     """What a unit of torque through a sample interval adds to the state at its end."""
     zero = jnp.zeros(())
-    rate = jax.jacfwd(lambda torque: model.rates(model.rest(), torque, zero))(zero)
+    # The same at any time and temperature.
+    conditions = Conditions(time=zero, temperature=zero)
+    rate = jax.jacfwd(lambda torque: model.rates(model.rest(), torque, zero, conditions))(zero)
     return (followed.from_start + followed.from_end) @ rate
 
 

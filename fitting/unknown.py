@@ -29,7 +29,7 @@ from fitting.linear_look import (
 )
 from fitting.screening import surrogates
 from hdjax import Model, ReducedModel
-from hdjax.effects import Motion
+from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over, combined
 
 # Parts that training data are left out in, in turn.
@@ -82,6 +82,7 @@ class Unknown(eqx.Module):
         candidates: all places and variables, best first by the first look.
         chosen: the one that was taken.
         states: of the model without it, at the instants that stand for the density of the data.
+        conditions: time and temperature there.
         push: what a unit of torque at its place adds to their rates.
         gain: decrease of the held-out objective.
         p_value: chance of such a gain where nothing is missing.
@@ -92,6 +93,7 @@ class Unknown(eqx.Module):
     candidates: tuple[Candidate, ...]
     chosen: Candidate
     states: Float[np.ndarray, "instants states"]
+    conditions: Conditions
     push: Float[np.ndarray, "instants states"]
     gain: float
     p_value: float
@@ -99,7 +101,7 @@ class Unknown(eqx.Module):
     @property
     def motion(self) -> Motion:
         """The motion at the instants."""
-        return jax.vmap(self.before.model.motion)(jnp.asarray(self.states))
+        return jax.vmap(self.before.model.motion)(jnp.asarray(self.states), self.conditions)
 
     @property
     def torque(self) -> Float[np.ndarray, " instants"]:
@@ -165,7 +167,8 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
         np.asarray(a).reshape(-1, a.shape[2])[instants]
         for a in (sight.look.followed.states, sight.pushes[chosen.form.name])
     )
-    return Unknown(before, trial, tuple(found), chosen, states, acting, gain, p_value)
+    conditions = jax.tree.map(lambda a: a.reshape(-1)[instants], sight.look.conditions)
+    return Unknown(before, trial, tuple(found), chosen, states, conditions, acting, gain, p_value)
 
 
 def _refined(
@@ -207,11 +210,11 @@ def share_of(named: Model, found: Unknown) -> float:
     hidden = jnp.asarray(named.rest())[found.states.shape[1] :]
     zero = jnp.zeros(())
 
-    def added(state: Array) -> Array:
-        own = named.rates(jnp.concatenate([state, hidden]), zero, zero)
-        return own[: state.shape[0]] - bare.rates(state, zero, zero)
+    def added(state: Array, conditions: Conditions) -> Array:
+        own = named.rates(jnp.concatenate([state, hidden]), zero, zero, conditions)
+        return own[: state.shape[0]] - bare.rates(state, zero, zero, conditions)
 
-    rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states)))
+    rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states), found.conditions))
     theirs = np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
     theirs, learned = (without(a, found.chosen.known) for a in (theirs, found.torque))
     return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))

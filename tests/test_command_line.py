@@ -200,7 +200,10 @@ BAD_USE: dict[str, tuple[Sequence[str], Sequence[str]]] = {
     "kinematic error that is no number": (("speeds", "--kinematic-error", "nan"), ("--kinematic-error",)),
     "limit of nothing": (("speeds", "--limit", "0"), ("--limit",)),
     "next experiment of no length": ((*FIT, "--next-experiment", "--duration", "0.001"), ("--duration", "0.1 s")),
-    "next experiment without torque": (("close-loop", *FIT[1:], "--next-experiment", "--largest-torque", "-1"), ("--largest-torque", "-1")),
+    "next experiment without torque": (
+        ("close-loop", *FIT[1:], "--next-experiment", "--largest-torque", "-1"),
+        ("--largest-torque", "-1"),
+    ),
     "next experiment of a folder": (
         ("fit", ".", *FIT[2:], "--next-experiment"),
         ("--next-experiment", "name its logs"),

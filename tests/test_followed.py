@@ -15,13 +15,15 @@ from fitting.followed import Followed, follow, respond
 from fitting.free import base_paths, strength_paths
 from fitting.regressors import along, regressors
 from fitting.residual import simulate_segments
+from hdjax import PiecewisePolynomial
 from hdjax.effects import Effect
 from hdjax.effects.actuation import InputDelay, TorqueBias
 from hdjax.effects.damping import DisplacementDamping, QuadraticDamping
 from hdjax.effects.effect import Scales
 from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.load import GravityLoad
+from hdjax.effects.load import GravityLoad, LoadDisturbance
 from hdjax.effects.stiffness import QuadraticStiffness
+from hdjax.effects.thermal import ThermalStiffness
 
 COUNT = 256
 SCALES = Scales(x=1e-3, x_max=3e-3, v=0.2, omega_m=5.0, omega_l=0.1, time_step=rig.STEP)
@@ -75,3 +77,22 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     real = np.asarray(found.problem.segments.weight)[:, :, None] > 0
     off = np.where(real, answer - slope, 0.0)
     assert np.abs(off).max() < tolerance * np.abs(np.where(real, slope, 0.0)).max()
+
+
+def test_a_motion_of_a_model_that_knows_time_and_temperature(found: Fit, followed: Followed):
+    """What a unit of torque does is the same at any time and temperature; an error of the mesh acts through the
+    stiffness, which is larger by 1e-3 of itself for each of 6.85 K."""
+    model = found.model.with_effects(LoadDisturbance(omega=30.0, cosine=1e-3), ThermalStiffness(k_T=1e-3))
+    segments = found.problem.segments
+    knots = segments.torque.knots[:, segments.halo :]
+    warm = PiecewisePolynomial(
+        knots, jnp.stack([jnp.full_like(knots[:, 1:], 300.0), jnp.zeros_like(knots[:, 1:])], axis=-1)
+    )
+    segments = replace(segments, temperature=warm)
+    plain = along(found.model, followed, found.problem.segments)
+    seen = along(model, followed, segments)
+    assert len(plain.pushes) == 6
+    for name, push in plain.pushes.items():
+        if name != "slope":
+            factor = 1.00685 if name == "error" else 1.0
+            np.testing.assert_allclose(seen.pushes[name], factor * push, rtol=1e-12, atol=0.0)
