@@ -27,6 +27,9 @@ from hdjax.program_cache import jit_kept
 _REWEIGHTINGS = 3
 # An output that the model can't follow may take longer to lose its say.
 _MOST_REWEIGHTINGS = 12
+# After twice the iterations of a pass, a fit goes on only as long as a pass gains this share of the error, and to so
+# many times them at most.
+_GAINS, _PATIENCE = 0.03, 8
 # Simulations longer than this many segments start from states that shorter ones have found already.
 _LONGEST_RETRY = 16
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
@@ -121,7 +124,8 @@ def fit(
         length: samples in a segment; see [`segment_length`][] where not given.
         halo: intervals of torque before each segment, for delays.
         substeps: solver steps in a sample interval; from the natural frequency where not given.
-        max_steps: iterations of each pass at most; with twice as many in all, no further pass begins.
+        max_steps: iterations of each pass at most; with twice as many in all, a further pass begins only where the last
+            one gained much.
         covariance: of the outputs' errors to start the weighing with.
         reweigh: whether to weigh by what is left over; with False the given covariance is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
@@ -165,7 +169,8 @@ def fit(
         before, objective = objective, _half_log_determinant(covariance)
         steps += int(solution.steps)
         settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
-        if settled or objective > give_up_above or steps >= 2 * max_steps:
+        gains = before - objective > _GAINS
+        if settled or objective > give_up_above or steps >= (_PATIENCE if gains else 2) * max_steps:
             break
     assert solution is not None
     # By way of the host: what is computed with the model alone need not run on every device.

@@ -93,6 +93,6 @@ def test_a_load_is_carried():
 
 def test_effects_with_memory_and_few_samples_are_refused():
     with pytest.raises(ValueError, match="bouc_wen"):
-        feedforward(PLANT.with_effects(BoucWen(k=500.0, yield_twist=1e-4)), 60.0)
+        feedforward(PLANT.with_effects(BoucWen(k=500.0, memory_twist=1e-4)), 60.0)
     with pytest.raises(ValueError, match="samples"):
         feedforward(PLANT, 60.0, harmonics=12, samples=24)

@@ -324,25 +324,31 @@ def follow(effect: BoucWen, x: jax.Array) -> jax.Array:
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    share=st.floats(0.05, 3.0),
+    ratio=st.floats(-0.7, 3.0),
     n=st.floats(1.0, 4.0),
-    yield_twist=st.floats(1e-5, 1e-2),
+    memory_twist=st.floats(1e-5, 1e-2),
 )
-def test_bouc_wen_never_exceeds_its_yield(seed, share, n, yield_twist):
+def test_bouc_wen_never_exceeds_its_yield(seed, ratio, n, memory_twist):
     rng = np.random.default_rng(seed)
+    yield_twist = memory_twist * (1 + ratio) ** (-1 / n)
     x = np.interp(np.arange(3000) / 100, np.arange(31), yield_twist * 4 * rng.normal(size=31))
-    z = np.asarray(follow(BoucWen(k=1.0, yield_twist=yield_twist, share=share, n=n), jnp.asarray(x)))
+    z = np.asarray(follow(BoucWen(k=1.0, memory_twist=memory_twist, ratio=ratio, n=n), jnp.asarray(x)))
     assert np.abs(z).max() <= yield_twist * (1 + 1e-9)
     assert np.abs(z).max() > 0.5 * yield_twist
 
 
 def test_bouc_wen_against_its_own_closed_form():
-    """n = 1 loads from 0 as y (1 - exp(-x/y)), unloads with slope 1 + (2 share - 1)|z|/y."""
+    """n = 1 loads from 0 as y (1 - exp(-x/y)), unloads with slope 1 + (beta - gamma)|z|; where gamma < -beta, y is
+    negative and z runs away."""
     y = 1e-3
     x = np.linspace(0, 3 * y, 1001)
-    z = np.asarray(follow(BoucWen(k=1.0, yield_twist=y, share=0.7), jnp.asarray(x)))
+    effect = BoucWen(k=1.0, memory_twist=y / 0.7, ratio=3 / 7)
+    z = np.asarray(follow(effect, jnp.asarray(x)))
     np.testing.assert_allclose(z, y * (1 - np.exp(-x[1:] / y)), atol=1e-9 * y)
-    effect = BoucWen(k=1.0, yield_twist=y, share=0.7)
+    hardening = BoucWen(k=1.0, memory_twist=1e-3, ratio=-1.5)
+    np.testing.assert_allclose(
+        np.asarray(follow(hardening, jnp.asarray(x))), 2 * y * (np.exp(x[1:] / (2 * y)) - 1), rtol=1e-9
+    )
     unloading = effect.state_rates(Motion(x=jnp.asarray(0.0), v=jnp.asarray(-2.0)), jnp.asarray([0.5 * y]))
     np.testing.assert_allclose(unloading, [-2.0 * (1 + 0.4 * 0.5)], rtol=1e-12)
     derived = {name: float(v) for name, (v, _) in effect.derived(DRIVE).items()}
@@ -351,7 +357,7 @@ def test_bouc_wen_against_its_own_closed_form():
 
 def loop_area(omega: float) -> float:
     """Area of torque against twist over the third cycle of a harmonic twist."""
-    model = BoucWen(k=3000.0, yield_twist=4e-4, share=0.6)
+    model = BoucWen(k=3000.0, memory_twist=4e-4 / 0.6, ratio=2 / 3)
     t = np.linspace(0, 3 * 2 * np.pi / omega, 3 * 400 + 1)
 
     @jax.jit

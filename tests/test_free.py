@@ -130,7 +130,7 @@ def test_paths_of_every_form(form: type[Effect]):
 
 
 def test_paths_of_bouc_wen_by_hand():
-    effect = BoucWen(k=1.0, yield_twist=1e-3)
+    effect = BoucWen(k=1.0, memory_twist=1e-3)
     assert strength_paths(effect) == ("bouc_wen.k",)
-    assert effect_paths(effect) == ("bouc_wen.k", "bouc_wen.yield_twist", "bouc_wen.share")
+    assert effect_paths(effect) == ("bouc_wen.k", "bouc_wen.memory_twist", "bouc_wen.ratio")
     assert BY_NAME["bouc_wen"] is BoucWen

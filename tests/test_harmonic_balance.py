@@ -225,7 +225,7 @@ def test_a_turning_drive_over_two_revolutions_is_that_over_one():
 def test_refusals():
     plain, whole = duffing(0.1, 0.0), TwoInertiaModel(DRIVE)
     with pytest.raises(ValueError, match="`bouc_wen` has memory"):
-        balance(plain.with_effects(BoucWen(yield_twist=0.1)))
+        balance(plain.with_effects(BoucWen(memory_twist=0.1)))
     with pytest.raises(ValueError, match="`torque_bias` has memory or acts on a logged torque"):
         balance(plain.with_effects(TorqueBias()))
     with pytest.raises(ValueError, match="`gravity_load` turns with the output"):

@@ -65,7 +65,7 @@ def test_round_trip_of_every_form(form: type[Effect], tmp_path: Path):
 
 @pytest.mark.parametrize("hold", HOLDS)
 def test_round_trip_without_and_with_several_effects(hold: str, tmp_path: Path):
-    for effects in ((), (QuadraticStiffness(k2=3.0), BoucWen(k=10.0, yield_twist=1e-4, n=1.5))):
+    for effects in ((), (QuadraticStiffness(k2=3.0), BoucWen(k=10.0, memory_twist=1e-4, n=1.5))):
         wanted = stored(rig.drive_model().with_effects(*effects), hold)
         assert_same(round_trip(wanted, tmp_path), wanted)
 

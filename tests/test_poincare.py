@@ -53,7 +53,7 @@ def test_amplitude_of_the_linear_drive():
 
 
 def test_an_effect_with_memory_settles_where_shooting_finds_it():
-    model = duffing(0.1, 0.0).with_effects(BoucWen(k=0.5, yield_twist=0.05))
+    model = duffing(0.1, 0.0).with_effects(BoucWen(k=0.5, memory_twist=0.05))
     forcing = harmonic_series(0.7, 0.5)
     section = poincare_section(model, forcing, model.rest()[None], steps_per_period=512)
     assert int(period_of(section)[0]) == 1

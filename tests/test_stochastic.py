@@ -368,7 +368,7 @@ def test_two_inertias_settle_to_the_law_of_the_error_equation():
 
 def test_the_same_torque_moves_both_models_alike():
     """A Runge-Kutta method commutes with the linear map to (x, v): to rounding, not only in law."""
-    hysteresis, reduced_hysteresis = (BoucWen(k=k, yield_twist=0.05) for k in (300.0, 300.0 * float(PAIR.c)))
+    hysteresis, reduced_hysteresis = (BoucWen(k=k, memory_twist=0.05) for k in (300.0, 300.0 * float(PAIR.c)))
     noise, forcing, key = ColouredNoise(rms=30.0, correlation_time=0.02), Harmonic(20.0, 40.0), jax.random.key(5)
     both = simulate_noisy(TwoInertiaModel(PAIR, (hysteresis,)), noise, TIMES, key, forcing=forcing)
     alone = simulate_noisy(ReducedModel(PAIR.reduced(), (reduced_hysteresis,)), noise, TIMES, key, forcing=forcing)
@@ -384,7 +384,7 @@ def test_the_same_torque_moves_both_models_alike():
 
 def test_without_noise_it_is_simulate():
     drive = hdc_40_050()
-    model = TwoInertiaModel(drive, (KinematicError(cos_2=1e-3), BoucWen(k=700.0, yield_twist=2e-3)))
+    model = TwoInertiaModel(drive, (KinematicError(cos_2=1e-3), BoucWen(k=700.0, memory_twist=2e-3)))
     times = np.linspace(0.1, 0.2, 21)
     motor, load = Harmonic(4.0, 300.0, 0.3, 1.0), Harmonic(5.0, 170.0, 1.1, -2.0)
     exact = simulate(model, motor, times, load_torque=load, rtol=1e-10, atol=1e-13)

@@ -18,32 +18,32 @@ SLIP = "Tjahjowidodo, Al-Bender, Van Brussel 2013: slip at 1e-4 to 1e-3 rad"
 class BoucWen(MeshTorqueEffect):
     """Torque `k z` with `z' = v - beta |v| |z|^(n-1) z - gamma v |z|^n`.
 
-    Kept in the terms that a log determines well: `beta = share / yield_twist^n` and
-    `gamma = (1 - share) / yield_twist^n`, so that |z| saturates at the yield twist whatever n and share are. It
-    dissipates for share >= 1/2.
+    Kept as `beta = memory_twist^-n` and `gamma = ratio beta`. It dissipates for |ratio| <= 1. Above -1 it yields: |z|
+    saturates at `memory_twist (1 + ratio)^(-1/n)`. Below, a branch bends the other way, as in the benchmark of Noel and
+    Schoukens (2016), and nothing bounds z.
     """
 
     family: ClassVar[str] = "hysteresis"
     name: ClassVar[str] = "bouc_wen"
     states: ClassVar[tuple[str, ...]] = ("z",)
 
-    k: Scalar = parameter(0.0, unit="N m/rad", doc="stiffness of the hysteretic part", source=SOURCE, role="strength")
-    yield_twist: Scalar = parameter(
+    k: Scalar = parameter(
+        0.0, unit="N m/rad", doc="stiffness of the hysteretic part", source=SOURCE, bounds=(0.0, 1e12), role="strength"
+    )
+    memory_twist: Scalar = parameter(
         unit="rad",
-        doc="where z saturates",
+        doc="twist within which z forgets where it came from",
         source=SOURCE,
         bounds=(0.0, 0.1),
-        plausible=(1e-4, 1e-3),
+        plausible=(1e-4, 2e-3),
         role="shape",
     )
-    share: Scalar = parameter(
-        0.6, unit="1", doc="beta / (beta + gamma)", source=SOURCE, bounds=(0.0, 1e2), role="shape"
-    )
+    ratio: Scalar = parameter(2.0 / 3.0, unit="1", doc="gamma / beta", source=SOURCE, bounds=(-1e2, 1e2), role="shape")
     n: Scalar = parameter(1.0, unit="1", doc="sharpness of the yield", source=SOURCE, bounds=(0.0, 1e2))
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(yield_twist=fraction * scales.x) for fraction in (0.3, 1.0, 0.1))
+        return tuple(cls(memory_twist=fraction * scales.x) for fraction in (0.5, 1.5, 0.15))
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         return self.k * state[0]
@@ -52,21 +52,18 @@ class BoucWen(MeshTorqueEffect):
         return jnp.zeros_like(self.k)[None]
 
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
-        z = state[0] / self.yield_twist
+        z = state[0] / self.memory_twist
         # |z|^(n-1) has no derivative at 0 where n = 1; the offset is far below any z that matters.
         magnitude = power(z * z + 1e-30, 0.5 * (self.n - 1.0))
-        bent = self.share * jnp.abs(motion.v) * z + (1.0 - self.share) * motion.v * jnp.abs(z)
+        bent = jnp.abs(motion.v) * z + self.ratio * motion.v * jnp.abs(z)
         return (motion.v - magnitude * bent)[None]
 
     def state_scale(self) -> Float[Array, "1"]:
-        return self.yield_twist[None]
+        return self.memory_twist[None]
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        total = self.yield_twist**-self.n
-        return {
-            "beta": (self.share * total, "rad^-n"),
-            "gamma": ((1.0 - self.share) * total, "rad^-n"),
-        }
+        beta = self.memory_twist**-self.n
+        return {"beta": (beta, "rad^-n"), "gamma": (self.ratio * beta, "rad^-n")}
 
 
 class Dahl(MeshTorqueEffect):
@@ -79,7 +76,9 @@ class Dahl(MeshTorqueEffect):
     name: ClassVar[str] = "dahl"
     states: ClassVar[tuple[str, ...]] = ("z",)
 
-    k: Scalar = parameter(0.0, unit="N m/rad", doc="stiffness of the hysteretic part", source="Dahl", role="strength")
+    k: Scalar = parameter(
+        0.0, unit="N m/rad", doc="stiffness of the hysteretic part", source="Dahl", bounds=(0.0, 1e12), role="strength"
+    )
     yield_twist: Scalar = parameter(
         unit="rad",
         doc="where z saturates",
@@ -122,9 +121,15 @@ class MaxwellSlip(MeshTorqueEffect):
     name: ClassVar[str] = "maxwell_slip"
     states: ClassVar[tuple[str, ...]] = ("z_1", "z_2", "z_3")
 
-    k_1: Scalar = parameter(0.0, unit="N m/rad", doc="spring that slips last", source=SLIP, role="strength")
-    k_2: Scalar = parameter(0.0, unit="N m/rad", doc="spring that slips at a half", source=SLIP, role="strength")
-    k_3: Scalar = parameter(0.0, unit="N m/rad", doc="spring that slips at a quarter", source=SLIP, role="strength")
+    k_1: Scalar = parameter(
+        0.0, unit="N m/rad", doc="spring that slips last", source=SLIP, bounds=(0.0, 1e12), role="strength"
+    )
+    k_2: Scalar = parameter(
+        0.0, unit="N m/rad", doc="spring that slips at a half", source=SLIP, bounds=(0.0, 1e12), role="strength"
+    )
+    k_3: Scalar = parameter(
+        0.0, unit="N m/rad", doc="spring that slips at a quarter", source=SLIP, bounds=(0.0, 1e12), role="strength"
+    )
     yield_twist: Scalar = parameter(
         unit="rad",
         doc="where the last spring slips",
