@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from fitting.base_fit import leaves_white_noise
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, fit, states_from
 from fitting.experiment import Stretch, scales
 from fitting.free import fitted_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
@@ -171,7 +171,7 @@ def _trained(
     max_steps: int = _TRIAL_STEPS,
     reweigh: bool = True,
 ) -> Fit:
-    """A fit that starts with the covariance of one near by, and from its states where the model has the same."""
+    """A fit that starts with the covariance of one near by, and from its states as far as the model has the same."""
     same = near is not None and near.model.state_names == model.state_names
     return fit(
         model,
@@ -184,7 +184,7 @@ def _trained(
         covariance=None if near is None else near.covariance,
         max_steps=max_steps,
         reweigh=reweigh,
-        states=near.unknowns.states if near is not None and same else None,
+        states=None if near is None else states_from(model, near),
         retry_states=retry_states or not same,
         give_up_above=give_up_above,
     )

@@ -371,6 +371,23 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
     return _settled(model, motion) if any(e.states for e in model.effects) else motion
 
 
+def states_from(model: Model, near: Fit) -> Float[Array, "segments states"]:
+    """Initial states of a fit of another model to the same segments: those that both have, and hidden ones of the new
+    model as if it had long moved like this. From poor states the first step would pull the parameters far away.
+
+    Args:
+        model: with the same motion.
+        near: the fit.
+    """
+    names = near.model.state_names
+    if names == model.state_names:
+        return near.unknowns.states
+    states = jnp.asarray(np.asarray(near.unknowns.states))
+    found = _settled(model, states[:, : len(model.motion_states)])
+    columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
+    return jnp.stack(columns, axis=1)
+
+
 @eqx.filter_jit
 def _settled(model: Model, motion: Array) -> Array:
     return jax.vmap(model.settled)(motion)

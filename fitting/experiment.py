@@ -166,7 +166,9 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
     stamps, samples = bridged(log.time[known], input_samples[known])
     time, rows = _grid(log, stamps)
     torque = _on_grid(sampled(stamps, samples, hold=hold), time)
-    load_torque = _straight(log, log.load_torque, time) if drive_log else None
+    # What a digital drive commands is held on both sides; what sensors measure runs on, and straight lines follow it.
+    load_hold = hold if hold == "zero-order" else "linear"
+    load_torque = _channel(log, log.load_torque, time, load_hold) if drive_log else None
     columns = [log.dynamic_error]
     if drive_log:
         assert log.motor_angle is not None and N is not None
@@ -186,14 +188,14 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         motor_angle=_filled(log, log.motor_angle, time, rows) if drive_log and log.motor_angle is not None else None,
         weight=None if weight.all() else weight,
         rows=None if rows.all() else rows,
-        temperature=_straight(log, log.temperature, time),
+        temperature=_channel(log, log.temperature, time, "linear"),
         origin=float(log.time[0]),
     )
 
 
-def _straight(log: Log, values: np.ndarray | None, time: np.ndarray) -> PiecewisePolynomial | None:
-    """A channel of the log on the grid, with straight lines between its samples; None where the log has none."""
-    return None if values is None else _on_grid(sampled(log.time, values, hold="linear"), time)
+def _channel(log: Log, values: np.ndarray | None, time: np.ndarray, hold: Hold) -> PiecewisePolynomial | None:
+    """A channel of the log on the grid; None where the log has none."""
+    return None if values is None else _on_grid(sampled(log.time, values, hold=hold), time)
 
 
 def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

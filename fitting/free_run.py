@@ -175,7 +175,8 @@ def _rest_where_at_rest(model: Model, starts: Fit, lanes: int) -> Array:
         covariance = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale[None, :]
         block = covariance[np.ix_(rates, rates)] * float(excess[lane])
         rate = states[lane, rates]
-        towards = np.linalg.solve(block, rate)
+        # What the window does not see at all is as good as at rest.
+        towards = np.linalg.pinv(block, rcond=1e-12, hermitian=True) @ rate
         if rate @ towards < _REST_LIMIT[rates.size]:
             states[lane] -= covariance[:, rates] @ towards * float(excess[lane])
             states[lane, rates] = 0.0
