@@ -23,7 +23,9 @@ from fitting.base_fit import base_fit, leaves_white_noise
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
+from fitting.errors import DataError
 from fitting.estimate import (
+    lost,
     measurement_noise,
     needed_substeps,
     segment_length,
@@ -40,6 +42,8 @@ Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
 # A residual this much larger than the measurement noise is not noise.
 _EXCESS = 1.5
+# Share of segments in which the base model may run away.
+_MOST_LOST = 0.5
 # Share of the unexplained variance that found effects must remove to be called the explanation.
 _EXPLAINED = 0.75
 
@@ -205,6 +209,11 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
+    if np.mean(lost(chosen.training)) > _MOST_LOST:
+        raise DataError(
+            "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
+            "drive file, and unit, sign and side of the torque column"
+        )
     return chosen, setting, chosen.hold, data
 
 

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, projected
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import FreeParameters, free_parameters
 from fitting.residual import (
+    RUNAWAY,
     Problem,
     Unknowns,
     linearise,
@@ -485,6 +486,12 @@ def _states_freedom(problem: Problem, unknowns: Unknowns) -> float:
     units = scale[:, :, None] * scale[:, None, :]
     inverse = np.linalg.pinv(all_rows / units, rcond=1e-12, hermitian=True)
     return float(np.einsum("sij,sji->", inverse, measured / units))
+
+
+def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
+    """The segments in which the simulation runs away."""
+    white = np.asarray(found.error) @ np.asarray(found.problem.whitening).T
+    return np.logical_not(np.all(np.abs(white) < RUNAWAY, axis=(1, 2)))
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:

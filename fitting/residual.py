@@ -18,6 +18,8 @@ from hdjax.where import where
 # A simulation that runs away, or leaves the numbers, is this many standard deviations off: a rejected step. (Its own
 # size would overflow where it is squared.)
 _LOST = 1e8
+RUNAWAY = 1e-3 * _LOST
+"""Standard deviations beyond which a simulation has lost its way; the weights may have changed since."""
 
 
 def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:

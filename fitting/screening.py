@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import prev_fast_len
 
-from fitting.estimate import STEP_ANGLE, Fit, suggested_substeps
+from fitting.estimate import STEP_ANGLE, Fit, lost, suggested_substeps
 from fitting.experiment import Segments, scales
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
@@ -27,6 +27,7 @@ from fitting.spectral_lines import spectral_lines
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.program_cache import jit_kept
+from hdjax.where import where
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -148,6 +149,11 @@ def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[
     segments: Segments = _on_host(problem.segments)
     whitening = _on_host(problem.whitening)
     residual = _on_host(fit.error) @ whitening.T
+    # Where the model runs away there is no motion to look along.
+    kept = jnp.asarray(~lost(fit) & np.isfinite(np.asarray(followed.transition)).all(axis=(1, 2, 3)))
+    followed = jax.tree.map(lambda a: where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
+    segments = replace(segments, weight=where(kept[:, None], segments.weight, 0.0))
+    residual = where(kept[:, None, None], residual, 0.0)
     drawn = jnp.asarray(surrogates(fit, seed))
     rows = float(np.sum(segments.weight)) * residual.shape[-1]
     already = slopes.size
