@@ -197,6 +197,15 @@ def _move(y, by, along, to):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _turned(before, after, side, rubbed):
+    """The rate after a step in which it has turned, while dry friction went on pointing as before: from the turn on it
+    takes `rubbed` in a whole step the other way; a rate that it would turn back has come to rest."""
+    rest = after / (after - before)
+    turned = after + 2.0 * side * rubbed * rest
+    return turned if turned * side < 0.0 else 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _integrate(p, start, shaking, follow, pull, brake, warm, dt, substeps):
     count = shaking.size
     h = dt / substeps
@@ -213,6 +222,7 @@ def _integrate(p, start, shaking, follow, pull, brake, warm, dt, substeps):
             if p.ramp != 0.0:
                 u1 = _command(commands, k, j, 0.5, substeps, dead, p)
                 u2 = _command(commands, k, j, 1.0, substeps, dead, p)
+            at_start_m, at_start_l = y[1], y[3]
             side_m, side_l = _sides(t, y, u0, brake[k], warm[k], p, k1)
             rates(t, y, u0, brake[k], warm[k], side_m, side_l, p, k1)
             _move(y, 0.5 * h, k1, at)
@@ -224,9 +234,9 @@ def _integrate(p, start, shaking, follow, pull, brake, warm, dt, substeps):
             for i in range(y.size):
                 y[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
             if side_m != 2 and y[1] * side_m < 0.0:
-                y[1] = 0.0
+                y[1] = _turned(at_start_m, y[1], side_m, h * _level_m(0.0, y[0], -side_m, p) / p.motor_inertia)
             if side_l != 2 and y[3] * side_l < 0.0:
-                y[3] = 0.0
+                y[3] = _turned(at_start_l, y[3], side_l, h * _level_l(0.0, p) / p.load_inertia)
             for i in range(4):
                 if p.slip_k[i] > 0.0:
                     y[7 + i] = min(max(y[7 + i], -p.slip_d[i]), p.slip_d[i])
