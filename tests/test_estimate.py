@@ -1,5 +1,7 @@
 """The fit finds what an independent simulation was made with, from far away and from several sides."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,16 +11,20 @@ from fitting.estimate import (
     Fit,
     fit,
     initial_states,
+    lost,
     measurement_noise,
     needed_substeps,
     short_horizon,
+    states_from,
     suggested_substeps,
     whitening,
 )
 from fitting.experiment import Stretch, cut, experiment_from_log
 from fitting.free import base_paths
 from fitting.uncertainty import uncertainty
+from hdjax.effects.creep import Creep
 from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.hysteresis import BoucWen
 
 COUNT, HORIZON = 2000, 256
 REDUCED_COUNT, REDUCED_HORIZON = 1000, 128
@@ -215,3 +221,25 @@ def test_horizon_and_steps_follow_the_frequency():
     # Six periods of 2 pi / (38.55 * 5e-4) = 326 samples, to the next power of two.
     assert short_horizon(slow, stretches) == 2048
     assert short_horizon(rig.drive_model(alpha=0.0), stretches) == 256
+
+
+def test_states_of_another_model_are_taken_by_name(found: Fit):
+    hidden = BoucWen(k=10.0, memory_twist=1e-3)
+    model = found.model.with_effects(hidden)
+    states = np.asarray(states_from(model, found))
+    np.testing.assert_array_equal(states[:, :4], np.asarray(found.unknowns.states))
+    # What has long moved as it does has no memory of anything else.
+    np.testing.assert_array_equal(states[:, 4], 0.0)
+    remembered = replace(found, model=model, unknowns=replace(found.unknowns, states=jnp.asarray(states + 1.0)))
+    creeping = found.model.with_effects(Creep(tau=0.1, share=0.1, span=1e-3), hidden)
+    mixed = np.asarray(states_from(creeping, remembered))
+    assert creeping.state_names[4:] == ("creep.z", "bouc_wen.z")
+    np.testing.assert_array_equal(mixed[:, [0, 1, 2, 3, 5]], states + 1.0)
+
+
+def test_a_segment_that_runs_away_is_lost(found: Fit):
+    assert not lost(found).any()
+    error = np.array(found.error)
+    error[1, 5, 0] = np.nan
+    error[2, 7, 1] = 1e7 * found.dynamic_error_std
+    assert np.flatnonzero(lost(replace(found, error=jnp.asarray(error)))).tolist() == [1, 2]

@@ -248,3 +248,13 @@ def test_a_log_that_is_mostly_a_gap_is_refused():
     late = short.time + 10.0 * (np.arange(1000) > 500)
     with pytest.raises(DataError, match="mostly gaps"):
         experiment_from_log(replace(short, time=late), hold="zero-order", N=rig.N)
+
+
+def test_the_load_torque_is_held_where_the_motor_torque_is():
+    held, lines = (experiment(hold, load=True).load_torque for hold in ("zero-order", "cubic"))
+    assert held is not None and lines is not None
+    step = np.diff(np.asarray(lines.knots))[:-1]
+    slope = np.diff(LOAD_TORQUE) / step
+    np.testing.assert_array_equal(np.asarray(held.coefficients)[:, 1:], 0.0)
+    np.testing.assert_allclose(np.asarray(lines.coefficients)[:-1, 1], slope, rtol=1e-9)
+    np.testing.assert_array_equal(np.asarray(held.coefficients)[:, 0], np.asarray(lines.coefficients)[:, 0])

@@ -291,3 +291,14 @@ def test_lists_of_cases():
         assert first.family != second.family
         changed = [set(f.changes(f.high, np.random.default_rng(0), BASE)) for f in (first, second)]
         assert not changed[0] & changed[1]
+
+
+def test_dry_friction_turns_within_a_step():
+    """Whether a step is long or short: what is lost where a rate turns is no more than the friction of a step."""
+    torque = shaking(400)
+    p = BASE._replace(slide_m=1e-4, hold_m=1e-4)
+    coarse, fine, without = (
+        integrate(mechanism, START, torque, dt=DT, substeps=substeps)[0][:, 0]
+        for mechanism, substeps in ((p, 10), (p, 200), (BASE, 200))
+    )
+    assert np.abs(coarse - fine).max() < 0.02 * np.abs(fine - without).max()

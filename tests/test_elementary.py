@@ -1,0 +1,47 @@
+"""Elementary functions in plain arithmetic: against numpy's, which call the processor's library."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdjax.elementary import cosine_and_sine, exponential, power
+
+
+@given(turns=st.integers(-250_000, 250_000), rest=st.floats(-4.0, 4.0))
+def test_cosine_and_sine(turns: int, rest: float):
+    angle = 2 * np.pi * turns + rest
+    cosine, sine = cosine_and_sine(jnp.asarray(angle))
+    assert float(cosine) == pytest.approx(np.cos(angle), abs=3e-16)
+    assert float(sine) == pytest.approx(np.sin(angle), abs=3e-16)
+
+
+def test_of_many_angles_at_every_quarter():
+    angles = np.arange(-40, 41) * (np.pi / 4)
+    cosine, sine = cosine_and_sine(jnp.asarray(angles))
+    np.testing.assert_allclose(cosine, np.cos(angles), atol=3e-16)
+    np.testing.assert_allclose(sine, np.sin(angles), atol=3e-16)
+
+
+def test_derivatives_turn_one_into_the_other():
+    angle = jnp.asarray(0.7)
+    for mode in (jax.jacfwd, jax.jacrev):
+        by_angle = mode(lambda a: jnp.stack(cosine_and_sine(a)))(angle)
+        np.testing.assert_allclose(by_angle, [-np.sin(0.7), np.cos(0.7)], rtol=1e-15)
+    twice = jax.hessian(lambda a: cosine_and_sine(a)[1])(angle)
+    assert float(twice) == pytest.approx(-np.sin(0.7), rel=1e-15)
+
+
+@given(st.floats(-700.0, 50.0))
+def test_exponential(exponent: float):
+    expected = np.exp(exponent)
+    assert float(exponential(jnp.asarray(exponent))) == pytest.approx(expected, rel=1e-15, abs=3e-16)
+
+
+@given(base=st.floats(1e-30, 1e3), exponent=st.floats(0.0, 3.0))
+def test_power(base: float, exponent: float):
+    expected = base**exponent
+    found = float(power(jnp.asarray(base), jnp.asarray(exponent)))
+    assert found == pytest.approx(expected, rel=1e-13, abs=3e-16)
