@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.along import place_of
 from fitting.estimate import Fit
 from fitting.explained import solved
 from fitting.linear_look import Look, look_along, products, push
-from fitting.regressors import place_of
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.along import conditions_at_knots, motions, unit_pushes
 from fitting.estimate import Fit
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
-from fitting.regressors import conditions_at_knots, motions, unit_pushes
 from fitting.residual import Blocks, Problem, linearise
 from hdjax import Model
 from hdjax.effects import Conditions, Motion

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fitting.along import ERROR, INPUT, PART, SLOPE, Along, place_of
 from fitting.experiment import Segments
 from fitting.followed import NODES, WEIGHTS, Followed
 from fitting.free import strength_paths
-from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
+from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import (
     ActuatorEffect,
     Conditions,
@@ -23,19 +24,15 @@ from hdjax.effects import (
     MeshTorqueEffect,
     Motion,
     MotorSideEffect,
-    Scales,
     SensorEffect,
 )
-from hdjax.effects.learned import LEARNED, LearnedTorque
-from hdjax.parameters import Scalar, own_value, parameter
+from hdjax.parameters import own_value
 from hdjax.program_cache import jit_kept
 from hdjax.signals import polynomial
 from hdjax.where import where
 
 # Steps of an effect's own states in a sample interval, along a motion that is a straight line in between.
 _OWN_STEPS = 2
-# The nodes as parts of an interval.
-_PART = 0.5 * (NODES + 1.0)[None, None, :]
 
 
 class Regressors(eqx.Module):
@@ -53,119 +50,6 @@ class Regressors(eqx.Module):
     at_start: Float[Array | np.ndarray, "segments samples states columns"]
     at_end: Float[Array | np.ndarray, "segments samples states columns"]
     reading: Float[Array | np.ndarray, "segments samples outputs columns"]
-
-
-class Along(eqx.Module):
-    """A motion, as effects look at it.
-
-    Attributes:
-        model: whose motion it is.
-        followed: its states.
-        segments: the data that it belongs to.
-        at_knots: the motion at each knot.
-        between: the motion at the nodes of each interval.
-        pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
-        goes_on: whether a segment goes on where the one before it ends in time, joined or not.
-    """
-
-    model: Model
-    followed: Followed
-    segments: Segments
-    at_knots: Motion
-    between: Motion
-    pushes: dict[str, Float[Array, "segments samples nodes states"]]
-    goes_on: Bool[Array, " segments"]
-
-
-def along(model: Model, followed: Followed, segments: Segments) -> Along:
-    """The motion of a model as effects look at it.
-
-    Args:
-        model: at the solution.
-        followed: its states.
-        segments: the data that it belongs to.
-    """
-    conditions = conditions_between(segments)
-    at_knots = motions(model, followed.states, conditions_at_knots(segments))
-    between = motions(model, followed.between, conditions)
-    pushes = unit_pushes(model, followed.between, conditions)
-    return Along(model, followed, segments, at_knots, between, pushes, jnp.asarray(continues(segments)))
-
-
-@jit_kept
-def conditions_at_knots(segments: Segments) -> Conditions:
-    """Time and temperature at each knot, the end of the last interval included."""
-    time = segments.torque.knots[:, segments.halo :]
-    return Conditions(time, _at_knots(segments.temperature, jnp.diff(time)))
-
-
-@jit_kept
-def conditions_between(segments: Segments) -> Conditions:
-    """Time and temperature at the nodes of each interval."""
-    time = segments.torque.knots[:, segments.halo :]
-    late = jnp.asarray(_PART) * jnp.diff(time)[..., None]
-    warmth = segments.temperature
-    return Conditions(
-        time[:, :-1, None] + late, None if warmth is None else polynomial(warmth.coefficients[..., None, :], late)
-    )
-
-
-@jit_kept
-def motions(model: Model, states: Float[Array, "*many states"], conditions: Conditions) -> Motion:
-    """The motion that each of many states means."""
-    find = model.motion
-    for _ in states.shape[:-1]:
-        find = jax.vmap(find)
-    return find(states, conditions)
-
-
-class _UnitGeometry(MeshGeometryEffect):
-    """An error of the mesh and a slope of it, each by itself."""
-
-    family: ClassVar[str] = "kinematic_error"
-    name: ClassVar[str] = "unit_geometry"
-
-    e: Scalar = parameter(0.0, unit="rad", doc="the error", role="strength")
-    e_slope: Scalar = parameter(0.0, unit="1", doc="its slope", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return ()
-
-    def error(self, theta_m: Array) -> Array:
-        return self.e
-
-    def slope(self, theta_m: Array) -> Array:
-        return self.e_slope
-
-
-# What effects add beside a torque at one of the places of [`hdjax.effects.learned`][].
-_INPUT, _ERROR, _SLOPE = "input", "error", "slope"
-
-
-@jit_kept
-def unit_pushes(
-    model: Model, states: Float[Array, "*many states"], conditions: Conditions
-) -> dict[str, Float[Array, "*many states"]]:
-    """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
-    of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
-    mesh, and its slope."""
-    whole = isinstance(model, TwoInertiaModel)
-    torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,)) for f in LEARNED if whole or not f.needs_motor]
-    geometry = [_UnitGeometry()] if whole else []
-    probed = model.with_effects(*torques, *geometry)
-    paths = [f"{f.name}.c_0" for f in torques] + [f"{g.name}.{n}" for g in geometry for n in ("e", "e_slope")]
-    names = [f.name for f in torques] + ([_ERROR, _SLOPE] if whole else [])
-
-    def rates(strengths: Array, torque: Array, state: Array, conditions: Conditions) -> Array:
-        changed = probed.replace(dict(zip(paths, strengths, strict=True)))
-        return changed.rates(state, torque, jnp.zeros_like(torque), conditions)
-
-    find = jax.jacfwd(rates, argnums=(0, 1))
-    for _ in states.shape[:-1]:
-        find = jax.vmap(find, in_axes=(None, None, 0, 0))
-    by_strength, by_input = find(jnp.zeros(len(paths)), jnp.zeros(()), states, conditions)
-    return {name: by_strength[..., i] for i, name in enumerate(names)} | {_INPUT: by_input}
 
 
 def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
@@ -192,20 +76,14 @@ def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
     if place is not None:
         added = {place.name: _torques(bare, stacked, seen.at_knots, seen.between, width, seen.goes_on)}
     elif isinstance(stacked, ActuatorEffect):
-        added = {_INPUT: _inputs(_actuated(seen.model, segments), stacked, segments.halo)}
+        added = {INPUT: _inputs(_actuated(seen.model, segments), stacked, segments.halo)}
     else:
         assert isinstance(stacked, MeshGeometryEffect)
-        added = dict(zip((_ERROR, _SLOPE), _geometry(stacked, seen.between), strict=True))
+        added = dict(zip((ERROR, SLOPE), _geometry(stacked, seen.between), strict=True))
     columns = next(iter(added.values())).shape[-1]
     lines = [_straight_lines(seen.pushes[n], _padded(_finite(np.asarray(v)))) for n, v in added.items()]
     at_start, at_end = (np.sum([np.asarray(line[side])[..., :columns] for line in lines], axis=0) for side in (0, 1))
     return Regressors(at_start, at_end, np.zeros((*segments.measured.shape, columns)))
-
-
-def place_of(effect: Effect) -> type[LearnedTorque] | None:
-    """The learned torque that acts where an effect does; None where that is no torque."""
-    kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
-    return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
 
 
 def _padded(values: np.ndarray) -> Array:
@@ -232,14 +110,6 @@ def _finite(values: np.ndarray) -> np.ndarray:
     """An effect that runs away along the motion explains nothing."""
     lost = ~np.isfinite(values).all(axis=tuple(range(values.ndim - 1)))
     return np.where(lost, 0.0, values) if lost.any() else values
-
-
-def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
-    """Whether a segment goes on where the one before it ends in time, joined or not."""
-    knots = np.asarray(segments.torque.knots)[:, segments.halo :]
-    step = np.median(np.diff(knots))
-    late = knots[1:, 0] - knots[:-1, -1]
-    return np.append(False, np.abs(late) < 0.5 * step)
 
 
 def _torque_columns(
@@ -296,7 +166,7 @@ def _input_columns(
     def acting(effect: Effect) -> Array:
         assert isinstance(effect, ActuatorEffect)
         found = jax.vmap(effect.actuate)(torque)
-        late = jnp.asarray(_PART) * jnp.diff(found.knots[:, halo:])[..., None]
+        late = jnp.asarray(PART) * jnp.diff(found.knots[:, halo:])[..., None]
         return polynomial(found.coefficients[:, halo:, None, :], late)
 
     return _by_strength(stacked, acting)
@@ -381,7 +251,7 @@ def _rates_and_reading(
     halo = segments.halo
     acting = jax.vmap(model.actuate)(segments.torque)
     acting = PiecewisePolynomial(acting.knots[:, halo:], acting.coefficients[:, halo:])
-    late = jnp.asarray(_PART) * jnp.diff(acting.knots)[..., None]
+    late = jnp.asarray(PART) * jnp.diff(acting.knots)[..., None]
     torque = polynomial(acting.coefficients[..., None, :], late)
     load, warmth = (
         None if signal is None else polynomial(signal.coefficients[..., None, :], late)
@@ -395,7 +265,7 @@ def _rates_and_reading(
 
 def _own_between(start: Array, end: Array) -> Array:
     """An effect's own states at the nodes, in a straight line between both ends of an interval."""
-    part = jnp.asarray(_PART)[..., None]
+    part = jnp.asarray(PART)[..., None]
     return start[:, :, None] * (1.0 - part) + end[:, :, None] * part
 
 
@@ -427,11 +297,3 @@ def _own_states(
         return jax.lax.scan(interval, own, (before, after, width))
 
     return jax.lax.scan(segment, jnp.zeros_like(effect.initial_state()), (motion, width, goes_on))[1]
-
-
-def _at_knots(signal: PiecewisePolynomial | None, width: Float[Array, "segments samples"]) -> Array | None:
-    """A signal's values at the samples and at the end of the last interval."""
-    if signal is None:
-        return None
-    last = polynomial(signal.coefficients[:, -1], width[:, -1])
-    return jnp.concatenate([signal.coefficients[:, :, 0], last[:, None]], axis=1)

@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import prev_fast_len
 
+from fitting.along import Along, along
 from fitting.estimate import STEP_ANGLE, Fit, lost, suggested_substeps
 from fitting.experiment import Segments, scales
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
-from fitting.regressors import Along, Regressors, along, regressors
+from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks, linearise
 from fitting.spectral_lines import spectral_lines
 from hdjax import TwoInertiaModel

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.along import along
 from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.followed import Followed, follow, respond
 from fitting.free import base_paths, strength_paths
-from fitting.regressors import along, regressors
+from fitting.regressors import regressors
 from fitting.residual import simulate_segments
 from hdjax import PiecewisePolynomial
 from hdjax.effects import Effect

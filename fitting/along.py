@@ -1,0 +1,164 @@
+"""A fitted motion as effects look at it, and what a unit of each thing that they can add does there."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitting.experiment import Segments
+from fitting.followed import NODES, Followed
+from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
+from hdjax.effects import (
+    Conditions,
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+    Scales,
+)
+from hdjax.effects.learned import LEARNED, LearnedTorque
+from hdjax.parameters import Scalar, parameter
+from hdjax.program_cache import jit_kept
+from hdjax.signals import polynomial
+
+PART = 0.5 * (NODES + 1.0)[None, None, :]
+"""The nodes as parts of an interval, behind segments and samples."""
+
+INPUT, ERROR, SLOPE = "input", "error", "slope"
+"""What effects add beside a torque at one of the places of [`hdjax.effects.learned`][]."""
+
+
+class Along(eqx.Module):
+    """A motion, as effects look at it.
+
+    Attributes:
+        model: whose motion it is.
+        followed: its states.
+        segments: the data that it belongs to.
+        at_knots: the motion at each knot.
+        between: the motion at the nodes of each interval.
+        pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
+        goes_on: whether a segment goes on where the one before it ends in time, joined or not.
+    """
+
+    model: Model
+    followed: Followed
+    segments: Segments
+    at_knots: Motion
+    between: Motion
+    pushes: dict[str, Float[Array, "segments samples nodes states"]]
+    goes_on: Bool[Array, " segments"]
+
+
+def along(model: Model, followed: Followed, segments: Segments) -> Along:
+    """The motion of a model as effects look at it.
+
+    Args:
+        model: at the solution.
+        followed: its states.
+        segments: the data that it belongs to.
+    """
+    conditions = conditions_between(segments)
+    at_knots = motions(model, followed.states, conditions_at_knots(segments))
+    between = motions(model, followed.between, conditions)
+    pushes = unit_pushes(model, followed.between, conditions)
+    return Along(model, followed, segments, at_knots, between, pushes, jnp.asarray(continues(segments)))
+
+
+@jit_kept
+def conditions_at_knots(segments: Segments) -> Conditions:
+    """Time and temperature at each knot, the end of the last interval included."""
+    time = segments.torque.knots[:, segments.halo :]
+    return Conditions(time, _at_knots(segments.temperature, jnp.diff(time)))
+
+
+@jit_kept
+def conditions_between(segments: Segments) -> Conditions:
+    """Time and temperature at the nodes of each interval."""
+    time = segments.torque.knots[:, segments.halo :]
+    late = jnp.asarray(PART) * jnp.diff(time)[..., None]
+    warmth = segments.temperature
+    return Conditions(
+        time[:, :-1, None] + late, None if warmth is None else polynomial(warmth.coefficients[..., None, :], late)
+    )
+
+
+@jit_kept
+def motions(model: Model, states: Float[Array, "*many states"], conditions: Conditions) -> Motion:
+    """The motion that each of many states means."""
+    find = model.motion
+    for _ in states.shape[:-1]:
+        find = jax.vmap(find)
+    return find(states, conditions)
+
+
+class _UnitGeometry(MeshGeometryEffect):
+    """An error of the mesh and a slope of it, each by itself."""
+
+    family: ClassVar[str] = "kinematic_error"
+    name: ClassVar[str] = "unit_geometry"
+
+    e: Scalar = parameter(0.0, unit="rad", doc="the error", role="strength")
+    e_slope: Scalar = parameter(0.0, unit="1", doc="its slope", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return ()
+
+    def error(self, theta_m: Array) -> Array:
+        return self.e
+
+    def slope(self, theta_m: Array) -> Array:
+        return self.e_slope
+
+
+@jit_kept
+def unit_pushes(
+    model: Model, states: Float[Array, "*many states"], conditions: Conditions
+) -> dict[str, Float[Array, "*many states"]]:
+    """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
+    of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
+    mesh, and its slope."""
+    whole = isinstance(model, TwoInertiaModel)
+    torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,)) for f in LEARNED if whole or not f.needs_motor]
+    geometry = [_UnitGeometry()] if whole else []
+    probed = model.with_effects(*torques, *geometry)
+    paths = [f"{f.name}.c_0" for f in torques] + [f"{g.name}.{n}" for g in geometry for n in ("e", "e_slope")]
+    names = [f.name for f in torques] + ([ERROR, SLOPE] if whole else [])
+
+    def rates(strengths: Array, torque: Array, state: Array, conditions: Conditions) -> Array:
+        changed = probed.replace(dict(zip(paths, strengths, strict=True)))
+        return changed.rates(state, torque, jnp.zeros_like(torque), conditions)
+
+    find = jax.jacfwd(rates, argnums=(0, 1))
+    for _ in states.shape[:-1]:
+        find = jax.vmap(find, in_axes=(None, None, 0, 0))
+    by_strength, by_input = find(jnp.zeros(len(paths)), jnp.zeros(()), states, conditions)
+    return {name: by_strength[..., i] for i, name in enumerate(names)} | {INPUT: by_input}
+
+
+def place_of(effect: Effect) -> type[LearnedTorque] | None:
+    """The learned torque that acts where an effect does; None where that is no torque."""
+    kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
+    return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
+
+
+def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
+    """Whether a segment goes on where the one before it ends in time, joined or not."""
+    knots = np.asarray(segments.torque.knots)[:, segments.halo :]
+    step = np.median(np.diff(knots))
+    late = knots[1:, 0] - knots[:-1, -1]
+    return np.append(False, np.abs(late) < 0.5 * step)
+
+
+def _at_knots(signal: PiecewisePolynomial | None, width: Float[Array, "segments samples"]) -> Array | None:
+    """A signal's values at the samples and at the end of the last interval."""
+    if signal is None:
+        return None
+    last = polynomial(signal.coefficients[:, -1], width[:, -1])
+    return jnp.concatenate([signal.coefficients[:, :, 0], last[:, None]], axis=1)
