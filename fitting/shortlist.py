@@ -10,8 +10,9 @@ NEARLY = 0.95
 
 # A form that to first order does no better than chance does in this share of cases is not refitted.
 _WORTH_A_REFIT = 0.2
-# Nor is one that explains less than this share of what the best one does.
-_SHARE_OF_BEST = 0.25
+# Nor is one that explains less than this share of what the best one does: where stiffness is far off, as with backlash,
+# the first look misses the gain of the right form by a factor of ten.
+_SHARE_OF_BEST = 0.05
 # Families whose likeliest form is refitted inside the equations in each round.
 _FAMILIES = 5
 # Further forms of the best one's family that compete with it there.
