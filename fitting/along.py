@@ -77,15 +77,22 @@ def conditions_at_knots(segments: Segments) -> Conditions:
     return Conditions(time, _at_knots(segments.temperature, jnp.diff(time)))
 
 
+def at_nodes(signal: PiecewisePolynomial) -> Float[Array, "segments samples nodes"]:
+    """A signal's values at the nodes of each interval."""
+    return polynomial(signal.coefficients[..., None, :], _late(signal.knots))
+
+
+def _late(knots: Float[Array, "segments knots"]) -> Float[Array, "segments samples nodes"]:
+    """How late in its interval each node comes."""
+    return jnp.asarray(PART) * jnp.diff(knots)[..., None]
+
+
 @jit_kept
 def conditions_between(segments: Segments) -> Conditions:
     """Time and temperature at the nodes of each interval."""
     time = segments.torque.knots[:, segments.halo :]
-    late = jnp.asarray(PART) * jnp.diff(time)[..., None]
-    warmth = segments.temperature
-    return Conditions(
-        time[:, :-1, None] + late, None if warmth is None else polynomial(warmth.coefficients[..., None, :], late)
-    )
+    warmth = None if segments.temperature is None else at_nodes(segments.temperature)
+    return Conditions(time[:, :-1, None] + _late(time), warmth)
 
 
 @jit_kept

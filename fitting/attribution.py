@@ -116,8 +116,8 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
         data: the stretches.
         hold: what the torque does between samples.
         setting: how the data are cut.
-        start: a trial near by, whose error covariance weighs the outputs at the start; of a model with the same states
-            it supplies those too.
+        start: a trial near by, whose error covariance weighs the outputs at the start, and whose initial states it
+            starts from.
     """
     training = _trained(model, data, hold, setting, None if start is None else start.training)
     return _judged(training, data, hold, setting)

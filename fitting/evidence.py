@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from fitting.along import place_of
 from fitting.estimate import Fit
 from fitting.explained import solved
-from fitting.linear_look import Look, look_along, products, push
+from fitting.linear_look import Look, look_along, products
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,
@@ -140,7 +140,7 @@ def _told(
         places.append(nodes)
         middle.append(_nearby(value[there], does[there], nodes))
         hats.append(_hats(value, nodes) * there[..., None])
-    found = products(look, push(look, form), np.concatenate(hats, axis=-1))
+    found = products(look, look.pushes[form.name], np.concatenate(hats, axis=-1))
     own = slice(len(look.problem.free.paths), None)
     # The error is whitened: an equal sum over the outputs is the likelihood.
     gram = np.einsum("siipq->pq", found.gram[..., own, own])

@@ -13,7 +13,6 @@ from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem, linearise
 from hdjax import Model
 from hdjax.effects import Conditions, Motion
-from hdjax.effects.learned import LearnedTorque
 from hdjax.where import where
 
 # Passes of "least squares, then weigh the outputs by what is left over".
@@ -90,11 +89,6 @@ def look_along(fit: Fit) -> Look:
     )
 
 
-def push(look: Look, form: type[LearnedTorque]) -> Float[Array, "segments knots states"]:
-    """What a unit of torque at the form's place adds to the state's rates, at each knot."""
-    return look.pushes[form.name]
-
-
 def parameter_torques(
     look: Look, push: Float[Array, "segments knots states"]
 ) -> Float[Array, "segments knots parameters"]:
@@ -129,7 +123,7 @@ def products(
 
     Args:
         look: the fit.
-        push: the place, from [`push`][].
+        push: the place, one of the look's pushes.
         torques: at each knot; in a straight line between.
     """
     found = _products(look, push, jnp.asarray(torques))

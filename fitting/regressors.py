@@ -10,14 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.along import ERROR, INPUT, PART, SLOPE, Along, place_of
+from fitting.along import ERROR, INPUT, PART, SLOPE, Along, at_nodes, conditions_between, place_of
 from fitting.experiment import Segments
 from fitting.followed import NODES, WEIGHTS, Followed
 from fitting.free import strength_paths
 from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import (
     ActuatorEffect,
-    Conditions,
     Effect,
     LoadSideEffect,
     MeshGeometryEffect,
@@ -28,7 +27,6 @@ from hdjax.effects import (
 )
 from hdjax.parameters import own_value
 from hdjax.program_cache import jit_kept
-from hdjax.signals import polynomial
 from hdjax.where import where
 
 # Steps of an effect's own states in a sample interval, along a motion that is a straight line in between.
@@ -65,7 +63,7 @@ def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
     bare = replace(seen.model, effects=())
     segments = seen.segments
     if isinstance(stacked, SensorEffect):
-        reading = _finite(np.asarray(_reading_columns(bare, stacked, seen.at_knots)))
+        reading = _finite(np.asarray(_readings(bare, stacked, seen.at_knots)))
         nothing = np.zeros((*segments.measured.shape[:2], seen.followed.states.shape[-1], reading.shape[-1]))
         return Regressors(nothing, nothing, reading)
     width = jnp.diff(segments.torque.knots[:, segments.halo :])
@@ -165,11 +163,14 @@ def _input_columns(
 
     def acting(effect: Effect) -> Array:
         assert isinstance(effect, ActuatorEffect)
-        found = jax.vmap(effect.actuate)(torque)
-        late = jnp.asarray(PART) * jnp.diff(found.knots[:, halo:])[..., None]
-        return polynomial(found.coefficients[:, halo:, None, :], late)
+        return at_nodes(_behind(halo, jax.vmap(effect.actuate)(torque)))
 
     return _by_strength(stacked, acting)
+
+
+def _behind(halo: int, torque: PiecewisePolynomial) -> PiecewisePolynomial:
+    """The torque from each segment's own start on."""
+    return PiecewisePolynomial(torque.knots[:, halo:], torque.coefficients[:, halo:])
 
 
 def _geometry_columns(stacked: Effect, between: Motion) -> tuple[Array, Array]:
@@ -182,7 +183,9 @@ def _geometry_columns(stacked: Effect, between: Motion) -> tuple[Array, Array]:
     return _by_strength(stacked, geometry)
 
 
-def _reading_of(bare: Model, stacked: Effect, at_knots: Motion) -> Float[Array, "segments samples outputs columns"]:
+def _reading_columns(
+    bare: Model, stacked: Effect, at_knots: Motion
+) -> Float[Array, "segments samples outputs columns"]:
     """Derivatives of the outputs at the samples."""
     theta_m, theta_l = at_knots.theta_m, at_knots.theta_l
     assert theta_m is not None and theta_l is not None
@@ -201,7 +204,7 @@ _QUICKLY_MADE: Any = {"compiler_options": {"xla_backend_optimization_level": 1}}
 _torques = jit_kept(_torque_columns, **_QUICKLY_MADE)
 _inputs = jit_kept(_input_columns, **_QUICKLY_MADE)
 _geometry = jit_kept(_geometry_columns, **_QUICKLY_MADE)
-_reading_columns = jit_kept(_reading_of, **_QUICKLY_MADE)
+_readings = jit_kept(_reading_columns, **_QUICKLY_MADE)
 
 
 def _looked_along(
@@ -212,25 +215,16 @@ def _looked_along(
     at_knots: Motion,
     goes_on: Bool[Array, " segments"],
 ) -> Regressors:
-    states, between = followed.states, followed.between
     width = jnp.diff(segments.torque.knots[:, segments.halo :])
 
-    def of(effect: Effect) -> Regressors:
-        own = _own_states(effect, at_knots, width, goes_on) if effect.states else None
-        paths = strength_paths(effect)
-        extended = model.with_effects(effect)
+    def looked_at(effect: Effect) -> tuple[Array, Array]:
+        own = _own_states(jax.lax.stop_gradient(effect), at_knots, width, goes_on) if effect.states else None
+        return _rates_and_reading(model.with_effects(effect), followed.states, followed.between, own, segments)
 
-        def looked_at(strengths: Array):
-            changed = extended.replace(dict(zip(paths, strengths, strict=True)))
-            return _rates_and_reading(changed, states, between, own, segments)
-
-        rates, reading = jax.jacfwd(looked_at)(jnp.stack([extended.get(p) for p in paths]))
-        mean = 0.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS), rates)
-        rise = 1.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS * NODES), rates)
-        return Regressors(mean - rise, mean + rise, reading)
-
-    found = jax.vmap(of, out_axes=-1)(stacked)
-    return jax.tree.map(_side_by_side, found)
+    rates, reading = _by_strength(stacked, looked_at)
+    mean = 0.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS), rates)
+    rise = 1.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS * NODES), rates)
+    return Regressors(mean - rise, mean + rise, reading)
 
 
 _regressors = jit_kept(_looked_along, **_QUICKLY_MADE)
@@ -248,17 +242,9 @@ def _rates_and_reading(
     if own is not None:
         between = jnp.concatenate([between, _own_between(*own)], axis=-1)
         samples = jnp.concatenate([samples, own[0]], axis=-1)
-    halo = segments.halo
-    acting = jax.vmap(model.actuate)(segments.torque)
-    acting = PiecewisePolynomial(acting.knots[:, halo:], acting.coefficients[:, halo:])
-    late = jnp.asarray(PART) * jnp.diff(acting.knots)[..., None]
-    torque = polynomial(acting.coefficients[..., None, :], late)
-    load, warmth = (
-        None if signal is None else polynomial(signal.coefficients[..., None, :], late)
-        for signal in (segments.load_torque, segments.temperature)
-    )
-    load = jnp.zeros_like(late) if load is None else load
-    conditions = Conditions(acting.knots[:, :-1, None] + late, warmth)
+    torque = at_nodes(_behind(segments.halo, jax.vmap(model.actuate)(segments.torque)))
+    load = jnp.zeros_like(torque) if segments.load_torque is None else at_nodes(segments.load_torque)
+    conditions = conditions_between(segments)
     rates = jax.vmap(jax.vmap(jax.vmap(model.rates)))(between, torque, load, conditions)
     return rates[..., :kept], jax.vmap(jax.vmap(model.outputs))(samples)
 

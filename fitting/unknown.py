@@ -24,7 +24,6 @@ from fitting.linear_look import (
     look_along,
     parameter_torques,
     products,
-    push,
     surrogate_gains,
 )
 from fitting.screening import surrogates
@@ -234,7 +233,7 @@ def _sight(fit: Fit, places: Sequence[type[LearnedTorque]] = LEARNED) -> _Sight:
     finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
     # The last knot of a segment is the first one of the next.
     weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
-    return _Sight(look, {f.name: push(look, f) for f in forms}, values, weight)
+    return _Sight(look, {f.name: look.pushes[f.name] for f in forms}, values, weight)
 
 
 def _candidates(sight: _Sight) -> list[Candidate]:

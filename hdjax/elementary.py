@@ -1,6 +1,6 @@
-"""Elementary functions in plain arithmetic, which XLA vectorises on a processor; its own call a library lane by lane.
+"""Elementary functions in plain arithmetic, which XLA vectorises on a processor.
 
-A library call for each lane would be most of the time of a simulation.
+Its own call a library lane by lane, which would be most of the time of a simulation.
 """
 
 import math

@@ -36,18 +36,19 @@ def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _
 def _together(tree: _Tree) -> _Tree:
     """The same arrays, all on the devices that share the lanes: where one of them was left behind, the program would
     be compiled again."""
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    leaves, structure = jax.tree.flatten(arrays)
-    mesh = next((a.sharding.mesh for a in leaves if _is_shared(a)), None)
+    mesh = next((a.sharding.mesh for a in jax.tree.leaves(tree) if _is_shared(a)), None)
     if mesh is None:
         return tree
     everywhere = NamedSharding(mesh, PartitionSpec())
-    leaves = [a if _is_shared(a) else jax.device_put(np.asarray(a), everywhere) for a in leaves]
-    return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
+
+    def placed(leaf: Any) -> Any:
+        return jax.device_put(np.asarray(leaf), everywhere) if eqx.is_array(leaf) and not _is_shared(leaf) else leaf
+
+    return jax.tree.map(placed, tree)
 
 
-def _is_shared(array: Any) -> bool:
-    return isinstance(array, jax.Array) and isinstance(array.sharding, NamedSharding)
+def _is_shared(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and isinstance(leaf.sharding, NamedSharding)
 
 
 def spread(tree: _Tree, lanes: int) -> _Tree:
