@@ -23,14 +23,12 @@ from fitting.residual import (
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import jit_lanes, spread
 from hdjax.program_cache import jit_kept
+from hdjax.where import where
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
 # An output that the model can't follow may take longer to lose its say.
 _MOST_REWEIGHTINGS = 12
-# After twice the iterations of a pass, a fit goes on only as long as a pass gains this share of the error, and to so
-# many times them at most.
-_GAINS, _PATIENCE = 0.03, 8
 # Simulations longer than this many segments start from states that shorter ones have found already.
 _LONGEST_RETRY = 16
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
@@ -39,7 +37,8 @@ _LONGEST_SEGMENT = 256
 _DAMPING = (1e-3, 1e-9)
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
-_RETRY_STEPS = 12
+# Iterations in each window of samples, of windows that grow.
+_WINDOW_STEPS = 12
 # So many samples tell the noise to 1 %.
 _NOISE_SAMPLES = 5000
 _NOISE_STEPS = 30
@@ -125,14 +124,14 @@ def fit(
         length: samples in a segment; see [`segment_length`][] where not given.
         halo: intervals of torque before each segment, for delays.
         substeps: solver steps in a sample interval; from the natural frequency where not given.
-        max_steps: iterations of each pass at most; with twice as many in all, a further pass begins only where the last
-            one gained much.
+        max_steps: iterations of each pass at most; no further pass begins after twice as many in all.
         covariance: of the outputs' errors to start the weighing with.
         reweigh: whether to weigh by what is left over; with False the given covariance is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         count: number of segments, see [`fitting.experiment.cut`][].
         states: initial states of the segments to start from; from their first samples where not given.
-        retry_states: whether segments that stand out are begun anew, since they may have ended in a wrong minimum.
+        retry_states: whether a first pass that does not converge is begun anew, from the first samples of each segment,
+            and so are segments that stand out: they may have ended in a wrong minimum.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
 
     Returns:
@@ -163,6 +162,9 @@ def fit(
         problem = _weighed(problem, covariance, swing)
         solution = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
         if turn == 0 and retry_states and horizon <= _LONGEST_RETRY * length:
+            if not (solution.success or hold_parameters):
+                again = _solve(problem, _grown(problem, unknowns), max_steps, _DAMPING[1])
+                solution = min(solution, again, key=lambda s: float(jnp.sum(s.squares)))
             mended = _retry_states(problem, solution)
             if mended is not None:
                 solution = _solve(problem, mended, max_steps, _DAMPING[1])
@@ -170,8 +172,7 @@ def fit(
         before, objective = objective, _half_log_determinant(covariance)
         steps += int(solution.steps)
         settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
-        gains = before - objective > _GAINS
-        if settled or objective > give_up_above or steps >= (_PATIENCE if gains else 2) * max_steps:
+        if settled or objective > give_up_above or steps >= 2 * max_steps:
             break
     assert solution is not None
     # By way of the host: what is computed with the model alone need not run on every device.
@@ -238,10 +239,12 @@ def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping
         throw=False,
     )
     success = solution.result == optx.RESULTS.successful
-    rows = solution.state.f_info.residual.rows
+    # An iteration that is given up before its first step, as from a start that is no number, has seen nothing.
+    steps = solution.stats["num_steps"]
+    rows = where(steps > 0, solution.state.f_info.residual.rows, jnp.inf)
     error, squares = _error_of_rows(problem, rows), jnp.sum(rows**2, axis=1)
     covariance = _covariance(error, problem.segments)
-    return _Solution(solution.value, error, covariance, squares, success, solution.stats["num_steps"])
+    return _Solution(solution.value, error, covariance, squares, success, steps)
 
 
 def _error_of_rows(problem: Problem, rows: Array) -> Array:
@@ -251,35 +254,44 @@ def _error_of_rows(problem: Problem, rows: Array) -> Array:
     return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
 
 
+def _grown(problem: Problem, unknowns: Unknowns) -> Unknowns:
+    """Fit the first samples of each segment, then ever more of them, until it is all of them.
+
+    Over half a natural period a simulation depends on parameters and state so smoothly that the fit finds its way from
+    afar; each window starts near the solution of the next one. Masking the later samples lets the same compiled
+    program do it.
+    """
+    weight = problem.segments.weight
+    length = weight.shape[1]
+    apart = _zeros_like(problem.segments.joined)
+    for samples in _growing(problem, length):
+        masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
+        part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
+        # The program of the fit, where all is in the same places.
+        part, unknowns = spread((part, unknowns), weight.shape[0])
+        unknowns = _solve(part, unknowns, _WINDOW_STEPS, _DAMPING[0]).unknowns
+    return unknowns
+
+
 def _retry_states(problem: Problem, found: _Solution) -> Unknowns | None:
     """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one; None where
     none is better.
 
     A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
-    segments would dominate the sum of squares. Masking the later samples lets the same compiled program do it.
+    segments would dominate the sum of squares.
     """
-    weight, unknowns = problem.segments.weight, found.unknowns
-    held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
-    model = problem.free.unpack(problem.model, unknowns.parameters)
-    fresh = Unknowns(unknowns.parameters, initial_states(model, problem.segments))
-    old = np.asarray(found.squares)
-    suspect = old > _OUTLIER * np.median(old[np.asarray(weight).any(axis=1)])
+    parameters, old = found.unknowns.parameters, np.asarray(found.squares)
+    suspect = old > _OUTLIER * np.median(old[np.asarray(problem.segments.weight).any(axis=1)])
     if not suspect.any():
         return None
-    length = weight.shape[1]
-    for samples in _growing(problem, length):
-        masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
-        part = eqx.tree_at(
-            lambda p: (p.segments.weight, p.segments.joined), held, (masked, _zeros_like(held.segments.joined))
-        )
-        # The program of the fit, where all is in the same places.
-        part, fresh = spread((part, fresh), weight.shape[0])
-        fresh = _solve(part, fresh, _RETRY_STEPS, _DAMPING[0]).unknowns
+    held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
+    model = problem.free.unpack(problem.model, parameters)
+    fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)))
     new = np.asarray(_evaluate(problem, fresh).squares)
     better = (new < 0.99 * old) & suspect
     if not better.any():
         return None
-    return Unknowns(unknowns.parameters, jnp.where(better[:, None], fresh.states, unknowns.states))
+    return Unknowns(parameters, jnp.where(better[:, None], fresh.states, found.unknowns.states))
 
 
 def _zeros_like(array: Array) -> Array:

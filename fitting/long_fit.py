@@ -16,7 +16,9 @@ _LOSS = 0.02
 def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     """Fit the same parameters to the same data, over horizons as long as the stretches and with steps fine enough.
 
-    Where a long simulation has lost its way, short segments say so, and the fit that was given stays.
+    Where a long simulation has lost its way, short segments say so, and the fit that was given stays. So it does where
+    the long one does not converge: a motion whose errors grow without end (backlash, say) has long simulations that
+    promise far more than they can tell.
 
     Args:
         start: a fit over shorter horizons.
@@ -30,6 +32,8 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=whole, substeps=substeps)
+    if not long.converged:
+        return start
     if must_explain and long.objective > start.objective + _freedom_of_states(start) + _LOSS:
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True)
