@@ -16,9 +16,9 @@ _LOSS = 0.02
 def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     """Fit the same parameters to the same data, over horizons as long as the stretches and with steps fine enough.
 
-    Where a long simulation has lost its way, short segments say so, and the fit that was given stays. So it does where
-    the long one does not converge: a motion whose errors grow without end (backlash, say) has long simulations that
-    promise far more than they can tell.
+    Where a long simulation has lost its way, the fit that was given stays. So it does where the long one does not
+    converge: a motion whose errors grow without end (backlash, say) has long simulations that promise far more than
+    they can tell.
 
     Args:
         start: a fit over shorter horizons.
@@ -32,12 +32,19 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=whole, substeps=substeps)
-    if not long.converged:
+    if not (long.converged and _follows(long)):
         return start
     if must_explain and long.objective > start.objective + _freedom_of_states(start) + _LOSS:
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True)
     return long if check.objective < start.objective + _LOSS else start
+
+
+def _follows(found: Fit) -> bool:
+    """Whether the simulation errs by less than half of how much each output moves."""
+    segments = found.problem.segments
+    measured = np.asarray(segments.measured)[np.asarray(segments.weight) > 0]
+    return bool(np.all(np.diag(np.asarray(found.covariance)) < 0.25 * measured.var(axis=0)))
 
 
 def _freedom_of_states(found: Fit) -> float:

@@ -22,6 +22,7 @@ from fitting.estimate import (
 from fitting.experiment import Stretch, cut, experiment_from_log
 from fitting.free import base_paths
 from fitting.uncertainty import uncertainty
+from hdjax.effects.backlash import Backlash
 from hdjax.effects.creep import Creep
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.hysteresis import BoucWen
@@ -205,6 +206,22 @@ def test_initial_speeds_of_a_noisy_oversampled_motion():
     off = np.sqrt(np.mean((states - motion[::200]) ** 2, axis=0)) / np.std(motion, axis=0)
     # 87 samples in a quarter period; from nine of them the speed would be mere noise.
     np.testing.assert_array_less(off, [0.2, 0.5])
+
+
+def test_a_dead_zone_is_recovered_from_afar():
+    """Long segments of a nonsmooth drive have many minima; windows that grow lead past them."""
+    gap = 1.5e-4
+    logged = whole(rig.drive_experiment(COUNT, gap=gap))
+    start = rig.drive_model(K=0.7 * rig.K, alpha=0.0).with_effects(Backlash(b=jnp.asarray(3e-5)))
+    found = fit(start, logged, (*PATHS, "backlash.b"), horizon=HORIZON, substeps=2, count=8, max_steps=25)
+    assert found.converged
+    assert_recovered(found, TRUTH | {"backlash.b": gap})
+
+
+def test_a_start_that_is_no_number_explains_nothing(found: Fit, stretches):
+    nowhere = found.unknowns.states * np.nan
+    got = drive_fit(found.model, stretches, states=nowhere, retry_states=False)
+    assert not got.converged and got.objective > found.objective + 3.0
 
 
 def test_whitening_inverts_the_covariance():

@@ -143,6 +143,21 @@ def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
     assert found["hold"] == HOLD and found["dropped"] == [] and found["unexplained"] is None
 
 
+def test_each_step_with_its_held_out_error(loop: Loop):
+    base, last = report_dict(loop)["steps"]
+    assert base["added"] is None and last["added"] == loop.findings[0].name
+    assert last["held_out_rmse"] < 0.5 * base["held_out_rmse"]
+    assert base["segment_seconds"] == pytest.approx(loop.setting.horizon * rig.STEP)
+
+
+def test_free_runs_that_leave_a_right_model_are_told(loop: Loop):
+    """As behind a dead zone: short simulations stay at the noise, long ones can't."""
+    assert not any("grow" in note for note in report_dict(loop)["cannot_tell"])
+    lost = eqx.tree_at(lambda x: x.after.validation[0].predicted, loop, replace_fn=lambda p: p + 1e-3)
+    (note,) = (n for n in report_dict(lost)["cannot_tell"] if "grow" in n)
+    assert "times the noise" in note
+
+
 def test_every_number_is_finite(loop: Loop):
     broken = eqx.tree_at(lambda x: x.before.validation[0].predicted, loop, replace_fn=lambda p: p * np.inf)
     found = report_dict(broken)

@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from fitting.attribution import Trial, Verdict
 from fitting.report.outcome import Outcome
 from fitting.report.separating import separating_experiment
+from fitting.report.steps import held_out_rmse
 
 
 def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
@@ -35,17 +34,12 @@ def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, A
     return {
         "family": verdict.family,
         "name": verdict.name,
-        "validation_rmse": _held_out_rmse(trial),
+        "validation_rmse": held_out_rmse(trial),
         "separable": verdict.separable,
         "separating_experiment": experiment,
         "instead_of": winner.name,
-        "validation_rmse_of_found": None if winner.trial is None else _held_out_rmse(winner.trial),
+        "validation_rmse_of_found": None if winner.trial is None else held_out_rmse(winner.trial),
     }
-
-
-def _held_out_rmse(trial: Trial) -> float:
-    """Rms of the dynamic error on held-out segments, whose initial states are fitted."""
-    return float(np.sqrt(np.asarray(trial.held_out.covariance)[-1, -1]))
 
 
 def _closeness(alternative: Mapping[str, Any]) -> tuple[bool, float]:

@@ -20,6 +20,7 @@ from fitting.report.outcome import Outcome
 from fitting.report.parameters import account_dict, effect_dict, no_account
 from fitting.report.posterior import posterior_dict
 from fitting.report.proposal import proposal_dict
+from fitting.report.steps import steps
 from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
 from fitting.report.unknown import unknown_dict
@@ -63,6 +64,7 @@ def report_dict(
         "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
         "identifiability": identifiability_dict(outcome.after.identifiability, units),
+        "steps": steps(outcome),
         "alternatives": alternatives(outcome),
         "goodness": None,
         "residual_tests": [],

@@ -9,6 +9,7 @@ from fitting import formatting
 from fitting.identifiability import Identifiability
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
+from fitting.report.steps import beyond_prediction
 from fitting.uncertainty import Estimate
 from hdjax.parameters import ParameterInfo
 
@@ -76,6 +77,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
                 f"A tie: {other['name']} ({plain_family(other['family'])}) explains the held-out data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
+    notes += [n for n in (beyond_prediction(report),) if n]
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated(own)
 

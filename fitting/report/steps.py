@@ -1,0 +1,56 @@
+"""What each step of the loop did to the held-out error, over times so short that little can pile up."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fitting import formatting
+from fitting.attribution import Trial
+from fitting.close_loop import Loop
+from fitting.report.outcome import Outcome
+
+# In units of the measurement noise: what leaves nothing but noise, and what a free run may be off without a word.
+_NOISE, _OFF = 1.2, 3.0
+
+
+def steps(outcome: Outcome) -> list[dict[str, Any]]:
+    """The base model, then the model after each step, each with its error on held-out segments whose initial states
+    are fitted; empty for a fit alone."""
+    if not isinstance(outcome, Loop) or not outcome.rounds:
+        return []
+    seconds = outcome.setting.horizon * outcome.stretches[0][0].experiment.time_step
+    found = [_step(None, outcome.rounds[0].before, seconds)]
+    for this in outcome.rounds:
+        if this.accepted and this.winner.trial is not None:
+            found.append(_step(this.winner.name, this.winner.trial, seconds))
+    if outcome.unknown is not None:
+        found.append(_step(outcome.unknown.chosen.form.name, outcome.unknown.trial, seconds))
+    return found
+
+
+def held_out_rmse(trial: Trial) -> float:
+    """Rms of the dynamic error on held-out segments, whose initial states are fitted."""
+    return float(np.sqrt(np.asarray(trial.held_out.covariance)[-1, -1]))
+
+
+def _step(added: str | None, trial: Trial, seconds: float) -> dict[str, Any]:
+    return {"added": added, "held_out_rmse": held_out_rmse(trial), "segment_seconds": seconds}
+
+
+def beyond_prediction(report: Mapping[str, Any]) -> str | None:
+    """What must be said where a model leaves nothing but noise over short times, and much over long ones."""
+    if not report["steps"]:
+        return None
+    last, noise = report["steps"][-1], report["noise"]["dynamic_error"]
+    final = report["after"] if report["after"]["parameters"] else report["before"]
+    free, short = final["rmse"]["validation"], last["held_out_rmse"]
+    if short is None or short > _NOISE * noise or (free is not None and free < _OFF * noise):
+        return None
+    unit = report["units"]["dynamic_error"]
+    return (
+        f"Over {formatting.quantity(last['segment_seconds'], 's')} at a time the model errs by "
+        f"{formatting.quantity(short, unit)} rms ({formatting.number(short / noise)} times the noise) on held-out "
+        "data. Its longer free runs leave the data all the same: along this motion small errors of the initial state "
+        "and of the parameters grow (as behind a dead zone), or something slow acts that the log does not show."
+    )

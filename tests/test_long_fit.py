@@ -1,0 +1,35 @@
+"""The fit over whole logs is taken where it tells more, and only there."""
+
+import jax.numpy as jnp
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import Stretch
+from fitting.long_fit import long_fit
+from fitting.uncertainty import uncertainty
+from hdjax.effects.backlash import Backlash
+
+COUNT, HORIZON, GAP = 8000, 128, 2e-4
+PATHS = ("K", "alpha", "B_sp", "backlash.b")
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    """A drive with a dead zone: its motion is chaotic."""
+    logged = rig.drive_experiment(COUNT, gap=GAP, rms=0.1)
+    start = rig.drive_model().with_effects(Backlash(b=jnp.asarray(GAP)))
+    return fit(start, [Stretch(logged, 0, COUNT)], PATHS, horizon=HORIZON, substeps=2)
+
+
+def test_a_chaotic_motion_keeps_the_fit_of_short_segments(found: Fit):
+    assert found.converged and long_fit(found) is found
+
+
+def test_a_long_simulation_tells_more_of_a_smooth_motion():
+    logged = rig.drive_experiment(COUNT)
+    short = fit(rig.drive_model(), [Stretch(logged, 0, COUNT)], PATHS[:3], horizon=HORIZON, substeps=1)
+    long = long_fit(short)
+    before, after = (uncertainty(f).estimates["K"] for f in (short, long))
+    assert after.std < 0.2 * before.std
+    assert abs(after.value - rig.K) < 4.0 * after.std
