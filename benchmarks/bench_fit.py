@@ -23,7 +23,7 @@ from fitting.arrow import normal_equations
 from fitting.estimate import Fit, fit, natural_frequency, short_horizon, suggested_substeps
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
-from fitting.residual import linearise, residual
+from fitting.residual import blocks, residual
 from fitting.starting_values import starting_models
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 from hdjax.lanes import jit_lanes
@@ -296,10 +296,10 @@ def show_profile(row: Row, repeats: int) -> None:
     """Where the time of one fit goes: compiled parts, timed apart, times how often they run."""
     found: Fit = row.result
     problem, unknowns = found.problem, found.unknowns
-    at_solution = linearise(problem, unknowns)
+    at_solution = _linearise(problem, unknowns)
     system = _system(at_solution, problem.segments.joined)
     parts = {
-        "simulation with sensitivities": lambda: linearise(problem, unknowns),
+        "simulation with sensitivities": lambda: _linearise(problem, unknowns),
         "normal equations": lambda: _system(at_solution, problem.segments.joined),
         "step": lambda: _step(system),
     }
@@ -314,6 +314,7 @@ def show_profile(row: Row, repeats: int) -> None:
     print(f"  simulation alone, without sensitivities: {1e3 * timed('', _residual(found), repeats).least:.2f} ms")
 
 
+_linearise = jit_lanes(blocks)
 _system = eqx.filter_jit(normal_equations)
 _step = eqx.filter_jit(lambda system: system.step(jnp.zeros(())))
 _simulated = jit_lanes(residual)

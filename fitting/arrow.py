@@ -176,6 +176,19 @@ def _solve_scaled(matrix: Array, right: Array) -> Array:
     return scale[:, None] * jnp.linalg.solve(scaled, scale[:, None] * right)
 
 
+def blocks_seen(
+    f_info: Any,
+    unknowns: Unknowns,
+    gap_weight: Float[Array, " states"],
+    joined: Bool[Array, " segments"],
+) -> Blocks:
+    """The blocks behind what optimistix knows of [`fitting.residual.residual_with_blocks`][] at the unknowns, its
+    `FunctionInfo.ResidualJac`."""
+    moved: LinearisedResidual = jax.vmap(f_info.jac.mv, out_axes=-1)(seeds(unknowns))
+    value, weight = f_info.residual, gap_weight[None]
+    return blocks_of_columns(value.rows, value.gap / weight, moved.rows, moved.gap / weight[:, :, None], joined)
+
+
 class ArrowDescent(optx.AbstractDescent):
     """Damped Gauss-Newton steps by elimination of the segments' states; damping is relative to diag(J^T J), for the
     shared parameters to the largest that it has been.
@@ -210,12 +223,7 @@ class ArrowDescent(optx.AbstractDescent):
         )
 
     def query(self, y: Unknowns, f_info, state: ArrowSystem) -> ArrowSystem:
-        moved: LinearisedResidual = jax.vmap(f_info.jac.mv, out_axes=-1)(seeds(y))
-        value, weight = f_info.residual, self.gap_weight[None]
-        found = blocks_of_columns(
-            value.rows, value.gap / weight, moved.rows, moved.gap / weight[:, :, None], self.joined
-        )
-        system = normal_equations(found, self.joined)
+        system = normal_equations(blocks_seen(f_info, y, self.gap_weight, self.joined), self.joined)
         # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
         # most that it has ever shown (Moré 1978).
         return eqx.tree_at(lambda s: s.yardstick, system, jnp.maximum(system.yardstick, state.yardstick))

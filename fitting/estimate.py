@@ -7,23 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, projected
+from fitting.arrow import projected
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import FreeParameters, free_parameters
-from fitting.residual import (
-    RUNAWAY,
-    Problem,
-    Unknowns,
-    linearise,
-    residual_with_blocks,
-)
+from fitting.residual import RUNAWAY, Problem, Unknowns
+from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, linearise, solve
 from hdjax import Drive, Model, TwoInertiaModel
-from hdjax.lanes import jit_lanes, spread
+from hdjax.lanes import spread
 from hdjax.program_cache import jit_kept
-from hdjax.where import where
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -33,8 +26,6 @@ _MOST_REWEIGHTINGS = 12
 _LONGEST_RETRY = 16
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
 _LONGEST_SEGMENT = 256
-# Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other weights.
-_DAMPING = (1e-3, 1e-9)
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
 # Iterations in each window of samples, of windows that grow.
@@ -152,22 +143,22 @@ def fit(
     unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
     problem = Problem(model, free, segments, *unweighed, substeps=substeps)
     problem, unknowns = spread((problem, unknowns), states.shape[0])
-    if covariance is None:
-        covariance = _evaluate(problem, unknowns).covariance
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = outputs > 1 or states.shape[1] > len(model.motion_states)
+    if covariance is None:
+        covariance = evaluate(problem, unknowns).covariance if scale_matters else swing[None, None] ** 2
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, swing)
-        solution = _solve(problem, unknowns, max_steps, _DAMPING[min(turn, 1)])
+        solution = solve(problem, unknowns, max_steps, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and retry_states and horizon <= _LONGEST_RETRY * length:
             if not (solution.success or hold_parameters):
-                again = _solve(problem, _grown(problem, unknowns), max_steps, _DAMPING[1])
+                again = solve(problem, _grown(problem, unknowns), max_steps, NEARBY_DAMPING)
                 solution = min(solution, again, key=lambda s: float(jnp.sum(s.squares)))
             mended = _retry_states(problem, solution)
             if mended is not None:
-                solution = _solve(problem, mended, max_steps, _DAMPING[1])
+                solution = solve(problem, mended, max_steps, NEARBY_DAMPING)
         unknowns, covariance = solution.unknowns, solution.covariance
         before, objective = objective, _half_log_determinant(covariance)
         steps += int(solution.steps)
@@ -198,62 +189,6 @@ def _weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
     return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, swing)))
 
 
-class _Solution(eqx.Module):
-    """Where the iteration has come to.
-
-    Attributes:
-        unknowns: the fitted ones.
-        error: measured minus simulated.
-        covariance: of the error.
-        squares: each segment's sum of squares.
-        success: whether the next step promised next to nothing.
-        steps: how many were taken.
-    """
-
-    unknowns: Unknowns
-    error: Float[Array, "segments samples outputs"]
-    covariance: Float[Array, "outputs outputs"]
-    squares: Float[Array, " segments"]
-    success: Array
-    steps: Array
-
-
-def _solve(problem: Problem, start: Unknowns, max_steps: int, damping: float) -> _Solution:
-    return _compiled_solve(problem, start, *(jnp.asarray(np.asarray(a)) for a in (max_steps, damping)))
-
-
-def _evaluate(problem: Problem, unknowns: Unknowns) -> _Solution:
-    """What there is at the given unknowns, by the program of the fit: its first step looks where it starts."""
-    return _solve(problem, unknowns, 1, _DAMPING[0])
-
-
-@jit_lanes
-def _compiled_solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array) -> _Solution:
-    descent = ArrowDescent(problem.segments.joined, problem.gap_weight, damping)
-    solution = optx.least_squares(
-        residual_with_blocks,
-        ArrowLevenbergMarquardt(descent=descent, most_steps=max_steps),
-        start,
-        args=problem,
-        max_steps=None,
-        throw=False,
-    )
-    success = solution.result == optx.RESULTS.successful
-    # An iteration that is given up before its first step, as from a start that is no number, has seen nothing.
-    steps = solution.stats["num_steps"]
-    rows = where(steps > 0, solution.state.f_info.residual.rows, jnp.inf)
-    error, squares = _error_of_rows(problem, rows), jnp.sum(rows**2, axis=1)
-    covariance = _covariance(error, problem.segments)
-    return _Solution(solution.value, error, covariance, squares, success, steps)
-
-
-def _error_of_rows(problem: Problem, rows: Array) -> Array:
-    """The output error behind the rows of a residual."""
-    shape = problem.segments.measured.shape
-    white = rows[:, : shape[1] * shape[2]].reshape(shape)
-    return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
-
-
 def _grown(problem: Problem, unknowns: Unknowns) -> Unknowns:
     """Fit the first samples of each segment, then ever more of them, until it is all of them.
 
@@ -269,11 +204,11 @@ def _grown(problem: Problem, unknowns: Unknowns) -> Unknowns:
         part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
         # The program of the fit, where all is in the same places.
         part, unknowns = spread((part, unknowns), weight.shape[0])
-        unknowns = _solve(part, unknowns, _WINDOW_STEPS, _DAMPING[0]).unknowns
+        unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING).unknowns
     return unknowns
 
 
-def _retry_states(problem: Problem, found: _Solution) -> Unknowns | None:
+def _retry_states(problem: Problem, found: Solution) -> Unknowns | None:
     """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one; None where
     none is better.
 
@@ -287,7 +222,7 @@ def _retry_states(problem: Problem, found: _Solution) -> Unknowns | None:
     held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
     model = problem.free.unpack(problem.model, parameters)
     fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)))
-    new = np.asarray(_evaluate(problem, fresh).squares)
+    new = np.asarray(evaluate(problem, fresh).squares)
     better = (new < 0.99 * old) & suspect
     if not better.any():
         return None
@@ -332,18 +267,6 @@ def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " 
     visible = 0.1 * swing * jnp.linalg.norm(white[:, -1])
     hidden = [visible / e.state_scale() for e in model.effects if e.states]
     return np.sqrt(problem.segments.weight.shape[1]) * jnp.concatenate([angles, rates, *hidden])
-
-
-def _covariance(error: Array, segments: Segments) -> Array:
-    """Covariance of the output error. Runaway simulations count as large, not as unknown."""
-    weight = segments.weight[:, :, None]
-    samples = jnp.sum(weight)
-    mean = jnp.sum(segments.measured * weight, axis=(0, 1), keepdims=True) / samples
-    variance = jnp.sum((segments.measured - mean) ** 2 * weight, axis=(0, 1), keepdims=True) / samples
-    span = jnp.sqrt(variance)
-    rows = jnp.clip(jnp.nan_to_num(error, nan=jnp.inf), -10 * span, 10 * span) * weight
-    # The floor keeps an output that the model follows to the last bit from becoming infinitely certain.
-    return jnp.einsum("sni,snj->ij", rows, rows) / samples + jnp.diag((1e-9 * span[0, 0] + 1e-300) ** 2)
 
 
 def _half_log_determinant(covariance: Array) -> float:
@@ -480,7 +403,7 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
         covariance = found.covariance
         for turn in range(_REWEIGHTINGS):
             part = _weighed(part, covariance, swing)
-            solution = _solve(part, unknowns, _NOISE_STEPS, _DAMPING[min(turn, 1)])
+            solution = solve(part, unknowns, _NOISE_STEPS, NEARBY_DAMPING if turn else FIRST_DAMPING)
             unknowns, covariance = solution.unknowns, solution.covariance
         total, samples = total + np.asarray(covariance) * head.sum(), samples + float(head.sum())
         freedom += _states_freedom(part, unknowns)
@@ -521,10 +444,10 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     columns = None
     if np.isfinite(shift):
         columns = np.asarray(projected(linearise(problem, found.unknowns), problem.segments.joined))
-    error, white_by_error = np.asarray(_evaluate(problem, found.unknowns).error), np.asarray(problem.whitening)
+    error, white_by_error = np.asarray(evaluate(problem, found.unknowns).error), np.asarray(problem.whitening)
     count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:
-        better = np.asarray(_evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error)
+        better = np.asarray(evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error)
         white = (better - error) @ white_by_error.T
         mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
         moved = 0.0 if columns is None else _standard_errors_moved(columns, white)

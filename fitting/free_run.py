@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from fitting.estimate import Fit, fit, suggested_substeps
 from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
-from fitting.residual import Problem, Unknowns, linearise, simulate_segments
+from fitting.residual import Problem, Unknowns, simulate_segments
+from fitting.solve import linearise
 from hdjax import Model, TwoInertiaModel
 from hdjax.lanes import jit_lanes
 

@@ -11,8 +11,9 @@ from scipy.special import stdtrit
 from fitting.arrow import project
 from fitting.estimate import Fit
 from fitting.experiment import scales
-from fitting.residual import Blocks, Problem, linearise
+from fitting.residual import Blocks, Problem
 from fitting.sandwich import directions
+from fitting.solve import linearise
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import TwoInertiaModel
 from hdjax.parameters import ParameterInfo

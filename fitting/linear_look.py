@@ -10,7 +10,8 @@ from fitting.along import conditions_at_knots, motions, unit_pushes
 from fitting.estimate import Fit
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
-from fitting.residual import Blocks, Problem, linearise
+from fitting.residual import Blocks, Problem
+from fitting.solve import linearise
 from hdjax import Model
 from hdjax.effects import Conditions, Motion
 from hdjax.where import where

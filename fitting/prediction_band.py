@@ -11,8 +11,9 @@ from fitting.estimate import Fit, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
 from fitting.normal_law import NORMAL_95
-from fitting.residual import Problem, Unknowns, linearise
+from fitting.residual import Problem, Unknowns, blocks
 from fitting.uncertainty import Uncertainty
+from hdjax.lanes import jit_lanes
 
 
 class PredictionBand(eqx.Module):
@@ -119,7 +120,7 @@ def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) 
 
 def _slopes(problem: Problem, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states."""
-    found = linearise(problem, unknowns)
+    found = _blocks(problem, unknowns)
     count, samples, outputs = problem.segments.measured.shape
     shape = (count, samples, outputs, -1)
     by_parameter, by_state = (
@@ -157,3 +158,6 @@ def _band(
         std_state=np.linalg.norm(spread, axis=1),
         std_noise=std_noise,
     )
+
+
+_blocks = jit_lanes(blocks)

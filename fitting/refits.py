@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 
 from fitting.arrow import normal_equations
 from fitting.estimate import Fit
-from fitting.residual import Blocks, Problem, Unknowns, linearise, residual
+from fitting.residual import Blocks, Problem, Unknowns, residual
+from fitting.solve import linearise
 from hdjax.lanes import jit_lanes
 
 # Data that run side by side; more would not fit into the processor's cache.

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Int
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
-from hdjax.lanes import jit_lanes
 from hdjax.program_cache import jit_kept
 from hdjax.simulate import march
 from hdjax.where import where
@@ -183,10 +182,6 @@ def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, j
         before_by_parameter=-slopes[..., :parameters],
         before_by_state=own - slopes[..., parameters:],
     )
-
-
-linearise = jit_lanes(blocks)
-"""[`blocks`][], compiled once for all who look at a solution."""
 
 
 class LinearisedResidual(eqx.Module):

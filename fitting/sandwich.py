@@ -19,7 +19,8 @@ from scipy.special import fdtri
 from fitting.arrow import chains, project
 from fitting.estimate import Fit, natural_frequency
 from fitting.experiment import Segments
-from fitting.residual import Blocks, Problem, linearise
+from fitting.residual import Blocks, Problem
+from fitting.solve import linearise
 from hdjax.program_cache import jit_kept
 
 # Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.

@@ -23,7 +23,8 @@ from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
 from fitting.regressors import Regressors, regressors
-from fitting.residual import Blocks, linearise
+from fitting.residual import Blocks
+from fitting.solve import linearise
 from fitting.spectral_lines import spectral_lines
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable

@@ -12,7 +12,8 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
 from fitting.posterior import Posterior, posterior
-from fitting.residual import Unknowns, linearise
+from fitting.residual import Unknowns
+from fitting.solve import linearise
 from fitting.uncertainty import Uncertainty, uncertainty
 
 COUNT, HORIZON = 256, 64
