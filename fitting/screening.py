@@ -25,7 +25,7 @@ from fitting.free import strength_paths
 from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks
 from fitting.solve import linearise
-from fitting.spectral_lines import spectral_lines
+from fitting.spectral_lines import STANDS_OUT, spectral_lines, surroundings
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.program_cache import jit_kept
@@ -225,7 +225,11 @@ def _inner_products(
 
 
 def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
-    """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour."""
+    """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour.
+
+    A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave: with a
+    phase of its own it would still be explained by that effect.
+    """
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0
     error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T
@@ -233,6 +237,8 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     samples = series.shape[1]
     length = prev_fast_len(samples, real=True)
     spectrum = np.fft.rfft(series[:, :length])
+    power = np.sum(np.abs(spectrum) ** 2, axis=0)
+    spectrum = spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
     found = np.zeros((DRAWS, *error.shape))
     for draw in range(DRAWS):
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))

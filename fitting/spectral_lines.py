@@ -8,7 +8,8 @@ from fitting.estimate import Fit
 # A line stands out of the median of so many frequencies around it.
 _NEIGHBOURS = 41
 # By this factor in power at least: among 10,000 frequencies of noise the largest is about 10 times the mean.
-_STANDS_OUT = 15.0
+STANDS_OUT = 15.0
+"""Power of a line against the median of its surroundings, at least."""
 
 
 def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
@@ -22,7 +23,6 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
         most: how many lines at most.
     """
     # Loaded here, where effects are looked for: a plain fit does without.
-    from scipy.ndimage import median_filter
     from scipy.signal import find_peaks
 
     series = _longest(fit)
@@ -32,14 +32,35 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     window = np.hanning(count)[:, None]
     # Twice the length: a frequency between two of the grid's is then no more than a quarter of a step away.
     power = np.sum(np.abs(np.fft.rfft(series * window, n=2 * count, axis=0)) ** 2, axis=1)
-    around = median_filter(power, size=2 * _NEIGHBOURS, mode="nearest")
-    ratio = power / np.maximum(around, 1e-300)
+    around = surroundings(power, neighbours=_NEIGHBOURS)
+    ratio = power / around
     # The lowest frequencies are drift, not lines: fewer than two periods in the log.
     ratio[:4] = 0.0
-    peaks, _ = find_peaks(ratio, height=_STANDS_OUT, distance=8)
+    peaks, _ = find_peaks(ratio, height=STANDS_OUT, distance=8)
     strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
     step = float(np.median(np.diff(fit.stretches[0].experiment.time)))
-    return tuple((2.0 * np.pi * (strongest / (2 * count * step))).tolist())
+    return tuple((2.0 * np.pi * ((strongest + _off_the_grid(power, strongest)) / (2 * count * step))).tolist())
+
+
+def surroundings(power: Float[np.ndarray, " n"], *, neighbours: int = _NEIGHBOURS // 2) -> Float[np.ndarray, " n"]:
+    """The median of a periodogram around each frequency: the colour of the noise without its lines.
+
+    Args:
+        power: of a series without padding.
+        neighbours: on each side.
+    """
+    from scipy.ndimage import median_filter
+
+    return np.maximum(median_filter(power, size=2 * neighbours, mode="nearest"), 1e-300)
+
+
+def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarray:
+    """How far from its highest point each line is: the vertex of the parabola through the logarithms. Unseen data come
+    later, where an error of frequency has become one of phase."""
+    inner = np.clip(peaks, 1, power.size - 2)
+    left, top, right = (np.log(np.maximum(power[inner + k], 1e-300)) for k in (-1, 0, 1))
+    curvature = np.minimum(left - 2 * top + right, -1e-12)
+    return np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)
 
 
 def _longest(fit: Fit) -> Float[np.ndarray, "samples outputs"]:

@@ -1,5 +1,7 @@
 """The first look: silent on noise, and on the right track where an effect hides."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.free import base_paths
-from fitting.screening import DRAWS, Screen, screen
+from fitting.screening import DRAWS, Screen, screen, surrogates
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash
@@ -108,6 +110,24 @@ def test_the_seed_decides_the_surrogates_only():
     np.testing.assert_array_equal(first.null_gains, again.null_gains)
     assert np.any(first.null_gains != other.null_gains)
     assert first.leads[0].gain == pytest.approx(other.leads[0].gain, rel=1e-12)
+
+
+def test_surrogates_have_the_noise_and_not_the_line():
+    """What a line leaves is no colour of noise: it would pass for chance in every surrogate."""
+    fitted, _ = fits()
+    noise = np.random.default_rng(3).normal(size=np.asarray(fitted.error).shape)
+    time = np.arange(noise[..., 0].size).reshape(noise.shape[:2])
+    line = 3.0 * np.sin(0.3 * time)[..., None]
+    white = eqx.tree_at(lambda f: f.problem.whitening, fitted, jnp.eye(1))
+    kept = np.asarray(fitted.problem.segments.weight) > 0
+    drawn = {}
+    for name, error in (("noise", noise), ("both", noise + line)):
+        given = eqx.tree_at(lambda f: f.error, white, jnp.asarray(error))
+        series = surrogates(given, 0).reshape(DRAWS, *noise.shape)[:, kept]
+        drawn[name] = float(np.std(series))
+    assert drawn["noise"] == pytest.approx(1.0, abs=0.03)
+    # Its skirts stay; with all of the line it would be 2.3.
+    assert drawn["both"] == pytest.approx(1.0, abs=0.15)
 
 
 def test_p_values_count_the_draws():

@@ -23,7 +23,7 @@ def test_a_hidden_line_is_found(omega: float):
     time = np.arange(2000) * rig.REDUCED_STEP
     lines = spectral_lines(found(rig.reduced_forcing(2000), 1.5 * np.sin(omega * time)))
     resolution = 2 * np.pi / (1600 * rig.REDUCED_STEP)
-    assert lines[0] == pytest.approx(omega, abs=0.5 * resolution)
+    assert lines[0] == pytest.approx(omega, abs=0.1 * resolution)
 
 
 def test_noise_has_no_lines():
