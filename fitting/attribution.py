@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from fitting.base_fit import leaves_white_noise
-from fitting.estimate import Fit, fit, states_from
+from fitting.estimate import Fit, fit, follows, segment_length, states_from
 from fitting.experiment import Stretch, scales
 from fitting.free import fitted_paths, strength_paths
 from fitting.screening import Lead, Screen, screen
@@ -70,7 +70,8 @@ class Verdict(eqx.Module):
         name: the form.
         family: its family.
         trial: the refitted model, or None where it was not worth a refit.
-        gain: decrease of the held-out objective (first-order estimate where there was no refit).
+        gain: decrease of the held-out objective (first-order estimate where there was no refit); of an effect with
+            memory, what of it lasts over whole stretches.
         p_value: of that gain against the best of the catalogue on noise.
         separable: whether held-out data tell it from the round's winner.
     """
@@ -227,7 +228,7 @@ def look(
     """
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
-    refitted: dict[str, Trial] = {}
+    refitted: dict[str, tuple[Trial, float]] = {}
     worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
 
     def refit(leads: Sequence[Lead], give_up_above: float = np.inf) -> None:
@@ -235,24 +236,24 @@ def look(
             progress(f"refitting with {lead.effect.name}")
             trial = _try_lead(before, lead, data, setting, give_up_above)
             if trial is not None and np.isfinite(trial.held_out.objective):
-                refitted[lead.effect.name] = trial
+                gain = before.held_out.objective - trial.held_out.objective
+                refitted[lead.effect.name] = trial, gain * _lasting(lead.effect, before, trial, data, setting)
 
     first = first_of_each_family(worth)
     refit(first[:1])
-    leader = refitted.get(first[0].effect.name) if first else None
+    leader = refitted.get(first[0].effect.name, (None,))[0] if first else None
     if leader is not None and leaves_white_noise(leader.training):
-        gain = before.training.objective - leader.training.objective
-        refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gain)
+        gained = before.training.objective - leader.training.objective
+        refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gained)
     else:
         refit(first[1:])
         if refitted:
-            best = min(refitted, key=lambda name: refitted[name].held_out.objective)
+            best = max(refitted, key=lambda name: refitted[name][1])
             family = next(lead.effect.family for lead in worth if lead.effect.name == best)
             refit(further_forms(worth, family, first))
     found: list[Verdict] = []
     for lead in screened.leads:
-        trial = refitted.get(lead.effect.name)
-        gain = lead.gain if trial is None else before.held_out.objective - trial.held_out.objective
+        trial, gain = refitted.get(lead.effect.name, (None, lead.gain))
         p_value = screened.p_value(gain)
         found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
     for hold in data:
@@ -353,6 +354,42 @@ def _with_positive_strengths(effect: Effect) -> Effect:
     return effect
 
 
+def _lasting(effect: Effect, before: Trial, trial: Trial, data: Data, setting: Setting) -> float:
+    """The share of an effect's gain that lasts over whole stretches; all of it for an effect without memory.
+
+    Hidden states are fitted to each short segment, where they can stand for what something else leaves there: an
+    offset, say. Along a whole stretch they have to follow from the motion.
+    """
+    if not effect.states:
+        return 1.0
+    short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
+    old, new = (_over_whole_stretches(t, data, setting) for t in (before, trial))
+    if short <= 0.0 or not (follows(old) or follows(new)):
+        return 1.0
+    return float(np.clip(np.log(old.dynamic_error_std / new.dynamic_error_std) / short, 0.0, 1.0))
+
+
+def _over_whole_stretches(trial: Trial, data: Data, setting: Setting) -> Fit:
+    """Held-out stretches, each simulated as a whole from a fitted initial state."""
+    held_out = data[trial.hold][1]
+    return fit(
+        trial.model,
+        held_out,
+        trial.training.free.paths,
+        horizon=max(len(s) for s in held_out),
+        length=segment_length(setting.horizon),
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
+        covariance=trial.training.covariance,
+        reweigh=False,
+        max_steps=_TRIAL_STEPS,
+        hold_parameters=True,
+        states=trial.held_out.unknowns.states,
+        retry_states=False,
+    )
+
+
 def _segment_squares(held_out: Fit, weigh: Fit) -> np.ndarray:
     """Weighted squared error of each held-out segment."""
     white = np.asarray(held_out.error) @ np.asarray(weigh.problem.whitening).T
@@ -393,7 +430,7 @@ def _simplest_first(verdicts: list[Verdict]) -> list[Verdict]:
     tied = [v for v in verdicts if v.trial is not None and not v.separable]
     if len(tied) < 2:
         return verdicts
-    best_gain = max(v.gain for v in tied)
+    best_gain = verdicts[0].gain
     close = [v for v in tied if v.gain > best_gain - max(LEAST_GAIN, 0.02 * best_gain)]
     leader = min(close, key=lambda v: (_beyond_real_drives(v), _size(v), -v.gain))
     return [leader] + [v for v in verdicts if v is not leader]

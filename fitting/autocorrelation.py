@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 
 from fitting.arrow import chains
 from fitting.estimate import Fit
-from fitting.residual import Problem, Unknowns, blocks
+from fitting.residual import Blocks
+from fitting.solve import linearise
 from hdjax.program_cache import jit_kept
 
 # Directions of a chain's first state that its samples hardly see.
@@ -47,7 +48,8 @@ def autocorrelation(fit: Fit, lags: int) -> Float[np.ndarray, " lags"]:
 def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
     """Autocovariance that the fitted initial states take out of white noise as large as the residual."""
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
-    slopes, first = (np.asarray(a) for a in _by_first_state(problem, fit.unknowns))
+    slopes = np.asarray(_by_first_state(linearise(problem, fit.unknowns), problem.segments.joined))
+    first = np.linalg.inv(np.asarray(problem.whitening))[-1]
     weight = np.asarray(problem.segments.weight) > 0
     segments, samples = weight.shape
     chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
@@ -63,12 +65,9 @@ def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
 
 
 @jit_kept
-def _by_first_state(problem: Problem, unknowns: Unknowns) -> tuple[Array, Array]:
-    """Derivative of each segment's rows by its chain's first state; and the dynamic error by whitened outputs."""
-    found = blocks(problem, unknowns)
-    path = chains(found, problem.segments.joined)
-    slopes = jnp.einsum("srq,sqk->srk", found.by_state, path.by_first)
-    return slopes, jnp.linalg.inv(problem.whitening)[-1]
+def _by_first_state(found: Blocks, joined: Array) -> Array:
+    """Derivative of each segment's rows by its chain's first state."""
+    return jnp.einsum("srq,sqk->srk", found.by_state, chains(found, joined).by_first)
 
 
 def _orthonormal(slopes: np.ndarray, chain: np.ndarray) -> np.ndarray:

@@ -155,15 +155,17 @@ def reduced_motion(
     state: Sequence[float] = (0.0, 0.0),
     bias: float = 0.0,
     friction: tuple[float, float] = (0.0, 1.0),
+    quadratic: float = 0.0,
     step: float = REDUCED_STEP,
     substeps: int = 10,
 ) -> np.ndarray:
-    """States (x, v) of `x'' + mu x' + omega_0^2 (x + alpha x^3) + T tanh(v/v_0) = gain (u + bias)`."""
+    """States (x, v) of `x'' + mu x' + omega_0^2 (x + q x^2 + alpha x^3) + T tanh(v/v_0) = gain (u + bias)`."""
     T_c, v_0 = friction
 
     def rates(y, u):
         x, v = y
-        return v, gain * (u + bias) - mu * v - omega_0**2 * (x + alpha * x**3) - T_c * math.tanh(v / v_0)
+        spring = x + quadratic * x**2 + alpha * x**3
+        return v, gain * (u + bias) - mu * v - omega_0**2 * spring - T_c * math.tanh(v / v_0)
 
     return rk4(rates, state, forcing, step, substeps)
 

@@ -26,6 +26,7 @@ from hdjax.effects.learned import (
     LearnedMotorTorque,
     SplineAxis,
     axis_over,
+    combined,
     functions,
 )
 
@@ -91,6 +92,28 @@ def test_two_variables_are_products():
     motion = Motion(x=jnp.asarray(0.3), v=jnp.zeros(()), theta_m=jnp.asarray(2.0))
     wanted = np.outer(one.functions(motion.x), other.functions(jnp.asarray(2.0))).reshape(-1)
     np.testing.assert_array_equal(functions((one, other), motion), wanted)
+
+
+def test_the_derivative_by_hand_is_that_of_the_formula():
+    axes = axis_over("x", -1.0, 1.0, beside="theta_m"), axis_over("theta_m", 0.0, 1.0, beside="x")
+    count = int(np.prod([axis.count for axis in axes]))
+    random = np.random.default_rng(0)
+    mixing, c = jnp.asarray(random.normal(size=(count, 5))), jnp.asarray(random.normal(size=5))
+
+    def motion(x, theta_m) -> Motion:
+        return Motion(x=x, v=jnp.zeros(()), theta_m=theta_m)
+
+    def by_hand(x, theta_m, c):
+        return combined(axes, mixing, tuple(c), motion(x, theta_m))
+
+    def formula(x, theta_m, c):
+        return functions(axes, motion(x, theta_m)) @ mixing @ c
+
+    at = jnp.asarray(0.3), jnp.asarray(2.0), c
+    for differentiate in (jax.jacfwd, jax.jacrev):
+        found, wanted = (differentiate(f, argnums=(0, 1, 2))(*at) for f in (by_hand, formula))
+        for one, other in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10)
 
 
 @pytest.mark.parametrize("form", LEARNED, ids=lambda form: form.name)

@@ -4,9 +4,11 @@ The function is linear in its coefficients, so that all coefficients at zero are
 """
 
 import abc
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -101,17 +103,50 @@ class AngleAxis(Axis):
 
 def functions(axes: tuple[Axis, ...], motion: Motion) -> Float[Array, " functions"]:
     """All products of one function of each axis, at one instant of a motion."""
-    found = jnp.ones(1)
-    for axis in axes:
-        value = getattr(motion, axis.variable)
-        assert value is not None, f"this motion has no {axis.variable}"
-        found = (found[:, None] * axis.functions(value)[None, :]).reshape(-1)
-    return found
+    return _products([axis.functions(v) for axis, v in zip(axes, _values(axes, motion), strict=True)])
 
 
 def combined(axes: tuple[Axis, ...], mixing: Array, c: tuple[Array, ...], motion: Motion) -> Array:
     """The function of the axes that coefficients stand for, at one instant of a motion."""
-    return functions(axes, motion) @ (mixing @ jnp.stack(c))
+    return _sum((_values(axes, motion), jnp.stack(c)), axes, mixing)
+
+
+def _values(axes: tuple[Axis, ...], motion: Motion) -> tuple[Array, ...]:
+    values = tuple(getattr(motion, axis.variable) for axis in axes)
+    missing = [axis.variable for axis, value in zip(axes, values, strict=True) if value is None]
+    assert not missing, f"this motion has no {missing}"
+    return values
+
+
+@eqx.filter_custom_jvp
+def _sum(at: tuple[tuple[Array, ...], Array], axes: tuple[Axis, ...], mixing: Array) -> Array:
+    values, c = at
+    return _products([axis.functions(v) for axis, v in zip(axes, values, strict=True)]) @ (mixing @ c)
+
+
+@_sum.def_jvp
+def _sum_jvp(primals, tangents):
+    """By hand, so that what is alike for all directions is not computed again for each: a fit has dozens."""
+    (values, c), axes, mixing = primals
+    (moved, c_moved), *_ = tangents
+    both = [jax.jvp(axis.functions, (v,), (jnp.ones_like(v),)) for axis, v in zip(axes, values, strict=True)]
+    found, weights = [f for f, _ in both], mixing @ c
+    by_coefficient = _products(found) @ mixing
+    tangent = jnp.zeros_like(weights[0])
+    if c_moved is not None:
+        tangent = tangent + by_coefficient @ c_moved
+    for i, ((_, slopes), moves) in enumerate(zip(both, moved, strict=True)):
+        if moves is not None:
+            tangent = tangent + _products([*found[:i], slopes, *found[i + 1 :]]) @ weights * moves
+    return by_coefficient @ c, tangent
+
+
+def _products(found: Sequence[Array]) -> Float[Array, " functions"]:
+    """All products of one entry of each."""
+    whole = jnp.ones(1)
+    for one in found:
+        whole = (whole[:, None] * one[None, :]).reshape(-1)
+    return whole
 
 
 class LearnedMeshTorque(MeshTorqueEffect):
