@@ -239,7 +239,7 @@ def _growing(problem: Problem, length: int) -> list[int]:
     knots = np.asarray(problem.segments.torque.knots)
     half = np.pi / float(problem.model.drive.omega_0) / float(np.median(np.diff(knots)))
     first = min(length, max(4, round(half)))
-    return [first * 2**k for k in range(20) if first * 2**k < length] + [length]
+    return [first * 4**k for k in range(10) if first * 4**k < length] + [length]
 
 
 @jit_kept
