@@ -27,7 +27,7 @@ from fitting.linear_look import (
     surrogate_gains,
 )
 from fitting.screening import surrogates
-from hdjax import Model, ReducedModel
+from hdjax import Model, ReducedModel, sampled
 from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over, combined
 
@@ -208,10 +208,13 @@ def share_of(named: Model, found: Unknown) -> float:
     bare = eqx.tree_at(lambda m: m.effects, named, found.before.model.effects)
     hidden = jnp.asarray(named.rest())[found.states.shape[1] :]
     zero = jnp.zeros(())
+    # An error of the torque is an effect as well: what acts where none is logged.
+    silence = sampled(np.arange(2.0), np.zeros(2), hold="zero-order")
+    acting, before = (model.actuate(silence)(zero) for model in (named, bare))
 
     def added(state: Array, conditions: Conditions) -> Array:
-        own = named.rates(jnp.concatenate([state, hidden]), zero, zero, conditions)
-        return own[: state.shape[0]] - bare.rates(state, zero, zero, conditions)
+        own = named.rates(jnp.concatenate([state, hidden]), acting, zero, conditions)
+        return own[: state.shape[0]] - bare.rates(state, before, zero, conditions)
 
     rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states), found.conditions))
     theirs = np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)

@@ -19,6 +19,7 @@ from fitting.shapes import shapes
 from fitting.uncertainty import uncertainty
 from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Model
+from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.stiffness import QuadraticStiffness
@@ -109,6 +110,9 @@ def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unkn
     wrong = TRUTH.with_effects(QuadraticStiffness(k2=1.0))
     assert share_of(right, rubbing) > 0.95
     assert share_of(wrong, rubbing) < 0.3
+    # An error of the torque counts: here one that is not in the data.
+    biased = right.with_effects(TorqueBias(bias=1.0))
+    assert share_of(biased, rubbing) < 0.8 * share_of(right, rubbing)
 
 
 @pytest.mark.slow
