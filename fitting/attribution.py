@@ -1,66 +1,32 @@
 """Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
 from fitting.base_fit import leaves_white_noise
-from fitting.estimate import Fit, fit, follows, segment_length, states_from
-from fitting.experiment import Stretch, scales
-from fitting.free import fitted_paths, strength_paths
+from fitting.estimate import Fit
+from fitting.experiment import scales
+from fitting.free import strength_paths
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import NEARLY, first_of_each_family, further_forms, possible_ties, worth_a_refit
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, challenge, lasting_share, trained
 from fitting.uncertainty import uncertainty
-from hdjax import Hold, Model, ReducedModel
+from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
 
 SIGNIFICANCE = 0.01
 """Largest p-value of an accepted effect: the chance that the best of the catalogue does as well on noise."""
 
-LEAST_GAIN = 1e-3
-"""Smallest accepted gain, a tenth of a percent of the error: below it a solver's imperfection counts too."""
 
-# Iterations of a trial at most: a form that needs more than this has no clear minimum.
-_TRIAL_STEPS = 25
 # Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
 # one finds the way.
 _HOLD_STEPS = 3
 # What can only be tied with the best must come as close as this share of its gain in its first pass.
 _NEAR_TIE = 0.1
-
-
-class Setting(eqx.Module):
-    """How the data are cut and simulated; the same for all trials, so that they share programs.
-
-    Attributes:
-        horizon: samples in a segment.
-        halo: intervals of torque before a segment.
-        substeps: solver steps in a sample interval.
-        count: segments in each program.
-    """
-
-    horizon: int = eqx.field(static=True)
-    halo: int = eqx.field(static=True)
-    substeps: int = eqx.field(static=True)
-    count: int = eqx.field(static=True)
-
-
-class Trial(eqx.Module):
-    """A model fitted to the training stretches, and what it does on the held-out ones.
-
-    Attributes:
-        model: with fitted values.
-        training: the fit.
-        held_out: the same parameters on unseen stretches; only initial states are fitted there.
-        hold: what the torque does between samples.
-    """
-
-    model: Model
-    training: Fit
-    held_out: Fit
-    hold: Hold = eqx.field(static=True)
 
 
 class Verdict(eqx.Module):
@@ -105,108 +71,6 @@ class Round(eqx.Module):
         return self.verdicts[0]
 
 
-Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
-"""Training and held-out stretches for each assumption about the torque between samples."""
-
-
-def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None) -> Trial:
-    """Fit a model and look at it on held-out data.
-
-    Args:
-        model: equations and starting values.
-        data: the stretches.
-        hold: what the torque does between samples.
-        setting: how the data are cut.
-        start: a trial near by, whose error covariance weighs the outputs at the start, and whose initial states it
-            starts from.
-    """
-    training = _trained(model, data, hold, setting, None if start is None else start.training)
-    return _judged(training, data, hold, setting)
-
-
-def challenge(
-    models: Sequence[Model],
-    data: Data,
-    hold: Hold,
-    setting: Setting,
-    *,
-    champion: Trial,
-    give_up_above: float = np.inf,
-) -> Trial | None:
-    """The best fit of several starts, if it explains the training data at least as well as the model that it is to
-    replace.
-
-    Args:
-        models: one and the same model at several starting values.
-        data: the stretches.
-        hold: what the torque does between samples.
-        setting: how the data are cut.
-        champion: the model to replace.
-        give_up_above: a lower objective that it must reach.
-    """
-    limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
-
-    def begun(model: Model, give_up_above: float) -> Fit:
-        return _trained(model, data, hold, setting, champion.training, give_up_above=give_up_above, retry_states=True)
-
-    if len(models) > 1:
-        # One pass each tells the best start; that one alone is followed to the end.
-        first = min((begun(m, -np.inf) for m in models), key=lambda found: found.objective)
-        if first.objective > limit:
-            return None
-        best = _trained(first.model, data, hold, setting, first, give_up_above=limit)
-    else:
-        best = begun(models[0], limit)
-    return _judged(best, data, hold, setting) if best.objective <= limit else None
-
-
-def _trained(
-    model: Model,
-    data: Data,
-    hold: Hold,
-    setting: Setting,
-    near: Fit | None,
-    *,
-    give_up_above: float = np.inf,
-    retry_states: bool = False,
-    max_steps: int = _TRIAL_STEPS,
-    reweigh: bool = True,
-) -> Fit:
-    """A fit that starts with the covariance of one near by, and from its states as far as the model has the same."""
-    same = near is not None and near.model.state_names == model.state_names
-    return fit(
-        model,
-        data[hold][0],
-        fitted_paths(model),
-        horizon=setting.horizon,
-        halo=setting.halo,
-        substeps=setting.substeps,
-        count=setting.count,
-        covariance=None if near is None else near.covariance,
-        max_steps=max_steps,
-        reweigh=reweigh,
-        states=None if near is None else states_from(model, near),
-        retry_states=retry_states or not same,
-        give_up_above=give_up_above,
-    )
-
-
-def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
-    held_out = fit(
-        training.model,
-        data[hold][1],
-        training.free.paths,
-        horizon=setting.horizon,
-        halo=setting.halo,
-        substeps=setting.substeps,
-        count=setting.count,
-        covariance=training.covariance,
-        max_steps=_TRIAL_STEPS,
-        hold_parameters=True,
-    )
-    return Trial(training.model, training, held_out, hold)
-
-
 def look(
     before: Trial,
     data: Data,
@@ -228,7 +92,7 @@ def look(
     """
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
-    refitted: dict[str, tuple[Trial, float]] = {}
+    refitted: dict[str, Trial] = {}
     worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
 
     def refit(leads: Sequence[Lead], give_up_above: float = np.inf) -> None:
@@ -236,24 +100,24 @@ def look(
             progress(f"refitting with {lead.effect.name}")
             trial = _try_lead(before, lead, data, setting, give_up_above)
             if trial is not None and np.isfinite(trial.held_out.objective):
-                gain = before.held_out.objective - trial.held_out.objective
-                refitted[lead.effect.name] = trial, gain * _lasting(lead.effect, before, trial, data, setting)
+                refitted[lead.effect.name] = trial
 
     first = first_of_each_family(worth)
     refit(first[:1])
-    leader = refitted.get(first[0].effect.name, (None,))[0] if first else None
+    leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
         gained = before.training.objective - leader.training.objective
         refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gained)
     else:
         refit(first[1:])
         if refitted:
-            best = max(refitted, key=lambda name: refitted[name][1])
+            best = max(refitted, key=lambda name: refitted[name].gain_over(before))
             family = next(lead.effect.family for lead in worth if lead.effect.name == best)
             refit(further_forms(worth, family, first))
     found: list[Verdict] = []
     for lead in screened.leads:
-        trial, gain = refitted.get(lead.effect.name, (None, lead.gain))
+        trial = refitted.get(lead.effect.name)
+        gain = lead.gain if trial is None else trial.gain_over(before)
         p_value = screened.p_value(gain)
         found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
     for hold in data:
@@ -261,7 +125,7 @@ def look(
             continue
         progress(f"refitting with a {hold} torque")
         trial = _try_hold(before, data, hold, setting)
-        gain = -np.inf if trial is None else before.held_out.objective - trial.held_out.objective
+        gain = -np.inf if trial is None else trial.gain_over(before)
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     verdicts = _determined_first(_simplest_first(_with_separability(found)))
@@ -333,13 +197,16 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
     typical = lead.effect.typical(scales(before.training.stretches, model))
     starts = [first, *(model.with_effects(effect) for effect in typical)]
-    return challenge(starts, data, before.hold, setting, champion=before, give_up_above=give_up_above)
+    trial = challenge(starts, data, before.hold, setting, champion=before, give_up_above=give_up_above)
+    if trial is None:
+        return None
+    return replace(trial, lasting=lasting_share(lead.effect, before, trial, data, setting))
 
 
 def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:
     """Refit under another hold. It acts on the same motion, so that a few steps from the present fit tell whether it
     is worth more."""
-    near = _trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS, reweigh=False)
+    near = trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS, reweigh=False)
     if near.objective > before.training.objective + LEAST_GAIN:
         return None
     return challenge([near.model], data, hold, setting, champion=before)
@@ -352,42 +219,6 @@ def _with_positive_strengths(effect: Effect) -> Effect:
             value = float(getattr(effect, name))
             effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(max(value, 1e-6)))
     return effect
-
-
-def _lasting(effect: Effect, before: Trial, trial: Trial, data: Data, setting: Setting) -> float:
-    """The share of an effect's gain that lasts over whole stretches; all of it for an effect without memory.
-
-    Hidden states are fitted to each short segment, where they can stand for what something else leaves there: an
-    offset, say. Along a whole stretch they have to follow from the motion.
-    """
-    if not effect.states:
-        return 1.0
-    short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
-    old, new = (_over_whole_stretches(t, data, setting) for t in (before, trial))
-    if short <= 0.0 or not (follows(old) or follows(new)):
-        return 1.0
-    return float(np.clip(np.log(old.dynamic_error_std / new.dynamic_error_std) / short, 0.0, 1.0))
-
-
-def _over_whole_stretches(trial: Trial, data: Data, setting: Setting) -> Fit:
-    """Held-out stretches, each simulated as a whole from a fitted initial state."""
-    held_out = data[trial.hold][1]
-    return fit(
-        trial.model,
-        held_out,
-        trial.training.free.paths,
-        horizon=max(len(s) for s in held_out),
-        length=segment_length(setting.horizon),
-        halo=setting.halo,
-        substeps=setting.substeps,
-        count=setting.count,
-        covariance=trial.training.covariance,
-        reweigh=False,
-        max_steps=_TRIAL_STEPS,
-        hold_parameters=True,
-        states=trial.held_out.unknowns.states,
-        retry_states=False,
-    )
 
 
 def _segment_squares(held_out: Fit, weigh: Fit) -> np.ndarray:
@@ -449,14 +280,3 @@ def _beyond_real_drives(verdict: Verdict) -> bool:
 def _size(verdict: Verdict) -> int:
     assert verdict.trial is not None
     return len(verdict.trial.training.free.paths)
-
-
-def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int:
-    """Intervals of torque before each segment.
-
-    Args:
-        training: training stretches.
-        longest_delay: how far back a delayed or lagging torque may reach [s].
-    """
-    step = training[0].experiment.time_step
-    return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))

@@ -8,17 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import (
-    LEAST_GAIN,
-    Data,
-    Round,
-    Setting,
-    Trial,
-    attempt,
-    halo_for,
-    look,
-    simpler_form,
-)
+from fitting.attribution import Round, look, simpler_form
 from fitting.base_fit import base_fit, leaves_white_noise
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
@@ -34,6 +24,7 @@ from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
 from fitting.outliers import with_weights
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
 from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import Trial, Verdict
+from fitting.attribution import Verdict
 from fitting.base_fit import as_followed
 from fitting.close_loop import Loop
 from fitting.command_search import Candidate, is_smooth, largest_twist, search
@@ -22,6 +22,7 @@ from fitting.experiment import Experiment, Stretch, scales, segment_count
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
+from fitting.trial import Trial
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000

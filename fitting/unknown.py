@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import eigh, null_space
 
-from fitting.attribution import LEAST_GAIN, SIGNIFICANCE, Data, Setting, Trial, challenge
+from fitting.attribution import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.linear_look import (
@@ -27,6 +27,7 @@ from fitting.linear_look import (
     surrogate_gains,
 )
 from fitting.screening import surrogates
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, ReducedModel, sampled
 from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over, combined

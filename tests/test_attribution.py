@@ -3,10 +3,11 @@
 import pytest
 
 import rig
-from fitting.attribution import Setting, Trial, attempt, halo_for, look
+from fitting.attribution import look
 from fitting.base_fit import base_fit
 from fitting.estimate import segment_length
 from fitting.experiment import segment_count, split
+from fitting.trial import Setting, Trial, attempt, halo_for
 from hdjax import Hold
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep

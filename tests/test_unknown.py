@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.attribution import Setting, Trial, attempt
 from fitting.close_loop import Loop, close_loop
 from fitting.experiment import experiment_from_log, split
 from fitting.free_run import free_run
@@ -16,6 +15,7 @@ from fitting.learned_curve import LearnedCurve, learned_curve
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.report import report_dict, write_report
 from fitting.shapes import shapes
+from fitting.trial import Setting, Trial, attempt
 from fitting.uncertainty import uncertainty
 from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Model

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fitting.attribution import Trial, Verdict
+from fitting.attribution import Verdict
 from fitting.report.outcome import Outcome
 from fitting.report.separating import separating_experiment
 from fitting.report.steps import held_out_rmse
+from fitting.trial import Trial
 
 
 def alternatives(outcome: Outcome) -> list[dict[str, Any]]:

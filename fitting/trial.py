@@ -1,0 +1,205 @@
+"""A model on trial: fitted to the training stretches, judged on those it has not seen."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from fitting.estimate import Fit, fit, follows, segment_length, states_from
+from fitting.experiment import Stretch
+from fitting.free import fitted_paths
+from hdjax import Hold, Model
+from hdjax.effects import Effect
+
+LEAST_GAIN = 1e-3
+"""Smallest accepted gain, a tenth of a percent of the error: below it a solver's imperfection counts too."""
+
+# Iterations of a trial at most: a form that needs more than this has no clear minimum.
+_TRIAL_STEPS = 25
+
+
+class Setting(eqx.Module):
+    """How the data are cut and simulated; the same for all trials, so that they share programs.
+
+    Attributes:
+        horizon: samples in a segment.
+        halo: intervals of torque before a segment.
+        substeps: solver steps in a sample interval.
+        count: segments in each program.
+    """
+
+    horizon: int = eqx.field(static=True)
+    halo: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+
+class Trial(eqx.Module):
+    """A model fitted to the training stretches, and what it does on the held-out ones.
+
+    Attributes:
+        model: with fitted values.
+        training: the fit.
+        held_out: the same parameters on unseen stretches; only initial states are fitted there.
+        hold: what the torque does between samples.
+        lasting: the share of its gain that lasts over whole stretches.
+    """
+
+    model: Model
+    training: Fit
+    held_out: Fit
+    hold: Hold = eqx.field(static=True)
+    lasting: float = eqx.field(static=True, default=1.0)
+
+    def gain_over(self, before: "Trial") -> float:
+        """Decrease of the held-out objective; of a model with memory, what of it lasts."""
+        return (before.held_out.objective - self.held_out.objective) * self.lasting
+
+
+Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
+"""Training and held-out stretches for each assumption about the torque between samples."""
+
+
+def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None) -> Trial:
+    """Fit a model and look at it on held-out data.
+
+    Args:
+        model: equations and starting values.
+        data: the stretches.
+        hold: what the torque does between samples.
+        setting: how the data are cut.
+        start: a trial near by, whose error covariance weighs the outputs at the start, and whose initial states it
+            starts from.
+    """
+    training = trained(model, data, hold, setting, None if start is None else start.training)
+    return _judged(training, data, hold, setting)
+
+
+def challenge(
+    models: Sequence[Model],
+    data: Data,
+    hold: Hold,
+    setting: Setting,
+    *,
+    champion: Trial,
+    give_up_above: float = np.inf,
+) -> Trial | None:
+    """The best fit of several starts, if it explains the training data at least as well as the model that it is to
+    replace.
+
+    Args:
+        models: one and the same model at several starting values.
+        data: the stretches.
+        hold: what the torque does between samples.
+        setting: how the data are cut.
+        champion: the model to replace.
+        give_up_above: a lower objective that it must reach.
+    """
+    limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
+
+    def begun(model: Model, give_up_above: float) -> Fit:
+        return trained(model, data, hold, setting, champion.training, give_up_above=give_up_above, retry_states=True)
+
+    if len(models) > 1:
+        # One pass each tells the best start; that one alone is followed to the end.
+        first = min((begun(m, -np.inf) for m in models), key=lambda found: found.objective)
+        if first.objective > limit:
+            return None
+        best = trained(first.model, data, hold, setting, first, give_up_above=limit)
+    else:
+        best = begun(models[0], limit)
+    return _judged(best, data, hold, setting) if best.objective <= limit else None
+
+
+def trained(
+    model: Model,
+    data: Data,
+    hold: Hold,
+    setting: Setting,
+    near: Fit | None,
+    *,
+    give_up_above: float = np.inf,
+    retry_states: bool = False,
+    max_steps: int = _TRIAL_STEPS,
+    reweigh: bool = True,
+) -> Fit:
+    """A fit that starts with the covariance of one near by, and from its states as far as the model has the same."""
+    same = near is not None and near.model.state_names == model.state_names
+    return fit(
+        model,
+        data[hold][0],
+        fitted_paths(model),
+        horizon=setting.horizon,
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
+        covariance=None if near is None else near.covariance,
+        max_steps=max_steps,
+        reweigh=reweigh,
+        states=None if near is None else states_from(model, near),
+        retry_states=retry_states or not same,
+        give_up_above=give_up_above,
+    )
+
+
+def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
+    held_out = fit(
+        training.model,
+        data[hold][1],
+        training.free.paths,
+        horizon=setting.horizon,
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
+        covariance=training.covariance,
+        max_steps=_TRIAL_STEPS,
+        hold_parameters=True,
+    )
+    return Trial(training.model, training, held_out, hold)
+
+
+def lasting_share(effect: Effect, before: Trial, trial: Trial, data: Data, setting: Setting) -> float:
+    """The share of an effect's gain that lasts over whole stretches; all of it for an effect without memory.
+
+    Hidden states are fitted to each short segment, where they can stand for what something else leaves there: an
+    offset, say. Along a whole stretch they have to follow from the motion.
+    """
+    if not effect.states:
+        return 1.0
+    short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
+    old, new = (_over_whole_stretches(t, data, setting) for t in (before, trial))
+    if short <= 0.0 or not (follows(old) or follows(new)):
+        return 1.0
+    return float(np.clip(np.log(old.dynamic_error_std / new.dynamic_error_std) / short, 0.0, 1.0))
+
+
+def _over_whole_stretches(trial: Trial, data: Data, setting: Setting) -> Fit:
+    """Held-out stretches, each simulated as a whole from a fitted initial state."""
+    held_out = data[trial.hold][1]
+    return fit(
+        trial.model,
+        held_out,
+        trial.training.free.paths,
+        horizon=max(len(s) for s in held_out),
+        length=segment_length(setting.horizon),
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
+        covariance=trial.training.covariance,
+        reweigh=False,
+        max_steps=_TRIAL_STEPS,
+        hold_parameters=True,
+        states=trial.held_out.unknowns.states,
+        retry_states=False,
+    )
+
+
+def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int:
+    """Intervals of torque before each segment.
+
+    Args:
+        training: training stretches.
+        longest_delay: how far back a delayed or lagging torque may reach [s].
+    """
+    step = training[0].experiment.time_step
+    return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))
