@@ -429,13 +429,6 @@ def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     return np.logical_not(np.all(np.abs(white) < RUNAWAY, axis=(1, 2)))
 
 
-def follows(found: Fit) -> bool:
-    """Whether the simulation errs by less than half of how much each output moves."""
-    segments = found.problem.segments
-    measured = np.asarray(segments.measured)[np.asarray(segments.weight) > 0]
-    return bool(np.all(np.diag(np.asarray(found.covariance)) < 0.25 * measured.var(axis=0)))
-
-
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:
     """Solver steps in a sample interval that keep the step error below a fraction of the residual.
 

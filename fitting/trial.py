@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from fitting.estimate import Fit, fit, follows, segment_length, states_from
+from fitting.estimate import Fit, fit, states_from
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
+from fitting.free_run import FreeRun, free_run, rms_error
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -162,35 +163,29 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial, data: Data, setti
     """The share of an effect's gain that lasts over whole stretches; all of it for an effect without memory.
 
     Hidden states are fitted to each short segment, where they can stand for what something else leaves there: an
-    offset, say. Along a whole stretch they have to follow from the motion.
+    offset, say. In a free run they have to follow from the motion.
     """
     if not effect.states:
         return 1.0
     short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
-    old, new = (_over_whole_stretches(t, data, setting) for t in (before, trial))
-    if short <= 0.0 or not (follows(old) or follows(new)):
+    old, new = (_free_runs(t, data, setting) for t in (before, trial))
+    before_long, after_long = rms_error(old), rms_error(new)
+    moves = float(np.std(np.concatenate([run.measured for run in old])))
+    # Where neither is followed for long, free runs tell nothing.
+    if short <= 0.0 or min(before_long, after_long) > 0.5 * moves:
         return 1.0
-    return float(np.clip(np.log(old.dynamic_error_std / new.dynamic_error_std) / short, 0.0, 1.0))
+    return float(np.clip(np.log(before_long / after_long) / short, 0.0, 1.0))
 
 
-def _over_whole_stretches(trial: Trial, data: Data, setting: Setting) -> Fit:
-    """Held-out stretches, each simulated as a whole from a fitted initial state."""
-    held_out = data[trial.hold][1]
-    return fit(
+def _free_runs(trial: Trial, data: Data, setting: Setting) -> tuple[FreeRun, ...]:
+    """Of the held-out stretches."""
+    return free_run(
         trial.model,
-        held_out,
-        trial.training.free.paths,
-        horizon=max(len(s) for s in held_out),
-        length=segment_length(setting.horizon),
+        data[trial.hold][1],
+        covariance=trial.training.covariance,
         halo=setting.halo,
         substeps=setting.substeps,
-        count=setting.count,
-        covariance=trial.training.covariance,
-        reweigh=False,
-        max_steps=_TRIAL_STEPS,
-        hold_parameters=True,
-        states=trial.held_out.unknowns.states,
-        retry_states=False,
+        like=trial.held_out,
     )
 
 
