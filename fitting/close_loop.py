@@ -37,6 +37,8 @@ _EXCESS = 1.5
 _MOST_LOST = 0.5
 # Share of the unexplained variance that found effects must remove to be called the explanation.
 _EXPLAINED = 0.75
+# A learned torque that adds less than this share to the gain of named effects casts no doubt on them.
+_LITTLE = 0.05
 
 
 class Finding(eqx.Module):
@@ -272,7 +274,7 @@ def _what_is_unknown(
     """The model whose names can be trusted, and the torque that is learned beside them.
 
     A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data better,
-    and does not come out as the named effect.
+    and does not come out as the named effect. What a learned torque beside it hardly betters is in no doubt.
     """
     if leaves_white_noise(named.training):
         return named, None
@@ -281,6 +283,8 @@ def _what_is_unknown(
         return named, None
     if named is base:
         return base, beside
+    if beside.gain < _LITTLE * named.gain_over(base):
+        return named, beside
     instead = learn(base, data, setting, seed=seed, progress=progress)
     if instead is None or not is_supported(instead):
         return named, beside

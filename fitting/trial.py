@@ -124,7 +124,19 @@ def trained(
     max_steps: int = _TRIAL_STEPS,
     reweigh: bool = True,
 ) -> Fit:
-    """A fit that starts with the covariance of one near by, and from its states as far as the model has the same."""
+    """A fit that starts with the covariance of one near by, and from its states as far as the model has the same.
+
+    Args:
+        model: equations and starting values.
+        data: the stretches.
+        hold: what the torque does between samples.
+        setting: how the data are cut.
+        near: the fit near by, if there is one.
+        give_up_above: see [`fitting.estimate.fit`][], as for the rest.
+        retry_states: likewise; so they are in any case where the model has other states.
+        max_steps: likewise.
+        reweigh: likewise.
+    """
     same = near is not None and near.model.state_names == model.state_names
     return fit(
         model,
