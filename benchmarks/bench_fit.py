@@ -309,7 +309,7 @@ def show_profile(row: Row, repeats: int) -> None:
         each = timed(name, lambda c=call: jax.block_until_ready(c()), repeats).least
         known += each * found.steps
         print(f"  {name:<32}{1e3 * each:7.2f} ms each {1e3 * each * found.steps:8.1f} ms together")
-    rest = "rest: host, first covariance"
+    rest = "rest: host, blocks of the last step"
     print(f"  {rest:<32}{'':15} {1e3 * (row.least - known):8.1f} ms")
     print(f"  simulation alone, without sensitivities: {1e3 * timed('', _residual(found), repeats).least:.2f} ms")
 
