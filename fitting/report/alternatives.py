@@ -6,7 +6,6 @@ from typing import Any
 from fitting.attribution import Verdict
 from fitting.report.outcome import Outcome
 from fitting.report.separating import separating_experiment
-from fitting.report.steps import held_out_rmse
 from fitting.trial import Trial
 
 
@@ -35,11 +34,11 @@ def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, A
     return {
         "family": verdict.family,
         "name": verdict.name,
-        "validation_rmse": held_out_rmse(trial),
+        "validation_rmse": trial.held_out.dynamic_error_std,
         "separable": verdict.separable,
         "separating_experiment": experiment,
         "instead_of": winner.name,
-        "validation_rmse_of_found": None if winner.trial is None else held_out_rmse(winner.trial),
+        "validation_rmse_of_found": None if winner.trial is None else winner.trial.held_out.dynamic_error_std,
     }
 
 

@@ -77,7 +77,8 @@ def limits(report: Mapping[str, Any]) -> list[str]:
                 f"A tie: {other['name']} ({plain_family(other['family'])}) explains the held-out data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
-    notes += [n for n in (beyond_prediction(report),) if n]
+    drifting = beyond_prediction(report, final["rmse"]["validation"])
+    notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated(own)
 

@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from fitting import formatting
 from fitting.close_loop import Loop
 from fitting.report.outcome import Outcome
@@ -29,22 +27,21 @@ def steps(outcome: Outcome) -> list[dict[str, Any]]:
     return found
 
 
-def held_out_rmse(trial: Trial) -> float:
-    """Rms of the dynamic error on held-out segments, whose initial states are fitted."""
-    return float(np.sqrt(np.asarray(trial.held_out.covariance)[-1, -1]))
-
-
 def _step(added: str | None, trial: Trial, seconds: float) -> dict[str, Any]:
-    return {"added": added, "held_out_rmse": held_out_rmse(trial), "segment_seconds": seconds}
+    return {"added": added, "held_out_rmse": trial.held_out.dynamic_error_std, "segment_seconds": seconds}
 
 
-def beyond_prediction(report: Mapping[str, Any]) -> str | None:
-    """What must be said where a model leaves nothing but noise over short times, and much over long ones."""
+def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | None:
+    """What must be said where a model leaves nothing but noise over short times, and much over long ones.
+
+    Args:
+        report: the report's content so far.
+        free: rms error of the final model's free runs on held-out data; None where they diverged.
+    """
     if not report["steps"]:
         return None
     last, noise = report["steps"][-1], report["noise"]["dynamic_error"]
-    final = report["after"] if report["after"]["parameters"] else report["before"]
-    free, short = final["rmse"]["validation"], last["held_out_rmse"]
+    short = last["held_out_rmse"]
     if short is None or short > _NOISE * noise or (free is not None and free < _OFF * noise):
         return None
     unit = report["units"]["dynamic_error"]
