@@ -20,9 +20,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fitting.arrow import normal_equations
-from fitting.estimate import Fit, fit, natural_frequency, short_horizon, suggested_substeps
+from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
+from fitting.posing import natural_frequency, short_horizon, suggested_substeps
 from fitting.residual import blocks, residual
 from fitting.starting_values import starting_models
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled

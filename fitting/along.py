@@ -1,14 +1,15 @@
 """A fitted motion as effects look at it, and what a unit of each thing that they can add does there."""
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from fitting.experiment import Segments
+from fitting.experiment import Segments, Stretch
 from fitting.followed import NODES, Followed
 from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
 from hdjax.effects import (
@@ -23,7 +24,7 @@ from hdjax.effects import (
 )
 from hdjax.effects.learned import LEARNED, LearnedTorque
 from hdjax.parameters import Scalar, parameter
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 from hdjax.signals import polynomial
 
 PART = 0.5 * (NODES + 1.0)[None, None, :]
@@ -44,6 +45,8 @@ class Along(eqx.Module):
         between: the motion at the nodes of each interval.
         pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
         goes_on: whether a segment goes on where the one before it ends in time, joined or not.
+        firsts: the first segment of each stretch.
+        ends: segment and knot where each stretch ends.
     """
 
     model: Model
@@ -53,24 +56,32 @@ class Along(eqx.Module):
     between: Motion
     pushes: dict[str, Float[Array, "segments samples nodes states"]]
     goes_on: Bool[Array, " segments"]
+    firsts: Int[np.ndarray, " stretches"]
+    ends: Int[np.ndarray, "stretches 2"]
 
 
-def along(model: Model, followed: Followed, segments: Segments) -> Along:
+def along(model: Model, followed: Followed, segments: Segments, stretches: Sequence[Stretch]) -> Along:
     """The motion of a model as effects look at it.
 
     Args:
         model: at the solution.
         followed: its states.
         segments: the data that it belongs to.
+        stretches: what was cut into them.
     """
+    length, samples = segments.weight.shape[1], np.array([len(s) for s in stretches])
+    pieces = -(-samples // length)
+    firsts = np.cumsum(pieces) - pieces
+    ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
     conditions = conditions_between(segments)
     at_knots = motions(model, followed.states, conditions_at_knots(segments))
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
-    return Along(model, followed, segments, at_knots, between, pushes, jnp.asarray(continues(segments)))
+    goes_on = jnp.asarray(continues(segments))
+    return Along(model, followed, segments, at_knots, between, pushes, goes_on, firsts, ends)
 
 
-@jit_kept
+@jit_small
 def conditions_at_knots(segments: Segments) -> Conditions:
     """Time and temperature at each knot, the end of the last interval included."""
     time = segments.torque.knots[:, segments.halo :]
@@ -87,7 +98,7 @@ def _late(knots: Float[Array, "segments knots"]) -> Float[Array, "segments sampl
     return jnp.asarray(PART) * jnp.diff(knots)[..., None]
 
 
-@jit_kept
+@jit_small
 def conditions_between(segments: Segments) -> Conditions:
     """Time and temperature at the nodes of each interval."""
     time = segments.torque.knots[:, segments.halo :]
@@ -95,7 +106,7 @@ def conditions_between(segments: Segments) -> Conditions:
     return Conditions(time[:, :-1, None] + _late(time), warmth)
 
 
-@jit_kept
+@jit_small
 def motions(model: Model, states: Float[Array, "*many states"], conditions: Conditions) -> Motion:
     """The motion that each of many states means."""
     find = model.motion
@@ -124,7 +135,7 @@ class _UnitGeometry(MeshGeometryEffect):
         return self.e_slope
 
 
-@jit_kept
+@jit_small
 def unit_pushes(
     model: Model, states: Float[Array, "*many states"], conditions: Conditions
 ) -> dict[str, Float[Array, "*many states"]]:

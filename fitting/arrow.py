@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.residual import Blocks, LinearisedResidual, Unknowns, blocks_of_columns, seeds
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 from hdjax.where import where
 
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
@@ -157,7 +157,7 @@ def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "se
     return found.by_parameter + jnp.einsum("srq,sqp->srp", found.by_state, moved)
 
 
-projected = jit_kept(project)
+projected = jit_small(project)
 """[`project`][], compiled."""
 
 

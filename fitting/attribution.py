@@ -1,7 +1,9 @@
 """Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import numpy as np
@@ -9,11 +11,11 @@ import numpy as np
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
-from fitting.free import strength_paths
-from fitting.screening import Lead, Screen, screen
+from fitting.free import effect_paths, strength_paths
+from fitting.screening import Lead, Screen, screen, screen_ahead
 from fitting.shortlist import NEARLY, first_of_each_family, further_forms, possible_ties, worth_a_refit
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, challenge, lasting_share, trained
-from fitting.uncertainty import uncertainty
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, challenge, coming, lasting_share, trained
+from fitting.uncertainty import Estimate, uncertainty
 from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
@@ -22,6 +24,9 @@ SIGNIFICANCE = 0.01
 """Largest p-value of an accepted effect: the chance that the best of the catalogue does as well on noise."""
 
 
+# No form and no solver is exact: an effect that removes less than this share (rms) of what those before it have removed
+# may be what they get wrong themselves.
+_IMPERFECTION = 3e-3
 # Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
 # one finds the way.
 _HOLD_STEPS = 3
@@ -79,6 +84,7 @@ def look(
     catalogue: Sequence[type[Effect]],
     seed: int,
     progress: Callable[[str], None],
+    base: Trial | None = None,
 ) -> Round:
     """Look for the effect that explains most of what a model leaves over.
 
@@ -89,23 +95,28 @@ def look(
         catalogue: forms to consider.
         seed: of the surrogates.
         progress: told what is being done.
+        base: the model without any effect; where not given, `before`.
     """
+    base = before if base is None else base
     progress("looking through the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     refitted: dict[str, Trial] = {}
     worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
 
     def refit(leads: Sequence[Lead], give_up_above: float = np.inf) -> None:
-        for lead in leads:
-            progress(f"refitting with {lead.effect.name}")
-            trial = _try_lead(before, lead, data, setting, give_up_above)
-            if trial is not None and np.isfinite(trial.held_out.objective):
-                refitted[lead.effect.name] = trial
+        with _programs_ahead(before, leads[1:], data, setting):
+            for lead in leads:
+                progress(f"refitting with {lead.effect.name}")
+                trial = _try_lead(before, lead, data, setting, give_up_above)
+                if trial is not None and np.isfinite(trial.held_out.objective):
+                    refitted[lead.effect.name] = trial
 
     first = first_of_each_family(worth)
-    refit(first[:1])
+    with _programs_ahead(before, first[1:], data, setting):
+        refit(first[:1])
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
+        screen_ahead(leader.training)
         gained = before.training.objective - leader.training.objective
         refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gained)
     else:
@@ -128,8 +139,9 @@ def look(
         gain = -np.inf if trial is None else trial.gain_over(before)
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    verdicts = _determined_first(_simplest_first(_with_separability(found)))
-    return Round(before, screened, tuple(verdicts), bool(verdicts) and _supported(verdicts[0]))
+    supported = partial(_supported, before=before, base=base)
+    verdicts = _supported_first(_simplest_first(_with_separability(found)), supported)
+    return Round(before, screened, tuple(verdicts), bool(verdicts) and supported(verdicts[0]))
 
 
 def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tuple[Round, Trial]:
@@ -155,33 +167,75 @@ def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tup
     return this, found
 
 
-def _supported(verdict: Verdict) -> bool:
+def _supported(verdict: Verdict, *, before: Trial, base: Trial) -> bool:
     """Whether a competitor is more than chance, more than an imperfection, and has a strength that is not zero."""
     return (
         verdict.trial is not None
         and verdict.gain > LEAST_GAIN
         and verdict.p_value <= SIGNIFICANCE
+        and _imperfect_share(verdict.trial, before, base) > _IMPERFECTION
         and _strength_is_determined(verdict)
     )
 
 
+def _imperfect_share(trial: Trial, before: Trial, base: Trial) -> float:
+    """What a further effect removes of the held-out error, over what the effects before it have removed (rms); infinite
+    for the first one."""
+    weight = np.linalg.inv(np.asarray(trial.held_out.covariance))
+    left, then, first = (float(np.trace(weight @ np.asarray(t.held_out.covariance))) for t in (trial, before, base))
+    if before is base or first <= then:
+        return np.inf
+    return float(np.sqrt(max(then - left, 0.0) / (first - then)))
+
+
 def _strength_is_determined(verdict: Verdict) -> bool:
-    """Whether the fit tells at least one of the effect's strengths from zero; another hold has none to tell."""
+    """Whether the fit tells at least one of the effect's strengths from zero; another hold has none to tell.
+
+    With the effect's shape as fitted: where a strength is zero, its shape means nothing, and along a valley of shapes
+    that explain the same (a creep's stiffness over its time) the strength may well be open.
+    """
     assert verdict.trial is not None
-    if verdict.name not in {e.name for e in verdict.trial.model.effects}:
+    model = verdict.trial.model
+    if verdict.name not in {e.name for e in model.effects}:
         return True
-    estimates = uncertainty(verdict.trial.training, torque_noise=False).estimates
-    return any(estimates[p].identifiable for p in strength_paths(verdict.trial.model.effect(verdict.name)))
+    effect = model.effect(verdict.name)
+    found = uncertainty(verdict.trial.training, torque_noise=False)
+    paths, strengths = list(found.estimates), strength_paths(effect)
+    shape = [paths.index(p) for p in effect_paths(effect) if p not in strengths]
+    across = found.covariance[:, shape]
+    explained = np.einsum("pi,ij,pj->p", across, np.linalg.pinv(across[shape], hermitian=True), across)
+    total = np.diag(found.covariance)
+    part = np.sqrt(np.clip(1.0 - explained / np.maximum(total, 1e-300), 0.0, 1.0))
+    return any(_is_known(found.estimates[p], float(part[paths.index(p)]), effect) for p in strengths)
 
 
-def _determined_first(verdicts: list[Verdict]) -> list[Verdict]:
+def _is_known(estimate: Estimate, part: float, effect: Effect) -> bool:
+    """Whether a strength is told from zero by an interval of which only a part is left."""
+    info = dict(own_parameters(effect))[estimate.path.split(".")[1]]
+    upper = estimate.ci95[1]
+    if info.positive:
+        return bool(part * np.log(max(upper / estimate.value, 1.0)) < 1.0)
+    return bool(part * (upper - estimate.value) < abs(estimate.value))
+
+
+def _supported_first(verdicts: list[Verdict], supported: Callable[[Verdict], bool]) -> list[Verdict]:
     """The list from its first supported competitor on, the unsupported ones behind it; unchanged where none is."""
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None or verdict.gain <= LEAST_GAIN:
             break
-        if _supported(verdict):
+        if supported(verdict):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]]
     return verdicts
+
+
+@contextmanager
+def _programs_ahead(before: Trial, leads: Sequence[Lead], data: Data, setting: Setting) -> Iterator[None]:
+    """Have the programs of refits to come made beside what is done meanwhile; what has not begun then is called off."""
+    with ExitStack() as stack:
+        for lead in leads:
+            model = before.model.with_effects(_with_positive_strengths(lead.effect))
+            stack.callback(coming(model, data, before.hold, setting))
+        yield
 
 
 def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
@@ -197,7 +251,15 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
     typical = lead.effect.typical(scales(before.training.stretches, model))
     starts = [first, *(model.with_effects(effect) for effect in typical)]
-    trial = challenge(starts, data, before.hold, setting, champion=before, give_up_above=give_up_above)
+    trial = challenge(
+        starts,
+        data,
+        before.hold,
+        setting,
+        champion=before,
+        give_up_above=give_up_above,
+        own_states=lead.own_states,
+    )
     if trial is None:
         return None
     return replace(trial, lasting=lasting_share(lead.effect, before, trial, data, setting))

@@ -9,7 +9,7 @@ from fitting.arrow import chains
 from fitting.estimate import Fit
 from fitting.residual import Blocks
 from fitting.solve import linearise
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 
 # Directions of a chain's first state that its samples hardly see.
 _BLIND = 1e-12
@@ -64,7 +64,7 @@ def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
     return autocovariance(apart, lags).sum(axis=(0, 1))
 
 
-@jit_kept
+@jit_small
 def _by_first_state(found: Blocks, joined: Array) -> Array:
     """Derivative of each segment's rows by its chain's first state."""
     return jnp.einsum("srq,sqk->srk", found.by_state, chains(found, joined).by_first)

@@ -12,10 +12,11 @@ import equinox as eqx
 import numpy as np
 from scipy.special import chdtri
 
-from fitting.estimate import Fit, fit, initial_states, segment_length, short_horizon, suggested_substeps
+from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
 from fitting.outliers import without_glitches, without_lone_errors
+from fitting.posing import initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.starting_values import starting_models
 from hdjax import Model
 

@@ -14,16 +14,12 @@ from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.errors import DataError
-from fitting.estimate import (
-    lost,
-    measurement_noise,
-    needed_substeps,
-    segment_length,
-)
+from fitting.estimate import lost, measurement_noise, needed_substeps
 from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
 from fitting.outliers import with_weights
+from fitting.posing import segment_length
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
 from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Hold, Model
@@ -235,6 +231,7 @@ def _add_effects(
             catalogue=catalogue,
             seed=seed + len(rounds),
             progress=progress,
+            base=base,
         )
         if not this.accepted:
             rounds.append(this)

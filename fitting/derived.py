@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 
 from fitting.compare import Account
 from hdjax import Drive, Model
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 
 Quantities = Mapping[str, tuple[Array, str]]
 """Value and unit by name."""
@@ -68,7 +68,7 @@ def derived(account: Account, quantities: Callable[..., Quantities], *given: flo
     }
 
 
-@jit_kept
+@jit_small
 def _values_and_slopes(
     model: Model, paths: tuple[str, ...], values: Array, quantities: Callable[..., Quantities], given: tuple[Any, ...]
 ) -> tuple[tuple[tuple[str, Array, str], ...], Array]:

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.arrow import projected
-from fitting.experiment import Segments, Stretch, cut, scales
-from fitting.free import FreeParameters, free_parameters
+from fitting.experiment import Stretch, cut, scales
+from fitting.free import FreeParameters
+from fitting.posing import initial_states, natural_frequency, pose
 from fitting.residual import RUNAWAY, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, linearise, solve
-from hdjax import Drive, Model, TwoInertiaModel
+from hdjax import Model
 from hdjax.lanes import spread
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 
 # Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
 _REWEIGHTINGS = 3
@@ -24,8 +25,6 @@ _REWEIGHTINGS = 3
 _MOST_REWEIGHTINGS = 12
 # Simulations longer than this many segments start from states that shorter ones have found already.
 _LONGEST_RETRY = 16
-# Segments are no longer than this; longer simulations join several, which are then lanes of one program.
-_LONGEST_SEGMENT = 256
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
 # Iterations in each window of samples, of windows that grow.
@@ -33,8 +32,6 @@ _WINDOW_STEPS = 12
 # So many samples tell the noise to 1 %.
 _NOISE_SAMPLES = 5000
 _NOISE_STEPS = 30
-STEP_ANGLE = 0.15
-"""A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
 
 
 class Fit(eqx.Module):
@@ -128,23 +125,23 @@ def fit(
     Returns:
         The fit.
     """
-    if length is None:
-        length = segment_length(horizon)
-    segments = cut(stretches, length, horizon=horizon, halo=halo, count=count)
-    if substeps is None:
-        substeps = suggested_substeps(model, stretches)
-    free = free_parameters(model, paths, typical_scales(model, stretches))
-    if states is None:
-        states = initial_states(model, segments)
-    unknowns = Unknowns(free.pack(model), states)
-    active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
+    problem, unknowns = pose(
+        model,
+        stretches,
+        paths,
+        horizon=horizon,
+        length=length,
+        halo=halo,
+        substeps=substeps,
+        hold_parameters=hold_parameters,
+        count=count,
+        states=states,
+    )
+    length = problem.segments.weight.shape[1]
+    outputs = problem.segments.measured.shape[-1]
     swing = jnp.asarray(np.asarray(scales(stretches).x))
-    outputs = segments.measured.shape[-1]
-    unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
-    problem = Problem(model, free, segments, *unweighed, substeps=substeps)
-    problem, unknowns = spread((problem, unknowns), states.shape[0])
     # The scale of a single output changes nothing but the say of the hidden states' prior.
-    scale_matters = outputs > 1 or states.shape[1] > len(model.motion_states)
+    scale_matters = outputs > 1 or unknowns.states.shape[1] > len(model.motion_states)
     if covariance is None:
         covariance = evaluate(problem, unknowns).covariance if scale_matters else swing[None, None] ** 2
     objective, steps = np.inf, 0
@@ -169,7 +166,7 @@ def fit(
     # By way of the host: what is computed with the model alone need not run on every device.
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
-        model=free.unpack(model, values),
+        model=problem.free.unpack(model, values),
         problem=_weighed(problem, covariance, swing) if reweigh else problem,
         unknowns=unknowns,
         error=solution.error,
@@ -182,7 +179,7 @@ def fit(
     )
 
 
-@jit_kept
+@jit_small
 def _weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
@@ -242,15 +239,10 @@ def _growing(problem: Problem, length: int) -> list[int]:
     return [first * 4**k for k in range(10) if first * 4**k < length] + [length]
 
 
-@jit_kept
+@jit_small
 def whitening(covariance: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
     """W with `W covariance W^T = 1`."""
     return jnp.linalg.inv(jnp.linalg.cholesky(covariance))
-
-
-def segment_length(horizon: int) -> int:
-    """Samples in a segment of simulations that start anew every `horizon` samples."""
-    return min(horizon, _LONGEST_SEGMENT)
 
 
 def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " states"]:
@@ -272,105 +264,6 @@ def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " 
 def _half_log_determinant(covariance: Array) -> float:
     sign, value = np.linalg.slogdet(np.asarray(covariance))
     return float(0.5 * value) if sign > 0 else np.inf
-
-
-def initial_states(model: Model, segments: Segments) -> Float[Array, "segments states"]:
-    """Each segment's first state from a local polynomial, through its first samples and, where the log goes on, the
-    last ones of the segment before; hidden states as if it had long moved like this.
-
-    A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
-    """
-    halo, length = segments.halo, segments.measured.shape[1]
-    measured, knots = np.asarray(segments.measured), np.asarray(segments.torque.knots)[:, halo:]
-    step = float(np.median(np.diff(knots)))
-    quarter = int(min(np.ceil(0.5 * np.pi / float(model.drive.omega_0) / step), _LONGEST_SEGMENT))
-    time = knots[:, :-1] - knots[:, :1]
-    ahead = slice(min(length, max(quarter, 5)))
-    value, rate = _value_and_rate(time[:, ahead], measured[:, ahead])
-    around = min(length - 1, max(quarter, 2))
-    if around >= 2:
-        before, previous = np.roll(knots, 1, axis=0), np.roll(measured, 1, axis=0)
-        earlier = before[:, -1 - around : -1] - knots[:, :1]
-        goes_on = np.abs(before[:, -1] - knots[:, 0]) < 0.5 * step
-        both = _value_and_rate(
-            np.hstack([earlier, time[:, : around + 1]]),
-            np.hstack([previous[:, -around:], measured[:, : around + 1]]),
-        )
-        value, rate = (np.where(goes_on[:, None], b, a) for a, b in zip((value, rate), both, strict=True))
-    if isinstance(model, TwoInertiaModel):
-        N = float(model.drive.N)
-        columns = [N * value[:, 0], value[:, 0] - value[:, 1]]
-        columns += [N * rate[:, 0], rate[:, 0] - rate[:, 1]]
-    else:
-        columns = [value[:, 0], rate[:, 0]]
-    motion = jnp.asarray(np.stack(columns, axis=1))
-    return _settled(model, motion) if any(e.states for e in model.effects) else motion
-
-
-def states_from(model: Model, near: Fit) -> Float[Array, "segments states"]:
-    """Initial states of a fit of another model to the same segments: those that both have, and hidden ones of the new
-    model as if it had long moved like this. From poor states the first step would pull the parameters far away.
-
-    Args:
-        model: with the same motion.
-        near: the fit.
-    """
-    names = near.model.state_names
-    if names == model.state_names:
-        return near.unknowns.states
-    states = jnp.asarray(np.asarray(near.unknowns.states))
-    found = _settled(model, states[:, : len(model.motion_states)])
-    columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
-    return jnp.stack(columns, axis=1)
-
-
-@eqx.filter_jit
-def _settled(model: Model, motion: Array) -> Array:
-    return jax.vmap(model.settled)(motion)
-
-
-def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value and slope at time zero of the cubic through samples of each segment."""
-    span = np.max(np.abs(time), axis=1, keepdims=True)
-    basis = (time / span)[:, :, None] ** np.arange(4)[None, None, :]
-    coefficients = np.linalg.pinv(basis) @ measured
-    return coefficients[:, 0], coefficients[:, 1] / span
-
-
-def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, float]:
-    """Units for parameters that may be zero: what makes each term visible at the measured twist."""
-    motion = scales(stretches)
-    drive = model.drive
-    stiffness = float(drive.stiffness)
-    damping = stiffness * motion.x / motion.v if motion.v > 0 else 1.0
-    typical = {"alpha": 0.1 / motion.x_max**2} if motion.x_max > 0 else {}
-    typical |= {"B_sp": 0.01 * damping} if isinstance(drive, Drive) else {"mu": 0.01 * damping}
-    return typical
-
-
-def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
-    """The fastest oscillation of the dynamic error on the data [rad/s], hardening at full twist included."""
-    drive = model.drive
-    stiffening = max(0.0, 3.0 * float(drive.alpha) * scales(stretches).x_max ** 2)
-    return float(drive.omega_0) * float(np.sqrt(1.0 + stiffening))
-
-
-def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle: float = STEP_ANGLE) -> int:
-    """Solver steps in a sample interval that resolve the fastest oscillation.
-
-    Args:
-        model: supplies the natural frequency.
-        stretches: supply the sample interval, and the twist that hardens the spring.
-        step_angle: by which a step may turn the oscillation [rad].
-    """
-    angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
-    return int(np.clip(np.ceil(angle / step_angle), 1, 16))
-
-
-def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:
-    """Samples in a segment of about `periods` natural periods, as a power of two (few shapes, few programs)."""
-    period = 2 * np.pi / natural_frequency(model, stretches) / stretches[0].experiment.time_step
-    return int(2 ** np.clip(np.round(np.log2(periods * period)), 5, 11))
 
 
 def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:

@@ -18,7 +18,7 @@ from fitting.residual import Problem, Unknowns
 from hdjax import Drive, Model, PiecewisePolynomial, ReducedDrive
 from hdjax.dynamics import State
 from hdjax.effects import Conditions, Effect, Motion
-from hdjax.lanes import jit_lanes
+from hdjax.lanes import jit_small_lanes
 from hdjax.signals import polynomial
 from hdjax.simulate import march
 
@@ -76,7 +76,7 @@ class _Pushed(Model):
         return self.model.outputs(state[:-1])
 
 
-@jit_lanes
+@jit_small_lanes
 def follow(problem: Problem, unknowns: Unknowns) -> Followed:
     """Simulate the segments and linearise every sample interval along the way."""
     model = problem.free.unpack(problem.model, unknowns.parameters)

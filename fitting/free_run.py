@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.estimate import Fit, fit, suggested_substeps
+from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
+from fitting.posing import suggested_substeps
 from fitting.residual import Problem, Unknowns, simulate_segments
 from fitting.solve import linearise
 from hdjax import Model, TwoInertiaModel

@@ -17,7 +17,7 @@ from fitting.solve import linearise
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import TwoInertiaModel
 from hdjax.parameters import ParameterInfo
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 
 # Two standard errors along a direction that are more than 40 % leave it open.
 _WEAK = 0.2
@@ -313,7 +313,7 @@ def _with_held(problem: Problem, path: str, value: float) -> Problem:
     return eqx.tree_at(lambda p: p.model, problem, problem.model.replace({path: value}))
 
 
-@jit_kept
+@jit_small
 def _wider(joined: Array, found: Blocks, rows: Array, gaps: Array) -> Array:
     """The products of the parameters' columns with further ones beside them."""
     wider = eqx.tree_at(

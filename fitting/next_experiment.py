@@ -16,12 +16,13 @@ from fitting.base_fit import as_followed
 from fitting.close_loop import Loop
 from fitting.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
-from fitting.estimate import Fit, fit, segment_length, typical_scales, whitening
+from fitting.estimate import Fit, fit, whitening
 from fitting.excitation import Excitation, Limits, excitations, reached
 from fitting.experiment import Experiment, Stretch, scales, segment_count
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
+from fitting.posing import segment_length, typical_scales
 from fitting.trial import Trial
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 

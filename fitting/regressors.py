@@ -8,13 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitting.along import ERROR, INPUT, PART, SLOPE, Along, at_nodes, conditions_between, place_of
 from fitting.experiment import Segments
 from fitting.followed import NODES, WEIGHTS, Followed
 from fitting.free import strength_paths
-from hdjax import Model, PiecewisePolynomial
+from hdjax import Drive, Model, PiecewisePolynomial
 from hdjax.effects import (
     ActuatorEffect,
     Effect,
@@ -25,8 +25,9 @@ from hdjax.effects import (
     MotorSideEffect,
     SensorEffect,
 )
+from hdjax.effects.learned import LearnedMotorTorque
 from hdjax.parameters import own_value
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 from hdjax.where import where
 
 # Steps of an effect's own states in a sample interval, along a motion that is a straight line in between.
@@ -50,12 +51,43 @@ class Regressors(eqx.Module):
     reading: Float[Array | np.ndarray, "segments samples outputs columns"]
 
 
-def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
-    """The regressors of proposals of one form along a motion.
+class Memory(eqx.Module):
+    """An effect's own states along a motion, for each proposal.
+
+    Attributes:
+        at_starts: where each segment starts.
+        at_ends: where each stretch ends.
+    """
+
+    at_starts: Float[np.ndarray, "segments own proposals"]
+    at_ends: Float[np.ndarray, "stretches own proposals"]
+
+
+class _Chain(eqx.Module):
+    """Where an effect's own states come from, and where they are wanted.
+
+    Attributes:
+        goes_on: whether a segment goes on where the one before it ends.
+        known: whether a segment starts with states that are given; settled ones are taken where neither holds.
+        given: these.
+        ends: segment and knot where each stretch ends.
+    """
+
+    goes_on: Bool[Array, " segments"]
+    known: Bool[Array, " segments"]
+    given: Float[Array, "segments own proposals"]
+    ends: Int[Array, "stretches 2"]
+
+
+def regressors(
+    seen: Along, proposals: Sequence[Effect], before: Memory | None = None
+) -> tuple[Regressors, Memory | None]:
+    """The regressors of proposals of one form along a motion, and the effect's own states there.
 
     Args:
         seen: the motion.
         proposals: effects of one and the same form, at zero strength.
+        before: own states along stretches that these ones continue.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *proposals)
     # What an effect adds is the same whatever other effects there are: one program for all models that the loop comes
@@ -65,14 +97,19 @@ def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
     if isinstance(stacked, SensorEffect):
         reading = _finite(np.asarray(_readings(bare, stacked, seen.at_knots)))
         nothing = np.zeros((*segments.measured.shape[:2], seen.followed.states.shape[-1], reading.shape[-1]))
-        return Regressors(nothing, nothing, reading)
+        return Regressors(nothing, nothing, reading), None
     width = jnp.diff(segments.torque.knots[:, segments.halo :])
     place = place_of(stacked)
-    if isinstance(stacked, LoadSideEffect) and type(stacked).inertia_taken is not LoadSideEffect.inertia_taken:
-        found = _regressors(seen.model, stacked, seen.followed, segments, seen.at_knots, seen.goes_on)
-        return jax.tree.map(lambda a: _finite(np.asarray(a)), found)
+    chain = _chain(seen, len(stacked.states), len(proposals), before)
+    if isinstance(stacked, LoadSideEffect) and stacked.takes_inertia():
+        found, *memory = _regressors(seen.model, stacked, seen.followed, segments, seen.at_knots, chain)
+        return jax.tree.map(lambda a: _finite(np.asarray(a)), found), _memory(stacked, memory)
+    memory = None
     if place is not None:
-        added = {place.name: _torques(bare, stacked, seen.at_knots, seen.between, width, seen.goes_on)}
+        torques, *own = _torques(bare, stacked, seen.at_knots, seen.between, width, chain)
+        added, memory = {place.name: torques}, _memory(stacked, own)
+        if isinstance(stacked, MeshTorqueEffect) and stacked.reacts():
+            added[LearnedMotorTorque.name] = _reactions(bare, stacked, seen.between)
     elif isinstance(stacked, ActuatorEffect):
         added = {INPUT: _inputs(_actuated(seen.model, segments), stacked, segments.halo)}
     else:
@@ -81,7 +118,19 @@ def regressors(seen: Along, proposals: Sequence[Effect]) -> Regressors:
     columns = next(iter(added.values())).shape[-1]
     lines = [_straight_lines(seen.pushes[n], _padded(_finite(np.asarray(v)))) for n, v in added.items()]
     at_start, at_end = (np.sum([np.asarray(line[side])[..., :columns] for line in lines], axis=0) for side in (0, 1))
-    return Regressors(at_start, at_end, np.zeros((*segments.measured.shape, columns)))
+    return Regressors(at_start, at_end, np.zeros((*segments.measured.shape, columns))), memory
+
+
+def _chain(seen: Along, own: int, proposals: int, before: Memory | None) -> _Chain:
+    segments = seen.goes_on.shape[0]
+    known, given = np.zeros(segments, dtype=bool), np.zeros((segments, own, proposals))
+    if before is not None:
+        known[seen.firsts], given[seen.firsts] = True, before.at_ends
+    return _Chain(seen.goes_on, jnp.asarray(known), jnp.asarray(given), jnp.asarray(seen.ends))
+
+
+def _memory(stacked: Effect, found: Sequence[Array]) -> Memory | None:
+    return Memory(*(np.asarray(a) for a in found)) if stacked.states else None
 
 
 def _padded(values: np.ndarray) -> Array:
@@ -91,7 +140,7 @@ def _padded(values: np.ndarray) -> Array:
     return jnp.asarray(np.concatenate([values, np.zeros((*values.shape[:-1], wide - columns))], axis=-1))
 
 
-@jit_kept
+@jit_small
 def _straight_lines(
     push: Float[Array, "segments samples nodes states"], values: Float[Array, "segments samples nodes columns"]
 ) -> tuple[Float[Array, "segments samples states columns"], Float[Array, "segments samples states columns"]]:
@@ -116,26 +165,51 @@ def _torque_columns(
     at_knots: Motion,
     between: Motion,
     width: Float[Array, "segments samples"],
-    goes_on: Bool[Array, " segments"],
-) -> Float[Array, "segments samples nodes columns"]:
-    """Derivatives of the torque by each strength of each proposal, at the nodes."""
+    chain: _Chain,
+) -> tuple[
+    Float[Array, "segments samples nodes columns"],
+    Float[Array, "segments own proposals"],
+    Float[Array, "stretches own proposals"],
+]:
+    """Derivatives of the torque by each strength of each proposal, at the nodes; the effect's own states where each
+    segment starts and where each stretch ends."""
+    start, end = _all_own_states(stacked, at_knots, width, chain)
 
-    def torque(effect: Effect) -> Array:
+    def torque(effect: Effect, own: Array) -> Array:
         assert isinstance(effect, MeshTorqueEffect | MotorSideEffect | LoadSideEffect)
-        own = jnp.zeros((*width.shape, NODES.size, 0))
-        if effect.states:
-            # At zero strength they don't depend on it.
-            own = _own_between(*_own_states(jax.lax.stop_gradient(effect), at_knots, width, goes_on))
         at = jax.vmap(jax.vmap(jax.vmap(lambda motion, state: effect.torque(motion, bare.drive, state))))  # pyright: ignore[reportArgumentType]
         return jnp.broadcast_to(at(between, own), own.shape[:-1])
 
-    return _by_strength(stacked, torque)
+    columns = _by_strength(stacked, torque, jax.vmap(_own_between, in_axes=-1, out_axes=-1)(start, end))
+    return columns, start[:, 0], _at(start, end, chain.ends)
 
 
-def _by_strength(stacked: Effect, find: Callable[[Effect], Any]) -> Any:
-    """Derivatives of what is found of an effect by each strength of each proposal, as columns."""
+def _at(start: Array, end: Array, places: Int[Array, "places 2"]) -> Array:
+    """Own states at knots, from those at both ends of each interval."""
+    knots = jnp.concatenate([start, end[:, -1:]], axis=1)
+    return knots[places[:, 0], places[:, 1]]
 
-    def of(effect: Effect) -> Any:
+
+def _reaction_columns(bare: Model, stacked: Effect, between: Motion) -> Float[Array, "segments samples nodes columns"]:
+    """Derivatives of what a mesh torque puts on the motor alone, at the nodes."""
+
+    def reaction(effect: Effect) -> Array:
+        assert isinstance(effect, MeshTorqueEffect) and isinstance(bare.drive, Drive)
+        return effect.reaction(between, bare.drive)
+
+    return _by_strength(stacked, reaction)
+
+
+def _by_strength(stacked: Effect, find: Callable[..., Any], *own: Array) -> Any:
+    """Derivatives of what is found of an effect by each strength of each proposal, as columns.
+
+    Args:
+        stacked: the proposals.
+        find: what is looked at, of an effect and its own states.
+        own: each proposal's, on the last axis. At zero strength they don't depend on it.
+    """
+
+    def of(effect: Effect, *own: Array) -> Any:
         names = [path.split(".")[1] for path in strength_paths(effect)]
 
         # Not typed: `eqx.tree_at` fills the effect with placeholders.
@@ -143,14 +217,14 @@ def _by_strength(stacked: Effect, find: Callable[[Effect], Any]) -> Any:
             return [own_value(effect, name) for name in names]
 
         def changed(strengths: Array) -> Any:
-            return find(eqx.tree_at(values, effect, list(strengths)))
+            return find(eqx.tree_at(values, effect, list(strengths)), *own)
 
         return jax.jacfwd(changed)(jnp.stack(values(effect)))
 
-    return jax.tree.map(_side_by_side, jax.vmap(of, out_axes=-1)(stacked))
+    return jax.tree.map(_side_by_side, jax.vmap(of, in_axes=(0, *[-1 for _ in own]), out_axes=-1)(stacked, *own))
 
 
-@jit_kept
+@jit_small
 def _actuated(model: Model, segments: Segments) -> PiecewisePolynomial:
     """The torque as the effects that there are let it act."""
     return jax.vmap(model.actuate)(segments.torque)
@@ -199,35 +273,30 @@ def _side_by_side(found: Array) -> Array:
     return jnp.swapaxes(found, -1, -2).reshape(*found.shape[:-2], -1)
 
 
-# Programs of little work for each form: compiling them well would take longer than what that saves.
-_QUICKLY_MADE: Any = {"compiler_options": {"xla_backend_optimization_level": 1}}
-_torques = jit_kept(_torque_columns, **_QUICKLY_MADE)
-_inputs = jit_kept(_input_columns, **_QUICKLY_MADE)
-_geometry = jit_kept(_geometry_columns, **_QUICKLY_MADE)
-_readings = jit_kept(_reading_columns, **_QUICKLY_MADE)
+_torques = jit_small(_torque_columns)
+_reactions = jit_small(_reaction_columns)
+_inputs = jit_small(_input_columns)
+_geometry = jit_small(_geometry_columns)
+_readings = jit_small(_reading_columns)
 
 
 def _looked_along(
-    model: Model,
-    stacked: Effect,
-    followed: Followed,
-    segments: Segments,
-    at_knots: Motion,
-    goes_on: Bool[Array, " segments"],
-) -> Regressors:
+    model: Model, stacked: Effect, followed: Followed, segments: Segments, at_knots: Motion, chain: _Chain
+) -> tuple[Regressors, Float[Array, "segments own proposals"], Float[Array, "stretches own proposals"]]:
     width = jnp.diff(segments.torque.knots[:, segments.halo :])
+    start, end = _all_own_states(stacked, at_knots, width, chain)
 
-    def looked_at(effect: Effect) -> tuple[Array, Array]:
-        own = _own_states(jax.lax.stop_gradient(effect), at_knots, width, goes_on) if effect.states else None
+    def looked_at(effect: Effect, start: Array, end: Array) -> tuple[Array, Array]:
+        own = (start, end) if effect.states else None
         return _rates_and_reading(model.with_effects(effect), followed.states, followed.between, own, segments)
 
-    rates, reading = _by_strength(stacked, looked_at)
+    rates, reading = _by_strength(stacked, looked_at, start, end)
     mean = 0.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS), rates)
     rise = 1.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS * NODES), rates)
-    return Regressors(mean - rise, mean + rise, reading)
+    return Regressors(mean - rise, mean + rise, reading), start[:, 0], _at(start, end, chain.ends)
 
 
-_regressors = jit_kept(_looked_along, **_QUICKLY_MADE)
+_regressors = jit_small(_looked_along)
 
 
 def _rates_and_reading(
@@ -255,10 +324,26 @@ def _own_between(start: Array, end: Array) -> Array:
     return start[:, :, None] * (1.0 - part) + end[:, :, None] * part
 
 
+def _all_own_states(
+    stacked: Effect, motion: Motion, width: Float[Array, "segments samples"], chain: _Chain
+) -> tuple[Float[Array, "segments samples own proposals"], Float[Array, "segments samples own proposals"]]:
+    """Each proposal's own states at both ends of each interval."""
+    if not stacked.states:
+        nothing = jnp.zeros((*width.shape, *chain.given.shape[1:]))
+        return nothing, nothing
+    find = jax.vmap(lambda effect, given: _own_states(effect, motion, width, chain, given), (0, -1), -1)
+    return find(stacked, chain.given)
+
+
 def _own_states(
-    effect: Effect, motion: Motion, width: Float[Array, "segments samples"], goes_on: Bool[Array, " segments"]
+    effect: Effect,
+    motion: Motion,
+    width: Float[Array, "segments samples"],
+    chain: _Chain,
+    given: Float[Array, "segments own"],
 ) -> tuple[Array, Array]:
-    """An effect's own states at both ends of each interval: settled at each log's start, then driven by the motion."""
+    """An effect's own states at both ends of each interval: given or settled where a stretch starts, then driven by the
+    motion."""
 
     def rate(own: Array, before: Motion, after: Motion, passed: float) -> Array:
         between = jax.tree.map(lambda a, b: (1.0 - passed) * a + passed * b, before, after)
@@ -276,10 +361,11 @@ def _own_states(
         return own, (start, own)
 
     def segment(own: Array, inputs):
-        motion, width, goes_on = inputs
+        motion, width, goes_on, known, given = inputs
         settled = effect.initial_state(jax.tree.map(lambda a: a[0], motion))
-        own = where(goes_on, own, settled)
+        own = where(goes_on, own, where(known, given, settled))
         before, after = (jax.tree.map(lambda a, s=s: a[s], motion) for s in (slice(None, -1), slice(1, None)))
         return jax.lax.scan(interval, own, (before, after, width))
 
-    return jax.lax.scan(segment, jnp.zeros_like(effect.initial_state()), (motion, width, goes_on))[1]
+    inputs = (motion, width, chain.goes_on, chain.known, given)
+    return jax.lax.scan(segment, jnp.zeros_like(effect.initial_state()), inputs)[1]

@@ -17,11 +17,12 @@ from jaxtyping import Array, Float
 from scipy.special import fdtri
 
 from fitting.arrow import chains, project
-from fitting.estimate import Fit, natural_frequency
+from fitting.estimate import Fit
 from fitting.experiment import Segments
+from fitting.posing import natural_frequency
 from fitting.residual import Blocks, Problem
 from fitting.solve import linearise
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 
 # Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.
 _MANY_CHAINS = 20
@@ -257,7 +258,7 @@ def _spectrum(series: np.ndarray) -> np.ndarray:
     return np.fft.rfft(series, axis=0) / np.sqrt(series.shape[0])
 
 
-@jit_kept
+@jit_small
 def _columns(problem: Problem, found: Blocks) -> tuple[Array, Array, Array]:
     """Residual by row, projected slopes, and the derivative with respect to the state that each chain starts from."""
     joined = problem.segments.joined

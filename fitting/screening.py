@@ -6,8 +6,11 @@ each effect's strength and gain to first order (a score test), on held-out data 
 surrogates of the residual gives the law of the best gain where there is nothing to find.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -17,13 +20,14 @@ from jaxtyping import Array, Float
 from scipy.fft import prev_fast_len
 
 from fitting.along import Along, along
-from fitting.estimate import STEP_ANGLE, Fit, lost, suggested_substeps
+from fitting.estimate import Fit, lost
 from fitting.experiment import Segments, scales
 from fitting.explained import explained, solved
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
-from fitting.regressors import Regressors, regressors
-from fitting.residual import Blocks
+from fitting.posing import STEP_ANGLE, suggested_substeps
+from fitting.regressors import Memory, Regressors, regressors
+from fitting.residual import Blocks, Problem
 from fitting.solve import linearise
 from fitting.spectral_lines import STANDS_OUT, spectral_lines, surroundings
 from hdjax import TwoInertiaModel
@@ -31,9 +35,13 @@ from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
+_Item = TypeVar("_Item")
+_Found = TypeVar("_Found")
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
 
+# Forms that are looked at at a time.
+_BEFOREHAND = 2
 # Columns that one program takes at once; as many proposals as fit share it.
 _COLUMNS = 16
 
@@ -45,11 +53,14 @@ class Lead(eqx.Module):
         effect: the form at the strengths that suit best to first order.
         drive_changes: change of the parameters that were free already, by path.
         gain: decrease of the objective on held-out data, to first order.
+        own_states: where the effect's own states start in each training segment, driven by the present model's motion;
+            None for an effect without.
     """
 
     effect: Effect
     drive_changes: dict[str, float]
     gain: float
+    own_states: Float[np.ndarray, "segments own"] | None = None
 
 
 class Screen(eqx.Module):
@@ -94,9 +105,11 @@ def screen(
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
     null_gains = np.full(DRAWS, -np.inf)
-    looks = zip(_scores(training, proposals, seed), _scores(held_out, proposals, seed + 1), strict=True)
-    for (own, fitted), (_, unseen) in looks:
-        for index, columns in own.items():
+    sights = _sight(training, seed), _sight(held_out, seed + 1)
+    for batch in _batches(sights, proposals, _follow_on(training, held_out)):
+        fitted, unseen = (_score(*pair) for pair in zip(sights, batch.forces, strict=True))
+        for index, own in batch.columns.items():
+            columns = [len(free_now) + c for c in own]
             effect = proposals[index]
             paths = strength_paths(effect)
             info = model.with_effects(effect).parameters()
@@ -109,9 +122,26 @@ def screen(
             strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
             filled = model.with_effects(effect).replace(strengths).effect(effect.name)
             changes = {p: step[i] for i, p in enumerate(free_now)}
-            leads[effect.name] = Lead(filled, changes, gain)
+            leads[effect.name] = Lead(filled, changes, gain, batch.own_states[index])
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), null_gains)
+
+
+def screen_ahead(training: Fit) -> None:
+    """Have the program that follows a model's motion made beside what else is done, before [`screen`][] asks for it."""
+    follow.prepare(_looked_at(training), training.unknowns)
+
+
+def _looked_at(fit: Fit) -> Problem:
+    """What a fit has solved, at its solution."""
+    # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
+    # than this; the residual is the fit's own.
+    return replace(
+        fit.problem,
+        model=fit.model,
+        active=jnp.ones_like(fit.problem.active),
+        substeps=suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE),
+    )
 
 
 class _Score(eqx.Module):
@@ -130,16 +160,26 @@ class _Score(eqx.Module):
     rows: float
 
 
-def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[dict[int, list[int]], _Score]]:
-    """The proposals' inner products, a few proposals at a time: each one's columns, and the score that has them."""
-    # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
-    # than this; the residual is the fit's own.
-    problem = replace(
-        fit.problem,
-        model=fit.model,
-        active=jnp.ones_like(fit.problem.active),
-        substeps=suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE),
-    )
+class _Sight(eqx.Module):
+    """A fit's motion, and its residual in the form that inner products take.
+
+    Attributes:
+        seen: the motion as effects look at it.
+        found: the residual's derivatives by what is free already, in physical units.
+        whitening: of the outputs.
+        residual: whitened.
+        surrogates: of it.
+    """
+
+    seen: Along
+    found: Blocks
+    whitening: Float[Array, "outputs outputs"]
+    residual: Float[Array, "segments samples outputs"]
+    surrogates: Float[Array, "draws segments rows"]
+
+
+def _sight(fit: Fit, seed: int) -> _Sight:
+    problem = _looked_at(fit)
     followed: Followed = _on_host(follow(problem, fit.unknowns))
     found: Blocks = _on_host(linearise(problem, fit.unknowns))
     slopes = fit.free.slopes(fit.model)[None, None, :]
@@ -156,16 +196,24 @@ def _scores(fit: Fit, proposals: Sequence[Effect], seed: int) -> Iterator[tuple[
     followed = jax.tree.map(lambda a: where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
     segments = replace(segments, weight=where(kept[:, None], segments.weight, 0.0))
     residual = where(kept[:, None, None], residual, 0.0)
-    drawn = jnp.asarray(surrogates(fit, seed))
-    rows = float(np.sum(segments.weight)) * residual.shape[-1]
-    already = slopes.size
-    for own, forces in _batches(along(fit.model, followed, segments), proposals):
-        products = _inner_products(found, followed, segments, whitening, forces, residual, drawn)
-        gram, gradient, against = (np.asarray(a) for a in products)
-        yield (
-            {i: [already + c for c in columns] for i, columns in own.items()},
-            _Score(gram, gradient, against, rows),
-        )
+    seen = along(fit.model, followed, segments, fit.stretches)
+    return _Sight(seen, found, whitening, residual, jnp.asarray(surrogates(fit, seed)))
+
+
+def _score(sight: _Sight, forces: Regressors) -> _Score:
+    seen = sight.seen
+    rows = float(np.sum(seen.segments.weight)) * sight.residual.shape[-1]
+    products = _inner_products(
+        sight.found, seen.followed, seen.segments, sight.whitening, forces, sight.residual, sight.surrogates
+    )
+    gram, gradient, against = (np.asarray(a) for a in products)
+    return _Score(gram, gradient, against, rows)
+
+
+def _follow_on(training: Fit, held_out: Fit) -> bool:
+    """Whether each held-out stretch begins where a training stretch ends."""
+    ends = [(s.name, s.stop) for s in training.stretches]
+    return ends == [(s.name, s.start) for s in held_out.stretches]
 
 
 def _on_host(tree):
@@ -173,30 +221,65 @@ def _on_host(tree):
     return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)) if eqx.is_array(a) else a, tree)
 
 
-def _batches(seen: Along, proposals: Sequence[Effect]) -> Iterator[tuple[dict[int, list[int]], Regressors]]:
-    """Regressors of the proposals, as many as go into one program; the columns of each, by its place in the list."""
-    own: dict[int, list[int]] = {}
-    waiting: list[Regressors] = []
+class _Batch(eqx.Module):
+    """Proposals that one program takes at once.
+
+    Attributes:
+        columns: of each proposal, by its place in the list.
+        forces: regressors along the training motion and along the held-out one.
+        own_states: where each proposal's own states start in each training segment; None where it has none.
+    """
+
+    columns: dict[int, list[int]]
+    forces: tuple[Regressors, Regressors]
+    own_states: dict[int, np.ndarray | None]
+
+
+def _batches(sights: tuple[_Sight, _Sight], proposals: Sequence[Effect], follow_on: bool) -> Iterator[_Batch]:
+    """Regressors of the proposals, as many as go into one program."""
+
+    def looked_at(same: Sequence[Effect]) -> tuple[Regressors, Regressors, Memory | None]:
+        fitted, memory = regressors(sights[0].seen, same)
+        unseen, _ = regressors(sights[1].seen, same, memory if follow_on else None)
+        return fitted, unseen, memory
+
+    columns: dict[int, list[int]] = {}
+    own: dict[int, np.ndarray | None] = {}
+    waiting: list[tuple[Regressors, Regressors]] = []
     taken, index = 0, 0
-    for form in dict.fromkeys(type(p) for p in proposals):
-        same = [p for p in proposals if type(p) is form]
-        found = regressors(seen, same)
+    forms = dict.fromkeys(type(p) for p in proposals)
+    alike = [[p for p in proposals if type(p) is form] for form in forms]
+    for same, (*found, memory) in zip(alike, _beforehand(looked_at, alike), strict=True):
         strengths = len(strength_paths(same[0]))
         for i in range(len(same)):
             if waiting and taken + strengths > _COLUMNS:
-                yield own, _filled(waiting)
-                own, waiting, taken = {}, [], 0
+                yield _Batch(columns, _filled(waiting), own)
+                columns, own, waiting, taken = {}, {}, [], 0
             mine = slice(i * strengths, (i + 1) * strengths)
-            waiting.append(jax.tree.map(lambda a, mine=mine: a[..., mine], found))
-            own[index] = list(range(taken, taken + strengths))
+            waiting.append(jax.tree.map(lambda a, mine=mine: a[..., mine], tuple(found)))
+            columns[index] = list(range(taken, taken + strengths))
+            own[index] = None if memory is None else memory.at_starts[..., i]
             taken, index = taken + strengths, index + 1
     if waiting:
-        yield own, _filled(waiting)
+        yield _Batch(columns, _filled(waiting), own)
 
 
-def _filled(parts: Sequence[Regressors]) -> Regressors:
+def _beforehand(find: Callable[[_Item], _Found], items: Sequence[_Item]) -> Iterator[_Found]:
+    """What is found of each item in turn, the next two while the last one is used: each form has a program of its own
+    to be compiled."""
+    with ThreadPoolExecutor(_BEFOREHAND) as workers:
+        coming: deque[Future[_Found]] = deque()
+        for item in items:
+            coming.append(workers.submit(find, item))
+            if len(coming) > _BEFOREHAND:
+                yield coming.popleft().result()
+        while coming:
+            yield coming.popleft().result()
+
+
+def _filled(parts: Sequence[tuple[Regressors, Regressors]]) -> tuple[Regressors, Regressors]:
     """The parts side by side, with columns of zeros up to the next size that has a program."""
-    missing = -sum(part.reading.shape[-1] for part in parts) % _COLUMNS
+    missing = -sum(part.reading.shape[-1] for part, _ in parts) % _COLUMNS
 
     def joined(*columns: np.ndarray) -> np.ndarray:
         return np.concatenate([*columns, np.zeros((*columns[0].shape[:-1], missing))], axis=-1)

@@ -1,5 +1,7 @@
 """One program a model: it iterates to the least squares, and looks at any point on the way."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -49,6 +51,11 @@ def solve(problem: Problem, start: Unknowns, max_steps: int, damping: float) -> 
         damping: of the first step, see [`FIRST_DAMPING`][].
     """
     return _solve(problem, start, *(jnp.asarray(np.asarray(a)) for a in (max_steps, damping)))
+
+
+def prepare(problem: Problem, start: Unknowns) -> Callable[[], object]:
+    """Have the program for such a problem made beside what else is done; what is returned calls it off."""
+    return _solve.prepare(problem, start, *(jnp.asarray(np.asarray(a)) for a in (1, FIRST_DAMPING)))
 
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> Solution:

@@ -22,7 +22,7 @@ from fitting.residual import Problem
 from fitting.sandwich import Linearised, Record
 from hdjax import Model
 from hdjax.effects import Conditions
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import jit_small
 from hdjax.where import where
 
 # Draws of torque noise whose mean periodogram stands for its expectation.
@@ -161,7 +161,7 @@ def _pushes(model: Model, followed: Followed) -> Float[Array, "segments samples 
     return (followed.from_start + followed.from_end) @ rate
 
 
-@jit_kept
+@jit_small
 def _answers(problem: Problem, followed: Followed, noise: Array) -> Float[Array, "segments samples outputs draws"]:
     """Whitened residual that torque noise leaves, segment after segment; it does not stop where one starts anew."""
     pushes = _pushes(problem.model, followed)
@@ -180,7 +180,7 @@ def _answers(problem: Problem, followed: Followed, noise: Array) -> Float[Array,
     return -jnp.einsum("ij,snjd->snid", problem.whitening, outputs)
 
 
-@jit_kept
+@jit_small
 def _torque_scores(
     problem: Problem, followed: Followed, slopes: Float[Array, "segments samples outputs parameters"]
 ) -> Float[Array, "parameters parameters"]:

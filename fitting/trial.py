@@ -1,14 +1,17 @@
 """A model on trial: fitted to the training stretches, judged on those it has not seen."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from fitting.estimate import Fit, fit, states_from
+from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.free_run import FreeRun, free_run, rms_error
+from fitting.posing import pose_ahead, states_from
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -84,6 +87,7 @@ def challenge(
     *,
     champion: Trial,
     give_up_above: float = np.inf,
+    own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Trial | None:
     """The best fit of several starts, if it explains the training data at least as well as the model that it is to
     replace.
@@ -95,11 +99,21 @@ def challenge(
         setting: how the data are cut.
         champion: the model to replace.
         give_up_above: a lower objective that it must reach.
+        own_states: where the own states of the first model's last effect start, in each segment.
     """
     limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
 
     def begun(model: Model, give_up_above: float) -> Fit:
-        return trained(model, data, hold, setting, champion.training, give_up_above=give_up_above, retry_states=True)
+        return trained(
+            model,
+            data,
+            hold,
+            setting,
+            champion.training,
+            give_up_above=give_up_above,
+            retry_states=True,
+            own_states=own_states if model is models[0] else None,
+        )
 
     if len(models) > 1:
         # One pass each tells the best start; that one alone is followed to the end.
@@ -123,6 +137,7 @@ def trained(
     retry_states: bool = False,
     max_steps: int = _TRIAL_STEPS,
     reweigh: bool = True,
+    own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Fit:
     """A fit that starts with the covariance of one near by, and from its states as far as the model has the same.
 
@@ -136,8 +151,13 @@ def trained(
         retry_states: likewise; so they are in any case where the model has other states.
         max_steps: likewise.
         reweigh: likewise.
+        own_states: where the last effect's own states start, in each segment; as if they had long moved like this where
+            not given.
     """
     same = near is not None and near.model.state_names == model.state_names
+    states = None if near is None else states_from(model, near.model, near.unknowns.states)
+    if states is not None and own_states is not None:
+        states = jnp.concatenate([states[:, : -own_states.shape[1]], jnp.asarray(own_states)], axis=1)
     return fit(
         model,
         data[hold][0],
@@ -149,9 +169,32 @@ def trained(
         covariance=None if near is None else near.covariance,
         max_steps=max_steps,
         reweigh=reweigh,
-        states=None if near is None else states_from(model, near),
+        states=states,
         retry_states=retry_states or not same,
         give_up_above=give_up_above,
+    )
+
+
+def coming(model: Model, data: Data, hold: Hold, setting: Setting) -> Callable[[], object]:
+    """Have the program of a coming fit made beside what else is done.
+
+    Args:
+        model: equations; the values don't matter.
+        data: the stretches.
+        hold: what the torque does between samples.
+        setting: how the data are cut.
+
+    Returns:
+        What calls it off, where it has not begun.
+    """
+    return pose_ahead(
+        model,
+        data[hold][0],
+        fitted_paths(model),
+        horizon=setting.horizon,
+        halo=setting.halo,
+        substeps=setting.substeps,
+        count=setting.count,
     )
 
 

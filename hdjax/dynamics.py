@@ -182,6 +182,9 @@ class TwoInertiaModel(Model):
         for effect in self._of(MeshGeometryEffect):
             transmission = transmission + effect.slope(state[0])
         on_motor = torque - transmission * tau
+        for effect in self._of(MeshTorqueEffect):
+            if effect.reacts():
+                on_motor = on_motor + effect.reaction(motion, drive)
         for effect in self._of(MotorSideEffect):
             on_motor = on_motor + effect.torque(motion, drive, own[effect.name])
         on_load, load_inertia = tau + load_torque, drive.J_l

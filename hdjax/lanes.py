@@ -2,14 +2,14 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import Kept, jit_kept, jit_small
 
 _Tree = TypeVar("_Tree")
 _Arguments = ParamSpec("_Arguments")
@@ -20,17 +20,32 @@ _WIDE: Any = {"compiler_options": {"xla_cpu_prefer_vector_width": 512}}
 _LEAST_LANES = 8
 
 
-def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+class Lanes(Generic[_Arguments, _Result]):
+    """A function of arrays that the devices share; see [`jit_lanes`][]."""
+
+    def __init__(self, kept: Kept[_Arguments, _Result]):
+        self._kept = kept
+        functools.update_wrapper(self, kept)
+
+    def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        args, kwargs = _together((args, kwargs))
+        return self._kept(*args, **kwargs)
+
+    def prepare(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Callable[[], object]:
+        """As [`hdjax.program_cache.Kept.prepare`][]."""
+        args, kwargs = _together((args, kwargs))
+        return self._kept.prepare(*args, **kwargs)
+
+
+def jit_lanes(function: Callable[_Arguments, _Result]) -> Lanes[_Arguments, _Result]:
     """[`jit_kept`][hdjax.program_cache.jit_kept] for programs whose lanes [`hdjax.simulate.march`][] moves. None can be
     called inside another."""
-    kept = jit_kept(function, **_WIDE)
+    return Lanes(jit_kept(function, **_WIDE))
 
-    @functools.wraps(function)
-    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        args, kwargs = _together((args, kwargs))
-        return kept(*args, **kwargs)
 
-    return call
+def jit_small_lanes(function: Callable[_Arguments, _Result]) -> Lanes[_Arguments, _Result]:
+    """[`jit_lanes`][] for programs of little work, as [`jit_small`][hdjax.program_cache.jit_small]."""
+    return Lanes(jit_small(function))
 
 
 def _together(tree: _Tree) -> _Tree:

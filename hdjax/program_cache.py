@@ -16,8 +16,9 @@ import hashlib
 import re
 import uuid
 from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -31,14 +32,71 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _Program = Callable[[list[Any]], Any]
 
-_held: list[dict[Hashable, _Program | None]] = []
+# Compiling well takes longer than what it saves where there is little work.
+_SMALL: Any = {"compiler_options": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}}
+
+_held: list["Kept"] = []
 _SUFFIX = ".program"
 # Calls out of a program, and those that mean the same in every process: a Python callback is an address in this one.
 _CALL = re.compile(r"custom_call @\"?([\w.]+)")
 _LASTING_CALL = re.compile(r"lapack_\w+|ducc_fft\w*|Sharding|SPMD\w+")
 
 
-def jit_kept(function: Callable[_Arguments, _Result], **options: Any) -> Callable[_Arguments, _Result]:
+class Kept(Generic[_Arguments, _Result]):
+    """A function whose programs are kept; see [`jit_kept`][]."""
+
+    def __init__(self, function: Callable[_Arguments, _Result], options: dict[str, Any]):
+        self._function, self._options = function, options
+        self._plain = eqx.filter_jit(function, **options)
+        # Only a program of its own may have options.
+        self._inside = eqx.filter_jit(function)
+        self._programs: dict[Hashable, _Program | None] = {}
+        self._coming: dict[Hashable, Future[_Program | None]] = {}
+        functools.update_wrapper(self, function)
+        _held.append(self)
+
+    def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            return self._inside(*args, **kwargs)
+        folder = _folder()
+        if folder is None:
+            return self._plain(*args, **kwargs)
+        key = _made_for(leaves, structure)
+        if key not in self._programs:
+            coming = self._coming.pop(key, None)
+            # What still waits behind others is made here.
+            if coming is None or coming.cancel():
+                self._programs[key] = self._program(folder, args, kwargs)
+            else:
+                self._programs[key] = coming.result()
+        program = self._programs[key]
+        return self._plain(*args, **kwargs) if program is None else program(_arrays(leaves))
+
+    def prepare(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Callable[[], object]:
+        """Have the program for such arguments made beside what else is done, before it is called for.
+
+        Returns:
+            What calls it off, where it has not begun.
+        """
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        folder, key = _folder(), _made_for(leaves, structure)
+        known = key in self._programs or (key in self._coming and not self._coming[key].cancelled())
+        if folder is None or known:
+            return lambda: None
+        self._coming[key] = _beside().submit(self._program, folder, args, kwargs)
+        return self._coming[key].cancel
+
+    def forget(self) -> None:
+        """Let go of the programs that this process holds."""
+        self._programs.clear()
+        self._coming.clear()
+
+    def _program(self, folder: Path, args: Any, kwargs: Any) -> _Program | None:
+        return _program(folder, self._function, self._options, (args, kwargs))
+
+
+def jit_kept(function: Callable[_Arguments, _Result], **options: Any) -> Kept[_Arguments, _Result]:
     """`eqx.filter_jit` whose programs are kept between processes, where JAX keeps those that it compiles.
 
     Inside another program, or where JAX keeps nothing, it is `eqx.filter_jit`.
@@ -47,29 +105,29 @@ def jit_kept(function: Callable[_Arguments, _Result], **options: Any) -> Callabl
         function: a function of a module, not one made inside another.
         options: of `jax.jit`.
     """
-    plain = eqx.filter_jit(function, **options)
-    programs: dict[Hashable, _Program | None] = {}
-    _held.append(programs)
+    return Kept(function, options)
 
-    @functools.wraps(function)
-    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        folder = _folder()
-        leaves, structure = jax.tree.flatten((args, kwargs))
-        if folder is None or any(isinstance(leaf, Tracer) for leaf in leaves):
-            return plain(*args, **kwargs)
-        key = (structure, *map(_kind, leaves), *_settings().values())
-        if key not in programs:
-            programs[key] = _program(folder, function, options, (args, kwargs))
-        program = programs[key]
-        return plain(*args, **kwargs) if program is None else program(_arrays(leaves))
 
-    return call
+def jit_small(function: Callable[_Arguments, _Result]) -> Kept[_Arguments, _Result]:
+    """[`jit_kept`][] for programs of so little work that they are rather compiled in no time than well."""
+    return jit_kept(function, **_SMALL)
+
+
+@functools.cache
+def _beside() -> ThreadPoolExecutor:
+    """Where programs are made beside what else is done."""
+    return ThreadPoolExecutor(1)
+
+
+def _made_for(leaves: Sequence[Any], structure: Any) -> Hashable:
+    """What of its arguments a program depends on."""
+    return (structure, *map(_kind, leaves), *_settings().values())
 
 
 def forget() -> None:
     """Let go of the programs that this process holds, as `jax.clear_caches` does of JAX's own; kept ones stay kept."""
-    for programs in _held:
-        programs.clear()
+    for kept in _held:
+        kept.forget()
 
 
 def _folder() -> Path | None:

@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 
 import rig
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, normal_equations, project
-from fitting.estimate import initial_states
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths, free_parameters
+from fitting.posing import initial_states
 from fitting.residual import Blocks, Problem, Unknowns, blocks, residual, residual_with_blocks
 
 SEGMENTS, ROWS, PARAMETERS, STATES = 4, 11, 3, 2

@@ -1,13 +1,19 @@
 """Competitors of one round: what a gain is worth."""
 
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import rig
-from fitting.attribution import look
+from fitting import attribution
+from fitting.attribution import Verdict, look
 from fitting.base_fit import base_fit
-from fitting.estimate import segment_length
 from fitting.experiment import segment_count, split
+from fitting.free import effect_paths
+from fitting.posing import segment_length
 from fitting.trial import Setting, Trial, attempt, halo_for
+from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
@@ -44,3 +50,42 @@ def test_memory_that_stands_for_something_else_does_not_last(verdicts):
     before, found = verdicts
     creep = found["creep"]
     assert 0.0 <= creep.gain < 0.7 * short_gain(before, creep.trial)
+
+
+def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
+    """Errors of 1000 and 1 in units of the noise: the last unit is a thousandth of what was removed before."""
+    trial, _ = verdicts
+
+    def with_error(rms: float) -> Trial:
+        return eqx.tree_at(lambda t: t.held_out.covariance, trial, jnp.asarray([[1.0 + rms**2]]))
+
+    base, before, after = with_error(1000.0), with_error(1.0), with_error(0.0)
+    assert attribution._imperfect_share(after, before, base) == pytest.approx(1e-3, rel=1e-3)
+    assert attribution._imperfect_share(after, base, base) == np.inf
+
+
+def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether a strength counts as determined beside K, by a fit with this covariance."""
+    model = rig.reduced_model().with_effects(effect)
+    paths = ("mu", *effect_paths(effect))
+    spread = np.sqrt(np.diag(covariance))
+    values = {p: float(model.get(p)) for p in paths}
+    estimates = {
+        p: Estimate(p, v, s, s, (v - 1.96 * s, v + 1.96 * s), "", False)
+        for (p, v), s in zip(values.items(), spread, strict=True)
+    }
+    found = Uncertainty(estimates, covariance / np.outer(spread, spread), covariance, covariance)
+    monkeypatch.setattr(attribution, "uncertainty", lambda *args, **options: found)
+    before, _ = verdicts
+    trial = eqx.tree_at(lambda t: t.model, before, model)
+    return attribution._strength_is_determined(Verdict(effect.name, effect.family, trial, 1.0, 0.005, True))
+
+
+def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: pytest.MonkeyPatch):
+    """A creep's stiffness over its time is known, neither of them is; at the fitted time the stiffness is known."""
+    creep = Creep(k=400.0, tau=0.5, span=1e-3)
+    along_valley = np.diag([1.0, 0.0, 0.0])
+    along_valley[1:, 1:] = np.outer([400.0, 1.0], [400.0, 1.0])
+    assert told_from_zero(verdicts, creep, along_valley + np.diag([0.0, 50.0**2, 0.0]), monkeypatch)
+    assert not told_from_zero(verdicts, creep, along_valley + np.diag([0.0, 400.0**2, 0.0]), monkeypatch)
+    assert not told_from_zero(verdicts, creep, np.diag([1.0, 400.0**2, 1.0]), monkeypatch)

@@ -9,12 +9,12 @@ from hdjax.effects import Motion
 from hdjax.effects.creep import Creep
 
 OMEGA, SHARE, TAU = 60.0, 0.25, 0.8
-EFFECT = Creep(share=SHARE, tau=TAU, span=1e-3)
+EFFECT = Creep(k=SHARE * OMEGA**2, tau=TAU, span=1e-3)
 DRIVE = ReducedDrive(mu=80.0, omega_0=OMEGA)
 
 
 def test_after_a_step_the_twist_relaxes_to_its_end():
-    """At once F / (omega_0^2 (1 + share)), in the end F / omega_0^2, between them exp(-t / (tau (1 + share))).
+    """At once F / (K (1 + share)), in the end F / K = F / omega_0^2, between them exp(-t / (tau (1 + share))).
 
     Inertia and damping follow in 1 / 30 s; they leave the slow motion late by about mu / omega_0^2 = 0.02 s.
     """

@@ -18,10 +18,11 @@ from hdjax.effects.actuation import InputDelay
 from hdjax.effects.backlash import Backlash
 from hdjax.effects.creep import Creep
 from hdjax.effects.friction import CoulombFriction, MotorFriction, StribeckMotorFriction
-from hdjax.effects.hysteresis import BoucWen
+from hdjax.effects.hysteresis import BoucWen, SharpBoucWen
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.load import GravityLoad
-from hdjax.effects.resonance import ExtraResonance
+from hdjax.effects.position import ConservativePositionDependentStiffness
+from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.stiffness import ThreeSlopeStiffness
 from hdjax.parameters import own_parameters
 from hdjax.simulate import march
@@ -200,7 +201,9 @@ def energy(model: TwoInertiaModel, states) -> np.ndarray:
     if "kinematic_error" in names:
         for n in (1, 2, 4):
             x = x + value[f"cos_{n}"] * np.cos(n * theta_m) + value[f"sin_{n}"] * np.sin(n * theta_m)
-    if "backlash" in names:
+    if "kinematic_harmonic" in names:
+        x = x + value["cosine"] * np.cos(value["n"] * theta_m) + value["sine"] * np.sin(value["n"] * theta_m)
+    if names & {"backlash", "undamped_backlash"}:
         return total + K * spring(np.sign(x) * np.maximum(np.abs(x) - value["b"], 0.0), alpha)
     total = total + K * spring(x, alpha)
     if "quadratic_stiffness" in names:
@@ -234,13 +237,19 @@ def energy(model: TwoInertiaModel, states) -> np.ndarray:
             shifted = a * np.cos(n * theta_m) + b * np.sin(n * theta_m)
             total = total + K * (spring(x + shifted, alpha) - spring(x, alpha))
             x = x + shifted
-    if "bouc_wen" in names:
+    if "conservative_position_dependent_stiffness" in names:
+        n = value["n"]
+        ripple = value["cosine"] * np.cos(n * theta_m) + value["sine"] * np.sin(n * theta_m)
+        total = total + K * spring(x, alpha) * ripple
+    if names & {"bouc_wen", "sharp_bouc_wen"}:
         total = total + value["k"] * own[0] ** 2 / 2
     if "creep" in names:
-        total = total + value["share"] * K * (x - own[0]) ** 2 / 2
-    if "extra_resonance" in names:
+        total = total + value["k"] * (x - own[0]) ** 2 / 2
+    if names & {"extra_resonance", "resonance_beside_load"}:
         J_3 = value["mass_ratio"] * value["J_l"]
-        total = total + J_3 * (value["omega_3"] ** 2 * own[0] ** 2 + own[1] ** 2 - omega_l**2) / 2
+        total = total + J_3 * (value["omega_3"] ** 2 * own[0] ** 2 + own[1] ** 2) / 2
+    if "extra_resonance" in names:
+        total = total - J_3 * omega_l**2 / 2
     return total
 
 
@@ -254,7 +263,7 @@ DISSIPATIVE = (
     "creep",
     "extra_resonance",
 )
-STORE_IS_KNOWN = (BoucWen, Creep, ExtraResonance)
+STORE_IS_KNOWN = (BoucWen, SharpBoucWen, Creep, ExtraResonance, ResonanceBesideLoad)
 
 
 def forms_of(families):
@@ -267,7 +276,11 @@ def lossless(form, share=0.2):
     return model, np.asarray(released(model))
 
 
-@forms_of(CONSERVATIVE)
+@pytest.mark.parametrize(
+    "form",
+    [*(f for f in CATALOGUE if f.family in CONSERVATIVE), ConservativePositionDependentStiffness],
+    ids=lambda form: form.name,
+)
 def test_a_conservative_effect_keeps_the_energy(form):
     model, states = lossless(form)
     found = energy(model, states)

@@ -7,25 +7,12 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import (
-    Fit,
-    fit,
-    initial_states,
-    lost,
-    measurement_noise,
-    needed_substeps,
-    short_horizon,
-    states_from,
-    suggested_substeps,
-    whitening,
-)
-from fitting.experiment import Stretch, cut, experiment_from_log
+from fitting.estimate import Fit, fit, lost, measurement_noise, needed_substeps, whitening
+from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
 from fitting.uncertainty import uncertainty
 from hdjax.effects.backlash import Backlash
-from hdjax.effects.creep import Creep
 from hdjax.effects.friction import CoulombFriction
-from hdjax.effects.hysteresis import BoucWen
 
 COUNT, HORIZON = 2000, 256
 REDUCED_COUNT, REDUCED_HORIZON = 1000, 128
@@ -186,28 +173,6 @@ def test_measurement_noise_needs_no_good_model():
     assert noise[1.02] < 0.2 * fits[1.02].dynamic_error_std
 
 
-def test_initial_states_of_a_smooth_motion():
-    torque = rig.drive_torque(200)
-    segments = cut(whole(rig.drive_experiment(200, noise=0.0)), 50)
-    states = initial_states(rig.drive_model(), segments)
-    expected = rig.drive_motion(torque)[::50]
-    # A cubic through eight intervals, a quarter of a period: a few percent of the rates.
-    off = np.max(np.abs(np.asarray(states) - expected), axis=0) / np.max(np.abs(expected), axis=0)
-    np.testing.assert_array_less(off, [0.01, 0.01, 0.15, 0.15])
-
-
-def test_initial_speeds_of_a_noisy_oversampled_motion():
-    forcing = np.repeat(rig.reduced_forcing(100), 20)
-    step = rig.REDUCED_STEP / 20
-    motion = rig.reduced_motion(forcing, step=step)
-    log = rig.reduced_log(motion[:, 0], forcing, noise=0.1 * np.std(motion[:, 0]), step=step)
-    segments = cut(whole(experiment_from_log(log, hold="zero-order")), 200, count=10)
-    states = np.asarray(initial_states(rig.reduced_model(), segments))
-    off = np.sqrt(np.mean((states - motion[::200]) ** 2, axis=0)) / np.std(motion, axis=0)
-    # 87 samples in a quarter period; from nine of them the speed would be mere noise.
-    np.testing.assert_array_less(off, [0.2, 0.5])
-
-
 def test_a_dead_zone_is_recovered_from_afar():
     """Long segments of a nonsmooth drive have many minima; windows that grow lead past them."""
     gap = 1.5e-4
@@ -227,31 +192,6 @@ def test_a_start_that_is_no_number_explains_nothing(found: Fit, stretches):
 def test_whitening_inverts_the_covariance():
     W = np.asarray(whitening(NOISE))
     np.testing.assert_allclose(W @ np.asarray(NOISE) @ W.T, np.eye(2), atol=1e-9)
-
-
-def test_horizon_and_steps_follow_the_frequency():
-    stretches = whole(rig.drive_experiment(400))
-    slow, fast = rig.drive_model(K=rig.K / 100, alpha=0.0), rig.drive_model(K=100 * rig.K, alpha=0.0)
-    assert suggested_substeps(slow, stretches) == 1
-    # omega_0 h = 3855 * 5e-4 = 1.93, at most 0.15 a step.
-    assert suggested_substeps(fast, stretches) == 13
-    # Six periods of 2 pi / (38.55 * 5e-4) = 326 samples, to the next power of two.
-    assert short_horizon(slow, stretches) == 2048
-    assert short_horizon(rig.drive_model(alpha=0.0), stretches) == 256
-
-
-def test_states_of_another_model_are_taken_by_name(found: Fit):
-    hidden = BoucWen(k=10.0, memory_twist=1e-3)
-    model = found.model.with_effects(hidden)
-    states = np.asarray(states_from(model, found))
-    np.testing.assert_array_equal(states[:, :4], np.asarray(found.unknowns.states))
-    # What has long moved as it does has no memory of anything else.
-    np.testing.assert_array_equal(states[:, 4], 0.0)
-    remembered = replace(found, model=model, unknowns=replace(found.unknowns, states=jnp.asarray(states + 1.0)))
-    creeping = found.model.with_effects(Creep(tau=0.1, share=0.1, span=1e-3), hidden)
-    mixed = np.asarray(states_from(creeping, remembered))
-    assert creeping.state_names[4:] == ("creep.z", "bouc_wen.z")
-    np.testing.assert_array_equal(mixed[:, [0, 1, 2, 3, 5]], states + 1.0)
 
 
 def test_a_segment_that_runs_away_is_lost(found: Fit):

@@ -8,16 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hdjax import Drive, TwoInertiaModel
-from hdjax.effects.resonance import ExtraResonance
+from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 
 N, J_M, J_L, K, B = 50.0, 5.26e-4, 5.0e-2, 7160.0, 0.4
 
 
-def model(J_3: float, K_3: float, B_3: float) -> TwoInertiaModel:
+def model(J_3: float, K_3: float, B_3: float, form=ExtraResonance) -> TwoInertiaModel:
     omega = np.sqrt(K_3 / J_3)
-    effect = ExtraResonance(
-        mass_ratio=J_3 / J_L, omega_3=omega, zeta=B_3 / (2 * omega * J_3), twist_span=1e-3, rate_span=1.0
-    )
+    effect = form(mass_ratio=J_3 / J_L, omega_3=omega, zeta=B_3 / (2 * omega * J_3), twist_span=1e-3, rate_span=1.0)
     return TwoInertiaModel(Drive(N=N, J_m=J_M, J_l=J_L, K=K, B_sp=B), (effect,))
 
 
@@ -31,7 +29,7 @@ def linear(model: TwoInertiaModel) -> tuple[jax.Array, jax.Array]:
     )
 
 
-def three_masses(J_3: float, K_3: float, B_3: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def three_masses(J_3: float, K_3: float, B_3: float, left: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mass, damping and stiffness of motor (at the output), load and third inertia."""
     pair = np.array([[1.0, -1.0], [-1.0, 1.0]])
     stiffness, damping = np.zeros((3, 3)), np.zeros((3, 3))
@@ -39,15 +37,17 @@ def three_masses(J_3: float, K_3: float, B_3: float) -> tuple[np.ndarray, np.nda
     stiffness[1:, 1:] += K_3 * pair
     damping[:2, :2] += B * pair
     damping[1:, 1:] += B_3 * pair
-    return np.diag([N**2 * J_M, J_L - J_3, J_3]), damping, stiffness
+    return np.diag([N**2 * J_M, left, J_3]), damping, stiffness
 
 
+@pytest.mark.parametrize("form", [ExtraResonance, ResonanceBesideLoad])
 @given(ratio=st.floats(1e-3, 0.8), omega=st.floats(50.0, 3000.0), zeta=st.floats(1e-3, 0.5))
-def test_poles_and_transfer_function_of_three_masses(ratio, omega, zeta):
+def test_poles_and_transfer_function_of_three_masses(form, ratio, omega, zeta):
     J_3 = ratio * J_L
     K_3, B_3 = J_3 * omega**2, 2 * zeta * omega * J_3
-    A, b = (np.asarray(a) for a in linear(model(J_3, K_3, B_3)))
-    M, D, S = three_masses(J_3, K_3, B_3)
+    A, b = (np.asarray(a) for a in linear(model(J_3, K_3, B_3, form)))
+    left = J_L - J_3 if form is ExtraResonance else J_L
+    M, D, S = three_masses(J_3, K_3, B_3, left)
     inverse = np.linalg.inv(M)
     other = np.block([[np.zeros((3, 3)), np.eye(3)], [-inverse @ S, -inverse @ D]])
     # Eigenvalues of a double root at zero (the drive turns freely) err by the root of the rounding.

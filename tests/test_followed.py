@@ -19,6 +19,7 @@ from fitting.residual import simulate_segments
 from hdjax import PiecewisePolynomial
 from hdjax.effects import Effect
 from hdjax.effects.actuation import InputDelay, TorqueBias
+from hdjax.effects.creep import Creep
 from hdjax.effects.damping import DisplacementDamping, QuadraticDamping
 from hdjax.effects.effect import Scales
 from hdjax.effects.kinematic import KinematicError
@@ -71,7 +72,8 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     start = float(getattr(effect, name))
     both = [eqx.tree_at(lambda e: getattr(e, name), effect, jnp.asarray(start + sign * size)) for sign in (0.0, 1.0)]
     slope = (simulated(found, both[1]) - simulated(found, both[0])) / size
-    forces = jax.tree.map(jnp.asarray, regressors(along(found.model, followed, found.problem.segments), [effect]))
+    seen = along(found.model, followed, found.problem.segments, found.stretches)
+    forces, _ = jax.tree.map(jnp.asarray, regressors(seen, [effect]))
     column = [p.split(".")[1] for p in strength_paths(effect)].index(name)
     outputs, _ = respond(followed, forces.at_start, forces.at_end)
     answer = np.asarray(outputs + forces.reading)[..., column]
@@ -90,10 +92,41 @@ def test_a_motion_of_a_model_that_knows_time_and_temperature(found: Fit, followe
         knots, jnp.stack([jnp.full_like(knots[:, 1:], 300.0), jnp.zeros_like(knots[:, 1:])], axis=-1)
     )
     segments = replace(segments, temperature=warm)
-    plain = along(found.model, followed, found.problem.segments)
-    seen = along(model, followed, segments)
+    plain = along(found.model, followed, found.problem.segments, found.stretches)
+    seen = along(model, followed, segments, found.stretches)
     assert len(plain.pushes) == 6
     for name, push in plain.pushes.items():
         if name != "slope":
             factor = 1.00685 if name == "error" else 1.0
             np.testing.assert_allclose(seen.pushes[name], factor * push, rtol=1e-12, atol=0.0)
+
+
+def test_own_states_follow_the_motion_and_go_on():
+    """Creep's state is the twist behind a lag; the stretch that comes next takes it over."""
+    tau = 0.03
+    creep = Creep(tau=tau, span=1e-3)
+    model = rig.drive_model()
+    parts = split([rig.drive_experiment(COUNT)], held_out=0.3)
+    fits = [fit(model, part, base_paths(model), horizon=64, substeps=3, halo=4, count=3) for part in parts]
+    first, second = (
+        along(f.model, follow(replace(f.problem, model=f.model), f.unknowns), f.problem.segments, f.stretches)
+        for f in fits
+    )
+    _, memory = regressors(first, [creep, creep])
+    _, later = regressors(second, [creep, creep], memory)
+    _, afresh = regressors(second, [creep, creep])
+    assert memory is not None and later is not None and afresh is not None
+    assert memory.at_starts.shape == (3, 1, 2) and memory.at_ends.shape == (1, 1, 2)
+    # A straight line through each interval of the twist as it was measured, in closed form.
+    twist = np.asarray(parts[0][0].experiment.measured)[:, 1]
+    z, decay = [twist[0]], np.exp(-rig.STEP / tau)
+    for x, rise in zip(twist, np.diff(twist), strict=False):
+        z.append(x + (z[-1] - x) * decay + rise - rise * tau / rig.STEP * (1.0 - decay))
+    border = parts[0][0].stop
+    expected = np.array([z[0], z[64], z[128]])
+    size = np.abs(z).max()
+    np.testing.assert_allclose(memory.at_starts[:, 0, 0], expected, atol=0.02 * size)
+    np.testing.assert_allclose(memory.at_ends[0, 0], z[border], atol=0.02 * size)
+    np.testing.assert_array_equal(later.at_starts[0], memory.at_ends[0])
+    np.testing.assert_allclose(later.at_starts[1, 0], z[border + 64], atol=0.02 * size)
+    assert abs(afresh.at_starts[0, 0, 0] - z[border]) > 0.1 * size

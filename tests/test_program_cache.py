@@ -4,6 +4,7 @@ import dataclasses
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import pytest
 
 from fitting.free import FreeParameters, base_paths, strength_paths
 from hdjax import ReducedDrive, program_cache, program_store, surroundings
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import Kept, jit_kept
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ class Traced:
         counted.__module__, counted.__qualname__ = "hdjax.example", "example"
         self._function = counted
 
-    def in_new_process(self) -> Callable:
+    def in_new_process(self) -> Kept:
         """The function, with nothing in memory of what was compiled before."""
         return jit_kept(self._function)
 
@@ -63,6 +64,43 @@ def test_a_kept_program_is_not_traced_again(folder: Path):
     plain = eqx.filter_jit(times)(x, 3)
     assert jax.tree.structure(plain) == jax.tree.structure(again) and plain["how"] == again["how"]
     np.testing.assert_array_equal(plain["product"], again["product"])
+
+
+def test_a_program_is_made_before_it_is_called_for(folder: Path):
+    traced, x = Traced(times), jnp.linspace(0.0, 1.0, 5)
+    function = traced.in_new_process()
+    function.prepare(x, 3)
+    first = function(x, 3)
+    function.prepare(x, 3)
+    assert traced.count == 1 and len(files(folder)) == 1
+    assert eqx.tree_equal(first, eqx.filter_jit(times)(x, 3))
+
+
+def test_what_waits_is_called_off_or_made_at_once(folder: Path):
+    traced, released = Traced(times), threading.Event()
+    slow = Traced(lambda x: x if released.wait(60) else None)
+    waited_for, function = slow.in_new_process(), traced.in_new_process()
+    waited_for.prepare(X)
+    call_off = function.prepare(X, 3)
+    # The one before it is still being made.
+    function(X, 3)
+    assert traced.count == 1
+    function.prepare(X, 4)()
+    assert call_off() and traced.count == 1
+    released.set()
+    np.testing.assert_array_equal(waited_for(X), X)
+    assert slow.count == 1
+    # What was called off can be asked for again.
+    function.prepare(X, 4)
+    function(X, 4)
+    assert traced.count == 2
+
+
+def test_nothing_is_prepared_where_nothing_is_kept():
+    traced = Traced(times)
+    function = traced.in_new_process()
+    assert not function.prepare(X, 3)()
+    assert traced.count == 0
 
 
 FREE = FreeParameters(("mu",), (False,), jnp.ones(1))
@@ -248,7 +286,7 @@ jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 import numpy as np
 from fitting.estimate import whitening
 from hdjax.lanes import spread
-from hdjax.program_cache import jit_kept
+from hdjax.program_cache import Kept, jit_kept
 
 def cumulated(lanes):
     return lanes.cumsum(axis=1), lanes.sum()

@@ -9,6 +9,8 @@ from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
+_ONSET, _NOTHING = 0.02, 1e-30
+
 
 class Backlash(MeshTorqueEffect):
     """The spring acts on `x - clip(x, -b, b)`: no stiffness within +-b of the middle."""
@@ -34,3 +36,19 @@ class Backlash(MeshTorqueEffect):
         x = motion.x
         engaged = x - jnp.clip(x, -self.b, self.b)
         return drive.stiffness * (restoring(engaged, drive.alpha) - restoring(x, drive.alpha))
+
+
+class UndampedBacklash(Backlash):
+    """The same dead zone, within which the mesh does not damp either.
+
+    Damping sets in over a fiftieth of the zone's half-width beyond its edge, so that it has a derivative.
+    """
+
+    name: ClassVar[str] = "undamped_backlash"
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        beyond = jnp.maximum(jnp.abs(motion.x) - self.b, 0.0)
+        part = jnp.minimum(beyond / (_ONSET * self.b + _NOTHING), 1.0)
+        engaged = part * part * (3.0 - 2.0 * part)
+        damping = drive.mesh_torque(jnp.zeros_like(motion.x), motion.v)
+        return super().torque(motion, drive, state) - (1.0 - engaged) * damping

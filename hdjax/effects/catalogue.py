@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
-from hdjax.effects.backlash import Backlash
+from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.cogging import Cogging, SingleOrderCogging
 from hdjax.effects.creep import Creep
 from hdjax.effects.damping import CubicDamping, DisplacementDamping, QuadraticDamping
@@ -15,16 +15,18 @@ from hdjax.effects.friction import (
     MotorFriction,
     StribeckMotorFriction,
 )
-from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip
-from hdjax.effects.kinematic import KinematicError, KinematicSidebands
+from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
 from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
+    ConservativePositionDependentStiffness,
     PositionDependentMeshFriction,
     PositionDependentMotorFriction,
     PositionDependentStiffness,
+    RipplingMotorFriction,
 )
 from hdjax.effects.presliding import DahlMotorFriction, LuGreMotorFriction
-from hdjax.effects.resonance import ExtraResonance
+from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
@@ -45,6 +47,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     LuGreMotorFriction,
     LoadFriction,
     KinematicError,
+    KinematicHarmonic,
     KinematicSidebands,
     TorqueBias,
     TorqueGain,
@@ -55,16 +58,21 @@ CATALOGUE: tuple[type[Effect], ...] = (
     LoadDisturbance,
     TwoLineDisturbance,
     Backlash,
+    UndampedBacklash,
     BoucWen,
+    SharpBoucWen,
     Dahl,
     MaxwellSlip,
     Creep,
     Cogging,
     SingleOrderCogging,
     PositionDependentStiffness,
+    ConservativePositionDependentStiffness,
     PositionDependentMotorFriction,
+    RipplingMotorFriction,
     PositionDependentMeshFriction,
     ExtraResonance,
+    ResonanceBesideLoad,
     ThermalStiffness,
     ThermalDamping,
     ThermalMotorFriction,

@@ -11,10 +11,11 @@ from hdjax.parameters import Scalar, parameter
 
 
 class Creep(MeshTorqueEffect):
-    """Torque `share K (x - z)` with `tau z' = x - z`: the standard linear solid.
+    """Torque `k (x - z)` with `tau z' = x - z`: the standard linear solid.
 
-    K is the stiffness after a long time, `(1 + share) K` that at once. After a step of the torque the twist goes its
-    last `share / (1 + share)` with the time constant `tau (1 + share)`.
+    K is the stiffness after a long time, `K + k` that at once. After a step of the torque the twist goes its last
+    `k / (K + k)` with the time constant `tau (1 + k / K)`. With k as a share of K, the product of both would make the
+    well-known sum K + k a curved valley, which a fit follows in small steps.
     """
 
     family: ClassVar[str] = "creep"
@@ -22,13 +23,8 @@ class Creep(MeshTorqueEffect):
     states: ClassVar[tuple[str, ...]] = ("z",)
     drawn_against: ClassVar[str | None] = None
 
-    share: Scalar = parameter(
-        0.0,
-        unit="1",
-        doc="stiffness that relaxes, over K",
-        source="EFFECTS: percent of the twist",
-        plausible=(1e-3, 1e-1),
-        role="strength",
+    k: Scalar = parameter(
+        0.0, unit="N m/rad", doc="stiffness that relaxes", source="EFFECTS: percent of the twist", role="strength"
     )
     tau: Scalar = parameter(
         unit="s", doc="relaxation time", source="EFFECTS: minutes to hours", bounds=(0.0, 1e7), role="shape"
@@ -43,7 +39,7 @@ class Creep(MeshTorqueEffect):
         return tuple(cls(tau=t, span=scales.x) for k, t in enumerate(times) if k == 0 or t > fastest)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
-        return self.share * drive.stiffness * (motion.x - state[0])
+        return self.k * (motion.x - state[0])
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
         return (jnp.zeros_like(self.tau) if motion is None else motion.x)[None]
@@ -53,3 +49,6 @@ class Creep(MeshTorqueEffect):
 
     def state_scale(self) -> Float[Array, "1"]:
         return self.span[None]
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {"share": (self.k / drive.stiffness, "1")}

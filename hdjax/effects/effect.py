@@ -166,6 +166,11 @@ class LoadSideEffect(Effect):
         """Inertia that is not on the load, although the drive's J_l counts it [kg m^2]."""
         return jnp.zeros_like(drive.J_l)
 
+    @classmethod
+    def takes_inertia(cls) -> bool:
+        """Whether there is such inertia."""
+        return cls.inertia_taken is not LoadSideEffect.inertia_taken
+
 
 class MeshTorqueEffect(Effect):
     """Adds to the torque that the mesh transmits.
@@ -178,6 +183,16 @@ class MeshTorqueEffect(Effect):
     @abc.abstractmethod
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         """Torque to add to `K f(x) + B_sp v` [N m]."""
+
+    def reaction(self, motion: Motion, drive: Drive) -> Array:
+        """Torque on the motor, along +theta_m, beside the mesh torque over N [N m]: what a spring whose energy depends
+        on the motor's angle puts there."""
+        return jnp.zeros_like(motion.x)
+
+    @classmethod
+    def reacts(cls) -> bool:
+        """Whether there is such a torque."""
+        return cls.reaction is not MeshTorqueEffect.reaction
 
 
 class MeshGeometryEffect(Effect):

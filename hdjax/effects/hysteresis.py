@@ -15,6 +15,10 @@ SOURCE = "Dhaouadi, Ghorbel, Gandhi 2003; Ruderman"
 SLIP = "Tjahjowidodo, Al-Bender, Van Brussel 2013: slip at 1e-4 to 1e-3 rad"
 
 
+# Beyond so many memory twists z is on its way back; with n > 1 a long step would throw it ever further.
+_FAR = 3.0
+
+
 class BoucWen(MeshTorqueEffect):
     """Torque `k z` with `z' = v - beta |v| |z|^(n-1) z - gamma v |z|^n`.
 
@@ -54,7 +58,7 @@ class BoucWen(MeshTorqueEffect):
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
         z = state[0] / self.memory_twist
         # |z|^(n-1) has no derivative at 0 where n = 1; the offset is far below any z that matters.
-        magnitude = power(z * z + 1e-30, 0.5 * (self.n - 1.0))
+        magnitude = power(jnp.minimum(z * z, _FAR**2) + 1e-30, 0.5 * (self.n - 1.0))
         bent = jnp.abs(motion.v) * z + self.ratio * motion.v * jnp.abs(z)
         return (motion.v - magnitude * bent)[None]
 
@@ -64,6 +68,18 @@ class BoucWen(MeshTorqueEffect):
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         beta = self.memory_twist**-self.n
         return {"beta": (beta, "rad^-n"), "gamma": (self.ratio * beta, "rad^-n")}
+
+
+class SharpBoucWen(BoucWen):
+    """[`BoucWen`][] whose yield is as sharp as the data say: n is fitted."""
+
+    name: ClassVar[str] = "sharp_bouc_wen"
+
+    n: Scalar = parameter(2.0, unit="1", doc="sharpness of the yield", source=SOURCE, bounds=(0.0, 1e2), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(memory_twist=fraction * scales.x) for fraction in (1.5, 0.5))
 
 
 class Dahl(MeshTorqueEffect):

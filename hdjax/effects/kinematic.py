@@ -59,6 +59,30 @@ class KinematicError(MeshGeometryEffect):
         return {k: v for n, a, b in self._terms for k, v in amplitude_and_phase(a, b, "rad", f"_{n}").items()}
 
 
+class KinematicHarmonic(MeshGeometryEffect):
+    """`e(theta_m) = cosine cos(n theta_m) + sine sin(n theta_m)` of one order that [`KinematicError`][] lacks."""
+
+    family: ClassVar[str] = "kinematic_error"
+    name: ClassVar[str] = "kinematic_harmonic"
+
+    cosine: Scalar = parameter(0.0, unit="rad", doc="cosine", source=SOURCE, plausible=PLAUSIBLE, role="strength")
+    sine: Scalar = parameter(0.0, unit="rad", doc="sine", source=SOURCE, plausible=PLAUSIBLE, role="strength")
+    n: Scalar = parameter(6.0, unit="1", doc="cycles in a motor revolution", bounds=(0.0, 1e3))
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return tuple(cls(n=n) for n in (6.0, 3.0, 8.0, 5.0, 10.0, 12.0))
+
+    def error(self, theta_m: Array) -> Array:
+        return ripple(theta_m, self.n, self.cosine, self.sine)
+
+    def slope(self, theta_m: Array) -> Array:
+        return ripple_slope(theta_m, self.n, self.cosine, self.sine)
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return amplitude_and_phase(self.cosine, self.sine, "rad")
+
+
 class KinematicSidebands(MeshGeometryEffect):
     """Kinematic error of order n that comes and goes with the output's revolution: orders `n +- 1/ratio`.
 

@@ -7,7 +7,7 @@ from jaxtyping import Array
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
 from hdjax.effects.friction import motor_rate, smooth_sign
-from hdjax.effects.ripple import amplitude_and_phase, ripple
+from hdjax.effects.ripple import amplitude_and_phase, ripple, ripple_slope
 from hdjax.parameters import Scalar, parameter
 
 _ORDERS = (1.0, 2.0, 4.0)
@@ -16,8 +16,7 @@ _ORDERS = (1.0, 2.0, 4.0)
 class PositionDependentStiffness(MeshTorqueEffect):
     """Torque `K f(x) (cosine cos(n theta_m) + sine sin(n theta_m))`: a stiffness that ripples with the motor angle.
 
-    The small torque `x^2 dK/dtheta_m / 2` that such a spring puts on the motor is left out, as in the literature: it
-    is `n N x / 2` of the ripple's own torque there, a few per cent.
+    As the literature writes it, without the small torque that a spring of such stiffness puts on the motor.
     """
 
     family: ClassVar[str] = "position_dependent_stiffness"
@@ -54,6 +53,22 @@ class PositionDependentStiffness(MeshTorqueEffect):
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "1")
+
+
+class ConservativePositionDependentStiffness(PositionDependentStiffness):
+    """The same ripple r(theta_m) of a spring that gives back what it stores.
+
+    With the energy `K F(x) r(theta_m)`, where `F' = f`, comes a torque `-K F(x) r'(theta_m)` on the motor: about
+    `n N x / 2` of what the ripple's mesh torque is there.
+    """
+
+    name: ClassVar[str] = "conservative_position_dependent_stiffness"
+
+    def reaction(self, motion: Motion, drive: Drive) -> Array:
+        assert motion.theta_m is not None
+        x_squared = motion.x * motion.x
+        stored = drive.stiffness * x_squared * (0.5 + 0.25 * drive.alpha * x_squared)
+        return -stored * ripple_slope(motion.theta_m, self.n, self.cosine, self.sine)
 
 
 class PositionDependentMotorFriction(MotorSideEffect):
@@ -125,3 +140,44 @@ class PositionDependentMeshFriction(MeshTorqueEffect):
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "N m")
+
+
+class RipplingMotorFriction(MotorSideEffect):
+    """Friction `(T_c + sum over n = 1, 2, 4 of cos_n cos(n theta_m) + sin_n sin(n theta_m)) sgn(omega_m)` against the
+    motor: [`PositionDependentMotorFriction`][] with several orders at once."""
+
+    family: ClassVar[str] = "position_dependent_friction"
+    name: ClassVar[str] = "rippling_motor_friction"
+    drawn_against: ClassVar[str | None] = "theta_m"
+
+    T_c: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="mean Coulomb torque at the motor",
+        source="Tuttle 1992",
+        bounds=(0.0, 1e3),
+        role="strength",
+    )
+    cos_1: Scalar = parameter(0.0, unit="N m", doc="cosine, order 1", source="Tuttle 1992", role="strength")
+    sin_1: Scalar = parameter(0.0, unit="N m", doc="sine, order 1", source="Tuttle 1992", role="strength")
+    cos_2: Scalar = parameter(0.0, unit="N m", doc="cosine, order 2", source="Tuttle 1992", role="strength")
+    sin_2: Scalar = parameter(0.0, unit="N m", doc="sine, order 2", source="Tuttle 1992", role="strength")
+    cos_4: Scalar = parameter(0.0, unit="N m", doc="cosine, order 4", source="Tuttle 1992", role="strength")
+    sin_4: Scalar = parameter(0.0, unit="N m", doc="sine, order 4", source="Tuttle 1992", role="strength")
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(transition=0.01 * scales.omega_m),)
+
+    @property
+    def _terms(self) -> tuple[tuple[int, Array, Array], ...]:
+        return (1, self.cos_1, self.sin_1), (2, self.cos_2, self.sin_2), (4, self.cos_4, self.sin_4)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        assert motion.theta_m is not None
+        level = sum((ripple(motion.theta_m, *term) for term in self._terms), start=self.T_c)
+        return -level * smooth_sign(motor_rate(motion), self.transition)
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return {k: v for n, a, b in self._terms for k, v in amplitude_and_phase(a, b, "N m", f"_{n}").items()}

@@ -10,19 +10,18 @@ from hdjax.effects.effect import Effect, LoadSideEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
 
-class ExtraResonance(LoadSideEffect):
-    """A part J_3 of the load's inertia is on a spring K_3 and a damper B_3: a flexible link or fixture.
+class _Resonance(LoadSideEffect):
+    """A third inertia J_3 on a spring K_3 and a damper B_3:
 
         J_3 theta_3'' = -K_3 (theta_3 - theta_l) - B_3 (theta_3' - theta_l')
 
-    and the opposite torque on the load, of which `J_l - J_3` is left: the drive's J_l is the whole. Kept in the terms
-    that a log determines well, and in which J_3 = 0 is the drive alone: `J_3 = mass_ratio J_l`, `K_3 = J_3 omega_3^2`,
-    `B_3 = 2 zeta omega_3 J_3`. The load's response has its zero at omega_3. States: `theta_3 - theta_l`, which stays
-    small on a load that turns, and `theta_3'`; both are driven by the load's rate alone.
+    and the opposite torque on the load. Kept in the terms that a log determines well, and in which J_3 = 0 is the drive
+    alone: `J_3 = mass_ratio J_l`, `K_3 = J_3 omega_3^2`, `B_3 = 2 zeta omega_3 J_3`. The load's response has its zero
+    at omega_3. States: `theta_3 - theta_l`, which stays small on a load that turns, and `theta_3'`; both are driven by
+    the load's rate alone.
     """
 
     family: ClassVar[str] = "extra_resonance"
-    name: ClassVar[str] = "extra_resonance"
     states: ClassVar[tuple[str, ...]] = ("twist", "omega")
     drawn_against: ClassVar[str | None] = None
 
@@ -46,16 +45,13 @@ class ExtraResonance(LoadSideEffect):
         return tuple(cls._at(scales.natural_frequency * ratio, scales, mass_ratio=0.2) for ratio in (0.7, 1.0, 1.4))
 
     @classmethod
-    def _at(cls, omega_3: float, scales: Scales, mass_ratio: float = 0.0) -> "ExtraResonance":
+    def _at(cls, omega_3: float, scales: Scales, mass_ratio: float = 0.0) -> "_Resonance":
         # Near its own resonance it swings far more than the drive twists.
         rate = 10.0 * scales.x * scales.natural_frequency
         return cls(mass_ratio=mass_ratio, omega_3=omega_3, twist_span=rate / omega_3, rate_span=rate)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return self.mass_ratio * drive.J_l * self._pull(motion, state)
-
-    def inertia_taken(self, drive: Drive) -> Array:
-        return self.mass_ratio * drive.J_l
 
     def _pull(self, motion: Motion, state: Array) -> Array:
         """What accelerates the load, over the mass ratio [rad/s^2]."""
@@ -82,3 +78,22 @@ class ExtraResonance(LoadSideEffect):
             "B_3": (2 * self.zeta * self.omega_3 * J_3, "N m s/rad"),
             "zero": (self.omega_3 / (2 * jnp.pi), "Hz"),
         }
+
+
+class ExtraResonance(_Resonance):
+    """A part J_3 of the load's inertia is on a spring and a damper, a flexible link: `J_l - J_3` is left on the load,
+    as the drive's J_l is the whole.
+    """
+
+    name: ClassVar[str] = "extra_resonance"
+
+    def inertia_taken(self, drive: Drive) -> Array:
+        return self.mass_ratio * drive.J_l
+
+
+class ResonanceBesideLoad(_Resonance):
+    """A third inertia J_3 that the drive's J_l does not count is on a spring and a damper beside the load: a payload or
+    a fixture that the drive file does not know of.
+    """
+
+    name: ClassVar[str] = "resonance_beside_load"
