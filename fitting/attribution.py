@@ -12,8 +12,9 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
-from fitting.screening import Lead, Screen, screen, screen_ahead
+from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import NEARLY, first_of_each_family, further_forms, possible_ties, worth_a_refit
+from fitting.sight import look_ahead
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, challenge, coming, lasting_share, trained
 from fitting.uncertainty import Estimate, uncertainty
 from hdjax import Hold, ReducedModel
@@ -116,7 +117,7 @@ def look(
         refit(first[:1])
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
-        screen_ahead(leader.training)
+        look_ahead(leader.training)
         gained = before.training.objective - leader.training.objective
         refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gained)
     else:

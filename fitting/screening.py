@@ -6,44 +6,27 @@ each effect's strength and gain to first order (a score test), on held-out data 
 surrogates of the residual gives the law of the best gain where there is nothing to find.
 """
 
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.fft import prev_fast_len
 
-from fitting.along import Along, along
-from fitting.estimate import Fit, lost
+from fitting.estimate import Fit
 from fitting.experiment import Segments, scales
 from fitting.explained import explained, solved
-from fitting.followed import Followed, follow
+from fitting.followed import Followed
 from fitting.free import strength_paths
-from fitting.posing import STEP_ANGLE, suggested_substeps
-from fitting.regressors import Memory, Regressors, regressors
-from fitting.residual import Blocks, Problem
-from fitting.solve import linearise
-from fitting.spectral_lines import STANDS_OUT, spectral_lines, surroundings
+from fitting.regressors import Regressors
+from fitting.residual import Blocks
+from fitting.sight import Sight, batches, follow_on, sight
+from fitting.spectral_lines import spectral_lines
+from fitting.surrogates import DRAWS
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 from hdjax.program_cache import jit_kept
-from hdjax.where import where
-
-_Item = TypeVar("_Item")
-_Found = TypeVar("_Found")
-DRAWS = 199
-"""Surrogate residuals; the smallest p-value that they can show is 1/200."""
-
-# Forms that are looked at at a time.
-_BEFOREHAND = 2
-# Columns that one program takes at once; as many proposals as fit share it.
-_COLUMNS = 16
 
 
 class Lead(eqx.Module):
@@ -105,8 +88,8 @@ def screen(
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
     null_gains = np.full(DRAWS, -np.inf)
-    sights = _sight(training, seed), _sight(held_out, seed + 1)
-    for batch in _batches(sights, proposals, _follow_on(training, held_out)):
+    sights = sight(training, seed), sight(held_out, seed + 1)
+    for batch in batches(sights, proposals, follow_on(training, held_out)):
         fitted, unseen = (_score(*pair) for pair in zip(sights, batch.forces, strict=True))
         for index, own in batch.columns.items():
             columns = [len(free_now) + c for c in own]
@@ -127,23 +110,6 @@ def screen(
     return Screen(tuple(ordered), null_gains)
 
 
-def screen_ahead(training: Fit) -> None:
-    """Have the program that follows a model's motion made beside what else is done, before [`screen`][] asks for it."""
-    follow.prepare(_looked_at(training), training.unknowns)
-
-
-def _looked_at(fit: Fit) -> Problem:
-    """What a fit has solved, at its solution."""
-    # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
-    # than this; the residual is the fit's own.
-    return replace(
-        fit.problem,
-        model=fit.model,
-        active=jnp.ones_like(fit.problem.active),
-        substeps=suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE),
-    )
-
-
 class _Score(eqx.Module):
     """Inner products of sensitivities with each other, with the residual, and with its surrogates.
 
@@ -160,47 +126,7 @@ class _Score(eqx.Module):
     rows: float
 
 
-class _Sight(eqx.Module):
-    """A fit's motion, and its residual in the form that inner products take.
-
-    Attributes:
-        seen: the motion as effects look at it.
-        found: the residual's derivatives by what is free already, in physical units.
-        whitening: of the outputs.
-        residual: whitened.
-        surrogates: of it.
-    """
-
-    seen: Along
-    found: Blocks
-    whitening: Float[Array, "outputs outputs"]
-    residual: Float[Array, "segments samples outputs"]
-    surrogates: Float[Array, "draws segments rows"]
-
-
-def _sight(fit: Fit, seed: int) -> _Sight:
-    problem = _looked_at(fit)
-    followed: Followed = _on_host(follow(problem, fit.unknowns))
-    found: Blocks = _on_host(linearise(problem, fit.unknowns))
-    slopes = fit.free.slopes(fit.model)[None, None, :]
-    found = replace(
-        found,
-        by_parameter=found.by_parameter / slopes,
-        before_by_parameter=found.before_by_parameter / slopes,
-    )
-    segments: Segments = _on_host(problem.segments)
-    whitening = _on_host(problem.whitening)
-    residual = _on_host(fit.error) @ whitening.T
-    # Where the model runs away there is no motion to look along.
-    kept = jnp.asarray(~lost(fit) & np.isfinite(np.asarray(followed.transition)).all(axis=(1, 2, 3)))
-    followed = jax.tree.map(lambda a: where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
-    segments = replace(segments, weight=where(kept[:, None], segments.weight, 0.0))
-    residual = where(kept[:, None, None], residual, 0.0)
-    seen = along(fit.model, followed, segments, fit.stretches)
-    return _Sight(seen, found, whitening, residual, jnp.asarray(surrogates(fit, seed)))
-
-
-def _score(sight: _Sight, forces: Regressors) -> _Score:
+def _score(sight: Sight, forces: Regressors) -> _Score:
     seen = sight.seen
     rows = float(np.sum(seen.segments.weight)) * sight.residual.shape[-1]
     products = _inner_products(
@@ -208,83 +134,6 @@ def _score(sight: _Sight, forces: Regressors) -> _Score:
     )
     gram, gradient, against = (np.asarray(a) for a in products)
     return _Score(gram, gradient, against, rows)
-
-
-def _follow_on(training: Fit, held_out: Fit) -> bool:
-    """Whether each held-out stretch begins where a training stretch ends."""
-    ends = [(s.name, s.stop) for s in training.stretches]
-    return ends == [(s.name, s.start) for s in held_out.stretches]
-
-
-def _on_host(tree):
-    """Arrays by way of the host: what follows is not shared among devices."""
-    return jax.tree.map(lambda a: jnp.asarray(np.asarray(a)) if eqx.is_array(a) else a, tree)
-
-
-class _Batch(eqx.Module):
-    """Proposals that one program takes at once.
-
-    Attributes:
-        columns: of each proposal, by its place in the list.
-        forces: regressors along the training motion and along the held-out one.
-        own_states: where each proposal's own states start in each training segment; None where it has none.
-    """
-
-    columns: dict[int, list[int]]
-    forces: tuple[Regressors, Regressors]
-    own_states: dict[int, np.ndarray | None]
-
-
-def _batches(sights: tuple[_Sight, _Sight], proposals: Sequence[Effect], follow_on: bool) -> Iterator[_Batch]:
-    """Regressors of the proposals, as many as go into one program."""
-
-    def looked_at(same: Sequence[Effect]) -> tuple[Regressors, Regressors, Memory | None]:
-        fitted, memory = regressors(sights[0].seen, same)
-        unseen, _ = regressors(sights[1].seen, same, memory if follow_on else None)
-        return fitted, unseen, memory
-
-    columns: dict[int, list[int]] = {}
-    own: dict[int, np.ndarray | None] = {}
-    waiting: list[tuple[Regressors, Regressors]] = []
-    taken, index = 0, 0
-    forms = dict.fromkeys(type(p) for p in proposals)
-    alike = [[p for p in proposals if type(p) is form] for form in forms]
-    for same, (*found, memory) in zip(alike, _beforehand(looked_at, alike), strict=True):
-        strengths = len(strength_paths(same[0]))
-        for i in range(len(same)):
-            if waiting and taken + strengths > _COLUMNS:
-                yield _Batch(columns, _filled(waiting), own)
-                columns, own, waiting, taken = {}, {}, [], 0
-            mine = slice(i * strengths, (i + 1) * strengths)
-            waiting.append(jax.tree.map(lambda a, mine=mine: a[..., mine], tuple(found)))
-            columns[index] = list(range(taken, taken + strengths))
-            own[index] = None if memory is None else memory.at_starts[..., i]
-            taken, index = taken + strengths, index + 1
-    if waiting:
-        yield _Batch(columns, _filled(waiting), own)
-
-
-def _beforehand(find: Callable[[_Item], _Found], items: Sequence[_Item]) -> Iterator[_Found]:
-    """What is found of each item in turn, the next two while the last one is used: each form has a program of its own
-    to be compiled."""
-    with ThreadPoolExecutor(_BEFOREHAND) as workers:
-        coming: deque[Future[_Found]] = deque()
-        for item in items:
-            coming.append(workers.submit(find, item))
-            if len(coming) > _BEFOREHAND:
-                yield coming.popleft().result()
-        while coming:
-            yield coming.popleft().result()
-
-
-def _filled(parts: Sequence[tuple[Regressors, Regressors]]) -> tuple[Regressors, Regressors]:
-    """The parts side by side, with columns of zeros up to the next size that has a program."""
-    missing = -sum(part.reading.shape[-1] for part, _ in parts) % _COLUMNS
-
-    def joined(*columns: np.ndarray) -> np.ndarray:
-        return np.concatenate([*columns, np.zeros((*columns[0].shape[:-1], missing))], axis=-1)
-
-    return jax.tree.map(joined, *parts)
 
 
 @jit_kept
@@ -305,31 +154,6 @@ def _inner_products(
         flat.T @ residual.reshape(-1),
         flat.T @ surrogates.reshape(surrogates.shape[0], -1).T,
     )
-
-
-def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
-    """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour.
-
-    A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave: with a
-    phase of its own it would still be explained by that effect.
-    """
-    random = np.random.default_rng(seed)
-    weight = np.asarray(fit.problem.segments.weight) > 0
-    error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T
-    series = error[weight].T
-    samples = series.shape[1]
-    length = prev_fast_len(samples, real=True)
-    spectrum = np.fft.rfft(series[:, :length])
-    power = np.sum(np.abs(spectrum) ** 2, axis=0)
-    spectrum = spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
-    found = np.zeros((DRAWS, *error.shape))
-    for draw in range(DRAWS):
-        turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
-        # Noise has no mean; what mean there is may be the very thing that is looked for.
-        turn[0] = 0.0
-        surrogate = np.fft.irfft(spectrum * turn[None, :], n=length)
-        found[draw][weight] = np.resize(surrogate.T, (samples, series.shape[0]))
-    return found.reshape(DRAWS, error.shape[0], -1)
 
 
 def _linear_gain(

@@ -26,7 +26,7 @@ from fitting.linear_look import (
     products,
     surrogate_gains,
 )
-from fitting.screening import surrogates
+from fitting.surrogates import surrogates
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, ReducedModel, sampled
 from hdjax.effects import Conditions, Motion

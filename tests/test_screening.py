@@ -9,7 +9,8 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.free import base_paths
-from fitting.screening import DRAWS, Screen, screen, surrogates
+from fitting.screening import Screen, screen
+from fitting.surrogates import DRAWS, surrogates
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash
