@@ -12,6 +12,7 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
+from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import NEARLY, first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
@@ -28,6 +29,8 @@ SIGNIFICANCE = 0.01
 # No form and no solver is exact: an effect that removes less than this share (rms) of what those before it have removed
 # may be what they get wrong themselves.
 _IMPERFECTION = 3e-3
+# Standard errors by which a strength must differ from zero: one percent of chance over a hundred forms and shapes.
+_BEST_OF_MANY = 3.9
 # Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
 # one finds the way.
 _HOLD_STEPS = 3
@@ -211,12 +214,12 @@ def _strength_is_determined(verdict: Verdict) -> bool:
 
 
 def _is_known(estimate: Estimate, part: float, effect: Effect) -> bool:
-    """Whether a strength is told from zero by an interval of which only a part is left."""
+    """Whether a strength is told from zero at the level of the best of many, where only a part of its error is left."""
     info = dict(own_parameters(effect))[estimate.path.split(".")[1]]
-    upper = estimate.ci95[1]
+    upper, widened = estimate.ci95[1], part * _BEST_OF_MANY / NORMAL_95
     if info.positive:
-        return bool(part * np.log(max(upper / estimate.value, 1.0)) < 1.0)
-    return bool(part * (upper - estimate.value) < abs(estimate.value))
+        return bool(widened * np.log(max(upper / estimate.value, 1.0)) < 1.0)
+    return bool(widened * (upper - estimate.value) < abs(estimate.value))
 
 
 def _supported_first(verdicts: list[Verdict], supported: Callable[[Verdict], bool]) -> list[Verdict]:
