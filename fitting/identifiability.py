@@ -26,6 +26,8 @@ _SHARE = 0.2
 # What a drive file states and no log of angles and torque can check: 1 % of it is the unit of its error.
 _HELD = ("J_m", "J_l")
 _PERCENT = 0.01
+# Relative changes of a parameter beyond this are no longer told by derivatives.
+_MOST_LINEAR = 0.3
 # Relative step of the central differences by what is held; their error is its square.
 _STEP = 1e-4
 # A positive parameter below this share of its start has run to zero.
@@ -281,13 +283,18 @@ def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
 
 
 def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[str, float]) -> Held:
-    told = [f"{p} by {100 * c:+.2g} %" for p, c in changes.items() if "." not in p and p != "alpha"]
-    sentence = (
-        f"{path} is taken from the drive file, since a log of angles and torque knows inertia and stiffness only in "
-        f"proportion to the torque: if it is 1 % too large there, that moves {_words(told)}."
-        if told
-        else f"{path} is taken from the drive file."
-    )
+    own = {p: c for p, c in changes.items() if "." not in p and p != "alpha"}
+    sentence = f"{path} is taken from the drive file"
+    if any(abs(c) > _MOST_LINEAR for c in own.values()):
+        sentence += f", and has to be right there: an error of 1 % is more than {_words(list(own))} could make up for."
+    elif own:
+        moved = _words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
+        sentence += (
+            ", since a log of angles and torque knows inertia and stiffness only in proportion to the torque: if it is "
+            f"1 % too large there, that moves {moved}."
+        )
+    else:
+        sentence += "."
     return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)
 
 

@@ -9,7 +9,7 @@ import pytest
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.identifiability import at_bound, identifiability, needed_samples, needed_twist, reason
+from fitting.identifiability import _held_one, at_bound, identifiability, needed_samples, needed_twist, reason
 from fitting.uncertainty import Estimate, uncertainty
 from hdjax.parameters import ParameterInfo
 
@@ -170,3 +170,9 @@ def test_reasons_of_open_intervals(path: str, ci95: tuple[float, float], words: 
 def test_a_reduced_log_holds_nothing(faint: tuple[Fit, Estimate]):
     found, _ = faint
     assert identifiability(found, uncertainty(found)).held == ()
+
+
+def test_an_inertia_that_the_logs_hang_on_has_to_be_right(drive: Fit):
+    """Along a motor that turns far, an error of its inertia is beyond what derivatives tell."""
+    held = _held_one(drive, "J_m", {"K": -0.23, "alpha": 0.1, "B_sp": 3.8}, {})
+    assert held.sentence.endswith("has to be right there: an error of 1 % is more than K and B_sp could make up for.")
