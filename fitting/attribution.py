@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
 
 import equinox as eqx
 import numpy as np
@@ -143,9 +142,8 @@ def look(
         gain = -np.inf if trial is None else trial.gain_over(before)
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    supported = partial(_supported, before=before, base=base)
-    verdicts = _supported_first(_simplest_first(_with_separability(found)), supported)
-    return Round(before, screened, tuple(verdicts), bool(verdicts) and supported(verdicts[0]))
+    verdicts, accepted = _supported_first(_simplest_first(_with_separability(found)), before, base)
+    return Round(before, screened, tuple(verdicts), accepted)
 
 
 def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tuple[Round, Trial]:
@@ -171,18 +169,18 @@ def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tup
     return this, found
 
 
-def _supported(verdict: Verdict, *, before: Trial, base: Trial) -> bool:
+def _supported(verdict: Verdict, before: Trial, base: Trial) -> bool:
     """Whether a competitor is more than chance, more than an imperfection, and has a strength that is not zero."""
     return (
         verdict.trial is not None
         and verdict.gain > LEAST_GAIN
         and verdict.p_value <= SIGNIFICANCE
-        and _imperfect_share(verdict.trial, before, base) > _IMPERFECTION
+        and _share_of_removed(verdict.trial, before, base) > _IMPERFECTION
         and _strength_is_determined(verdict)
     )
 
 
-def _imperfect_share(trial: Trial, before: Trial, base: Trial) -> float:
+def _share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:
     """What a further effect removes of the held-out error, over what the effects before it have removed (rms); infinite
     for the first one."""
     weight = np.linalg.inv(np.asarray(trial.held_out.covariance))
@@ -222,14 +220,15 @@ def _is_known(estimate: Estimate, part: float, effect: Effect) -> bool:
     return bool(widened * (upper - estimate.value) < abs(estimate.value))
 
 
-def _supported_first(verdicts: list[Verdict], supported: Callable[[Verdict], bool]) -> list[Verdict]:
-    """The list from its first supported competitor on, the unsupported ones behind it; unchanged where none is."""
+def _supported_first(verdicts: list[Verdict], before: Trial, base: Trial) -> tuple[list[Verdict], bool]:
+    """The list from its first supported competitor on, the unsupported ones behind it, unchanged where none is; and
+    whether there is one."""
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None or verdict.gain <= LEAST_GAIN:
             break
-        if supported(verdict):
-            return [verdict, *verdicts[:i], *verdicts[i + 1 :]]
-    return verdicts
+        if _supported(verdict, before, base):
+            return [verdict, *verdicts[:i], *verdicts[i + 1 :]], True
+    return verdicts, False
 
 
 @contextmanager

@@ -287,8 +287,7 @@ def _looked_along(
     start, end = _all_own_states(stacked, at_knots, width, chain)
 
     def looked_at(effect: Effect, start: Array, end: Array) -> tuple[Array, Array]:
-        own = (start, end) if effect.states else None
-        return _rates_and_reading(model.with_effects(effect), followed.states, followed.between, own, segments)
+        return _rates_and_reading(model.with_effects(effect), followed, start, end, segments)
 
     rates, reading = _by_strength(stacked, looked_at, start, end)
     mean = 0.5 * jnp.einsum("k,snkip->snip", jnp.asarray(WEIGHTS), rates)
@@ -301,16 +300,16 @@ _regressors = jit_small(_looked_along)
 
 def _rates_and_reading(
     model: Model,
-    states: Float[Array, "segments knots states"],
-    between: Float[Array, "segments samples nodes states"],
-    own: tuple[Array, Array] | None,
+    followed: Followed,
+    own_start: Float[Array, "segments samples own"],
+    own_end: Float[Array, "segments samples own"],
     segments: Segments,
 ) -> tuple[Array, Array]:
-    """Rates of the given states, at the nodes of each interval, and the outputs at the samples."""
-    kept, samples = states.shape[-1], states[:, :-1]
-    if own is not None:
-        between = jnp.concatenate([between, _own_between(*own)], axis=-1)
-        samples = jnp.concatenate([samples, own[0]], axis=-1)
+    """Rates of the motion's states at the nodes of each interval, and the outputs at the samples, with an effect's own
+    states beside them."""
+    kept = followed.states.shape[-1]
+    between = jnp.concatenate([followed.between, _own_between(own_start, own_end)], axis=-1)
+    samples = jnp.concatenate([followed.states[:, :-1], own_start], axis=-1)
     torque = at_nodes(_behind(segments.halo, jax.vmap(model.actuate)(segments.torque)))
     load = jnp.zeros_like(torque) if segments.load_torque is None else at_nodes(segments.load_torque)
     conditions = conditions_between(segments)

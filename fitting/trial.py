@@ -1,6 +1,7 @@
 """A model on trial: fitted to the training stretches, judged on those it has not seen."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,6 +37,11 @@ class Setting(eqx.Module):
     halo: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The same as options of [`fitting.estimate.fit`][]."""
+        return {"horizon": self.horizon, "halo": self.halo, "substeps": self.substeps, "count": self.count}
 
 
 class Trial(eqx.Module):
@@ -162,10 +168,7 @@ def trained(
         model,
         data[hold][0],
         fitted_paths(model),
-        horizon=setting.horizon,
-        halo=setting.halo,
-        substeps=setting.substeps,
-        count=setting.count,
+        **setting.options,
         covariance=None if near is None else near.covariance,
         max_steps=max_steps,
         reweigh=reweigh,
@@ -187,15 +190,7 @@ def coming(model: Model, data: Data, hold: Hold, setting: Setting) -> Callable[[
     Returns:
         What calls it off, where it has not begun.
     """
-    return pose_ahead(
-        model,
-        data[hold][0],
-        fitted_paths(model),
-        horizon=setting.horizon,
-        halo=setting.halo,
-        substeps=setting.substeps,
-        count=setting.count,
-    )
+    return pose_ahead(model, data[hold][0], fitted_paths(model), **setting.options)
 
 
 def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
@@ -203,10 +198,7 @@ def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
         training.model,
         data[hold][1],
         training.free.paths,
-        horizon=setting.horizon,
-        halo=setting.halo,
-        substeps=setting.substeps,
-        count=setting.count,
+        **setting.options,
         covariance=training.covariance,
         max_steps=_TRIAL_STEPS,
         hold_parameters=True,

@@ -60,8 +60,8 @@ def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
         return eqx.tree_at(lambda t: t.held_out.covariance, trial, jnp.asarray([[1.0 + rms**2]]))
 
     base, before, after = with_error(1000.0), with_error(1.0), with_error(0.0)
-    assert attribution._imperfect_share(after, before, base) == pytest.approx(1e-3, rel=1e-3)
-    assert attribution._imperfect_share(after, base, base) == np.inf
+    assert attribution._share_of_removed(after, before, base) == pytest.approx(1e-3, rel=1e-3)
+    assert attribution._share_of_removed(after, base, base) == np.inf
 
 
 def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:

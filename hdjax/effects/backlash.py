@@ -9,6 +9,7 @@ from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
+# Share of the half-width over which damping sets in beyond the edge; and what divides where there is no zone.
 _ONSET, _NOTHING = 0.02, 1e-30
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, Motion, MotorSideEffect, Scales
-from hdjax.effects.ripple import amplitude_and_phase, ripple
+from hdjax.effects.ripple import Term, amplitude_and_phase, amplitudes_and_phases, ripple, ripples
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "EFFECTS: percent of rated torque; Taghirad and Belanger"
@@ -34,16 +34,15 @@ class Cogging(MotorSideEffect):
         return (cls(),)
 
     @property
-    def _terms(self) -> tuple[tuple[int, Array, Array], ...]:
+    def _terms(self) -> tuple[Term, ...]:
         return (1, self.cos_1, self.sin_1), (2, self.cos_2, self.sin_2), (4, self.cos_4, self.sin_4)
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         assert motion.theta_m is not None
-        first, *others = (ripple(motion.theta_m, *term) for term in self._terms)
-        return sum(others, start=first)
+        return ripples(motion.theta_m, self._terms)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        return {k: v for n, a, b in self._terms for k, v in amplitude_and_phase(a, b, "N m", f"_{n}").items()}
+        return amplitudes_and_phases(self._terms, "N m")
 
 
 class SingleOrderCogging(MotorSideEffect):

@@ -2,12 +2,19 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, MeshGeometryEffect, Scales
-from hdjax.effects.ripple import amplitude_and_phase, ripple, ripple_slope
+from hdjax.effects.ripple import (
+    Term,
+    amplitude_and_phase,
+    amplitudes_and_phases,
+    ripple,
+    ripple_slope,
+    ripple_slopes,
+    ripples,
+)
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Ghorbel, Gandhi, Alpeter 2001; vendors: 1.5e-4 to 5.8e-4 rad peak to peak"
@@ -42,7 +49,7 @@ class KinematicError(MeshGeometryEffect):
         return (cls(),)
 
     @property
-    def _terms(self) -> tuple[tuple[int, Array, Array], ...]:
+    def _terms(self) -> tuple[Term, ...]:
         return (
             (1, self.cos_1, self.sin_1),
             (2, self.cos_2, self.sin_2),
@@ -50,13 +57,13 @@ class KinematicError(MeshGeometryEffect):
         )
 
     def error(self, theta_m: Array) -> Array:
-        return sum((ripple(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
+        return ripples(theta_m, self._terms)
 
     def slope(self, theta_m: Array) -> Array:
-        return sum((ripple_slope(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
+        return ripple_slopes(theta_m, self._terms)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        return {k: v for n, a, b in self._terms for k, v in amplitude_and_phase(a, b, "rad", f"_{n}").items()}
+        return amplitudes_and_phases(self._terms, "rad")
 
 
 class KinematicHarmonic(MeshGeometryEffect):
@@ -113,12 +120,12 @@ class KinematicSidebands(MeshGeometryEffect):
         return tuple(cls(n=n, ratio=scales.reduction_ratio) for n in (2.0, 1.0))
 
     @property
-    def _terms(self) -> tuple[tuple[Array, Array, Array], ...]:
+    def _terms(self) -> tuple[Term, ...]:
         away = 1.0 / self.ratio
         return (self.n - away, self.cos_below, self.sin_below), (self.n + away, self.cos_above, self.sin_above)
 
     def error(self, theta_m: Array) -> Array:
-        return sum((ripple(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
+        return ripples(theta_m, self._terms)
 
     def slope(self, theta_m: Array) -> Array:
-        return sum((ripple_slope(theta_m, *term) for term in self._terms), start=jnp.zeros_like(theta_m))
+        return ripple_slopes(theta_m, self._terms)

@@ -1,13 +1,15 @@
 """Stiffness and friction that depend on where the motor stands."""
 
+import abc
 from typing import ClassVar
 
+import equinox as eqx
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
 from hdjax.effects.friction import motor_rate, smooth_sign
-from hdjax.effects.ripple import amplitude_and_phase, ripple, ripple_slope
+from hdjax.effects.ripple import Term, amplitude_and_phase, amplitudes_and_phases, ripple, ripple_slope, ripples
 from hdjax.parameters import Scalar, parameter
 
 _ORDERS = (1.0, 2.0, 4.0)
@@ -71,16 +73,16 @@ class ConservativePositionDependentStiffness(PositionDependentStiffness):
         return -stored * ripple_slope(motion.theta_m, self.n, self.cosine, self.sine)
 
 
-class PositionDependentMotorFriction(MotorSideEffect):
-    """Friction `(T_c + cosine cos(n theta_m) + sine sin(n theta_m)) sgn(omega_m)` against the motor.
+class _MotorFrictionOverAngle(MotorSideEffect):
+    """Friction `(T_c + ripple(theta_m)) sgn(omega_m)` against the motor.
 
     The ripple changes its sign with the direction, unlike cogging. It dissipates where it is smaller than T_c.
     """
 
     family: ClassVar[str] = "position_dependent_friction"
-    name: ClassVar[str] = "position_dependent_motor_friction"
     drawn_against: ClassVar[str | None] = "theta_m"
 
+    transition: eqx.AbstractVar[Scalar]
     T_c: Scalar = parameter(
         0.0,
         unit="N m",
@@ -89,6 +91,22 @@ class PositionDependentMotorFriction(MotorSideEffect):
         bounds=(0.0, 1e3),
         role="strength",
     )
+
+    @abc.abstractmethod
+    def _ripple(self, theta_m: Array) -> Array:
+        """What the angle adds to T_c [N m]."""
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        assert motion.theta_m is not None
+        level = self.T_c + self._ripple(motion.theta_m)
+        return -level * smooth_sign(motor_rate(motion), self.transition)
+
+
+class PositionDependentMotorFriction(_MotorFrictionOverAngle):
+    """Of one order: the ripple is `cosine cos(n theta_m) + sine sin(n theta_m)`."""
+
+    name: ClassVar[str] = "position_dependent_motor_friction"
+
     cosine: Scalar = parameter(0.0, unit="N m", doc="ripple, cosine", source="Tuttle 1992", role="strength")
     sine: Scalar = parameter(0.0, unit="N m", doc="ripple, sine", source="Tuttle 1992", role="strength")
     n: Scalar = parameter(2.0, unit="1", doc="cycles in a motor revolution", bounds=(0.0, 1e3))
@@ -98,13 +116,39 @@ class PositionDependentMotorFriction(MotorSideEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n, transition=0.01 * scales.omega_m) for n in _ORDERS)
 
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        assert motion.theta_m is not None
-        level = self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
-        return -level * smooth_sign(motor_rate(motion), self.transition)
+    def _ripple(self, theta_m: Array) -> Array:
+        return ripple(theta_m, self.n, self.cosine, self.sine)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "N m")
+
+
+class RipplingMotorFriction(_MotorFrictionOverAngle):
+    """Of several orders: the ripple is the sum over n = 1, 2, 4 of `cos_n cos(n theta_m) + sin_n sin(n theta_m)`."""
+
+    name: ClassVar[str] = "rippling_motor_friction"
+
+    cos_1: Scalar = parameter(0.0, unit="N m", doc="cosine, order 1", source="Tuttle 1992", role="strength")
+    sin_1: Scalar = parameter(0.0, unit="N m", doc="sine, order 1", source="Tuttle 1992", role="strength")
+    cos_2: Scalar = parameter(0.0, unit="N m", doc="cosine, order 2", source="Tuttle 1992", role="strength")
+    sin_2: Scalar = parameter(0.0, unit="N m", doc="sine, order 2", source="Tuttle 1992", role="strength")
+    cos_4: Scalar = parameter(0.0, unit="N m", doc="cosine, order 4", source="Tuttle 1992", role="strength")
+    sin_4: Scalar = parameter(0.0, unit="N m", doc="sine, order 4", source="Tuttle 1992", role="strength")
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(transition=0.01 * scales.omega_m),)
+
+    @property
+    def _terms(self) -> tuple[Term, ...]:
+        return (1, self.cos_1, self.sin_1), (2, self.cos_2, self.sin_2), (4, self.cos_4, self.sin_4)
+
+    def _ripple(self, theta_m: Array) -> Array:
+        return ripples(theta_m, self._terms)
+
+    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
+        return amplitudes_and_phases(self._terms, "N m")
 
 
 class PositionDependentMeshFriction(MeshTorqueEffect):
@@ -140,44 +184,3 @@ class PositionDependentMeshFriction(MeshTorqueEffect):
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "N m")
-
-
-class RipplingMotorFriction(MotorSideEffect):
-    """Friction `(T_c + sum over n = 1, 2, 4 of cos_n cos(n theta_m) + sin_n sin(n theta_m)) sgn(omega_m)` against the
-    motor: [`PositionDependentMotorFriction`][] with several orders at once."""
-
-    family: ClassVar[str] = "position_dependent_friction"
-    name: ClassVar[str] = "rippling_motor_friction"
-    drawn_against: ClassVar[str | None] = "theta_m"
-
-    T_c: Scalar = parameter(
-        0.0,
-        unit="N m",
-        doc="mean Coulomb torque at the motor",
-        source="Tuttle 1992",
-        bounds=(0.0, 1e3),
-        role="strength",
-    )
-    cos_1: Scalar = parameter(0.0, unit="N m", doc="cosine, order 1", source="Tuttle 1992", role="strength")
-    sin_1: Scalar = parameter(0.0, unit="N m", doc="sine, order 1", source="Tuttle 1992", role="strength")
-    cos_2: Scalar = parameter(0.0, unit="N m", doc="cosine, order 2", source="Tuttle 1992", role="strength")
-    sin_2: Scalar = parameter(0.0, unit="N m", doc="sine, order 2", source="Tuttle 1992", role="strength")
-    cos_4: Scalar = parameter(0.0, unit="N m", doc="cosine, order 4", source="Tuttle 1992", role="strength")
-    sin_4: Scalar = parameter(0.0, unit="N m", doc="sine, order 4", source="Tuttle 1992", role="strength")
-    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(transition=0.01 * scales.omega_m),)
-
-    @property
-    def _terms(self) -> tuple[tuple[int, Array, Array], ...]:
-        return (1, self.cos_1, self.sin_1), (2, self.cos_2, self.sin_2), (4, self.cos_4, self.sin_4)
-
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        assert motion.theta_m is not None
-        level = sum((ripple(motion.theta_m, *term) for term in self._terms), start=self.T_c)
-        return -level * smooth_sign(motor_rate(motion), self.transition)
-
-    def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        return {k: v for n, a, b in self._terms for k, v in amplitude_and_phase(a, b, "N m", f"_{n}").items()}

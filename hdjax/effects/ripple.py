@@ -1,11 +1,15 @@
 """What several families share: a term that is locked to an angle."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.elementary import cosine_and_sine
 
 Angle = Float[Array, "*n"]
+Term = tuple[int | Array, Array, Array]
+"""Order, and the amplitudes of its cosine and its sine."""
 
 
 def ripple(angle: Angle, order: float | int | Array, cosine: Array, sine: Array) -> Angle:
@@ -19,9 +23,26 @@ def ripple_slope(angle: Angle, order: float | int | Array, cosine: Array, sine: 
     return order * ripple(angle, order, sine, -cosine)
 
 
+def ripples(angle: Angle, terms: Sequence[Term]) -> Angle:
+    """Sum of [`ripple`][] over several orders."""
+    first, *others = (ripple(angle, *term) for term in terms)
+    return sum(others, start=first)
+
+
+def ripple_slopes(angle: Angle, terms: Sequence[Term]) -> Angle:
+    """Sum of [`ripple_slope`][] over several orders."""
+    first, *others = (ripple_slope(angle, *term) for term in terms)
+    return sum(others, start=first)
+
+
 def amplitude_and_phase(cosine: Array, sine: Array, unit: str, suffix: str = "") -> dict[str, tuple[Array, str]]:
     """`A` and `psi` of the same term as `A cos(order angle + psi)`, for `Effect.derived`."""
     return {
         f"amplitude{suffix}": (jnp.hypot(cosine, sine), unit),
         f"phase{suffix}": (jnp.arctan2(-sine, cosine), "rad"),
     }
+
+
+def amplitudes_and_phases(terms: Sequence[Term], unit: str) -> dict[str, tuple[Array, str]]:
+    """[`amplitude_and_phase`][] of several orders."""
+    return {k: v for n, a, b in terms for k, v in amplitude_and_phase(a, b, unit, f"_{n}").items()}
