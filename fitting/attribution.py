@@ -13,9 +13,9 @@ from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
-from fitting.shortlist import NEARLY, first_of_each_family, further_forms, possible_ties, worth_a_refit
+from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, challenge, coming, lasting_share, trained
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, trained
 from fitting.uncertainty import Estimate, uncertainty
 from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
@@ -144,29 +144,6 @@ def look(
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     verdicts, accepted = _supported_first(_simplest_first(_with_separability(found)), before, base)
     return Round(before, screened, tuple(verdicts), accepted)
-
-
-def simpler_form(this: Round, found: Trial, data: Data, setting: Setting) -> tuple[Round, Trial]:
-    """The round and its winner, or a simpler form of the same family that explains as much once the solver's steps
-    follow both: a richer form may have made up for steps that were too long.
-
-    Args:
-        this: the round, judged with longer steps.
-        found: its winner, fitted again with the steps of `setting`.
-        data: the stretches.
-        setting: how they are cut.
-    """
-    for verdict in this.verdicts[1:]:
-        rival = verdict.trial
-        if rival is None or verdict.family != this.winner.family or _size(verdict) >= _size(this.winner):
-            continue
-        if verdict.gain < NEARLY * this.winner.gain:
-            continue
-        simpler = attempt(rival.model, data, found.hold, setting, start=found)
-        if simpler.held_out.objective <= found.held_out.objective + LEAST_GAIN:
-            verdicts = (verdict, *(v for v in this.verdicts if v is not verdict))
-            return Round(this.before, this.screen, verdicts, this.accepted), simpler
-    return this, found
 
 
 def _supported(verdict: Verdict, before: Trial, base: Trial) -> bool:

@@ -1,6 +1,7 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -8,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import Round, look, simpler_form
+from fitting.attribution import Round, look
 from fitting.base_fit import base_fit, leaves_white_noise
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.errors import DataError
-from fitting.estimate import lost, measurement_noise, needed_substeps
+from fitting.estimate import lost, measurement_noise
 from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
@@ -198,6 +199,9 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, data, h, setting) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
+    finer = setting.fine_enough(chosen.training)
+    if finer is not setting:
+        setting, chosen = finer, attempt(chosen.model, data, chosen.hold, finer, start=chosen)
     if np.mean(lost(chosen.training)) > _MOST_LOST:
         raise DataError(
             "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
@@ -239,14 +243,9 @@ def _add_effects(
         assert this.winner.trial is not None
         current = this.winner.trial
         found += 1
-        substeps = needed_substeps(current.training)
-        # A new effect may turn sharper corners than the steps so far resolve; and what a trial has not quite reached
-        # the next look would take for a further effect.
-        finer = substeps > setting.substeps
-        setting = Setting(setting.horizon, setting.halo, max(substeps, setting.substeps), setting.count)
+        setting = replace(setting, substeps=current.training.substeps)
+        # What a trial has not quite reached the next look would take for a further effect.
         current = attempt(current.model, data, current.hold, setting, start=current)
-        if finer:
-            this, current = simpler_form(this, current, data, setting)
         rounds.append(this)
         progress(f"found {this.winner.name}")
     dropped = []

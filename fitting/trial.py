@@ -1,6 +1,7 @@
 """A model on trial: fitted to the training stretches, judged on those it has not seen."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, fit, needed_substeps
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.free_run import FreeRun, free_run, rms_error
@@ -42,6 +43,11 @@ class Setting(eqx.Module):
     def options(self) -> dict[str, Any]:
         """The same as options of [`fitting.estimate.fit`][]."""
         return {"horizon": self.horizon, "halo": self.halo, "substeps": self.substeps, "count": self.count}
+
+    def fine_enough(self, found: Fit) -> "Setting":
+        """The same, with as many solver steps as the fitted motion needs; itself where these are enough."""
+        substeps = needed_substeps(found)
+        return replace(self, substeps=substeps) if substeps > self.substeps else self
 
 
 class Trial(eqx.Module):
@@ -126,10 +132,17 @@ def challenge(
         first = min((begun(m, -np.inf) for m in models), key=lambda found: found.objective)
         if first.objective > limit:
             return None
+        setting = setting.fine_enough(first)
         best = trained(first.model, data, hold, setting, first, give_up_above=limit)
     else:
         best = begun(models[0], limit)
-    return _judged(best, data, hold, setting) if best.objective <= limit else None
+    if best.objective > limit:
+        return None
+    # Where a corner is sharper than the steps resolve, a fit rounds it until they do.
+    finer = setting.fine_enough(best)
+    if finer is not setting:
+        best = trained(best.model, data, hold, finer, best, give_up_above=limit)
+    return _judged(best, data, hold, finer) if best.objective <= limit else None
 
 
 def trained(

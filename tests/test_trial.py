@@ -1,0 +1,48 @@
+"""Models on trial: how finely they are simulated, and what they must reach."""
+
+import pytest
+
+import rig
+from fitting.base_fit import base_fit
+from fitting.experiment import segment_count, split
+from fitting.posing import segment_length
+from fitting.trial import Data, Setting, attempt, challenge, halo_for
+from hdjax import Hold
+from hdjax.effects.friction import CoulombFriction
+
+HOLD: Hold = "zero-order"
+SHARP = 100.0, 0.05
+"""Friction and the rate over which its sign turns: sharper than the steps that suit the oscillator resolve."""
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """A base model of a drive that sticks, and what its trials share."""
+    experiment = rig.reduced_experiment(3000, noise=2e-4, rms=30.0, friction=SHARP, substeps=60)
+    data: Data = {HOLD: split((experiment,))}
+    training = data[HOLD][0]
+    base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
+    count = segment_count(training, segment_length(base.horizon))
+    setting = Setting(base.horizon, halo_for(training), base.substeps, count)
+    return attempt(base.model, data, HOLD, setting), data, setting
+
+
+def with_friction(model, T_c: float, v_0: float):
+    return model.with_effects(CoulombFriction(T_c=T_c, v_0=v_0))
+
+
+def test_a_sharp_corner_takes_finer_steps(begun):
+    """The base model has no corner and keeps its steps; with friction in it the trial finds out what it needs."""
+    before, data, setting = begun
+    assert setting.fine_enough(before.training) is setting
+    found = challenge([with_friction(before.model, 50.0, 0.3)], data, HOLD, setting, champion=before)
+    assert found is not None
+    assert found.training.substeps == found.held_out.substeps > setting.substeps
+    assert float(found.model.effects[0].T_c) == pytest.approx(SHARP[0], rel=0.02)
+
+
+def test_a_champion_stays_where_nothing_explains_more(begun):
+    before, data, setting = begun
+    limit = before.training.objective - 20.0
+    start = with_friction(before.model, 50.0, 0.3)
+    assert challenge([start], data, HOLD, setting, champion=before, give_up_above=limit) is None
