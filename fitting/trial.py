@@ -115,27 +115,24 @@ def challenge(
     """
     limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
 
-    def begun(model: Model, give_up_above: float) -> Fit:
+    def begun(model: Model) -> Fit:
         return trained(
             model,
             data,
             hold,
             setting,
             champion.training,
-            give_up_above=give_up_above,
+            give_up_above=-np.inf,
             retry_states=True,
             own_states=own_states if model is models[0] else None,
         )
 
-    if len(models) > 1:
-        # One pass each tells the best start; that one alone is followed to the end.
-        first = min((begun(m, -np.inf) for m in models), key=lambda found: found.objective)
-        if first.objective > limit:
-            return None
-        setting = setting.fine_enough(first)
-        best = trained(first.model, data, hold, setting, first, give_up_above=limit)
-    else:
-        best = begun(models[0], limit)
+    # One pass each tells the best start; that one alone is followed to the end.
+    first = min(map(begun, models), key=lambda found: found.objective)
+    if first.objective > limit:
+        return None
+    setting = setting.fine_enough(first)
+    best = trained(first.model, data, hold, setting, first, give_up_above=limit)
     if best.objective > limit:
         return None
     # Where a corner is sharper than the steps resolve, a fit rounds it until they do.
