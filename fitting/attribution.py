@@ -106,7 +106,7 @@ def look(
     refitted: dict[str, Trial] = {}
     worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
 
-    def refit(leads: Sequence[Lead], give_up_above: float = np.inf) -> None:
+    def refit(leads: Sequence[Lead], setting: Setting, give_up_above: float = np.inf) -> None:
         with _programs_ahead(before, leads[1:], data, setting):
             for lead in leads:
                 progress(f"refitting with {lead.effect.name}")
@@ -116,18 +116,20 @@ def look(
 
     first = first_of_each_family(worth)
     with _programs_ahead(before, first[1:], data, setting):
-        refit(first[:1])
+        refit(first[:1], setting)
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
         look_ahead(leader.training)
         gained = before.training.objective - leader.training.objective
-        refit(possible_ties(worth, first), leader.training.objective + _NEAR_TIE * gained)
+        # What is to come near it in its first pass needs its steps.
+        fine = replace(setting, substeps=leader.training.substeps)
+        refit(possible_ties(worth, first), fine, leader.training.objective + _NEAR_TIE * gained)
     else:
-        refit(first[1:])
+        refit(first[1:], setting)
         if refitted:
             best = max(refitted, key=lambda name: refitted[name].gain_over(before))
             family = next(lead.effect.family for lead in worth if lead.effect.name == best)
-            refit(further_forms(worth, family, first))
+            refit(further_forms(worth, family, first), setting)
     found: list[Verdict] = []
     for lead in screened.leads:
         trial = refitted.get(lead.effect.name)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from fitting.free import effect_paths
 from fitting.screening import Lead, Screen
 
-# A form with fewer parameters goes first where it explains at least this share of what its family's best one does.
-_NEARLY = 0.95
+NEARLY = 0.95
+"""A form with fewer parameters goes first where it explains at least this share of what its family's best one does."""
 # A form that to first order does no better than chance does in this share of cases is not refitted.
 _WORTH_A_REFIT = 0.2
 # Nor is one that explains less than this share of what the best one does: where stiffness is far off, as with backlash,
@@ -38,7 +38,7 @@ def first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
     families: dict[str, list[Lead]] = {}
     for lead in leads:
         families.setdefault(lead.effect.family, []).append(lead)
-    found = [_simplest([a for a in forms if a.gain >= _NEARLY * forms[0].gain]) for forms in families.values()]
+    found = [_simplest([a for a in forms if a.gain >= NEARLY * forms[0].gain]) for forms in families.values()]
     return found[:_FAMILIES]
 
 
