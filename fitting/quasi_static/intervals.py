@@ -91,14 +91,14 @@ class Scatter:
         return float(stdtrit(max(1.0, effective - 1.0), 0.975))
 
 
-def scatter(fit: CurveFit, cluster: np.ndarray) -> Scatter:
-    """The scatter of a fit's parameters over clusters of blocks.
+def scatter(jacobian: np.ndarray, residual: np.ndarray, cluster: np.ndarray) -> Scatter:
+    """The scatter of a fit's parameters over clusters of rows.
 
     Args:
-        fit: The fit.
-        cluster: Number of the cluster of each block, (n,).
+        jacobian: Of the residual, (n, parameters).
+        residual: Of the fit, (n,).
+        cluster: Number of the cluster of each row, (n,).
     """
-    jacobian, residual = fit.jacobian, fit.residual
     # A column that the data do not see would make the scale infinite.
     norms = np.linalg.norm(jacobian, axis=0)
     scale = 1.0 / np.where(norms > 0, norms, 1.0)
@@ -137,9 +137,11 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
         hysteresis_loss, lost_motion and lost_motion_outer, as far as the curve has them.
     """
     curve = fit.curve
-    found = scatter(fit, stretches(fit.residual, blocks.log))
+    found = scatter(fit.jacobian, fit.residual, stretches(fit.residual, blocks.log))
     known = {
-        name: _known(formula, fit, blocks, found, unit, description, must_be_positive)
+        name: known_figure(
+            formula(fit.parameters), _slope(formula, fit, blocks), found, unit, description, must_be_positive
+        )
         for name, (formula, unit, description, must_be_positive) in _formulas(curve, blocks, rated_torque).items()
     }
     largest = _largest_torque(fit, blocks)
@@ -247,16 +249,19 @@ def _between(curve: Curve, parameters: np.ndarray, amplitude: float, torque: flo
     return float(high - low), float(outer)
 
 
-def _known(
-    formula: Formula,
-    fit: CurveFit,
-    blocks: Blocks,
-    found: Scatter,
-    unit: str,
-    description: str,
-    must_be_positive: bool,
+def known_figure(
+    value: float, slope: np.ndarray, found: Scatter, unit: str, description: str, must_be_positive: bool
 ) -> Known:
-    value, slope = formula(fit.parameters), _slope(formula, fit, blocks)
+    """A figure with its interval.
+
+    Args:
+        value: At the fitted parameters.
+        slope: Its derivative with respect to the parameters, (parameters,).
+        found: How the parameters scatter.
+        unit: SI unit.
+        description: What it is.
+        must_be_positive: Whether a negative value would be none; the interval is then one of its logarithm.
+    """
     std, quantile = found.std(slope), found.quantile(slope)
     if must_be_positive and quantile * std > _NOT_AT_ALL * abs(value):
         return Known(value, std, None, unit, False, description, "the logs do not determine it at all")
@@ -295,7 +300,7 @@ def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:
             cost = float(other.residual @ other.residual)
             if free * (cost / best - 1.0) > stdtrit(max(1.0, free - 1.0), 0.975) ** 2:
                 continue
-            found = scatter(other, stretches(fit.residual, blocks.log))
+            found = scatter(other.jacobian, other.residual, stretches(fit.residual, blocks.log))
             direction = np.eye(len(other.parameters))[-1]
             half = found.quantile(direction) * found.std(direction)
             alone, moved = replace(curve, memory=memory), fit.parameters.copy()

@@ -42,12 +42,14 @@ class QuasiStaticData:
     findings: dict[str, tuple[Finding, ...]]
 
 
-def prepare(logs: Sequence[Log], drive_file: DriveFile) -> QuasiStaticData:
+def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False) -> QuasiStaticData:
     """Check quasi-static logs and leave out the rows in which friction has no known sign.
 
     Args:
         logs: Of kind "quasi-static".
         drive_file: The drive that they were read with.
+        at_rest: Whether rows at rest of a joint that moved stay, for who reckons with friction of their own. What
+            depends on the angle may then hide how the twist follows the torque, too.
 
     Returns:
         What can be fitted.
@@ -59,15 +61,17 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile) -> QuasiStaticData:
     for log in logs:
         seen = examine(log, drive_file)
         refuse_unfit(seen, log)
-        _refuse_mix_ups(log)
-        kept, motion, more = _steady(_measured(log), drive_file)
+        known = _measured(log)
+        motion, speed = _motion(known, drive_file.reduction_ratio)
+        _refuse_mix_ups(log, must_follow=not (at_rest and motion in ("one way", "both ways")))
+        kept, more = (known, ()) if speed is None or at_rest else _steady(known, speed)
         ready.append(kept)
         motions.append(motion)
         findings[log.name] = (*seen, *more)
     return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
 
 
-def _refuse_mix_ups(log: Log) -> None:
+def _refuse_mix_ups(log: Log, *, must_follow: bool) -> None:
     torque, twist = log.joint_torque, log.dynamic_error
     assert torque is not None
     span = float(np.ptp(twist))
@@ -87,48 +91,67 @@ def _refuse_mix_ups(log: Log) -> None:
     with np.errstate(invalid="ignore"):
         # Means that never change have no correlation.
         likeness = float(np.nan_to_num(np.corrcoef(means(torque, size), means(twist, size))[0, 1]))
-    if abs(likeness) < _UNRELATED:
+    if abs(likeness) < _UNRELATED and must_follow:
         raise DataError(
             f"{log.path}: the twist does not follow the joint torque (their correlation is {likeness:.2g}); check "
             "which columns they are, or record larger torque cycles"
         )
-    if likeness < 0:
+    if likeness < -_UNRELATED:
         raise DataError(
             f"{log.path}: the twist falls where the joint torque rises; give one of the two sign = -1 in [columns]"
         )
 
 
-def _speed(log: Log, drive_file: DriveFile) -> np.ndarray | None:
-    """Speed of the joint [rad/s], smoothed over a few rows; None where nothing tells it."""
+def speed_of(log: Log, ratio: float | None) -> np.ndarray | None:
+    """Speed of the joint [rad/s], smoothed over a few rows; None where nothing tells it.
+
+    Args:
+        log: The log.
+        ratio: Reduction ratio, or None.
+    """
     rows = max(3, len(log) // 200)
-    if log.motor_angle is not None and drive_file.reduction_ratio is not None:
-        angle = log.motor_angle / drive_file.reduction_ratio
+    if log.motor_angle is not None and ratio is not None:
+        angle = log.motor_angle / ratio
         lag = np.minimum(np.arange(len(log)) + rows, len(log) - 1)
         lead = np.maximum(np.arange(len(log)) - rows, 0)
         return (angle[lag] - angle[lead]) / (log.time[lag] - log.time[lead])
     if log.motor_velocity is not None:
-        return np.convolve(log.motor_velocity / (drive_file.reduction_ratio or 1.0), np.ones(rows) / rows, mode="same")
+        return np.convolve(log.motor_velocity / (ratio or 1.0), np.ones(rows) / rows, mode="same")
     return None
 
 
-def _steady(log: Log, drive_file: DriveFile) -> tuple[Log, Motion, tuple[Finding, ...]]:
-    """The rows of steady motion where the joint moved; all rows where it was held.
+def _motion(log: Log, ratio: float | None) -> tuple[Motion, np.ndarray | None]:
+    """How the joint moved, and its speed where it did."""
+    speed = speed_of(log, ratio)
+    if speed is None or not np.all(np.isfinite(speed)):
+        return "unknown", None
+    if _travel(log, speed) < FREE_MOTION:
+        return "held", None
+    steady = _is_steady(speed)
+    forwards, backwards = np.mean(speed[steady] > 0), np.mean(speed[steady] < 0)
+    return ("both ways" if min(forwards, backwards) > 0.05 else "one way"), speed
+
+
+def _travel(log: Log, speed: np.ndarray) -> float:
+    """How far the joint got [rad]."""
+    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(log.time))])
+    return float(np.ptp(path))
+
+
+def _is_steady(speed: np.ndarray) -> np.ndarray:
+    return np.abs(speed) > _STEADY * np.percentile(np.abs(speed), 90)
+
+
+def _steady(log: Log, speed: np.ndarray) -> tuple[Log, tuple[Finding, ...]]:
+    """The rows of steady motion of a joint that moved.
 
     While a joint moves, friction is a torque of known sign. At rest it takes any value up to sticking, so that rows at
     rest don't belong to the same curve.
     """
-    speed = _speed(log, drive_file)
-    if speed is None or not np.all(np.isfinite(speed)):
-        return log, "unknown", ()
-    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(log.time))])
-    if np.ptp(path) < FREE_MOTION:
-        return log, "held", ()
-    steady = np.abs(speed) > _STEADY * np.percentile(np.abs(speed), 90)
-    forwards, backwards = np.mean(speed[steady] > 0), np.mean(speed[steady] < 0)
-    motion: Motion = "both ways" if min(forwards, backwards) > 0.05 else "one way"
+    steady = _is_steady(speed)
     left_out = int(np.sum(~steady))
     if left_out == 0:
-        return log, motion, ()
+        return log, ()
     if len(log) - left_out < SHORTEST:
         raise DataError(
             f"{log.path}: the joint moves steadily in only {len(log) - left_out} rows, which is fewer than the "
@@ -136,12 +159,12 @@ def _steady(log: Log, drive_file: DriveFile) -> tuple[Log, Motion, tuple[Finding
         )
     told = Finding(
         "note",
-        f"the joint moved by {np.ptp(path):.3g} rad, and in {left_out} rows it was at rest or slower than "
+        f"the joint moved by {_travel(log, speed):.3g} rad, and in {left_out} rows it was at rest or slower than "
         f"{100 * _STEADY:.0f} % of its usual speed",
         "all columns",
         "these rows were left out, since friction at rest has no known sign",
     )
-    return _rows(log, steady), motion, (told,)
+    return _rows(log, steady), (told,)
 
 
 def _measured(log: Log) -> Log:

@@ -1,0 +1,192 @@
+"""Points of a quasi-static log for the loop: every row counts, at rest or moving, and the torque without its noise.
+
+The rows are averaged only as far as it takes to have few thousands of them, since ripples and relaxations are fast. The
+torque's noise is taken off by local cubics instead (Savitzky and Golay 1964) whose width Stein's estimate of the risk
+chooses (Stein 1981): noise that stayed in the torque would be explained by whatever candidate smooths it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.signal import savgol_coeffs, savgol_filter
+
+from fitting.logs import Log
+from fitting.quasi_static.blocks import means, noise, turns
+from fitting.quasi_static.preparation import Motion, speed_of
+
+MOST_POINTS = 2000
+# Of local cubics, in rows; even the widest keeps ten of them in a log.
+_WIDTHS = (5, 7, 9, 13, 19, 27, 37, 53, 75, 105, 149, 211, 299)
+# A joint slower than this share of its usual speed is at rest.
+_AT_REST = 0.05
+# Points that a rest must last to have a level of its own.
+_SHORTEST_REST = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Means over a few rows each, of one log or of several.
+
+    Attributes:
+        torque: Joint torque without its noise [N m], (n,).
+        twist: [rad], less its mean in its log, (n,).
+        time: From the start of its log [s], (n,).
+        log: Number of the log that a point is from, (n,), rising.
+        motor_angle: theta_m [rad], (n,), or None where a log has none.
+        load_angle: theta_l [rad], (n,), or None.
+        direction: Sign of the joint's speed, zero at rest, (n,), or None where no joint moved.
+        rest: Number of the rest that a point belongs to, -1 while the joint moves or where no joint does, (n,).
+        temperature: [K], (n,), or None.
+        motion: How the joint moved, by log.
+        names: Of the logs.
+        paths: Of the logs' files.
+        torque_noise: Standard deviation of the noise of one row's torque [N m].
+        twist_noise: Of a point's twist [rad].
+        rows: Rows in a point, by log.
+        reversals: Of the torque, by log.
+    """
+
+    torque: np.ndarray
+    twist: np.ndarray
+    time: np.ndarray
+    log: np.ndarray
+    motor_angle: np.ndarray | None
+    load_angle: np.ndarray | None
+    direction: np.ndarray | None
+    rest: np.ndarray
+    temperature: np.ndarray | None
+    motion: tuple[Motion, ...]
+    names: tuple[str, ...]
+    paths: tuple[str, ...]
+    torque_noise: float
+    twist_noise: float
+    rows: tuple[int, ...]
+    reversals: tuple[int, ...]
+
+    @cached_property
+    def logs(self) -> tuple[np.ndarray, ...]:
+        """The points of each log."""
+        return tuple(np.flatnonzero(self.log == i) for i in range(len(self.names)))
+
+    def in_each_log(self, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """What a function of the points of one log gives, over all logs, (n,)."""
+        return np.concatenate([of(own) for own in self.logs])
+
+    @cached_property
+    def duration(self) -> float:
+        """Of the longest log [s]."""
+        return max(float(np.ptp(self.time[own])) for own in self.logs)
+
+    @cached_property
+    def step(self) -> float:
+        """Usual time between points [s]."""
+        return float(np.median(np.concatenate([np.diff(self.time[own]) for own in self.logs])))
+
+    @cached_property
+    def centre(self) -> float:
+        """Torque about which bends are counted [N m]: zero where both signs occur, else the middle of the range."""
+        low, high = float(np.min(self.torque)), float(np.max(self.torque))
+        return 0.0 if low < 0 < high else 0.5 * (low + high)
+
+    @cached_property
+    def reach(self) -> float:
+        """Half the range of the torque [N m]."""
+        return 0.5 * float(np.ptp(self.torque))
+
+
+def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None) -> Points:
+    """The points of quasi-static logs of one drive.
+
+    Args:
+        logs: With all their rows, as [`fitting.quasi_static.preparation.prepare`][] leaves them.
+        motion: How the joint moved in each.
+        ratio: Reduction ratio, or None.
+    """
+    parts = [_points(log, how, ratio, MOST_POINTS // len(logs)) for log, how in zip(logs, motion, strict=True)]
+    sizes = [len(part["torque"]) for part in parts]
+
+    def together(key: str) -> np.ndarray | None:
+        return np.concatenate([p[key] for p in parts]) if all(key in p for p in parts) else None
+
+    def every(key: str) -> np.ndarray:
+        return np.concatenate([p[key] for p in parts])
+
+    torque_noise, twist_noise = (float(np.mean([p["noise"][i] for p in parts])) for i in (0, 1))
+    return Points(
+        torque=every("torque"),
+        twist=every("twist"),
+        time=every("time"),
+        log=np.repeat(np.arange(len(logs)), sizes),
+        motor_angle=together("motor_angle"),
+        load_angle=together("load_angle"),
+        direction=every("direction") if any(how in ("one way", "both ways") for how in motion) else None,
+        rest=_rests(every("direction"), np.repeat([how in ("one way", "both ways") for how in motion], sizes), sizes),
+        temperature=together("temperature"),
+        motion=tuple(motion),
+        names=tuple(log.name for log in logs),
+        paths=tuple(str(log.path) for log in logs),
+        torque_noise=torque_noise,
+        twist_noise=max(twist_noise, 1e-7 * max(float(np.ptp(p["twist"])) for p in parts)),
+        rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
+        reversals=tuple(len(turns(p["torque"], max(1, len(p["torque"]) // 1000))) for p in parts),
+    )
+
+
+def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[str, np.ndarray]:
+    torque = log.joint_torque
+    assert torque is not None
+    size = math.ceil(len(log) / most)
+    found = {
+        "torque": means(without_noise(torque), size),
+        "twist": means(log.dynamic_error - np.mean(log.dynamic_error), size),
+        "time": means(log.time - log.time[0], size),
+        "noise": np.array([noise(torque), noise(means(log.dynamic_error, size))]),
+    }
+    found["twist"] = found["twist"] - np.mean(found["twist"])
+    for name in ("motor_angle", "load_angle", "temperature"):
+        values = getattr(log, name)
+        if values is not None:
+            found[name] = means(values, size)
+    speed = speed_of(log, ratio) if motion in ("one way", "both ways") else None
+    if speed is None:
+        found["direction"] = np.zeros_like(found["torque"])
+    else:
+        smooth = means(speed, size)
+        moves = np.abs(smooth) > _AT_REST * np.percentile(np.abs(smooth), 90)
+        found["direction"] = np.sign(smooth) * moves
+    return found
+
+
+def without_noise(values: np.ndarray) -> np.ndarray:
+    """A course without its white noise, whose size third differences tell.
+
+    Among local cubics of all widths, and the values as they are, that of the least expected square error.
+
+    References:
+        Stein 1981, Annals of Statistics 9(6), equation 2.5; Savitzky and Golay 1964, Analytical Chemistry 36(8).
+    """
+    variance = noise(values) ** 2
+    best, least = values, variance
+    for width in _WIDTHS:
+        if 10 * width > len(values):
+            break
+        smooth = savgol_filter(values, width, 3)
+        own_share = float(savgol_coeffs(width, 3)[width // 2])
+        risk = float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance
+        if risk < least:
+            best, least = smooth, risk
+    return best
+
+
+def _rests(direction: np.ndarray, moving_log: np.ndarray, sizes: Sequence[int]) -> np.ndarray:
+    """Number of the rest of each point; short ones are reversals of the motion."""
+    at_rest = (direction == 0) & moving_log
+    firsts = np.isin(np.arange(len(direction)), np.cumsum([0, *sizes]))
+    begins = at_rest & (firsts | ~np.roll(at_rest, 1))
+    number = np.where(at_rest, np.cumsum(begins) - 1, -1)
+    lasting = [i for i in range(int(number.max(initial=-1)) + 1) if np.sum(number == i) >= _SHORTEST_REST]
+    renamed = {old: new for new, old in enumerate(lasting)}
+    return np.array([renamed.get(int(i), -1) for i in number])
