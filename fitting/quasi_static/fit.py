@@ -1,17 +1,14 @@
 """All curves fitted to quasi-static logs of one drive, and the one that held-out stretches ask for."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
-
 from fitting.logs import Log
 from fitting.quasi_static.blocks import average
 from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish
 from fitting.quasi_static.intervals import Known, figures
-from fitting.quasi_static.stretches import FOLDS, stretches
+from fitting.quasi_static.stretches import FOLDS, folds, stretches, worse
 from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape
 
 _CONTAINED: dict[Shape, Shape] = {"cubic": "linear", "two slopes": "linear", "three slopes": "two slopes"}
@@ -85,9 +82,7 @@ def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
 
     The torque of a stretch that is held out still moves the hysteresis, since it is an input; its twist is unseen.
     """
-    count = int(stretch[-1]) + 1
-    # Drawn, since a regular comb could leave the same torque out at every pass.
-    fold = np.random.default_rng(0).permutation(np.arange(count) % FOLDS)[stretch]
+    fold = folds(stretch)
     misfit = np.empty_like(blocks.twist)
     for i in range(FOLDS):
         kept = polish(blocks, fit.curve, fit.parameters, fit.excess, (fold != i).astype(float), most=20)
@@ -112,14 +107,3 @@ def _choice(
 
 def _is_of_shape(name: str) -> bool:
     return name[0] in "KT" or name == "alpha"
-
-
-def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float) -> bool:
-    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %.
-
-    A difference of less than a hundredth of the noise's variance is none, or rounding would choose among exact fits.
-    """
-    excess = np.bincount(stretch, one**2 - other**2)
-    error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
-    clear = float(np.mean(excess)) > float(stdtrit(len(excess) - 1, 0.95)) * error
-    return clear and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

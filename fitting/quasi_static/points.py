@@ -131,7 +131,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
         torque_noise=torque_noise,
         twist_noise=max(twist_noise, 1e-7 * max(float(np.ptp(p["twist"])) for p in parts)),
         rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
-        reversals=tuple(len(turns(p["torque"], max(1, len(p["torque"]) // 1000))) for p in parts),
+        reversals=tuple(int(p["reversals"]) for p in parts),
     )
 
 
@@ -146,6 +146,8 @@ def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[st
         "noise": np.array([noise(torque), noise(means(log.dynamic_error, size))]),
     }
     found["twist"] = found["twist"] - np.mean(found["twist"])
+    # As coarse as it takes for turns to stand out of the torque's noise.
+    found["reversals"] = np.array(len(turns(torque, max(1, len(torque) // 200))))
     for name in ("motor_angle", "load_angle", "temperature"):
         values = getattr(log, name)
         if values is not None:

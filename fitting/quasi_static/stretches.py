@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.special import stdtrit
 
 FOLDS = 5
 
@@ -21,12 +22,13 @@ def correlation_length(residual: np.ndarray) -> float:
     return max(1.0, 1.0 + 2.0 * float(np.sum(rho[1:until])))
 
 
-def stretches(residual: np.ndarray, log: np.ndarray) -> np.ndarray:
+def stretches(residual: np.ndarray, log: np.ndarray, *, each: int = 1) -> np.ndarray:
     """Runs of blocks so long that residuals of different runs hardly know of each other.
 
     Args:
         residual: Of a fit, (n,).
         log: Number of the log of each block, (n,); no run crosses into another log.
+        each: Least number of runs in a log.
 
     Returns:
         Number of the run of each block, (n,); at least `FOLDS` runs.
@@ -36,7 +38,25 @@ def stretches(residual: np.ndarray, log: np.ndarray) -> np.ndarray:
     logs = int(log[-1]) + 1
     for i in range(logs):
         own = np.flatnonzero(log == i)
-        runs = max(math.ceil(FOLDS / logs), len(own) // length)
+        runs = max(each, math.ceil(FOLDS / logs), len(own) // length)
         numbers[own] = count + np.arange(len(own)) * runs // len(own)
         count += runs
     return numbers
+
+
+def folds(stretch: np.ndarray) -> np.ndarray:
+    """Number of the fold of each block, (n,), from the numbers of their stretches."""
+    count = int(stretch[-1]) + 1
+    # Drawn, since a regular comb could leave the same torque out at every pass.
+    return np.random.default_rng(0).permutation(np.arange(count) % FOLDS)[stretch]
+
+
+def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float) -> bool:
+    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %.
+
+    A difference of less than a hundredth of the noise's variance is none, or rounding would choose among exact fits.
+    """
+    excess = np.bincount(stretch, one**2 - other**2)
+    error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
+    clear = float(np.mean(excess)) > float(stdtrit(len(excess) - 1, 0.95)) * error
+    return clear and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

@@ -1,0 +1,193 @@
+"""Which effect explains what the torque-twist equation leaves over: one look at the catalogue, refits, ties."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fitting.attribution import SIGNIFICANCE
+from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.points import Points
+from fitting.quasi_static.screening import Lead, Screen, screen
+from fitting.quasi_static.stretches import folds, worse
+from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out
+from fitting.shortlist import NEARLY
+from fitting.trial import LEAST_GAIN
+
+# A form that explains less than this share of what the best one does is no rival, and is not refitted.
+_RIVAL = 0.25
+# Forms of one family that are refitted.
+_FORMS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A model with its errors on stretches that its fit has not seen.
+
+    Attributes:
+        model: Fitted to all points.
+        held_out: Misfit of each point by fits without its fold [rad], (n,).
+    """
+
+    model: TwistModel
+    held_out: np.ndarray
+
+    @property
+    def mean_square(self) -> float:
+        """Of the held-out misfit [rad^2]."""
+        return float(np.mean(self.held_out**2))
+
+    @property
+    def rmse(self) -> float:
+        """Held-out [rad]."""
+        return math.sqrt(self.mean_square)
+
+    def gain_over(self, other: "Trial") -> float:
+        """Half the logarithm of the other's held-out mean square over this one's."""
+        return 0.5 * math.log(max(other.mean_square, 1e-300) / max(self.mean_square, 1e-300))
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Points, and how they are parted into what a fit sees and what it doesn't.
+
+    Attributes:
+        points: Of all logs.
+        stretch: Number of the stretch of each point, (n,).
+        fold: Number of the fold of each point, (n,).
+    """
+
+    points: Points
+    stretch: np.ndarray
+    fold: np.ndarray
+
+    @classmethod
+    def of(cls, points: Points, stretch: np.ndarray) -> "Held":
+        """Points parted into folds of whole stretches."""
+        return cls(points, stretch, folds(stretch))
+
+    def attempt(self, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ...]) -> Trial:
+        """A fit with its held-out errors."""
+        model = fit_twist(self.points, forms, shapes)
+        return Trial(model, hold_out(self.points, model, self.fold))
+
+    def beside(self, trial: Trial, lead: Lead) -> Trial:
+        """The model with one form more."""
+        return self.attempt((*trial.model.forms, lead.form), (*trial.model.shapes, lead.shape))
+
+    def without(self, trial: Trial, forms: Sequence[Form]) -> Trial:
+        """The model without some of its forms."""
+        model = trial.model
+        kept = [i for i, form in enumerate(model.forms) if form not in forms]
+        return self.attempt(tuple(model.forms[i] for i in kept), tuple(model.shapes[i] for i in kept))
+
+    def is_worse(self, one: Trial, other: Trial) -> bool:
+        """Whether the first predicts held-out stretches clearly worse."""
+        return worse(one.held_out, other.held_out, self.stretch, self.points.twist_noise)
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A form that was refitted inside the equation.
+
+    Attributes:
+        lead: The form, where its refit began.
+        trial: The refit.
+        gain: Over the model without it, on held-out stretches.
+        p_value: Chance that the best of the catalogue gains as much on noise.
+        separable: Whether the logs tell it from the round's winner.
+    """
+
+    lead: Lead
+    trial: Trial
+    gain: float
+    p_value: float
+    separable: bool = True
+
+    @property
+    def form(self) -> Form:
+        """The form."""
+        return self.lead.form
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One look at the catalogue beside one model.
+
+    Attributes:
+        before: The model that was looked at.
+        screen: What each form would gain, and the law of chance.
+        rivals: Forms that were refitted, the winner first; empty where none was worth it.
+        accepted: Whether the winner is supported.
+    """
+
+    before: Trial
+    screen: Screen
+    rivals: tuple[Rival, ...]
+    accepted: bool
+
+
+def look(held: Held, before: Trial, base: Trial, forms: Sequence[Form], seed: int, imperfection: float) -> Round:
+    """Look for the effect that explains most of what a model leaves over.
+
+    Args:
+        held: The points.
+        before: The current model.
+        base: The model without any effect.
+        forms: To consider, the more usual ones first.
+        seed: Of the surrogates.
+        imperfection: Share (rms) of what earlier effects removed that a further one must remove at least.
+    """
+    screened = screen(held.points, before.model, forms, held.fold, seed)
+    leads = _worth_a_refit(screened)
+    rivals = []
+    for lead in leads:
+        trial = held.beside(before, lead)
+        gain = trial.gain_over(before)
+        rivals.append(Rival(lead, trial, gain, screened.p_value(gain)))
+    rivals.sort(key=lambda rival: -rival.gain)
+    if not rivals or rivals[0].p_value > SIGNIFICANCE or rivals[0].gain < LEAST_GAIN:
+        return Round(before, screened, tuple(rivals), accepted=False)
+    winner, told = _compared(held, rivals, screened, [id(form) for form in forms])
+    removed = before.mean_square - winner.trial.mean_square
+    enough = removed > imperfection**2 * (base.mean_square - before.mean_square)
+    return Round(before, screened, (winner, *told), accepted=enough)
+
+
+def _worth_a_refit(screened: Screen) -> list[Lead]:
+    """The best forms of each family that come near the best of all, or none where that one is no more than chance."""
+    best = screened.leads[0].gain if screened.leads else 0.0
+    if best < LEAST_GAIN or screened.p_value(best) > SIGNIFICANCE:
+        return []
+    near = [lead for lead in screened.leads if lead.gain >= _RIVAL * best]
+    return [
+        lead
+        for i, lead in enumerate(near)
+        if sum(other.form.family == lead.form.family for other in near[:i]) < _FORMS
+    ]
+
+
+def _compared(held: Held, rivals: list[Rival], screened: Screen, order: list[int]) -> tuple[Rival, list[Rival]]:
+    """The winner, and the other rivals with whether the logs tell them from it.
+
+    Forms are tied where neither predicts held-out stretches clearly better, and where the better one has nothing left to
+    explain beside the other. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more usual.
+    """
+    leader = rivals[0]
+    tied = [leader, *(rival for rival in rivals[1:] if _is_tied(held, rival, leader, screened))]
+    fewest = min(rival.form.size for rival in tied)
+    small = [rival for rival in tied if rival.form.size == fewest]
+    most = max(rival.gain for rival in small)
+    winner = min((r for r in small if r.gain >= NEARLY * most), key=lambda r: order.index(id(r.form)))
+    others = [
+        Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner
+    ]
+    return winner, others
+
+
+def _is_tied(held: Held, rival: Rival, leader: Rival, screened: Screen) -> bool:
+    if rival.p_value > SIGNIFICANCE or held.is_worse(rival.trial, leader.trial):
+        return False
+    both = held.beside(rival.trial, leader.lead)
+    return screened.p_value(both.gain_over(rival.trial)) > SIGNIFICANCE

@@ -1,0 +1,88 @@
+"""Whether what a model leaves over depends on something, though on nothing that the catalogue holds."""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+from fitting.attribution import SIGNIFICANCE
+from fitting.quasi_static.attribution import Held, Trial
+from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.points import Points
+from fitting.quasi_static.screening import screen
+from fitting.trial import LEAST_GAIN
+
+_SPLINES = 8
+_HARMONICS = 6
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What is left over, and on what it depends.
+
+    Attributes:
+        depends_on: The quantity.
+        explained_share: Share of the held-out mean square that a smooth function of it removes.
+        p_value: Chance that the best of the quantities does as well on noise.
+    """
+
+    depends_on: str
+    explained_share: float
+    p_value: float
+
+
+def leftover(held: Held, trial: Trial, seed: int) -> Leftover | None:
+    """The quantity of which a smooth function predicts the residual on unseen stretches; None where none does.
+
+    Args:
+        held: The points.
+        trial: The final model.
+        seed: Of the surrogates.
+    """
+    found = screen(held.points, trial.model, _smooth_functions(held.points), held.fold, seed)
+    if not found.leads:
+        return None
+    best = found.leads[0]
+    p_value = found.p_value(best.gain)
+    if best.gain < LEAST_GAIN or p_value > SIGNIFICANCE:
+        return None
+    return Leftover(best.form.name, 1.0 - math.exp(-2.0 * best.gain), p_value)
+
+
+def _smooth_functions(points: Points) -> list[Form]:
+    quantities = {"joint torque": points.torque, "rate of the joint torque": _rate(points)}
+    if points.temperature is not None and np.ptp(points.temperature) > 0:
+        quantities["temperature"] = points.temperature
+    found = []
+    if points.direction is not None:
+        if points.load_angle is not None:
+            quantities["load angle"] = points.load_angle
+        if points.motor_angle is not None:
+            found.append(_form("motor angle", _waves(points.motor_angle)))
+    return found + [_form(name, _splines(values)) for name, values in quantities.items()]
+
+
+def _form(name: str, columns: np.ndarray) -> Form:
+    return Form("unknown", name, partial(_given, columns), ("",) * columns.shape[1], f"a function of the {name}")
+
+
+def _given(columns: np.ndarray, points: Points, shape: np.ndarray) -> np.ndarray:
+    return columns
+
+
+def _rate(points: Points) -> np.ndarray:
+    return points.in_each_log(lambda own: np.gradient(points.torque[own], points.time[own]))
+
+
+def _waves(angle: np.ndarray) -> np.ndarray:
+    phases = angle[:, None] * np.arange(1, _HARMONICS + 1)
+    return np.column_stack([np.cos(phases), np.sin(phases)])
+
+
+def _splines(values: np.ndarray) -> np.ndarray:
+    """Cubic splines with as many points between any two knots."""
+    inner = np.unique(np.quantile(values, np.linspace(0, 1, _SPLINES - 2)))
+    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+    return BSpline.design_matrix(values, knots, 3).toarray()

@@ -1,0 +1,156 @@
+"""The whole story for quasi-static logs: fit the line, look at what it leaves over, add the effect behind it, refit."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fitting.quasi_static.attribution import Held, Round, Trial, look
+from fitting.quasi_static.candidates import Form, catalogue
+from fitting.quasi_static.leftover import Leftover, leftover
+from fitting.quasi_static.points import Points
+from fitting.quasi_static.stretches import stretches
+from fitting.quasi_static.twist_model import fit_twist
+from fitting.trial import LEAST_GAIN
+
+Decision = Literal["effect_found", "model_sufficient", "unexplained"]
+
+# As in the loop for drive logs: a residual this much larger than the noise is not noise, and effects that remove this
+# share of the unexplained variance are the explanation.
+_EXCESS, _EXPLAINED = 1.5, 0.75
+# A further effect must remove this share (rms) of what those before it removed. Laws of hysteresis and of stiffness are
+# good to some hundredths, so that less may be what they get wrong themselves.
+_IMPERFECTION = 0.05
+# Forms of one family in a model: orders of an angle, sliders side by side.
+_MOST_OF_A_FAMILY = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """A family of effects that the logs support.
+
+    Attributes:
+        family: Its name.
+        forms: Its forms in the final model, in the order in which they were found.
+        validation_gain: Share of the held-out error that it removes, against the final model without it.
+        p_value: Chance that the best of the catalogue would gain as much on noise.
+    """
+
+    family: str
+    forms: tuple[Form, ...]
+    validation_gain: float
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False)
+class QuasiStaticLoop:
+    """The outcome of closing the loop on quasi-static logs.
+
+    Attributes:
+        decision: What the logs say.
+        held: The points, and how they were parted.
+        before: The straight line.
+        after: The final model; the same where nothing was found.
+        findings: Largest gain first.
+        rounds: Every look at the catalogue.
+        dropped: Forms that a later one made superfluous.
+        left: What the final model leaves over, where it depends on something.
+        forms_tried: Number of forms in the catalogue.
+    """
+
+    decision: Decision
+    held: Held
+    before: Trial
+    after: Trial
+    findings: tuple[Finding, ...]
+    rounds: tuple[Round, ...]
+    dropped: tuple[str, ...]
+    left: Leftover | None
+    forms_tried: int
+
+
+def _silent(message: str) -> None:
+    pass
+
+
+def close_loop(
+    points: Points, *, max_effects: int = 3, seed: int = 0, progress: Callable[[str], None] = _silent
+) -> QuasiStaticLoop:
+    """Close the loop between the torque-twist equation and quasi-static logs of one drive.
+
+    Args:
+        points: Of the logs.
+        max_effects: Families of effects to add at most.
+        seed: Of the surrogates behind the p-values.
+        progress: Told what is being done.
+    """
+    line = fit_twist(points, (), ())
+    # Two stretches in each log at least, so that its zero is known where one is held out.
+    held = Held.of(points, stretches(line.misfit, points.log, each=2))
+    base = held.attempt((), ())
+    forms = catalogue(points)
+    current, rounds = base, []
+    while len(candidates := _still_open(forms, current, max_effects)) > 0:
+        progress("looking through the catalogue")
+        this = look(held, current, base, candidates, seed + len(rounds), _IMPERFECTION)
+        rounds.append(this)
+        if not this.accepted:
+            break
+        current = this.rivals[0].trial
+        progress(f"found {this.rivals[0].form.name}")
+    current, dropped = _without_superfluous(held, current)
+    left = leftover(held, current, seed)
+    return QuasiStaticLoop(
+        decision=_decide(base, current, left, points.twist_noise),
+        held=held,
+        before=base,
+        after=current,
+        findings=_findings(held, current, rounds),
+        rounds=tuple(rounds),
+        dropped=dropped,
+        left=left,
+        forms_tried=len(forms),
+    )
+
+
+def _still_open(forms: tuple[Form, ...], current: Trial, max_effects: int) -> list[Form]:
+    """Forms that may be added: of new families up to the most that are wanted, and further ones of those found."""
+    present = [form.family for form in current.model.forms]
+    full = len(set(present)) >= max_effects
+    return [
+        form
+        for form in forms
+        if form not in current.model.forms
+        and (form.family in present or not full)
+        and present.count(form.family) < _MOST_OF_A_FAMILY
+    ]
+
+
+def _without_superfluous(held: Held, trial: Trial) -> tuple[Trial, tuple[str, ...]]:
+    dropped = []
+    for form in trial.model.forms[:-1]:
+        poorer = held.without(trial, [form])
+        if trial.gain_over(poorer) < LEAST_GAIN:
+            trial = poorer
+            dropped.append(form.name)
+    return trial, tuple(dropped)
+
+
+def _findings(held: Held, after: Trial, rounds: list[Round]) -> tuple[Finding, ...]:
+    found = []
+    for family in dict.fromkeys(form.family for form in after.model.forms):
+        own = tuple(form for form in after.model.forms if form.family == family)
+        without = held.without(after, own)
+        chance = min(r.rivals[0].p_value for r in rounds if r.accepted and r.rivals[0].form in own)
+        found.append(Finding(family, own, 1.0 - after.rmse / without.rmse, chance))
+    return tuple(sorted(found, key=lambda one: -one.validation_gain))
+
+
+def _decide(base: Trial, after: Trial, left: Leftover | None, noise: float) -> Decision:
+    """Something unexplained is what predictably depends on something; noise of whatever colour does not."""
+    if left is None or after.rmse < _EXCESS * noise:
+        return "effect_found" if after is not base else "model_sufficient"
+    before, behind = (max(t.mean_square - noise**2, 0.0) for t in (base, after))
+    explained = 1.0 - behind / before if before > 0 else 0.0
+    return "effect_found" if after is not base and explained >= _EXPLAINED else "unexplained"
