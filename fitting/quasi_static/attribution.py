@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fitting.attribution import SIGNIFICANCE
-from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.candidates import Form, is_plausible
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import Lead, Screen, screen
 from fitting.quasi_static.stretches import folds, worse
@@ -73,8 +73,10 @@ class Held:
         return Trial(model, hold_out(self.points, model, self.fold))
 
     def beside(self, trial: Trial, lead: Lead) -> Trial:
-        """The model with one form more."""
-        return self.attempt((*trial.model.forms, lead.form), (*trial.model.shapes, lead.shape))
+        """The model with what it lacks of a lead."""
+        new = [i for i, form in enumerate(lead.forms) if form not in trial.model.forms]
+        forms, shapes = (tuple(of[i] for i in new) for of in (lead.forms, lead.shapes))
+        return self.attempt((*trial.model.forms, *forms), (*trial.model.shapes, *shapes))
 
     def without(self, trial: Trial, forms: Sequence[Form]) -> Trial:
         """The model without some of its forms."""
@@ -89,10 +91,10 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A form that was refitted inside the equation.
+    """A form, or two, refitted inside the equation.
 
     Attributes:
-        lead: The form, where its refit began.
+        lead: The forms, where its refit began.
         trial: The refit.
         gain: Over the model without it, on held-out stretches.
         p_value: Chance that the best of the catalogue gains as much on noise.
@@ -104,11 +106,6 @@ class Rival:
     gain: float
     p_value: float
     separable: bool = True
-
-    @property
-    def form(self) -> Form:
-        """The form."""
-        return self.lead.form
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,31 +125,42 @@ class Round:
     accepted: bool
 
 
-def look(held: Held, before: Trial, base: Trial, forms: Sequence[Form], seed: int, imperfection: float) -> Round:
+def look(
+    held: Held, before: Trial, base: Trial, choices: Sequence[tuple[Form, ...]], seed: int, imperfection: float
+) -> Round:
     """Look for the effect that explains most of what a model leaves over.
 
     Args:
         held: The points.
         before: The current model.
         base: The model without any effect.
-        forms: To consider, the more usual ones first.
+        choices: Forms, or two together, to consider, the more usual ones first.
         seed: Of the surrogates.
         imperfection: Share (rms) of what earlier effects removed that a further one must remove at least.
     """
-    screened = screen(held.points, before.model, forms, held.fold, seed)
+    screened = screen(held.points, before.model, choices, held.fold, seed)
     leads = _worth_a_refit(screened)
     rivals = []
     for lead in leads:
         trial = held.beside(before, lead)
         gain = trial.gain_over(before)
-        rivals.append(Rival(lead, trial, gain, screened.p_value(gain)))
+        # The law of chance holds for the grid of shapes; what a search between its points gains has to count as chance.
+        rivals.append(Rival(lead, trial, gain, screened.p_value(min(gain, lead.gain))))
     rivals.sort(key=lambda rival: -rival.gain)
     if not rivals or rivals[0].p_value > SIGNIFICANCE or rivals[0].gain < LEAST_GAIN:
         return Round(before, screened, tuple(rivals), accepted=False)
-    winner, told = _compared(held, rivals, screened, [id(form) for form in forms])
+    winner, told = _compared(held, rivals, screened, list(choices))
     removed = before.mean_square - winner.trial.mean_square
     enough = removed > imperfection**2 * (base.mean_square - before.mean_square)
+    if any(form.of_torque for form in winner.lead.forms):
+        enough = enough and removed > torque_error(held.points, base)
     return Round(before, screened, (winner, *told), accepted=enough)
+
+
+def torque_error(points: Points, base: Trial) -> float:
+    """Mean square of the twist that the torque's own error may account for [rad^2]; less than this shows no effect."""
+    # Stein's estimate of a single log scatters, and the error stands together at the torque's corners.
+    return 2.0 * float(base.model.coefficients[0] * points.torque_error) ** 2
 
 
 def _worth_a_refit(screened: Screen) -> list[Lead]:
@@ -164,26 +172,36 @@ def _worth_a_refit(screened: Screen) -> list[Lead]:
     return [
         lead
         for i, lead in enumerate(near)
-        if sum(other.form.family == lead.form.family for other in near[:i]) < _FORMS
+        if sum(other.families == lead.families for other in near[:i]) < _FORMS
     ]
 
 
-def _compared(held: Held, rivals: list[Rival], screened: Screen, order: list[int]) -> tuple[Rival, list[Rival]]:
+def _compared(held: Held, rivals: list[Rival], screened: Screen, order: list[tuple[Form, ...]]) -> tuple[Rival, list[Rival]]:
     """The winner, and the other rivals with whether the logs tell them from it.
 
     Forms are tied where neither predicts held-out stretches clearly better, and where the better one has nothing left to
-    explain beside the other. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more usual.
+    explain beside the other. Of tied forms the one with the fewest parameters, none beyond what real drives show, wins; of
+    nearly equal ones the more usual.
     """
     leader = rivals[0]
     tied = [leader, *(rival for rival in rivals[1:] if _is_tied(held, rival, leader, screened))]
-    fewest = min(rival.form.size for rival in tied)
-    small = [rival for rival in tied if rival.form.size == fewest]
+    able = [rival for rival in tied if _is_plausible(held.points, rival)] or tied
+    fewest = min(rival.lead.size for rival in able)
+    small = [rival for rival in able if rival.lead.size == fewest]
     most = max(rival.gain for rival in small)
-    winner = min((r for r in small if r.gain >= NEARLY * most), key=lambda r: order.index(id(r.form)))
+    winner = min((r for r in small if r.gain >= NEARLY * most), key=lambda r: order.index(r.lead.forms))
     others = [
         Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner
     ]
     return winner, others
+
+
+def _is_plausible(points: Points, rival: Rival) -> bool:
+    model = rival.trial.model
+    return all(
+        is_plausible(form, model.coefficients[model.own(form, len(points.names))[0]], model.coefficients[0], points)
+        for form in rival.lead.forms
+    )
 
 
 def _is_tied(held: Held, rival: Rival, leader: Rival, screened: Screen) -> bool:

@@ -6,7 +6,7 @@ A column may hang on one or two shape parameters (a knee, a time constant), whic
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -28,6 +28,9 @@ _POINTS_IN_CONSTANT, _CONSTANTS_IN_LOG = 8, 4
 # A drift can be told from the way there and back after two full cycles.
 _REVERSALS_FOR_DRIFT = 4
 
+# Some times the 3 ms that actuators show.
+_LARGEST_DELAY = 0.01
+
 Columns = Callable[[Points, np.ndarray], np.ndarray]
 
 
@@ -46,6 +49,7 @@ class Form:
         low: Least value of each shape parameter.
         high: Largest.
         sign: Sign that physics asks of the first strength; zero for either.
+        of_torque: Whether its columns follow the torque, so that an error of the torque may pass for it.
     """
 
     family: str
@@ -58,6 +62,7 @@ class Form:
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
     sign: int = 0
+    of_torque: bool = True
 
     @property
     def size(self) -> int:
@@ -81,6 +86,28 @@ def catalogue(points: Points) -> tuple[Form, ...]:
         *_delay(points),
         *_temperature(points),
     )
+
+
+def choices(forms: Sequence[Form], families: int) -> list[tuple[Form, ...]]:
+    """Forms to look at: each alone, and each bend together with each loop, of which either hides the other.
+
+    Args:
+        forms: That may be added.
+        families: Number of families that may be added.
+    """
+    alone = [(form,) for form in forms]
+    if families < 2:
+        return alone
+    loops = [form for form in forms if form.family == "hysteresis"]
+    bends = [form for form in forms if form.family == "stiffness_shape" and not form.shape_names]
+    return alone + [(loop, bend) for loop in loops for bend in bends]
+
+
+def is_plausible(form: Form, strengths: np.ndarray, compliance: float | np.floating, points: Points) -> bool:
+    """Whether real drives show such a strength: a channel is late by milliseconds, or by samples."""
+    if form.family != "input_delay" or compliance == 0.0:
+        return True
+    return abs(strengths[0] / compliance) <= max(_LARGEST_DELAY, 2.0 * points.step)
 
 
 def base_columns(points: Points) -> np.ndarray:
@@ -213,6 +240,7 @@ def _of_the_motor_angle(points: Points) -> Iterator[Form]:
             partial(_order, n, None),
             names,
             f"twist = tau/K + a cos({n} theta_m) + b sin({n} theta_m)",
+            of_torque=False,
         )
         yield Form(
             "position_dependent_stiffness",
@@ -248,6 +276,7 @@ def _eccentricity(points: Points) -> Iterator[Form]:
             partial(_load_order, n),
             (f"cosine {n}", f"sine {n}"),
             f"reading of theta_l = theta_l - a cos({n} theta_l) - b sin({n} theta_l)",
+            of_torque=False,
         )
 
 

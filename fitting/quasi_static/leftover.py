@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from fitting.attribution import SIGNIFICANCE
-from fitting.quasi_static.attribution import Held, Trial
+from fitting.quasi_static.attribution import Held, Trial, torque_error
 from fitting.quasi_static.candidates import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import screen
@@ -33,22 +33,24 @@ class Leftover:
     p_value: float
 
 
-def leftover(held: Held, trial: Trial, seed: int) -> Leftover | None:
+def leftover(held: Held, trial: Trial, base: Trial, seed: int) -> Leftover | None:
     """The quantity of which a smooth function predicts the residual on unseen stretches; None where none does.
 
     Args:
         held: The points.
         trial: The final model.
+        base: The straight line.
         seed: Of the surrogates.
     """
-    found = screen(held.points, trial.model, _smooth_functions(held.points), held.fold, seed)
+    found = screen(held.points, trial.model, [(form,) for form in _smooth_functions(held.points)], held.fold, seed)
     if not found.leads:
         return None
     best = found.leads[0]
     p_value = found.p_value(best.gain)
-    if best.gain < LEAST_GAIN or p_value > SIGNIFICANCE:
+    share = 1.0 - math.exp(-2.0 * best.gain)
+    if best.gain < LEAST_GAIN or p_value > SIGNIFICANCE or share * trial.mean_square < torque_error(held.points, base):
         return None
-    return Leftover(best.form.name, 1.0 - math.exp(-2.0 * best.gain), p_value)
+    return Leftover(best.name, share, p_value)
 
 
 def _smooth_functions(points: Points) -> list[Form]:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from fitting.quasi_static.attribution import Held, Round, Trial, look
-from fitting.quasi_static.candidates import Form, catalogue
+from fitting.quasi_static.candidates import Form, catalogue, choices
 from fitting.quasi_static.leftover import Leftover, leftover
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import stretches
@@ -91,16 +91,16 @@ def close_loop(
     base = held.attempt((), ())
     forms = catalogue(points)
     current, rounds = base, []
-    while len(candidates := _still_open(forms, current, max_effects)) > 0:
+    while still_open := _still_open(forms, current, max_effects):
         progress("looking through the catalogue")
-        this = look(held, current, base, candidates, seed + len(rounds), _IMPERFECTION)
+        this = look(held, current, base, still_open, seed + len(rounds), _IMPERFECTION)
         rounds.append(this)
         if not this.accepted:
             break
         current = this.rivals[0].trial
-        progress(f"found {this.rivals[0].form.name}")
-    current, dropped = _without_superfluous(held, current)
-    left = leftover(held, current, seed)
+        progress(f"found {this.rivals[0].lead.name}")
+    current, dropped = _without_superfluous(held, current, base)
+    left = leftover(held, current, base, seed)
     return QuasiStaticLoop(
         decision=_decide(base, current, left, points.twist_noise),
         held=held,
@@ -114,24 +114,27 @@ def close_loop(
     )
 
 
-def _still_open(forms: tuple[Form, ...], current: Trial, max_effects: int) -> list[Form]:
-    """Forms that may be added: of new families up to the most that are wanted, and further ones of those found."""
+def _still_open(forms: tuple[Form, ...], current: Trial, max_effects: int) -> list[tuple[Form, ...]]:
+    """What may be added: new families up to the most that are wanted, and further forms of those found."""
     present = [form.family for form in current.model.forms]
-    full = len(set(present)) >= max_effects
-    return [
+    free = max_effects - len(set(present))
+    left = [
         form
         for form in forms
         if form not in current.model.forms
-        and (form.family in present or not full)
+        and (form.family in present or free > 0)
         and present.count(form.family) < _MOST_OF_A_FAMILY
     ]
+    return choices(left, 0 if present else free)
 
 
-def _without_superfluous(held: Held, trial: Trial) -> tuple[Trial, tuple[str, ...]]:
+def _without_superfluous(held: Held, trial: Trial, base: Trial) -> tuple[Trial, tuple[str, ...]]:
+    """The model without forms that hardly matter beside the others."""
     dropped = []
-    for form in trial.model.forms[:-1]:
+    for form in trial.model.forms if len(trial.model.forms) > 1 else ():
         poorer = held.without(trial, [form])
-        if trial.gain_over(poorer) < LEAST_GAIN:
+        least = _IMPERFECTION**2 * (base.mean_square - trial.mean_square)
+        if trial.gain_over(poorer) < LEAST_GAIN or poorer.mean_square - trial.mean_square < least:
             trial = poorer
             dropped.append(form.name)
     return trial, tuple(dropped)
@@ -142,7 +145,7 @@ def _findings(held: Held, after: Trial, rounds: list[Round]) -> tuple[Finding, .
     for family in dict.fromkeys(form.family for form in after.model.forms):
         own = tuple(form for form in after.model.forms if form.family == family)
         without = held.without(after, own)
-        chance = min(r.rivals[0].p_value for r in rounds if r.accepted and r.rivals[0].form in own)
+        chance = min(r.rivals[0].p_value for r in rounds if r.accepted and set(r.rivals[0].lead.forms) & set(own))
         found.append(Finding(family, own, 1.0 - after.rmse / without.rmse, chance))
     return tuple(sorted(found, key=lambda one: -one.validation_gain))
 

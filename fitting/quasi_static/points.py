@@ -2,7 +2,8 @@
 
 The rows are averaged only as far as it takes to have few thousands of them, since ripples and relaxations are fast. The
 torque's noise is taken off by local cubics instead (Savitzky and Golay 1964) whose width Stein's estimate of the risk
-chooses (Stein 1981): noise that stayed in the torque would be explained by whatever candidate smooths it.
+chooses (Stein 1981): noise that stayed in the torque would be explained by whatever candidate smooths it. The estimate
+also says how far the torque is still off.
 """
 
 import math
@@ -44,6 +45,7 @@ class Points:
         names: Of the logs.
         paths: Of the logs' files.
         torque_noise: Standard deviation of the noise of one row's torque [N m].
+        torque_error: Root mean square error of `torque` [N m]: what noise is left, and what smoothing has rounded off.
         twist_noise: Of a point's twist [rad].
         rows: Rows in a point, by log.
         reversals: Of the torque, by log.
@@ -62,6 +64,7 @@ class Points:
     names: tuple[str, ...]
     paths: tuple[str, ...]
     torque_noise: float
+    torque_error: float
     twist_noise: float
     rows: tuple[int, ...]
     reversals: tuple[int, ...]
@@ -114,7 +117,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
     def every(key: str) -> np.ndarray:
         return np.concatenate([p[key] for p in parts])
 
-    torque_noise, twist_noise = (float(np.mean([p["noise"][i] for p in parts])) for i in (0, 1))
+    torque_noise, torque_error, twist_noise = (float(np.mean([p["noise"][i] for p in parts])) for i in range(3))
     return Points(
         torque=every("torque"),
         twist=every("twist"),
@@ -129,6 +132,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
         names=tuple(log.name for log in logs),
         paths=tuple(str(log.path) for log in logs),
         torque_noise=torque_noise,
+        torque_error=torque_error,
         twist_noise=max(twist_noise, 1e-7 * max(float(np.ptp(p["twist"])) for p in parts)),
         rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
         reversals=tuple(int(p["reversals"]) for p in parts),
@@ -139,11 +143,12 @@ def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[st
     torque = log.joint_torque
     assert torque is not None
     size = math.ceil(len(log) / most)
+    smooth, error = without_noise(torque)
     found = {
-        "torque": means(without_noise(torque), size),
+        "torque": means(smooth, size),
         "twist": means(log.dynamic_error - np.mean(log.dynamic_error), size),
         "time": means(log.time - log.time[0], size),
-        "noise": np.array([noise(torque), noise(means(log.dynamic_error, size))]),
+        "noise": np.array([noise(torque), error, noise(means(log.dynamic_error, size))]),
     }
     found["twist"] = found["twist"] - np.mean(found["twist"])
     # As coarse as it takes for turns to stand out of the torque's noise.
@@ -156,14 +161,14 @@ def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[st
     if speed is None:
         found["direction"] = np.zeros_like(found["torque"])
     else:
-        smooth = means(speed, size)
-        moves = np.abs(smooth) > _AT_REST * np.percentile(np.abs(smooth), 90)
-        found["direction"] = np.sign(smooth) * moves
+        speed = means(speed, size)
+        moves = np.abs(speed) > _AT_REST * np.percentile(np.abs(speed), 90)
+        found["direction"] = np.sign(speed) * moves
     return found
 
 
-def without_noise(values: np.ndarray) -> np.ndarray:
-    """A course without its white noise, whose size third differences tell.
+def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """A course without its white noise, whose size third differences tell, and the root mean square error left.
 
     Among local cubics of all widths, and the values as they are, that of the least expected square error.
 
@@ -177,10 +182,13 @@ def without_noise(values: np.ndarray) -> np.ndarray:
             break
         smooth = savgol_filter(values, width, 3)
         own_share = float(savgol_coeffs(width, 3)[width // 2])
-        risk = float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance
+        # The variance of what is left is a local cubic's, whatever the estimate of the rounding says.
+        risk = max(
+            float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance
+        )
         if risk < least:
             best, least = smooth, risk
-    return best
+    return best, math.sqrt(least)
 
 
 def _rests(direction: np.ndarray, moving_log: np.ndarray, sizes: Sequence[int]) -> np.ndarray:

@@ -4,16 +4,17 @@ Everything is linear in the strengths, so that inner products of columns, residu
 hold all that cross-validation needs: the whole catalogue is looked at under 199 surrogates in a fraction of a second.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.noise_colour import noise_of_the_same_colour
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS
 from fitting.quasi_static.twist_model import TwistModel
-from fitting.surrogates import same_colour
 
 # Columns of which so little is beside those that the model has already can't be seen.
 _BLIND = 1e-3
@@ -22,17 +23,32 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """One form at the grid point that suits it best.
+    """One form, or two that may hide each other, at the grid point that suits best.
 
     Attributes:
-        form: The form.
-        shape: Its shape parameters.
-        gain: Half the logarithm of the held-out mean square without it over that with it.
+        forms: The form or forms.
+        shapes: Shape parameters of each.
+        gain: Half the logarithm of the held-out mean square without over that with it.
     """
 
-    form: Form
-    shape: np.ndarray
+    forms: tuple[Form, ...]
+    shapes: tuple[np.ndarray, ...]
     gain: float
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Of the forms."""
+        return tuple(form.family for form in self.forms)
+
+    @property
+    def name(self) -> str:
+        """Of the forms."""
+        return " and ".join(form.name for form in self.forms)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(form.size for form in self.forms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +56,8 @@ class Screen:
     """A look at the whole catalogue.
 
     Attributes:
-        leads: Each form at its best, best first.
-        null_gains: The best gain over all forms and shapes in each surrogate, (draws,).
+        leads: Each choice at its best, best first.
+        null_gains: The best gain over all choices and shapes in each surrogate, (draws,).
     """
 
     leads: tuple[Lead, ...]
@@ -52,39 +68,48 @@ class Screen:
         return (1 + int(np.sum(self.null_gains >= gain))) / (1 + len(self.null_gains))
 
 
-def screen(points: Points, model: TwistModel, forms: Sequence[Form], fold: np.ndarray, seed: int) -> Screen:
+def screen(
+    points: Points, model: TwistModel, choices: Sequence[tuple[Form, ...]], fold: np.ndarray, seed: int
+) -> Screen:
     """Look at forms beside a fitted model.
 
     Args:
         points: That were fitted.
         model: Of these points; its shape parameters move along to first order.
-        forms: To look at.
+        choices: Forms, or several together, to look at.
         fold: Number of the fold of each point, (n,).
         seed: Of the surrogates.
     """
     random = np.random.default_rng(seed)
-    chance = [same_colour(model.misfit[own][:, None], random)[:, :, 0] for own in points.logs]
+    chance = [noise_of_the_same_colour(model.misfit[own], random) for own in points.logs]
     series = np.column_stack([model.misfit, np.concatenate(chance, axis=1).T])
     known = _orthonormal(model.jacobian)
-    pairs = [(form, shape) for form in forms for shape in form.shapes]
-    blocks = [_beside(known, form.columns(points, shape)) for form, shape in pairs]
-    products = _Products.of(np.column_stack([known, *blocks]), series, fold)
+    forms = dict.fromkeys(form for choice in choices for form in choice)
+    columns = {form: [_beside(known, form.columns(points, shape)) for shape in form.shapes] for form in forms}
+    products = _Products.of(np.column_stack([known, *(c for own in columns.values() for c in own)]), series, fold)
+    seats, first = {}, known.shape[1]
+    for form, own in columns.items():
+        seats[form] = [np.arange(first + i * c.shape[1], first + (i + 1) * c.shape[1]) for i, c in enumerate(own)]
+        first += sum(c.shape[1] for c in own)
+    tried = [
+        (choice, grid) for choice in choices for grid in itertools.product(*(range(len(f.shapes)) for f in choice))
+    ]
+    chosen = [np.concatenate([seats[f][i] for f, i in zip(*one, strict=True)]) for one in tried]
     nuisance = np.arange(known.shape[1])
     before = products.held_out_loss(nuisance[None, :])[0][0]
-    ends = known.shape[1] + np.cumsum([0, *(block.shape[1] for block in blocks)])
-    gains = np.zeros((len(pairs), series.shape[1]))
-    sizes = np.array([block.shape[1] for block in blocks], dtype=int)
+    gains = np.zeros((len(tried), series.shape[1]))
+    sizes = np.array([len(own) for own in chosen], dtype=int)
     for size in np.unique(sizes):
         these = np.flatnonzero(sizes == size)
-        chosen = np.array([[*nuisance, *range(ends[i], ends[i] + size)] for i in these])
-        loss, strengths = products.held_out_loss(chosen)
-        signs = np.array([pairs[i][0].sign for i in these])
+        loss, strengths = products.held_out_loss(np.array([[*nuisance, *chosen[i]] for i in these]))
+        # Only forms that stand alone ask for a sign.
+        signs = np.array([tried[i][0][0].sign if len(tried[i][0]) == 1 else 0 for i in these])
         wrong = (signs[:, None] != 0) & (np.sign(strengths[:, len(nuisance)]) == -signs[:, None])
         gains[these] = np.where(wrong, 0.0, 0.5 * np.log(before / np.maximum(loss, 1e-300)))
-    leads: dict[int, Lead] = {}
-    for (form, shape), gain in zip(pairs, gains[:, 0].tolist(), strict=True):
-        if id(form) not in leads or gain > leads[id(form)].gain:
-            leads[id(form)] = Lead(form, shape, gain)
+    leads: dict[tuple[Form, ...], Lead] = {}
+    for (choice, grid), gain in zip(tried, gains[:, 0].tolist(), strict=True):
+        if choice not in leads or gain > leads[choice].gain:
+            leads[choice] = Lead(choice, tuple(f.shapes[i] for f, i in zip(choice, grid, strict=True)), gain)
     null_gains = np.max(gains[:, 1:], axis=0, initial=0.0)
     return Screen(tuple(sorted(leads.values(), key=lambda lead: -lead.gain)), null_gains)
 

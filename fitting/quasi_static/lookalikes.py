@@ -1,0 +1,74 @@
+"""What the torque-twist equation can't tell from a found effect whatever the fit, and the experiment that would."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from fitting.quasi_static.points import Points
+
+_LOADED_TWICE = "Run the same path under another load: {}"
+_BOTH_WAYS = "Run the same path both ways: friction changes its sign, {} does not."
+
+
+def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
+    """Families whose columns are the same as a found one's on these logs, each with the experiment that separates.
+
+    Args:
+        family: Of the effect that was found.
+        points: Of the logs.
+    """
+    moved = points.direction is not None
+    if family == "kinematic_error":
+        torque_ripple = "an error of the gear's geometry stays in the twist, a torque on the motor's side does not."
+        yield "cogging", f"Measure the torque at the output instead of by the motor's current: {torque_ripple}"
+        yield (
+            "encoder_eccentricity",
+            "Pass quickly through the speed at which the order meets the natural frequency: a kinematic error is amplified "
+            "there, an error of the motor's encoder is not.",
+        )
+        if "both ways" not in points.motion:
+            yield "position_dependent_friction", _BOTH_WAYS.format("a kinematic error")
+    elif family == "hysteresis":
+        yield (
+            "motor_friction",
+            "Measure the torque at the output, behind the motor's bearings and seals: friction on the motor's side is then "
+            "out of the loop, hysteresis of the gear stays.",
+        )
+        yield (
+            "coulomb_friction",
+            "Cycle the torque with small loops inside large ones: hysteresis has a slope before it slides.",
+        )
+    elif family == "motor_friction":
+        yield "load_friction", "Drive one side at a time, the other one uncoupled."
+        if "both ways" not in points.motion:
+            yield "torque_sensor", _BOTH_WAYS.format("an error of the torque sensor")
+    elif family == "creep":
+        yield "temperature", "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
+    elif family == "input_delay":
+        yield (
+            "nonlinear_damping",
+            "Cycle the torque at two rates, with clocks that are known to agree: damping depends on how twist and torque are "
+            "coupled, a delay is the same for any two channels.",
+        )
+    elif family == "temperature":
+        yield "creep", "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
+    elif family == "encoder_eccentricity":
+        yield "kinematic_error", _LOADED_TWICE.format("turn the load's encoder disc on its shaft and see what turns along.")
+    elif family == "stiffness_shape" and moved and _hangs_on_position(points):
+        yield (
+            "encoder_eccentricity",
+            "Run the same path under another load: a bent stiffness follows the torque, an error of an encoder follows "
+            "the angle.",
+        )
+
+
+def _hangs_on_position(points: Points) -> bool:
+    """Whether the torque was a function of the load's angle, as where gravity loads a joint that moves."""
+    if points.load_angle is None:
+        return False
+    for own in points.logs:
+        angle, torque = points.load_angle[own], points.torque[own]
+        rest = torque - np.polyval(np.polyfit(angle - np.mean(angle), torque, 3), angle - np.mean(angle))
+        if np.var(rest) > 0.1 * np.var(torque):
+            return False
+    return True

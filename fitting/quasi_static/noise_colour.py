@@ -1,0 +1,71 @@
+"""What chance might have left over instead: noise of the residual's own colour, from an autoregressive process.
+
+Surrogates with random phases return to where they began, which slow noise does not; against slow effects that would be
+too little chance.
+"""
+
+import numpy as np
+from scipy.fft import prev_fast_len
+from scipy.signal import lfilter
+
+from fitting.spectral_lines import STANDS_OUT, surroundings
+from fitting.surrogates import DRAWS
+
+_HIGHEST_ORDER = 30
+# Values of the process before the first that counts, over its order at most.
+_WARM_UP = 2000
+
+
+def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Draws of Gaussian noise with the spectrum of a residual, (draws, n).
+
+    Lines that stand out of their surroundings are cut down first: they are no colour of noise, but what a periodic effect
+    leaves.
+
+    Args:
+        residual: In order of time, evenly spaced or nearly, (n,).
+        random: Generator.
+    """
+    series = _without_lines(residual - np.mean(residual))
+    coefficients, variance = autoregression(series)
+    innovations = random.normal(size=(DRAWS, _WARM_UP + len(residual))) * np.sqrt(variance)
+    return lfilter([1.0], coefficients, innovations, axis=1)[:, _WARM_UP:]
+
+
+def _without_lines(series: np.ndarray) -> np.ndarray:
+    length = prev_fast_len(len(series), real=True)
+    spectrum = np.fft.rfft(series[:length])
+    power = np.abs(spectrum) ** 2
+    cut = np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
+    return np.fft.irfft(spectrum / cut, n=length)
+
+
+def autoregression(series: np.ndarray) -> tuple[np.ndarray, float]:
+    """The autoregressive process that predicts a series best, its order chosen by Akaike's criterion.
+
+    Args:
+        series: Of mean zero, (n,).
+
+    Returns:
+        Coefficients of the prediction error filter, the first of them 1, and the variance of its output.
+
+    References:
+        Burg 1975, Maximum entropy spectral analysis (thesis, Stanford); Akaike 1974, IEEE Trans. Autom. Control 19(6).
+    """
+    size = len(series)
+    forwards, backwards = series[1:].copy(), series[:-1].copy()
+    filter_, variance = np.ones(1), float(np.mean(series**2))
+    best, least = (filter_, variance), size * np.log(max(variance, 1e-300))
+    for order in range(1, min(_HIGHEST_ORDER, size // 10) + 1):
+        power = float(forwards @ forwards + backwards @ backwards)
+        if power <= 0.0:
+            break
+        reflection = -2.0 * float(forwards @ backwards) / power
+        longer = np.append(filter_, 0.0)
+        filter_ = longer + reflection * longer[::-1]
+        variance *= 1.0 - reflection**2
+        forwards, backwards = (forwards + reflection * backwards)[1:], (backwards + reflection * forwards)[:-1]
+        criterion = size * np.log(max(variance, 1e-300)) + 2.0 * order
+        if criterion < least:
+            best, least = (filter_, variance), criterion
+    return best
