@@ -39,7 +39,7 @@ from fitting.next_experiment import experiment_for_alpha, experiment_for_ties
 from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
+from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, ready_log, ready_logs, rig_of
 from fitting.sweep_commands import sweep
 from hdjax import (
     PRESETS,
@@ -136,6 +136,7 @@ def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -
     from fitting.quasi_static import content as quasi_static_content
     from fitting.quasi_static import report as quasi_static_report
     from fitting.quasi_static.fit import fit_quasi_static
+    from fitting.quasi_static.plots import pictures
     from fitting.quasi_static.preparation import prepare
 
     with _progress() as progress:
@@ -145,7 +146,7 @@ def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -
             data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion
         )
         report = quasi_static_content.report_dict(data, found)
-    paths = quasi_static_report.write_report(out, report, found)
+    paths = quasi_static_report.write_report(out, report, pictures(found))
     print(quasi_static_report.report_text(report))
     print(f"Report: {paths['report.html']}")
 
@@ -213,10 +214,12 @@ def close_loop_command(
 ) -> None:
     """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
 
+    Quasi-static logs (twist and joint torque) are explained without inertia: the equation is the torque-twist line.
+
     Parameters
     ----------
     out
-        Folder for report.html, report.json and model.json.
+        Folder for report.html, report.json and, but for quasi-static logs, model.json.
     max_effects
         Effects to add at most.
     seed
@@ -228,7 +231,35 @@ def close_loop_command(
     if max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
     asked = wanted(limits, next_experiment)
-    _close_loop(read_rig(logs, drive), out, max_effects, seed, asked)
+    drive_file = read_drive_file(drive)
+    read = ready_logs(logs, drive_file)
+    if read[0].kind == "quasi-static":
+        if asked is not None:
+            raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
+        _close_quasi_static_loop(read, drive_file, out, max_effects, seed)
+    else:
+        _close_loop(rig_of(read, drive_file), out, max_effects, seed, asked)
+
+
+def _close_quasi_static_loop(
+    logs: tuple[Log, ...], drive_file: DriveFile, out: Path, max_effects: int, seed: int
+) -> None:
+    from fitting.quasi_static.loop import close_loop as close_quasi_static_loop
+    from fitting.quasi_static.loop_content import loop_report
+    from fitting.quasi_static.loop_plots import loop_pictures
+    from fitting.quasi_static.loop_text import loop_text as quasi_static_text
+    from fitting.quasi_static.points import points_of
+    from fitting.quasi_static.preparation import prepare
+    from fitting.quasi_static.report import write_report
+
+    with _progress() as progress:
+        data = prepare(logs, drive_file, at_rest=True)
+        points = points_of(data.logs, data.motion, drive_file.reduction_ratio)
+        loop = close_quasi_static_loop(points, max_effects=max_effects, seed=seed, progress=progress)
+        report = loop_report(data, loop)
+    paths = write_report(out, report, loop_pictures(loop))
+    print(quasi_static_text(report))
+    print(f"Report: {paths['report.html']}")
 
 
 def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None) -> None:

@@ -169,14 +169,12 @@ def _worth_a_refit(screened: Screen) -> list[Lead]:
     if best < LEAST_GAIN or screened.p_value(best) > SIGNIFICANCE:
         return []
     near = [lead for lead in screened.leads if lead.gain >= _RIVAL * best]
-    return [
-        lead
-        for i, lead in enumerate(near)
-        if sum(other.families == lead.families for other in near[:i]) < _FORMS
-    ]
+    return [lead for i, lead in enumerate(near) if sum(other.families == lead.families for other in near[:i]) < _FORMS]
 
 
-def _compared(held: Held, rivals: list[Rival], screened: Screen, order: list[tuple[Form, ...]]) -> tuple[Rival, list[Rival]]:
+def _compared(
+    held: Held, rivals: list[Rival], screened: Screen, order: list[tuple[Form, ...]]
+) -> tuple[Rival, list[Rival]]:
     """The winner, and the other rivals with whether the logs tell them from it.
 
     Forms are tied where neither predicts held-out stretches clearly better, and where the better one has nothing left to
@@ -190,9 +188,7 @@ def _compared(held: Held, rivals: list[Rival], screened: Screen, order: list[tup
     small = [rival for rival in able if rival.lead.size == fewest]
     most = max(rival.gain for rival in small)
     winner = min((r for r in small if r.gain >= NEARLY * most), key=lambda r: order.index(r.lead.forms))
-    others = [
-        Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner
-    ]
+    others = [Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner]
     return winner, others
 
 

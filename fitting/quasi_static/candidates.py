@@ -155,9 +155,7 @@ def _stiffness_shapes(points: Points) -> Iterator[Form]:
     line = "twist = tau/K1 up to T1, with slope 1/K2 beyond"
     yield Form(stiffness, "two slopes", _beyond, ("beyond knee",), line, knees[:, None], ("log knee",), *ends)
     if points.centre == 0.0:
-        yield Form(
-            "backlash", "dead zone", _dead_zone, ("half-width",), "twist = tau/K + b sgn(tau)", sign=1
-        )
+        yield Form("backlash", "dead zone", _dead_zone, ("half-width",), "twist = tau/K + b sgn(tau)", sign=1)
 
 
 def _powers(powers: tuple[int, ...], points: Points, shape: np.ndarray) -> np.ndarray:
@@ -226,7 +224,9 @@ def orders_seen(angle: np.ndarray, points: Points, highest: int) -> list[int]:
     travel = max(float(np.ptp(angle[own])) for own in points.logs)
     steps = np.abs(np.concatenate([np.diff(angle[own]) for own in points.logs]))
     step = float(np.median(steps[steps >= 0.1 * np.percentile(steps, 90)]))
-    return [n for n in range(1, highest + 1) if n * travel >= 2 * math.pi and n * step <= 2 * math.pi / _POINTS_IN_PERIOD]
+    return [
+        n for n in range(1, highest + 1) if n * travel >= 2 * math.pi and n * step <= 2 * math.pi / _POINTS_IN_PERIOD
+    ]
 
 
 def _of_the_motor_angle(points: Points) -> Iterator[Form]:

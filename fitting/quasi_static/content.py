@@ -1,30 +1,26 @@
 """What a quasi-static fit found, as `report.json` has it: figures, held-out errors, and what the logs can't tell."""
 
 import dataclasses
-import platform
 from collections.abc import Mapping
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from fitting import formatting
 from fitting.files import finite
+from fitting.quasi_static.facts import ABOUT_SCALE, ending, estimates, few_stretches, heading, log_dict
 from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.stretches import stretches
 from fitting.quasi_static.torque_twist import SHAPES, Shape
 
-SCHEMA = "hdjax-report/1"
 PLAIN_SHAPE: dict[Shape, str] = {
     "linear": "straight line",
     "cubic": "cubic",
     "two slopes": "two slopes",
     "three slopes": "three slopes",
 }
-_LIBRARIES = ("hdjax", "numpy", "scipy")
-_FEW_STRETCHES = 10
 # The least of the values that vendors' tables imply.
 _TYPICAL_ALPHA = 1.1e5
 _SEPARATING = "Cycle the torque slowly to larger twists, past the knees, in both directions."
@@ -44,14 +40,7 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
     parameters = fit.known[fit.chosen] | _unknown(fit, rated)
     shapes = {shape: _account(fit, shape, fit.known[shape]) for shape in SHAPES}
     blocks = fit.blocks
-    report = {
-        "schema": SCHEMA,
-        "version": version("hdjax"),
-        "name": data.drive_file.name,
-        "kind": "quasi-static",
-        "decision": "fit_only",
-        "summary": "",
-        "units": {"dynamic_error": "rad", "joint_torque": "N m"},
+    report = heading(data) | {
         "noise": {"dynamic_error": blocks.twist_noise, "joint_torque": blocks.torque_noise},
         "shape": fit.chosen,
         "memory": fit.best.curve.memory,
@@ -63,13 +52,9 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         "alternatives": [_alternative(fit, shape) for shape in SHAPES if shape != fit.chosen],
         "shapes": shapes,
         "cannot_tell": [],
-        "logs": [_log(data, fit, i) for i in range(len(data.logs))],
-        "health": [
-            {"log": name} | dataclasses.asdict(finding) for name, found in data.findings.items() for finding in found
-        ],
-        "versions": {"python": platform.python_version()} | {library: version(library) for library in _LIBRARIES},
+        "logs": [log_dict(data, i, blocks.rows[i], blocks.reversals[i]) for i in range(len(data.logs))],
     }
-    report = finite(report)
+    report = finite(report | ending(data))
     report["summary"] = summary(report)
     report["cannot_tell"] = _limits(report, data, fit)
     return report
@@ -108,14 +93,10 @@ def _account(fit: QuasiStaticFit, shape: Shape, known: Mapping[str, Known]) -> d
     validation = float(np.sqrt(np.mean(fit.held_out[shape] ** 2)))
     return {
         "effects": [],
-        "parameters": {name: _estimate(one) for name, one in known.items()},
+        "parameters": estimates(known),
         "derived": {},
         "rmse": {"training": training, "validation": validation},
     }
-
-
-def _estimate(known: Known) -> dict[str, Any]:
-    return dataclasses.asdict(known) | {"ci95": list(known.ci95 or (None, None))}
 
 
 def _alternative(fit: QuasiStaticFit, shape: Shape) -> dict[str, Any]:
@@ -125,19 +106,6 @@ def _alternative(fit: QuasiStaticFit, shape: Shape) -> dict[str, Any]:
         "validation_rmse": float(np.sqrt(np.mean(fit.held_out[shape] ** 2))),
         "separable": fit.is_worse(shape, fit.chosen) or fit.is_worse(fit.chosen, shape),
         "separating_experiment": _SEPARATING,
-    }
-
-
-def _log(data: QuasiStaticData, fit: QuasiStaticFit, i: int) -> dict[str, Any]:
-    log = data.logs[i]
-    return {
-        "name": log.name,
-        "samples": len(log),
-        "held_out": len(log),
-        "seconds": float(log.time[-1] - log.time[0]),
-        "rows_per_block": fit.blocks.rows[i],
-        "reversals": fit.blocks.reversals[i],
-        "motion": data.motion[i],
     }
 
 
@@ -226,12 +194,7 @@ def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFi
             "A drift of the twist with time is taken as zero: it takes two full torque cycles to tell it apart."
         )
     count = int(stretches(fit.best.residual, fit.blocks.log)[-1]) + 1
-    if count < _FEW_STRETCHES:
-        notes.append(
-            f"What the curve leaves over is so correlated that the logs hold only {count} independent stretches: the "
-            "intervals are wide, and rest on little. Record more torque cycles."
-        )
-    return notes
+    return notes + few_stretches(count)
 
 
 def _about_shape(report: Mapping[str, Any], fit: QuasiStaticFit) -> list[str]:
@@ -278,15 +241,11 @@ def _about_motion(data: QuasiStaticData) -> list[str]:
     if {"one way", "both ways"} & set(data.motion):
         notes.append(
             "While the joint moves, kinematic error and eccentric encoders move the twist as well; they count as error "
-            "here, and bend the curve where they are slow. An angle-dependent term needs hdjax close-loop and a drive "
-            "log."
+            "here, and bend the curve where they are slow; hdjax close-loop looks for them."
         )
     if "unknown" in data.motion:
         notes.append("Whether the joint moved is unknown, since no motor angle or velocity was logged.")
-    notes.append(
-        "If the joint torque was not measured but computed, from gravity or a current, its errors of scale go into "
-        "every stiffness in proportion."
-    )
+    notes.append(ABOUT_SCALE)
     return notes
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
 from fitting.logs import Log
 from fitting.quasi_static.blocks import average
 from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish

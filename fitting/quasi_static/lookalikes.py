@@ -43,7 +43,10 @@ def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
         if "both ways" not in points.motion:
             yield "torque_sensor", _BOTH_WAYS.format("an error of the torque sensor")
     elif family == "creep":
-        yield "temperature", "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
+        yield (
+            "temperature",
+            "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away.",
+        )
     elif family == "input_delay":
         yield (
             "nonlinear_damping",
@@ -53,7 +56,10 @@ def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
     elif family == "temperature":
         yield "creep", "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
     elif family == "encoder_eccentricity":
-        yield "kinematic_error", _LOADED_TWICE.format("turn the load's encoder disc on its shaft and see what turns along.")
+        yield (
+            "kinematic_error",
+            _LOADED_TWICE.format("turn the load's encoder disc on its shaft and see what turns along."),
+        )
     elif family == "stiffness_shape" and moved and _hangs_on_position(points):
         yield (
             "encoder_eccentricity",

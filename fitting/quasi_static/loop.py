@@ -4,8 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from fitting.quasi_static.attribution import Held, Round, Trial, look
 from fitting.quasi_static.candidates import Form, catalogue, choices
 from fitting.quasi_static.leftover import Leftover, leftover

@@ -9,7 +9,9 @@ from scipy.fft import prev_fast_len
 from scipy.signal import lfilter
 
 from fitting.spectral_lines import STANDS_OUT, surroundings
-from fitting.surrogates import DRAWS
+
+DRAWS = 999
+"""Draws: cheap here, and with fewer a chance of one in a hundred would itself be a matter of chance."""
 
 _HIGHEST_ORDER = 30
 # Values of the process before the first that counts, over its order at most.
@@ -19,8 +21,8 @@ _WARM_UP = 2000
 def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Draws of Gaussian noise with the spectrum of a residual, (draws, n).
 
-    Lines that stand out of their surroundings are cut down first: they are no colour of noise, but what a periodic effect
-    leaves.
+    Lines that stand out of their surroundings are cut down first: they are no colour of noise, but what a periodic
+    effect leaves.
 
     Args:
         residual: In order of time, evenly spaced or nearly, (n,).

@@ -183,9 +183,7 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
         smooth = savgol_filter(values, width, 3)
         own_share = float(savgol_coeffs(width, 3)[width // 2])
         # The variance of what is left is a local cubic's, whatever the estimate of the rounding says.
-        risk = max(
-            float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance
-        )
+        risk = max(float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance)
         if risk < least:
             best, least = smooth, risk
     return best, math.sqrt(least)

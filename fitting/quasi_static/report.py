@@ -1,7 +1,6 @@
 """The report of a quasi-static fit: text for the terminal, a page, and JSON."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,26 +11,25 @@ from plotly.offline import get_plotlyjs
 from fitting import formatting
 from fitting.files import write_whole
 from fitting.quasi_static.content import PLAIN_SHAPE
-from fitting.quasi_static.fit import QuasiStaticFit
-from fitting.quasi_static.plots import Picture, pictures
+from fitting.quasi_static.drawing import Picture
+from fitting.quasi_static.facts import ARCMIN
+from fitting.quasi_static.loop_text import figure_line
 from fitting.web_page import environment
 
-_ARCMIN = math.degrees(1.0) * 60.0
 
-
-def write_report(out: Path, report: Mapping[str, Any], fit: QuasiStaticFit) -> dict[str, Path]:
+def write_report(out: Path, report: Mapping[str, Any], shown: Sequence[Picture]) -> dict[str, Path]:
     """Write `report.html` and `report.json`: both, whole, or none.
 
     Args:
         out: Folder; made where absent.
-        report: From [`fitting.quasi_static.content.report_dict`][].
-        fit: Its pictures.
+        report: Of a fit or of a loop.
+        shown: Its pictures.
 
     Returns:
         The files' paths, by name.
     """
     texts = {
-        "report.html": report_page(report, pictures(fit)),
+        "report.html": report_page(report, shown),
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
     }
     paths = {file: out / file for file in texts}
@@ -45,8 +43,11 @@ def report_page(report: Mapping[str, Any], shown: Sequence[Picture]) -> str:
         "value": _value,
         "interval": _interval,
         "shape": PLAIN_SHAPE.__getitem__,
+        "percent": formatting.percent,
+        "family": lambda name: name.replace("_", " "),
     }
-    page = environment(filters).get_template("quasi_static.html.jinja")
+    template = "quasi_static.html.jinja" if report["decision"] == "fit_only" else "quasi_static_loop.html.jinja"
+    page = environment(filters).get_template(template)
     return page.render(report=report, pictures=shown, plotlyjs=Markup(get_plotlyjs()))
 
 
@@ -64,7 +65,7 @@ def _interval(known: Mapping[str, Any]) -> str:
 
 def _in_arcmin(known: Mapping[str, Any]) -> str:
     """The unit in which vendors state small angles."""
-    return f" ({formatting.number(_ARCMIN * known['value'])} arcmin)" if known["unit"] == "rad" else ""
+    return f" ({formatting.number(ARCMIN * known['value'])} arcmin)" if known["unit"] == "rad" else ""
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -77,7 +78,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     lines.append("[Parameters]")
     known = report["before"]["parameters"]
     width = max(map(len, known))
-    lines += [f"    {name:{width}}  {_line(one)}" for name, one in known.items()]
+    lines += [f"    {name:{width}}  {figure_line(one)}" for name, one in known.items()]
     lines.append("[Shapes, by held-out error]")
     for shape, account in sorted(report["shapes"].items(), key=lambda item: item[1]["rmse"]["validation"]):
         mark = "  chosen" if shape == report["shape"] else ""
@@ -85,15 +86,3 @@ def report_text(report: Mapping[str, Any]) -> str:
     lines += [f"[Note] {note}" for note in report["cannot_tell"]]
     lines += [f"[{f['severity']}] {f['log']}: {f['where']}: {f['what']}; {f['consequence']}" for f in report["health"]]
     return "\n".join(lines)
-
-
-def _line(known: Mapping[str, Any]) -> str:
-    if known["value"] is None:
-        return "unknown"
-    low, high = known["ci95"]
-    ends = "" if low is None or high is None else f"  [{low:.4g}, {high:.4g}]"
-    share = (
-        f" ({100 * known['std'] / abs(known['value']):.2g} %)" if known["value"] and known["std"] is not None else ""
-    )
-    flag = "" if known["identifiable"] else "  NOT IDENTIFIABLE"
-    return f"{known['value']:.5g} +/- {known['std']:.2g}{share} {known['unit']}{ends}{flag}"

@@ -1,4 +1,4 @@
-"""What a fitted torque-twist equation says in figures: stiffness, amplitudes, friction, knees, each with its interval."""
+"""The figures of a fitted torque-twist equation: stiffness, amplitudes, friction, knees, each with its interval."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -42,7 +42,7 @@ def _known(points: Points, model: TwistModel, figures: list[_Figure]) -> dict[st
     fitted = np.concatenate([model.coefficients, *model.shapes])
     found = scatter(model.jacobian, model.misfit, stretches(model.misfit, points.log, each=2))
     return {
-        name: known_figure(formula(fitted), _slope(formula, fitted, found), found, unit, description, positive)
+        name: known_figure(float(formula(fitted)), _slope(formula, fitted, found), found, unit, description, positive)
         for name, formula, unit, description, positive in figures
     }
 
