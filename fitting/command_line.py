@@ -39,7 +39,7 @@ from fitting.next_experiment import experiment_for_alpha, experiment_for_ties
 from fitting.posterior import sampler
 from fitting.report import fit_text, loop_text, write_fit_report, write_loop_report
 from fitting.response_commands import amplitudes, seed_tables, speeds
-from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, ready_log, ready_logs, rig_of
+from fitting.rig import WHY_NOT_QUASI_STATIC, Rig, experiments, read_rig, ready_log, ready_logs, rig_of
 from fitting.sweep_commands import sweep
 from hdjax import (
     PRESETS,

@@ -75,8 +75,9 @@ class Held:
     def beside(self, trial: Trial, lead: Lead) -> Trial:
         """The model with what it lacks of a lead."""
         new = [i for i, form in enumerate(lead.forms) if form not in trial.model.forms]
-        forms, shapes = (tuple(of[i] for i in new) for of in (lead.forms, lead.shapes))
-        return self.attempt((*trial.model.forms, *forms), (*trial.model.shapes, *shapes))
+        return self.attempt(
+            (*trial.model.forms, *(lead.forms[i] for i in new)), (*trial.model.shapes, *(lead.shapes[i] for i in new))
+        )
 
     def without(self, trial: Trial, forms: Sequence[Form]) -> Trial:
         """The model without some of its forms."""
@@ -177,9 +178,9 @@ def _compared(
 ) -> tuple[Rival, list[Rival]]:
     """The winner, and the other rivals with whether the logs tell them from it.
 
-    Forms are tied where neither predicts held-out stretches clearly better, and where the better one has nothing left to
-    explain beside the other. Of tied forms the one with the fewest parameters, none beyond what real drives show, wins; of
-    nearly equal ones the more usual.
+    Forms are tied where the one does not predict held-out stretches clearly worse, and where the better one has nothing
+    left to explain beside it. Of tied forms the one with the fewest parameters, none beyond what real drives show,
+    wins; of nearly equal ones the more usual.
     """
     leader = rivals[0]
     tied = [leader, *(rival for rival in rivals[1:] if _is_tied(held, rival, leader, screened))]

@@ -209,7 +209,7 @@ def _lag(values: np.ndarray, steps: np.ndarray, constant: float) -> np.ndarray:
     if np.ptp(steps) <= 1e-6 * np.mean(steps):
         kept = math.exp(-float(np.mean(steps)) / constant)
         share = (1.0 - kept) * constant / float(np.mean(steps))
-        return lfilter([1.0 - share, share - kept], [1.0, -kept], values)
+        return np.asarray(lfilter([1.0 - share, share - kept], [1.0, -kept], values))
     kept = np.exp(-steps / constant)
     share = (1.0 - kept) * constant / steps
     added = (1.0 - share) * values[1:] + (share - kept) * values[:-1]

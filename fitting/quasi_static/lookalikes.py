@@ -6,7 +6,7 @@ import numpy as np
 
 from fitting.quasi_static.points import Points
 
-_LOADED_TWICE = "Run the same path under another load: {}"
+_CONSTANT = "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
 _BOTH_WAYS = "Run the same path both ways: friction changes its sign, {} does not."
 
 
@@ -23,7 +23,7 @@ def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
         yield "cogging", f"Measure the torque at the output instead of by the motor's current: {torque_ripple}"
         yield (
             "encoder_eccentricity",
-            "Pass quickly through the speed at which the order meets the natural frequency: a kinematic error is amplified "
+            "Pass through the speed at which the order meets the natural frequency: a kinematic error is amplified "
             "there, an error of the motor's encoder is not.",
         )
         if "both ways" not in points.motion:
@@ -31,8 +31,8 @@ def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
     elif family == "hysteresis":
         yield (
             "motor_friction",
-            "Measure the torque at the output, behind the motor's bearings and seals: friction on the motor's side is then "
-            "out of the loop, hysteresis of the gear stays.",
+            "Measure the torque at the output: friction on the motor's side is then out of the loop, hysteresis of the "
+            "gear stays.",
         )
         yield (
             "coulomb_friction",
@@ -43,23 +43,17 @@ def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
         if "both ways" not in points.motion:
             yield "torque_sensor", _BOTH_WAYS.format("an error of the torque sensor")
     elif family == "creep":
-        yield (
-            "temperature",
-            "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away.",
-        )
+        yield "temperature", _CONSTANT
     elif family == "input_delay":
         yield (
             "nonlinear_damping",
-            "Cycle the torque at two rates, with clocks that are known to agree: damping depends on how twist and torque are "
-            "coupled, a delay is the same for any two channels.",
+            "Record a step of another quantity on both channels: a delay of the log is there as well, damping of the "
+            "mesh is not.",
         )
     elif family == "temperature":
-        yield "creep", "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
+        yield "creep", _CONSTANT
     elif family == "encoder_eccentricity":
-        yield (
-            "kinematic_error",
-            _LOADED_TWICE.format("turn the load's encoder disc on its shaft and see what turns along."),
-        )
+        yield "kinematic_error", "Turn the load's encoder on its shaft: its own error turns along, the gear's stays."
     elif family == "stiffness_shape" and moved and _hangs_on_position(points):
         yield (
             "encoder_eccentricity",

@@ -71,7 +71,7 @@ def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
         for name, known in estimates(strengths_of(loop.held.points, loop.after.model, form)).items():
             path = f"{finding.family}.{name}"
             number = sum(other == path or other.startswith(f"{path} (") for other in parameters)
-            parameters[f"{path} ({number + 1})" if number else path] = known | _in_arcmin(known)
+            parameters[f"{path} ({number + 1})" if number else path] = known | _in_arcmin(name, known)
     return {
         "family": finding.family,
         "name": " and ".join(form.name for form in finding.forms),
@@ -82,10 +82,12 @@ def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
     }
 
 
-def _in_arcmin(known: Mapping[str, Any]) -> dict[str, Any]:
-    """The unit in which small angles are stated, beside SI; not for phases."""
-    if known["unit"] != "rad" or known["value"] is None or known["description"].startswith("psi"):
+def _in_arcmin(name: str, known: Mapping[str, Any]) -> dict[str, Any]:
+    """The unit in which small angles are stated, beside SI; phases are not small."""
+    if known["unit"] != "rad" or known["value"] is None:
         return {}
+    if name.startswith("phase"):
+        return {"arcmin": None}
     ends = [None if end is None else ARCMIN * end for end in known["ci95"]]
     return {"arcmin": {"value": ARCMIN * known["value"], "ci95": ends}}
 
@@ -198,18 +200,19 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
         notes += _about_loops(friction["value"])
     if loop.decision == "model_sufficient" and loop.after.rmse > 2.0 * points.twist_noise:
         notes.append(
-            "What is left over is slower than the twist's noise, and follows nothing that was logged, as far as held-out "
-            "stretches can tell: noise of that colour, an error of the torque, or too few cycles to tell an effect."
+            "What is left over is slower than the twist's noise, and follows nothing that was logged, as far as "
+            "held-out stretches can tell: noise of that colour, an error of the torque, or too few cycles to tell an "
+            "effect."
         )
     error = formatting.quantity(float(abs(loop.before.model.coefficients[0])) * points.torque_error, "rad")
     notes.append(
-        f"The torque is still off by {formatting.quantity(points.torque_error, 'N m')} rms when its noise is taken off, "
-        f"which is {error} of twist: an effect that follows the torque and is smaller than that can't be seen."
+        f"The torque is still off by {formatting.quantity(points.torque_error, 'N m')} rms when its noise is taken "
+        f"off, which is {error} of twist: an effect that follows the torque and is smaller than that can't be seen."
     )
     if "one way" in points.motion:
         notes.append(
-            "The joint moved one way only: nothing is said of hysteresis, and friction that is constant while it moves is a "
-            "part of the zero."
+            "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is a "
+            "part of the zero, and friction that depends on load or position is a part of the stiffness."
         )
     count = int(stretches(model.misfit, points.log, each=2)[-1]) + 1
     return [*notes, *few_stretches(count), ABOUT_SCALE]
@@ -218,11 +221,11 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
 def _about_loops(friction: float) -> list[str]:
     if friction < 0:
         return [
-            "The loop runs the wrong way round, as if the gear gave out energy. Hysteresis of the gear alone can't do that; "
-            "friction on the motor's side does where the torque is a motor's current, since it bears a part of the torque "
-            "that the gear passes on, and so does a torque channel that lags behind."
+            "The loop runs the wrong way round, as if the gear gave out energy. Hysteresis of the gear alone can't do "
+            "that; friction on the motor's side does where the torque is a motor's current, since it bears a part of "
+            "the torque that the gear passes on, and so does a torque channel that lags behind."
         ]
     return [
-        "The loop contains all friction between torque and twist: a torque measured on the motor's side, by its current "
-        "above all, counts friction of motor and bearings as hysteresis of the gear."
+        "The loop contains all friction between torque and twist: a torque measured on the motor's side, by its "
+        "current above all, counts friction of motor and bearings as hysteresis of the gear."
     ]

@@ -87,8 +87,10 @@ def _spectrum(loop: QuasiStaticLoop, finding: Finding) -> Picture:
     angle = points.load_angle if side == "load" else points.motor_angle
     assert angle is not None
     orders = np.arange(0.25, HIGHEST_ORDER + 0.5, 0.125)
-    before = _amplitudes(angle, model.misfit + contribution(points, model, finding.forms), orders)
-    after = _amplitudes(angle, model.misfit, orders)
+    # At rest every order is a constant.
+    moves = np.full(len(angle), True) if points.direction is None else points.direction != 0
+    own = contribution(points, model, finding.forms)
+    before, after = (_amplitudes(angle[moves], v[moves], orders) for v in (model.misfit + own, model.misfit))
     factor, unit = scaled_unit(float(np.max(before)), "rad")
     traces = [
         drawn(orders, factor * before, mode="lines", color=FALLING, name="without the effect"),
@@ -98,7 +100,7 @@ def _spectrum(loop: QuasiStaticLoop, finding: Finding) -> Picture:
         f"evidence-{finding.family}",
         f"Evidence for {finding.family.replace('_', ' ')}: orders of the {side}'s angle",
         f"Amplitude of waves in the twist that repeat so many times in a revolution of the {side}, without and with "
-        "the effect in the equation.",
+        "the effect in the equation, while the joint moves.",
         figure(traces, 360, f"order of the {side}'s revolution", axis_label("amplitude", unit)),
     )
 

@@ -53,7 +53,7 @@ def figure_line(known: Mapping[str, Any]) -> str:
 
 
 def _arcmin(known: Mapping[str, Any]) -> str:
-    if "arcmin" not in known:
+    if known.get("arcmin") is None:
         return ""
     value, (low, high) = known["arcmin"]["value"], known["arcmin"]["ci95"]
     ends = "" if low is None or high is None else f" [{low:.3g}, {high:.3g}]"

@@ -31,7 +31,7 @@ def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) 
     series = _without_lines(residual - np.mean(residual))
     coefficients, variance = autoregression(series)
     innovations = random.normal(size=(DRAWS, _WARM_UP + len(residual))) * np.sqrt(variance)
-    return lfilter([1.0], coefficients, innovations, axis=1)[:, _WARM_UP:]
+    return np.asarray(lfilter([1.0], coefficients, innovations, axis=1))[:, _WARM_UP:]
 
 
 def _without_lines(series: np.ndarray) -> np.ndarray:

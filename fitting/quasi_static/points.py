@@ -180,7 +180,7 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
     for width in _WIDTHS:
         if 10 * width > len(values):
             break
-        smooth = savgol_filter(values, width, 3)
+        smooth = np.asarray(savgol_filter(values, width, 3))
         own_share = float(savgol_coeffs(width, 3)[width // 2])
         # The variance of what is left is a local cubic's, whatever the estimate of the rounding says.
         risk = max(float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance)

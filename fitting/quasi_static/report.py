@@ -65,7 +65,8 @@ def _interval(known: Mapping[str, Any]) -> str:
 
 def _in_arcmin(known: Mapping[str, Any]) -> str:
     """The unit in which vendors state small angles."""
-    return f" ({formatting.number(ARCMIN * known['value'])} arcmin)" if known["unit"] == "rad" else ""
+    small = known["unit"] == "rad" and known.get("arcmin", known) is not None
+    return f" ({formatting.number(ARCMIN * known['value'])} arcmin)" if small else ""
 
 
 def report_text(report: Mapping[str, Any]) -> str:

@@ -63,7 +63,7 @@ def _figures(points: Points, model: TwistModel, form: Form) -> Iterator[_Figure]
         yield from _of_an_order(form, first)
     elif form.family == "hysteresis":
         yield "friction", lambda p: -p[first] / p[0], "N m", "friction behind the loop, half its width in torque", False
-        yield "width", lambda p: -2.0 * p[first], "rad", "width of the developed loop", False
+        yield "width", lambda p: float(-2.0 * p[first]), "rad", "width of the developed loop", False
         yield "reach", lambda p: math.exp(p[shape]), "N m", "torque over which the branch changes, half way", True
     elif form.family == "stiffness_shape":
         yield from _of_a_bend(form, first, shape)
