@@ -12,7 +12,7 @@ from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import Motion
 
 K = 4e4
-RATIO = 100
+RATIO = 100.0
 STEP = 0.004
 
 Effect = Callable[["Motion_"], np.ndarray]

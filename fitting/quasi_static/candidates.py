@@ -107,7 +107,7 @@ def is_plausible(form: Form, strengths: np.ndarray, compliance: float | np.float
     """Whether real drives show such a strength: a channel is late by milliseconds, or by samples."""
     if form.family != "input_delay" or compliance == 0.0:
         return True
-    return abs(strengths[0] / compliance) <= max(_LARGEST_DELAY, 2.0 * points.step)
+    return bool(abs(strengths[0] / compliance) <= max(_LARGEST_DELAY, 2.0 * points.step))
 
 
 def base_columns(points: Points) -> np.ndarray:
@@ -178,30 +178,29 @@ def _creep(points: Points) -> Iterator[Form]:
     if not low < high:
         return
     logs = len(points.names)
-    grid = np.linspace(math.log(low), math.log(high), 10)[:, None]
+    constants, starts = np.linspace(math.log(low), math.log(high), 10), (-1.0, 0.0, 1.0)
     yield Form(
         "creep",
         "standard linear solid",
         _lagging,
-        ("delayed compliance", *(f"start {i}" for i in range(logs))),
+        ("delayed compliance",),
         "twist = tau/K + k z, where T z' = tau - z",
-        grid,
-        ("log time constant",),
-        (math.log(low),),
-        (math.log(high),),
+        np.array([[at, *[start] * logs] for at in constants for start in starts]),
+        ("log time constant", *(f"start {i}" for i in range(logs))),
+        (math.log(low), *[-1.0] * logs),
+        (math.log(high), *[1.0] * logs),
         sign=1,
     )
 
 
 def _lagging(points: Points, shape: np.ndarray) -> np.ndarray:
-    """The torque behind a first-order lag, and how each log's own start fades."""
-    constant = math.exp(shape[0])
-    lags, fades = [], np.zeros((len(points.torque), len(points.names)))
-    for i, own in enumerate(points.logs):
-        torque, steps = points.torque[own], np.diff(points.time[own])
-        lags.append(_lag(torque - torque[0], steps, constant) + torque[0])
-        fades[own, i] = np.exp(-points.time[own] / constant)
-    return np.column_stack([np.concatenate(lags) - points.centre, fades])
+    """The torque behind a first-order lag, which begins by a share of the torque's range off it."""
+    constant, lags = math.exp(shape[0]), []
+    for start, own in zip(shape[1:], points.logs, strict=True):
+        torque, time = points.torque[own], points.time[own]
+        fading = start * points.reach * np.exp(-(time - time[0]) / constant)
+        lags.append(_lag(torque - torque[0], np.diff(time), constant) + torque[0] + fading)
+    return (np.concatenate(lags) - points.centre)[:, None]
 
 
 def _lag(values: np.ndarray, steps: np.ndarray, constant: float) -> np.ndarray:

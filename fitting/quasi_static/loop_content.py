@@ -211,8 +211,8 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
     )
     if "one way" in points.motion:
         notes.append(
-            "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is a "
-            "part of the zero, and friction that depends on load or position is a part of the stiffness."
+            "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is "
+            "a part of the zero, and friction that depends on load or position is a part of the stiffness."
         )
     count = int(stretches(model.misfit, points.log, each=2)[-1]) + 1
     return [*notes, *few_stretches(count), ABOUT_SCALE]

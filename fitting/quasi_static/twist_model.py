@@ -63,11 +63,15 @@ def fit_twist(points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray,
 
 
 def hold_out(points: Points, model: TwistModel, fold: np.ndarray) -> np.ndarray:
-    """Misfit [rad] of each point by the equation that was fitted, shapes and all, without the point's fold, (n,)."""
+    """Misfit [rad] of each point by the equation that was fitted, shapes and all, without the point's fold, (n,).
+
+    Where a log begins, the branch of a loop or the state of a relaxation, is taken from the fit of all points: it is an
+    initial state, of which only the log's first stretch knows.
+    """
     misfit = np.empty_like(points.twist)
     for i in range(FOLDS):
         seen = fold != i
-        shapes = _polished(points, model.forms, model.shapes, seen)
+        shapes = _polished(points, model.forms, model.shapes, seen, starts=False)
         matrix = design(points, model.forms, shapes)
         misfit[~seen] = (points.twist - matrix @ _solved(matrix[seen], points.twist[seen]))[~seen]
     return misfit
@@ -80,23 +84,36 @@ def design(points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ..
 
 
 def _polished(
-    points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ...], seen: np.ndarray
+    points: Points,
+    forms: tuple[Form, ...],
+    shapes: tuple[np.ndarray, ...],
+    seen: np.ndarray,
+    *,
+    starts: bool = True,
 ) -> tuple[np.ndarray, ...]:
+    """Shape parameters that suit the seen points best, with or without those that say where a log begins."""
     start = np.concatenate([np.zeros(0), *shapes])
-    if start.size == 0:
+    names = [name for form in forms for name in form.shape_names]
+    free = np.array([starts or not name.startswith("start") for name in names], dtype=bool)
+    if not free.any():
         return shapes
     ends = np.cumsum([len(shape) for shape in shapes])[:-1]
     scale = float(np.std(points.twist)) or 1.0
 
-    def residual(shape: np.ndarray) -> np.ndarray:
-        matrix = design(points, forms, tuple(np.split(shape, ends)))[seen]
+    def whole(moved: np.ndarray) -> tuple[np.ndarray, ...]:
+        shape = start.copy()
+        shape[free] = moved
+        return tuple(np.split(shape, ends))
+
+    def residual(moved: np.ndarray) -> np.ndarray:
+        matrix = design(points, forms, whole(moved))[seen]
         return (points.twist[seen] - matrix @ _solved(matrix, points.twist[seen])) / scale
 
-    low, high = (np.concatenate([np.asarray(getattr(form, side)) for form in forms]) for side in ("low", "high"))
-    inside = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+    low, high = (np.concatenate([np.asarray(getattr(form, side)) for form in forms])[free] for side in ("low", "high"))
+    inside = np.clip(start[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
     # Kinks pass from point to point: steps of the derivative must reach over them.
     found = least_squares(residual, inside, bounds=(low, high), diff_step=1e-3, x_scale=high - low, max_nfev=25)
-    return tuple(np.split(found.x, ends))
+    return whole(found.x)
 
 
 def _solved(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
