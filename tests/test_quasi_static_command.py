@@ -6,7 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from torque_cycles import K1, cycles, line
+from torque_cycles import FRICTION, K1, cycles, line, no_friction, sliders
 
 from fitting.command_line import main
 from fitting.drive_file import read_drive_file
@@ -177,11 +177,59 @@ def test_what_cannot_be_fitted_is_refused_in_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_close_loop_says_what_to_do_instead(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    log, drive = write(tmp_path, table())
-    assert run("close-loop", log, "--drive", drive, "--out", tmp_path / "out") == 2
+def test_close_loop_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table(friction=sliders, rows=1000, twist_noise=1e-6))
+    assert run("close-loop", log, "--drive", drive, "--out", tmp_path / "out") == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.html", "report.json"]
+    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=no_constant)
+    assert report["schema"] == "hdjax-report/1" and report["kind"] == "quasi-static"
+    assert report["decision"] == "effect_found"
+    (effect,) = report["after"]["effects"]
+    assert effect["family"] == "hysteresis" and effect["p_value"] <= 0.01 and 0 < effect["validation_gain"] < 1
+    width = effect["parameters"]["hysteresis.width"]
+    assert width["unit"] == "rad" and width["ci95"][0] < 2 * FRICTION / K1 < width["ci95"][1]
+    assert width["arcmin"]["value"] == pytest.approx(np.rad2deg(width["value"]) * 60)
+    assert report["after"]["rmse"]["validation"] < report["before"]["rmse"]["validation"]
+    assert set(report["before"]["parameters"]["K"]) >= {"value", "std", "ci95", "unit", "identifiable"}
+    assert [step["added"] for step in report["steps"]][0] is None
+    friction = next(one for one in report["alternatives"] if one["family"] == "motor_friction")
+    assert friction["separable"] is False and friction["separating_experiment"]
+    page = (tmp_path / "out/report.html").read_text()
+    assert "Plotly.newPlot" in page and "<script src" not in page and "evidence-hysteresis" in page
+    text = capsys.readouterr().out
+    assert "effect_found" in text and "hysteresis.width" in text and "arcmin" in text and "TIE" in text
+
+
+def test_close_loop_says_that_the_line_suffices(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    log, drive = write(tmp_path, table(friction=no_friction, rows=1000))
+    assert run("close-loop", log, "--drive", drive, "--out", tmp_path / "out") == 0
+    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=no_constant)
+    assert report["decision"] == "model_sufficient" and report["after"]["effects"] == []
+    assert "suffices" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "code", "words"),
+    [
+        (turned_round(), [], 1, "sign = -1"),
+        (table() | {"twist": np.full(400, 1e-3)}, [], 1, "dynamic_error"),
+        (table(), ["--max-effects", "-1"], 2, "--max-effects"),
+        (table(), ["--next-experiment"], 2, "quasi-static"),
+    ],
+)
+def test_what_close_loop_cannot_do_is_one_sentence(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    columns: dict[str, np.ndarray],
+    options: list[str],
+    code: int,
+    words: str,
+) -> None:
+    log, file = write(tmp_path, columns, "")
+    assert run("close-loop", log, "--drive", file, "--out", tmp_path / "out", *options) == code
     message = capsys.readouterr().err
-    assert "hdjax fit" in message and "drive log" in message and message.count("\n") == 1
+    assert words in message and message.count("\n") == 1 and "Traceback" not in message
+    assert not (tmp_path / "out").exists()
 
 
 def test_predict_says_what_to_do_instead(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

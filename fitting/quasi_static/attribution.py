@@ -17,6 +17,8 @@ from fitting.trial import LEAST_GAIN
 
 # A form that explains less than this share of what the best one does is no rival, and is not refitted.
 _RIVAL = 0.25
+# A form within what real drives show leads where it explains this share of what the best one does.
+_PLAUSIBLE = 0.5
 # Forms of one family that are refitted.
 _FORMS = 3
 
@@ -179,18 +181,22 @@ def _compared(
     """The winner, and the other rivals with whether the logs tell them from it.
 
     Forms are tied where the one does not predict held-out stretches clearly worse, and where the better one has nothing
-    left to explain beside it. Of tied forms the one with the fewest parameters, none beyond what real drives show,
-    wins; of nearly equal ones the more usual.
+    left to explain beside it. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more
+    usual. A strength beyond what real drives show stands back where another form explains half as much.
     """
-    leader = rivals[0]
-    tied = [leader, *(rival for rival in rivals[1:] if _is_tied(held, rival, leader, screened))]
+    supported = [
+        rival for rival in rivals if rival.p_value <= SIGNIFICANCE and rival.gain >= _PLAUSIBLE * rivals[0].gain
+    ]
+    leader = next((rival for rival in supported if _is_plausible(held.points, rival)), rivals[0])
+    others = [rival for rival in rivals if rival is not leader]
+    tied = [leader, *(rival for rival in others if _is_tied(held, rival, leader, screened))]
     able = [rival for rival in tied if _is_plausible(held.points, rival)] or tied
     fewest = min(rival.lead.size for rival in able)
     small = [rival for rival in able if rival.lead.size == fewest]
     most = max(rival.gain for rival in small)
     winner = min((r for r in small if r.gain >= NEARLY * most), key=lambda r: order.index(r.lead.forms))
-    others = [Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner]
-    return winner, others
+    told = [Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner]
+    return winner, told
 
 
 def _is_plausible(points: Points, rival: Rival) -> bool:

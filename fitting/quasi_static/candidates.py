@@ -30,6 +30,8 @@ _REVERSALS_FOR_DRIFT = 4
 
 # Some times the 3 ms that actuators show.
 _LARGEST_DELAY = 0.01
+# Some times the percents of the twist that drives creep by.
+_LARGEST_CREEP = 0.5
 
 Columns = Callable[[Points, np.ndarray], np.ndarray]
 
@@ -104,10 +106,12 @@ def choices(forms: Sequence[Form], families: int) -> list[tuple[Form, ...]]:
 
 
 def is_plausible(form: Form, strengths: np.ndarray, compliance: float | np.floating, points: Points) -> bool:
-    """Whether real drives show such a strength: a channel is late by milliseconds, or by samples."""
-    if form.family != "input_delay" or compliance == 0.0:
-        return True
-    return bool(abs(strengths[0] / compliance) <= max(_LARGEST_DELAY, 2.0 * points.step))
+    """Whether real drives show such a strength: a channel is late by milliseconds or samples, and what creeps is a part
+    of the twist that was there at once."""
+    share = abs(strengths[0] / compliance) if compliance else math.inf
+    if form.family == "input_delay":
+        return bool(share <= max(_LARGEST_DELAY, 2.0 * points.step))
+    return bool(form.family != "creep" or share <= _LARGEST_CREEP)
 
 
 def base_columns(points: Points) -> np.ndarray:
