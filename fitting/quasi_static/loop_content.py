@@ -16,6 +16,8 @@ from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.strengths import stiffness_of, strengths_of
 from fitting.quasi_static.stretches import FOLDS, stretches
 
+# A residual this much larger than the noise of neighbouring points is slower than they are.
+_NOISE = 2.0
 _TOLD_APART = "None is needed: the held-out stretches tell the two apart."
 _TIED = "Log more: several slow cycles at several loads, both ways, and a rest under load at the end."
 
@@ -160,9 +162,14 @@ def _summary(report: Mapping[str, Any]) -> str:
     families = [one["family"].replace("_", " ") for one in report["after"]["effects"]]
     said = f"{formatting.quantity(before, 'rad')} rms ({formatting.number(before / noise)} times the twist's noise)"
     if report["decision"] == "model_sufficient":
+        tried = (
+            f"none of the {report['forms_tried']} forms of missing physics that were tried gains more than chance would"
+        )
+        if before < _NOISE * noise:
+            return f"The straight line suffices: on held-out stretches it errs by {said}, and {tried}."
         return (
-            f"The straight line suffices: on held-out stretches it errs by {said}, and none of the "
-            f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
+            f"Nothing more than a straight line is supported: on held-out stretches it errs by {said}, but {tried}, "
+            "and what is left over depends on nothing that was logged."
         )
     change = (
         ""
@@ -198,7 +205,7 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
     friction = parameters.get("hysteresis.friction")
     if friction is not None:
         notes += _about_loops(friction["value"])
-    if loop.decision == "model_sufficient" and loop.after.rmse > 2.0 * points.twist_noise:
+    if loop.decision == "model_sufficient" and loop.after.rmse > _NOISE * points.twist_noise:
         notes.append(
             "What is left over is slower than the twist's noise, and follows nothing that was logged, as far as "
             "held-out stretches can tell: noise of that colour, an error of the torque, or too few cycles to tell an "
