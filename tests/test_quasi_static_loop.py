@@ -11,7 +11,8 @@ from test_quasi_static_command import lara_drive
 from fitting.drive_file import read_drive_file
 from fitting.logs import read_log
 from fitting.quasi_static.attribution import Held
-from fitting.quasi_static.candidates import Form, catalogue
+from fitting.quasi_static.candidates import catalogue
+from fitting.quasi_static.form import Form
 from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import QuasiStaticLoop, close_loop
 from fitting.quasi_static.noise_colour import DRAWS, autoregression, noise_of_the_same_colour

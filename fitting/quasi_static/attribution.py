@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fitting.attribution import SIGNIFICANCE
-from fitting.quasi_static.candidates import Form, is_plausible
+from fitting.quasi_static.candidates import is_plausible
+from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import Lead, Screen, screen
 from fitting.quasi_static.stretches import folds, worse

@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 
 from fitting.attribution import SIGNIFICANCE
 from fitting.quasi_static.attribution import Held, Trial, torque_error
-from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import screen
 from fitting.trial import LEAST_GAIN

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from fitting.quasi_static.attribution import Held, Round, Trial, look
-from fitting.quasi_static.candidates import Form, catalogue, choices
+from fitting.quasi_static.candidates import catalogue, choices
+from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import stretches

@@ -4,9 +4,9 @@ import numpy as np
 
 from fitting.formatting import axis_label, scaled_unit
 from fitting.quasi_static.attribution import Trial
-from fitting.quasi_static.candidates import HIGHEST_ORDER
 from fitting.quasi_static.drawing import CURVE, FALLING, RISING, Figure, Picture, drawn, figure
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
+from fitting.quasi_static.motion_forms import HIGHEST_ORDER
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.strengths import contribution
 

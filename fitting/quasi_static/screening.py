@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.form import Form
 from fitting.quasi_static.noise_colour import noise_of_the_same_colour
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS

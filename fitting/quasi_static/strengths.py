@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from fitting.quasi_static.candidates import Form
+from fitting.quasi_static.form import Form
 from fitting.quasi_static.intervals import Known, Scatter, known_figure, scatter
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import stretches

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.quasi_static.candidates import Form, base_columns
+from fitting.quasi_static.form import Form, base_columns
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS
 

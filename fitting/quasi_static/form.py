@@ -1,0 +1,55 @@
+"""One form of an effect: columns beside the straight line, linear in their strengths.
+
+twist = tau/K + zero of the log + sum of (strength times column)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fitting.quasi_static.points import Points
+
+Columns = Callable[[Points, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """One form of an effect.
+
+    Attributes:
+        family: Name of the effect, as reports use it.
+        name: Of the form.
+        columns: Columns (n, strengths) at points, for given shape parameters.
+        strengths: Names of the strengths.
+        equation: What it adds to the twist.
+        shapes: Values of the shape parameters to begin with, in rows of a grid, (grid, shape parameters).
+        shape_names: Names of the shape parameters; those that begin with "log " are logarithms.
+        low: Least value of each shape parameter.
+        high: Largest.
+        sign: Sign that physics asks of the first strength; zero for either.
+        of_torque: Whether its columns follow the torque, so that an error of the torque may pass for it.
+    """
+
+    family: str
+    name: str
+    columns: Columns
+    strengths: tuple[str, ...]
+    equation: str
+    shapes: np.ndarray = field(default_factory=lambda: np.zeros((1, 0)))
+    shape_names: tuple[str, ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    sign: int = 0
+    of_torque: bool = True
+
+    @property
+    def size(self) -> int:
+        """Number of strengths and shape parameters; where a log begins is none of them."""
+        own = [n for n in (*self.strengths, *self.shape_names) if not n.startswith("start")]
+        return len(own)
+
+
+def base_columns(points: Points) -> np.ndarray:
+    """Columns of the straight line: torque, and one for each log's zero, (n, 1 + logs)."""
+    return np.column_stack([points.torque - points.centre, *(points.log == i for i in range(len(points.names)))])
