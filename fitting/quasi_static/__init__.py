@@ -1,4 +1,5 @@
 """Quasi-static logs: twist against slowly changing joint torque, fitted without inertia.
 
-log -> prepare -> average -> fit of each curve -> intervals -> choice by held-out stretches -> report
+fit:        log -> prepare -> average -> fit of each curve -> intervals -> choice by held-out stretches -> report
+close-loop: log -> prepare -> points -> straight line -> look at the catalogue -> refit, again -> strengths -> report
 """

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fitting.attribution import SIGNIFICANCE
-from fitting.quasi_static.candidates import is_plausible
+from fitting.quasi_static.candidates import is_possible, is_usual
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import Lead, Screen, screen
@@ -18,7 +18,7 @@ from fitting.trial import LEAST_GAIN
 
 # A form that explains less than this share of what the best one does is no rival, and is not refitted.
 _RIVAL = 0.25
-# A form within what real drives show leads where it explains this share of what the best one does.
+# A form of a strength that drives can show leads where it explains this share of what the best one does.
 _PLAUSIBLE = 0.5
 # Forms of one family that are refitted.
 _FORMS = 3
@@ -183,15 +183,16 @@ def _compared(
 
     Forms are tied where the one does not predict held-out stretches clearly worse, and where the better one has nothing
     left to explain beside it. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more
-    usual. A strength beyond what real drives show stands back where another form explains half as much.
+    usual, and an unusual strength comes last. One that no drive can show stands back where another form explains half
+    as much.
     """
     supported = [
         rival for rival in rivals if rival.p_value <= SIGNIFICANCE and rival.gain >= _PLAUSIBLE * rivals[0].gain
     ]
-    leader = next((rival for rival in supported if _is_plausible(held.points, rival)), rivals[0])
+    leader = next((rival for rival in supported if _is_possible(held.points, rival)), rivals[0])
     others = [rival for rival in rivals if rival is not leader]
     tied = [leader, *(rival for rival in others if _is_tied(held, rival, leader, screened))]
-    able = [rival for rival in tied if _is_plausible(held.points, rival)] or tied
+    able = [rival for rival in tied if _is_usual(held.points, rival)] or tied
     fewest = min(rival.lead.size for rival in able)
     small = [rival for rival in able if rival.lead.size == fewest]
     most = max(rival.gain for rival in small)
@@ -200,12 +201,20 @@ def _compared(
     return winner, told
 
 
-def _is_plausible(points: Points, rival: Rival) -> bool:
+def _is_possible(points: Points, rival: Rival) -> bool:
+    return all(is_possible(form, own, compliance) for form, own, compliance in _strengths(points, rival))
+
+
+def _is_usual(points: Points, rival: Rival) -> bool:
+    return all(is_usual(form, own, compliance, points) for form, own, compliance in _strengths(points, rival))
+
+
+def _strengths(points: Points, rival: Rival) -> list[tuple[Form, np.ndarray, np.floating]]:
+    """Each form with its strengths and the compliance beside them."""
     model = rival.trial.model
-    return all(
-        is_plausible(form, model.coefficients[model.own(form, len(points.names))[0]], model.coefficients[0], points)
-        for form in rival.lead.forms
-    )
+    return [
+        (f, model.coefficients[model.own(f, len(points.names))[0]], model.coefficients[0]) for f in rival.lead.forms
+    ]
 
 
 def _is_tied(held: Held, rival: Rival, leader: Rival, screened: Screen) -> bool:

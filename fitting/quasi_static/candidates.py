@@ -1,6 +1,5 @@
 """The catalogue of effects that a torque-twist log may hide, and which of them are looked at together."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,10 +38,12 @@ def choices(forms: Sequence[Form], families: int) -> list[tuple[Form, ...]]:
     return alone + [(loop, bend) for loop in loops for bend in bends]
 
 
-def is_plausible(form: Form, strengths: np.ndarray, compliance: float | np.floating, points: Points) -> bool:
-    """Whether real drives show such a strength: a channel is late by milliseconds or samples, and what creeps is a part
-    of the twist that was there at once."""
-    share = abs(strengths[0] / compliance) if compliance else math.inf
-    if form.family == "input_delay":
-        return bool(share <= max(_LARGEST_DELAY, 2.0 * points.step))
-    return bool(form.family != "creep" or share <= _LARGEST_CREEP)
+def is_possible(form: Form, strengths: np.ndarray, compliance: float | np.floating) -> bool:
+    """Whether a drive can show such a strength: what creeps is a part of the twist that was there at once."""
+    return bool(form.family != "creep" or abs(strengths[0]) <= _LARGEST_CREEP * abs(compliance))
+
+
+def is_usual(form: Form, strengths: np.ndarray, compliance: float | np.floating, points: Points) -> bool:
+    """Whether logs mostly show such a strength: a channel is late by milliseconds or samples."""
+    longest = max(_LARGEST_DELAY, 2.0 * points.step)
+    return bool(form.family != "input_delay" or abs(strengths[0]) <= longest * abs(compliance))

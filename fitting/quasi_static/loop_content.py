@@ -109,6 +109,8 @@ def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for one in loop.findings:
         for family, experiment in lookalikes(one.family, points):
+            if family == "coulomb_friction" and _slides_late(loop, one):
+                continue
             found[family, one.family] = {
                 "family": family,
                 "name": f"{family.replace('_', ' ')} instead of {one.family.replace('_', ' ')}",
@@ -129,6 +131,11 @@ def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
                 continue
             found.setdefault((rival.lead.name, winner.lead.name), _refitted(rival, winner))
     return sorted(found.values(), key=lambda one: (one["separable"], one["validation_rmse"]))
+
+
+def _slides_late(loop: QuasiStaticLoop, finding: Finding) -> bool:
+    """Whether the logs know the torque that it takes to change the branch; Coulomb friction takes none."""
+    return any(strengths_of(loop.held.points, loop.after.model, form)["reach"].identifiable for form in finding.forms)
 
 
 def _refitted(rival: Rival, winner: Rival) -> dict[str, Any]:
