@@ -35,6 +35,8 @@ _BEST_OF_MANY = 3.9
 _HOLD_STEPS = 3
 # What can only be tied with the best must come as close as this share of its gain in its first pass.
 _NEAR_TIE = 0.1
+# A rival that explains less than this share of what the best one so far does, in its first pass, is given up.
+_HOPELESS = 0.3
 
 
 class Verdict(eqx.Module):
@@ -110,7 +112,9 @@ def look(
         with _programs_ahead(before, leads[1:], data, setting):
             for lead in leads:
                 progress(f"refitting with {lead.effect.name}")
-                trial = _try_lead(before, lead, data, setting, give_up_above)
+                best = min((t.training.objective for t in refitted.values()), default=np.inf)
+                hopeless = _on_the_way(before, best, _HOPELESS)
+                trial = _try_lead(before, lead, data, setting, min(give_up_above, hopeless))
                 if trial is not None and np.isfinite(trial.held_out.objective):
                     refitted[lead.effect.name] = trial
 
@@ -120,10 +124,9 @@ def look(
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
         look_ahead(leader.training)
-        gained = before.training.objective - leader.training.objective
         # What is to come near it in its first pass needs its steps.
         fine = replace(setting, substeps=leader.training.substeps)
-        refit(possible_ties(worth, first), fine, leader.training.objective + _NEAR_TIE * gained)
+        refit(possible_ties(worth, first), fine, _on_the_way(before, leader.training.objective, 1.0 - _NEAR_TIE))
     else:
         refit(first[1:], setting)
         if refitted:
@@ -208,6 +211,11 @@ def _supported_first(verdicts: list[Verdict], before: Trial, base: Trial) -> tup
         if _supported(verdict, before, base):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], True
     return verdicts, False
+
+
+def _on_the_way(before: Trial, best: float, share: float) -> float:
+    """The training objective of what gains a share of what the best one does; infinite where there is none yet."""
+    return before.training.objective - share * (before.training.objective - best) if np.isfinite(best) else np.inf
 
 
 @contextmanager
