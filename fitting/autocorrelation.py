@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import chdtrc
 
 from fitting.arrow import chains
 from fitting.estimate import Fit
@@ -43,6 +44,18 @@ def autocorrelation(fit: Fit, lags: int) -> Float[np.ndarray, " lags"]:
     share = min(taken[0] / found[0], 0.9)
     corrected = found + taken / (1.0 - share)
     return corrected / corrected[0]
+
+
+def ljung_box(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> tuple[float, float]:
+    """The statistic of Ljung and Box (1978), and the chance that white noise has one as large.
+
+    Args:
+        autocorrelation: at lags 1, 2, ...
+        samples: that it was estimated from.
+    """
+    lags = np.arange(1, autocorrelation.size + 1)
+    statistic = float(samples * (samples + 2) * np.sum(autocorrelation**2 / (samples - lags)))
+    return statistic, float(chdtrc(lags.size, statistic))
 
 
 def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:

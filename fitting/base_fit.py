@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy.special import chdtri
 
+from fitting.autocorrelation import autocorrelation, left_over, ljung_box
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
@@ -128,18 +128,8 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
 def leaves_white_noise(found: Fit) -> bool:
     """Whether nothing is left of the dynamic error that a better minimum could explain: a test of its first
     autocorrelations (Ljung and Box 1978)."""
-    kept = np.asarray(found.problem.segments.weight)
-    error = np.asarray(found.error)[..., -1] * kept
-    count = kept.sum()
-    power = np.sum(error**2)
-    if not power > 0:
-        return True
-    lags = np.arange(1, min(_LAGS, error.shape[1] // 2) + 1)
-    correlation = np.array([np.sum(error[:, k:] * error[:, :-k]) for k in lags]) / power
-    pairs = np.array([np.sum(kept[:, k:] * kept[:, :-k]) for k in lags])
-    # Each correlation has a variance of pairs / count^2.
-    statistic = np.sum(correlation**2 * count**2 / pairs)
-    return bool(statistic < chdtri(lags.size, _FALSE_ALARM))
+    _, p_value = ljung_box(autocorrelation(found, _LAGS)[1:], left_over(found).size)
+    return p_value > _FALSE_ALARM
 
 
 def as_followed(found: Fit) -> tuple[Stretch, ...]:

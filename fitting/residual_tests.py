@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy import linalg
 from scipy.special import chdtrc
 
-from fitting.autocorrelation import autocovariance, left_over
+from fitting.autocorrelation import autocovariance, left_over, ljung_box
 from fitting.diagnostics import ResidualDiagnostics
 from fitting.estimate import Fit
 from fitting.normal_law import NORMAL_95
@@ -136,19 +136,17 @@ def whiteness(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> Resi
         autocorrelation: at lags 0, 1, 2, ...
         samples: that it was estimated from.
     """
-    lags = np.arange(1, min(LAGS, autocorrelation.size - 1, samples - 1) + 1)
-    r = autocorrelation[lags]
-    statistic = float(samples * (samples + 2) * np.sum(r**2 / (samples - lags)))
-    p_value = float(chdtrc(lags.size, statistic))
+    r = autocorrelation[1 : min(LAGS, samples - 1) + 1]
+    statistic, p_value = ljung_box(r, samples)
     worst = int(np.argmax(np.abs(r))) if r.size else 0
-    seen = f"autocorrelation {r[worst]:+.2g} at lag {lags[worst]}" if r.size else ""
+    seen = f"autocorrelation {r[worst]:+.2g} at lag {worst + 1}" if r.size else ""
     verdict = _verdict(p_value, bool(np.max(np.abs(r), initial=0.0) < _SLIGHT_CORRELATION))
     says = {
         "passed": "White: no memory beyond chance.",
         "slight": f"Nearly white: a memory that is certain, but small ({seen}).",
         "failed": f"Not white ({seen}): what is left over has a memory that noise has not.",
     }[verdict]
-    return ResidualTest("whiteness", statistic, int(lags.size), p_value, verdict, says)
+    return ResidualTest("whiteness", statistic, int(r.size), p_value, verdict, says)
 
 
 def independence(

@@ -64,6 +64,12 @@ def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
     assert not leaves_white_noise(off)
 
 
+def test_many_initial_states_leave_white_noise_white(found: Fit, clean):
+    """A state every 32 samples follows some of the noise; that is no sign of a wrong minimum."""
+    short = fit(found.model, whole(clean), base_paths(PLACEHOLDER), horizon=32, substeps=found.substeps)
+    assert leaves_white_noise(short)
+
+
 def test_horizons_grow_step_by_step(clean):
     far = rig.reduced_model(omega_0=0.5 * rig.OMEGA_0, gain=0.25 * rig.GAIN, alpha=0.0)
     paths = base_paths(far)
