@@ -11,6 +11,7 @@ from fitting.logs import Log
 # All thresholds are assumed: they part the practice logs from their mix-ups by a wide margin.
 RATIO_TOLERANCE = 0.02
 FREE_MOTION = 0.02  # rad of the output, more than any gear twists; below it a load may be locked
+LARGE_TWIST = 5e-3  # rad, more than a gear twists by within its ratings, assumed
 SLOW_MODES = 8
 SLOW_SHARE = 0.5
 SLOW_CORRELATION = 0.999
@@ -91,13 +92,14 @@ def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     drifts = neighbour and deviation * span > FREE_MOTION
     if deviation <= RATIO_TOLERANCE and not drifts:
         return
-    moved_freely = span > FREE_MOTION
-    yield Finding(
-        "refusal" if moved_freely else "warning",
-        f"reduction_ratio says {ratio:g} but the angles say {_shown(says)}",
-        where,
-        _mend(says, ratio) if moved_freely else f"unless it was locked, {_mend(says, ratio)}",
-    )
+    mend = _mend(says, ratio)
+    if span <= FREE_MOTION:
+        severity, consequence = "warning", f"unless it was locked, {mend}"
+    elif deviation * span <= LARGE_TWIST:
+        severity, consequence = "warning", f"unless slow torque twists the gear by {deviation * span:.2g} rad, {mend}"
+    else:
+        severity, consequence = "refusal", mend
+    yield Finding(severity, f"reduction_ratio says {ratio:g} but the angles say {_shown(says)}", where, consequence)
 
 
 def _shown(ratio: float) -> str:

@@ -153,6 +153,14 @@ def test_a_locked_load_is_no_wrong_ratio() -> None:
     only(examine(yielding, drive_file()), "warning", "unless it was locked")
 
 
+@pytest.mark.parametrize(("swing", "severity"), [(0.02, "warning"), (1.0, "refusal")])
+def test_slow_torque_that_twists_the_gear_is_no_wrong_ratio(swing: float, severity: str) -> None:
+    """The load stays behind by 3 %, which over a small swing is a twist that a gear bears, and over a large one none."""
+    motor, load = angles(drive_log(swing=swing))
+    log = replace(drive_log(), motor_angle=motor, load_angle=0.97 * load)
+    only(examine(log, drive_file()), severity, "says 50 but")
+
+
 def test_a_resonance_is_no_wrong_ratio() -> None:
     """At one frequency past the antiresonance the load moves against the motor, rightly."""
     time = np.arange(ROWS) * STEP
