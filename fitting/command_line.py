@@ -469,10 +469,14 @@ def main(arguments: list[str] | None = None) -> None:
     _set_up_jax()
     try:
         app(arguments, exit_on_error=False, print_error=False)
+        sys.stdout.flush()
     except (cyclopts.CycloptsError, InputError) as error:
         _fail(error, 2)
     except (DataError, SimulationError) as error:
         _fail(error, 1)
+    except BrokenPipeError:
+        # Who reads along, as `head` does, has seen enough; the files are written before anything is printed.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}; check the path and its permissions", 2)
 

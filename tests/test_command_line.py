@@ -12,6 +12,7 @@ import polars as pl
 import pytest
 
 import rig
+from fitting import command_line
 from fitting.command_line import main
 from fitting.free_run import WINDOW
 from fitting.model_file import StoredModel, to_json
@@ -111,6 +112,19 @@ BAD_LOGS: dict[str, tuple[Callable[[], dict[str, np.ndarray]], int, Sequence[str
     "too short": (lambda: {n: c[:150] for n, c in table().items()}, 1, ("150 rows", "200")),
     "mirrored": (lambda: spoiled(load_angle=np.negative), 1, ("sign = -1",)),
 }
+
+
+def test_a_reader_that_leaves_early_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def broken(*arguments: object, **options: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(command_line, "app", broken)
+    with (tmp_path / "shown").open("w") as out:
+        monkeypatch.setattr(sys, "stdout", out)
+        assert run("--help") == 0
+    assert capsys.readouterr().err == ""
 
 
 def assert_one_line(capsys: pytest.CaptureFixture[str], *words: str):

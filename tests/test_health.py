@@ -155,7 +155,7 @@ def test_a_locked_load_is_no_wrong_ratio() -> None:
 
 @pytest.mark.parametrize(("swing", "severity"), [(0.02, "warning"), (1.0, "refusal")])
 def test_slow_torque_that_twists_the_gear_is_no_wrong_ratio(swing: float, severity: str) -> None:
-    """The load stays behind by 3 %, which over a small swing is a twist that a gear bears, and over a large one none."""
+    """The load stays behind by 3 %, which over a small swing is a twist that gears bear, over a large one none."""
     motor, load = angles(drive_log(swing=swing))
     log = replace(drive_log(), motor_angle=motor, load_angle=0.97 * load)
     only(examine(log, drive_file()), severity, "says 50 but")
