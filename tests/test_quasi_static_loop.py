@@ -149,6 +149,16 @@ def test_what_no_form_explains_is_unexplained() -> None:
     assert loop.left is not None and loop.left.depends_on == "load angle"
 
 
+def test_a_slow_wander_that_follows_nothing_is_unexplained() -> None:
+    def wander(motion: slow_joints.Motion_) -> np.ndarray:
+        count = len(motion.motor)
+        return 3e-4 * np.sin(3.7 * 2 * np.pi * np.arange(count) / count + 1.0)
+
+    loop = closed(slow_joint([wander], cycles=5.0))
+    assert loop.left is None and not loop.findings
+    assert loop.decision == "unexplained"
+
+
 def test_logs_of_one_drive_are_explained_together() -> None:
     logs = [slow_joint([slow_joints.sliders(WIDTH)], seed=seed, name=f"log {seed}", cycles=1.6) for seed in range(3)]
     loop = closed(*logs)

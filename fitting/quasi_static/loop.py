@@ -18,6 +18,9 @@ Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 # As in the loop for drive logs: a residual this much larger than the noise is not noise, and effects that remove this
 # share of the unexplained variance are the explanation.
 _EXCESS, _EXPLAINED = 1.5, 0.75
+# What wanders by more than this many times the noise from row to row is no noise of an encoder, assumed: correlated by
+# 0.98 from row to row it would be nine times.
+_WANDER = 20.0
 # A further effect must remove this share (rms) of what those before it removed. Laws of hysteresis and of stiffness are
 # good to some hundredths, so that less may be what they get wrong themselves.
 _IMPERFECTION = 0.05
@@ -150,7 +153,9 @@ def _findings(held: Held, after: Trial, rounds: list[Round]) -> tuple[Finding, .
 
 
 def _decide(base: Trial, after: Trial, left: Leftover | None, noise: float) -> Decision:
-    """Something unexplained is what predictably depends on something; noise of whatever colour does not."""
+    """Something unexplained is what predictably depends on something, or what is too large for noise of any colour."""
+    if after is base and left is None:
+        return "unexplained" if base.rmse > _WANDER * noise else "model_sufficient"
     if left is None or after.rmse < _EXCESS * noise:
         return "effect_found" if after is not base else "model_sufficient"
     before, behind = (max(t.mean_square - noise**2, 0.0) for t in (base, after))

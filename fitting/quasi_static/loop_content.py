@@ -1,5 +1,6 @@
 """What the loop found on quasi-static logs, as `report.json` has it."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -151,14 +152,13 @@ def _refitted(rival: Rival, winner: Rival) -> dict[str, Any]:
 
 
 def _unexplained(loop: QuasiStaticLoop) -> dict[str, Any] | None:
-    if loop.decision != "unexplained" or loop.left is None:
+    if loop.decision != "unexplained":
         return None
+    left = dict.fromkeys(("depends_on", "explained_share", "p_value"))
     return {
         "rms": loop.after.rmse,
         "times_noise": loop.after.rmse / loop.held.points.twist_noise,
-        "depends_on": loop.left.depends_on,
-        "explained_share": loop.left.explained_share,
-        "p_value": loop.left.p_value,
+        **(left if loop.left is None else dataclasses.asdict(loop.left)),
     }
 
 
@@ -191,10 +191,13 @@ def _summary(report: Mapping[str, Any]) -> str:
         return f"{count} found: {formatting.words(families)}.{change}"
     left = report["unexplained"]
     part = f" A part was found ({formatting.words(families)}).{change}" if families else ""
+    depends = "depends on nothing that was logged"
+    if left["depends_on"] is not None:
+        share = formatting.percent(left["explained_share"])
+        depends = f"depends on the {left['depends_on']}, which accounts for {share} of it on unseen stretches"
     return (
         f"Something is missing that the catalogue does not explain.{part} What is left over, "
-        f"{formatting.number(left['times_noise'])} times the twist's noise, depends on the {left['depends_on']}, which "
-        f"accounts for {formatting.percent(left['explained_share'])} of it on unseen stretches."
+        f"{formatting.number(left['times_noise'])} times the twist's noise, {depends}."
     )
 
 
