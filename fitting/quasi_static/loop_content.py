@@ -154,7 +154,7 @@ def _refitted(rival: Rival, winner: Rival) -> dict[str, Any]:
 def _unexplained(loop: QuasiStaticLoop) -> dict[str, Any] | None:
     if loop.decision != "unexplained":
         return None
-    left = dict.fromkeys(("depends_on", "explained_share", "p_value"))
+    left: dict[str, Any] = dict.fromkeys(("depends_on", "explained_share", "p_value"))
     return {
         "rms": loop.after.rmse,
         "times_noise": loop.after.rmse / loop.held.points.twist_noise,
