@@ -25,7 +25,7 @@ from rich.progress import MofNCompleteColumn, Progress
 from fitting.close_loop import close_loop
 from fitting.demonstration import write_demo_logs
 from fitting.design_commands import design
-from fitting.drive_file import DriveFile, read_drive_file
+from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.experiment import Experiment, Stretch
 from fitting.experiment_options import ExperimentLimits, stated_limits, wanted
@@ -33,7 +33,6 @@ from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
-from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.next_experiment import experiment_for_alpha, experiment_for_ties
 from fitting.posterior import sampler
@@ -126,29 +125,14 @@ def fit(
     if read[0].kind == "quasi-static":
         if asked is not None:
             raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
-        _fit_quasi_static(read, drive_file, out)
+        # Loaded here: most logs are of other kinds.
+        from fitting.quasi_static.commands import fit_quasi_static_logs
+
+        with _progress() as progress:
+            shown = fit_quasi_static_logs(read, drive_file, out, progress=progress)
+        print(shown)
     else:
         _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None, asked)
-
-
-def _fit_quasi_static(logs: tuple[Log, ...], drive_file: DriveFile, out: Path) -> None:
-    # Loaded here: most fits are of other logs.
-    from fitting.quasi_static import content as quasi_static_content
-    from fitting.quasi_static import report as quasi_static_report
-    from fitting.quasi_static.fit import fit_quasi_static
-    from fitting.quasi_static.plots import pictures
-    from fitting.quasi_static.preparation import prepare
-
-    with _progress() as progress:
-        progress("fitting torque-twist curves")
-        data = prepare(logs, drive_file)
-        found = fit_quasi_static(
-            data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion
-        )
-        report = quasi_static_content.report_dict(data, found)
-    paths = quasi_static_report.write_report(out, report, pictures(found))
-    print(quasi_static_report.report_text(report))
-    print(f"Report: {paths['report.html']}")
 
 
 def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
@@ -236,30 +220,15 @@ def close_loop_command(
     if read[0].kind == "quasi-static":
         if asked is not None:
             raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
-        _close_quasi_static_loop(read, drive_file, out, max_effects, seed)
+        from fitting.quasi_static.commands import close_quasi_static_loop
+
+        with _progress() as progress:
+            shown = close_quasi_static_loop(
+                read, drive_file, out, max_effects=max_effects, seed=seed, progress=progress
+            )
+        print(shown)
     else:
         _close_loop(rig_of(read, drive_file), out, max_effects, seed, asked)
-
-
-def _close_quasi_static_loop(
-    logs: tuple[Log, ...], drive_file: DriveFile, out: Path, max_effects: int, seed: int
-) -> None:
-    from fitting.quasi_static.loop import close_loop as close_quasi_static_loop
-    from fitting.quasi_static.loop_content import loop_report
-    from fitting.quasi_static.loop_plots import loop_pictures
-    from fitting.quasi_static.loop_text import loop_text as quasi_static_text
-    from fitting.quasi_static.points import points_of
-    from fitting.quasi_static.preparation import prepare
-    from fitting.quasi_static.report import write_report
-
-    with _progress() as progress:
-        data = prepare(logs, drive_file, at_rest=True)
-        points = points_of(data.logs, data.motion, drive_file.reduction_ratio)
-        loop = close_quasi_static_loop(points, max_effects=max_effects, seed=seed, progress=progress)
-        report = loop_report(data, loop)
-    paths = write_report(out, report, loop_pictures(loop))
-    print(quasi_static_text(report))
-    print(f"Report: {paths['report.html']}")
 
 
 def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None) -> None:
