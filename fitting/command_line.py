@@ -33,6 +33,7 @@ from fitting.files import write_whole
 from fitting.fit_only import fit_only
 from fitting.fleet import fit_fleet, fleet_text
 from fitting.free_run import WINDOW, free_run
+from fitting.logs import Log
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.next_experiment import experiment_for_alpha, experiment_for_ties
 from fitting.posterior import sampler
@@ -122,9 +123,7 @@ def fit(
         return
     drive_file = read_drive_file(drive)
     read = ready_logs(logs, drive_file)
-    if read[0].kind == "quasi-static":
-        if asked is not None:
-            raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
+    if _is_quasi_static(read, asked):
         # Loaded here: most logs are of other kinds.
         from fitting.quasi_static.commands import fit_quasi_static_logs
 
@@ -133,6 +132,15 @@ def fit(
         print(shown)
     else:
         _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed if posterior else None, asked)
+
+
+def _is_quasi_static(logs: tuple[Log, ...], asked: ExperimentLimits | None) -> bool:
+    """Whether logs hold nothing of the resonance, for which no next experiment can be looked for."""
+    if logs[0].kind != "quasi-static":
+        return False
+    if asked is not None:
+        raise InputError(f"{logs[0].path}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
+    return True
 
 
 def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
@@ -217,9 +225,7 @@ def close_loop_command(
     asked = wanted(limits, next_experiment)
     drive_file = read_drive_file(drive)
     read = ready_logs(logs, drive_file)
-    if read[0].kind == "quasi-static":
-        if asked is not None:
-            raise InputError(f"{logs[0]}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
+    if _is_quasi_static(read, asked):
         from fitting.quasi_static.commands import close_quasi_static_loop
 
         with _progress() as progress:

@@ -37,6 +37,22 @@ def drawn(x: np.ndarray, y: np.ndarray, *, mode: str, color: str | None, name: s
     return {"type": "scatter", "mode": mode, "name": name, "x": numbers(x), "y": numbers(y)} | look
 
 
+def by_direction(torque: np.ndarray, values: np.ndarray, rising: np.ndarray, *, name: str) -> list[Figure]:
+    """Values against torque, in two colours.
+
+    Args:
+        torque: [N m], (n,).
+        values: Likewise.
+        rising: Whether the torque rises there, likewise.
+        name: What they are.
+    """
+    ways = ((rising, RISING, "rising"), (~rising, FALLING, "falling"))
+    return [
+        drawn(torque[own], values[own], mode="markers", color=color, name=f"{name}, torque {way}")
+        for own, color, way in ways
+    ]
+
+
 def numbers(values: np.ndarray) -> list[float]:
     """Values to as many digits as a screen shows."""
     return [float(f"{v:.{_DIGITS}g}") for v in values]

@@ -4,7 +4,7 @@ import numpy as np
 
 from fitting.formatting import axis_label, scaled_unit
 from fitting.quasi_static.attribution import Trial
-from fitting.quasi_static.drawing import CURVE, FALLING, RISING, Figure, Picture, drawn, figure
+from fitting.quasi_static.drawing import CURVE, FALLING, RISING, Figure, Picture, by_direction, drawn, figure
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.motion_forms import HIGHEST_ORDER
 from fitting.quasi_static.points import Points
@@ -116,7 +116,4 @@ def _amplitudes(angle: np.ndarray, values: np.ndarray, orders: np.ndarray) -> np
 
 def _by_direction(points: Points, values: np.ndarray) -> list[Figure]:
     rising = points.in_each_log(lambda own: np.gradient(points.torque[own])) >= 0
-    return [
-        drawn(points.torque[rising], values[rising], mode="markers", color=RISING, name="measured, torque rising"),
-        drawn(points.torque[~rising], values[~rising], mode="markers", color=FALLING, name="measured, torque falling"),
-    ]
+    return by_direction(points.torque, values, rising, name="measured")

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fitting.formatting import axis_label, scaled_unit
-from fitting.quasi_static.drawing import CURVE, FALLING, RISING, Figure, Picture, drawn, figure
+from fitting.quasi_static.drawing import CURVE, Picture, by_direction, drawn, figure
 from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.torque_twist import Blocks
 
@@ -20,7 +20,7 @@ def _loops(fit: QuasiStaticFit) -> Picture:
     predicted = blocks.twist - best.misfit - zero
     measured = blocks.twist - zero
     factor, unit = scaled_unit(float(np.max(np.abs(measured))), "rad")
-    traces = _by_direction(blocks, factor * measured, name="measured")
+    traces = by_direction(blocks.torque, factor * measured, _is_rising(blocks), name="measured")
     for i, name in enumerate(blocks.names):
         own = blocks.log == i
         trace = drawn(blocks.torque[own], factor * predicted[own], mode="lines", color=CURVE, name=f"fitted, {name}")
@@ -40,7 +40,8 @@ def _loops(fit: QuasiStaticFit) -> Picture:
 
 def _misfit_by_torque(fit: QuasiStaticFit) -> Picture:
     factor, unit = scaled_unit(float(np.sqrt(np.mean(fit.best.misfit**2))), "rad")
-    traces = _by_direction(fit.blocks, factor * fit.best.misfit, name="misfit")
+    blocks = fit.blocks
+    traces = by_direction(blocks.torque, factor * fit.best.misfit, _is_rising(blocks), name="misfit")
     return Picture(
         "misfit-torque",
         "What the curve leaves over, against torque",
@@ -66,9 +67,5 @@ def _misfit_by_time(fit: QuasiStaticFit) -> Picture:
     )
 
 
-def _by_direction(blocks: Blocks, values: np.ndarray, *, name: str) -> list[Figure]:
-    way = np.gradient(blocks.torque) >= 0
-    return [
-        drawn(blocks.torque[way], values[way], mode="markers", color=RISING, name=f"{name}, torque rising"),
-        drawn(blocks.torque[~way], values[~way], mode="markers", color=FALLING, name=f"{name}, torque falling"),
-    ]
+def _is_rising(blocks: Blocks) -> np.ndarray:
+    return np.gradient(blocks.torque) >= 0
