@@ -41,12 +41,14 @@ class Direction(eqx.Module):
 
     Attributes:
         weights: entries of a unit vector by path. A positive parameter counts by its logarithm, any other in `units`.
+        members: the paths that have more than a small share of it.
         units: what one is of each parameter: 1 for a logarithm, else in SI units.
         std: standard error along the direction.
         sentence: what is not determined; None where the direction is.
     """
 
     weights: dict[str, float]
+    members: tuple[str, ...] = eqx.field(static=True)
     units: dict[str, float]
     std: float
     sentence: str | None
@@ -185,17 +187,21 @@ def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:
     made = []
     for std, vector in directions(found.covariance):
         weights = dict(zip(free.paths, vector.tolist(), strict=True))
-        sentence = _not_determined(fit, weights, units) if std > _WEAK else None
-        made.append(Direction(weights, units, std, sentence))
+        largest = max(abs(w) for w in weights.values())
+        part = {p: w / largest for p, w in weights.items() if abs(w) >= _SHARE * largest}
+        sentence = _not_determined(fit, part, units) if std > _WEAK and len(part) > 1 else None
+        made.append(Direction(weights, tuple(part), units, std, sentence))
     return tuple(made)
 
 
-def _not_determined(fit: Fit, weights: Mapping[str, float], units: Mapping[str, float]) -> str | None:
-    """A weak direction as a sentence; None where it is that of a single parameter."""
-    largest = max(abs(w) for w in weights.values())
-    part = {p: w / largest for p, w in weights.items() if abs(w) >= _SHARE * largest}
-    if len(part) == 1:
-        return None
+def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, float]) -> str:
+    """A weak direction as a sentence.
+
+    Args:
+        fit: the fit.
+        part: weights of those that have a share of it, the largest of size one.
+        units: what one is of each parameter.
+    """
     logarithmic = dict(zip(fit.free.paths, fit.free.logarithmic, strict=True))
     values = {p: float(fit.model.get(p)) for p in part}
     # Relative changes are what an engineer thinks in; near zero there are none.

@@ -16,25 +16,28 @@ _LOSS = 0.02
 def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     """Fit the same parameters to the same data, over horizons as long as the stretches and with steps fine enough.
 
-    Where a long simulation has lost its way, the fit that was given stays. So it does where the long one does not
-    converge: a motion whose errors grow without end (backlash, say) has long simulations that promise far more than
-    they can tell.
+    Where a long simulation has lost its way, the short horizons stay. So they do where the long one leaves more over
+    and does not converge: a motion whose errors grow without end (backlash, say) has long simulations that promise far
+    more than they can tell.
 
     Args:
         start: a fit over shorter horizons.
-        must_explain: whether the fit that was given stays as well where long simulations leave more over than short
-            ones. Then something drives the motion that the model does not know (noise of the torque, missing physics);
-            what piles up over a long simulation imitates parameters, and their standard errors would not tell.
+        must_explain: whether the short horizons stay as well where long simulations converge but leave more over. Then
+            something drives the motion that the model does not know (noise of the torque, missing physics); what piles
+            up over a long simulation imitates parameters, and their standard errors would not tell.
     """
+    substeps = _fine_enough(start)
+    if substeps > start.substeps:
+        # A corner that is sharper than its steps resolved has moved by then.
+        start = _again(start, start.model, horizon=start.horizon, substeps=substeps)
     whole = max(len(s) for s in start.stretches)
-    long = _again(start, start.model, horizon=whole, substeps=_fine_enough(start))
+    long = _again(start, start.model, horizon=whole, substeps=substeps)
     # Long horizons know the parameters better, and so ask for finer steps.
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=whole, substeps=substeps)
-    if not (long.converged and _follows(long)):
-        return start
-    if must_explain and long.objective > start.objective + _freedom_of_states(start) + _LOSS:
+    explains = long.objective <= start.objective + _freedom_of_states(start) + _LOSS
+    if not (_follows(long) and (explains or (long.converged and not must_explain))):
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True)
     return long if check.objective < start.objective + _LOSS else start

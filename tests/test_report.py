@@ -36,7 +36,7 @@ from fitting.report import (
     separating_experiment,
     write_report,
 )
-from fitting.report.limits import parameter_note
+from fitting.report.limits import limits, parameter_note
 from fitting.starting_values import starting_models
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
@@ -222,6 +222,27 @@ def test_what_is_not_identifiable_is_told_once_and_why(loop: Loop):
     assert found["identifiability"]["reasons"]["alpha"] == found["after"]["parameters"]["alpha"]["note"] == VAGUE
     assert found["before"]["parameters"]["alpha"]["note"] is None
     assert "NOT IDENTIFIABLE" in report_text(found)
+
+
+def test_orders_that_are_not_there_are_told_in_one_sentence(loop: Loop):
+    """An order that is known to be next to nothing is no failure of the log, and deserves no sentence of its own."""
+    found = report_dict(loop)
+    (effect,) = found["after"]["effects"]
+    first, second = "motor_friction.c_1", "motor_friction.c_2"
+    entry = {"unit": "N m", "value": 1e-9, "ci95": [-2e-9, 4e-9], "note": "more samples", "flag": "not told from zero"}
+    effect["parameters"] |= {first: entry, second: entry}
+    found["identifiability"]["directions"] = [
+        {"members": (first, second), "sentence": "the two"},
+        {"members": (first, "K"), "sentence": "one and K"},
+    ]
+    notes = limits(found)
+    (told,) = [n for n in notes if first in n]
+    assert told.startswith(f"{first} and {second} are not told from zero: at most 4.0 nN m")
+    assert "more samples" not in notes and "the two" not in notes and "one and K" in notes
+    assert report_text(found).count("NOT TOLD FROM ZERO") == 2
+    # With nothing of its kind beside it, it is the effect itself that is in doubt.
+    effect["parameters"] = {first: entry}
+    assert "more samples" in limits(found)
 
 
 def test_the_page_loads_nothing(page: str):

@@ -55,7 +55,7 @@ def _parameters(account: Mapping[str, Any]) -> list[str]:
 
 
 def _flags(entry: Mapping[str, Any]) -> str:
-    flags = ["AT BOUND"] if entry["at_bound"] else [] if entry["identifiable"] else ["NOT IDENTIFIABLE"]
+    flags = [entry["flag"].upper()] if entry["flag"] else []
     if entry["interval"] == "profile":
         flags.append("interval from profile")
     return ", ".join(flags)

@@ -18,6 +18,9 @@ _CORRELATED = 0.9
 _MOST_CORRELATIONS = 8
 _DAMPING = ("B_sp", "mu")
 
+NOT_TOLD_FROM_ZERO = "not told from zero"
+"""Flag of an effect's parameter whose interval holds zero."""
+
 
 def parameter_note(estimate: Estimate, found: Identifiability, info: ParameterInfo | None = None) -> str | None:
     """What must be said beside a parameter; None where its number speaks for itself.
@@ -67,9 +70,14 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     found = report["identifiability"]
     # A learned torque's coefficients mean nothing one by one.
     learned = tuple(f"{e['name']}." for e in report["after"]["effects"] if e["family"] == "unknown")
-    parts = [final, *(e for e in report["after"]["effects"] if e["family"] != "unknown")]
-    told = [e.get("note") for part in parts for e in part["parameters"].values()]
-    notes = [n for n in (*told, *(d["sentence"] for d in found["directions"])) if n]
+    effects = [e["parameters"] for e in report["after"]["effects"] if e["family"] != "unknown"]
+    silent = frozenset(path for effect in effects for paths in _absent(effect).values() for path in paths)
+    told = [e.get("note") for e in final["parameters"].values()]
+    for effect in effects:
+        told += [e.get("note") for path, e in effect.items() if path not in silent]
+        told += [_absence(effect, unit, paths) for unit, paths in _absent(effect).items()]
+    told += [d["sentence"] for d in found["directions"] if not silent.issuperset(d["members"])]
+    notes = [n for n in told if n]
     notes += [h["sentence"] for h in found["held"]]
     for other in report["alternatives"]:
         if not other["separable"]:
@@ -80,7 +88,29 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     drifting = beyond_prediction(report, final["rmse"]["validation"])
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
-    return notes + _correlated(own)
+    return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _absent(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Parameters of an effect, by unit, that are not told from zero beside others of the unit that are: the orders,
+    say, that a kinematic error does not have."""
+    fitted = {path: e for path, e in parameters.items() if not e.get("derived")}
+    found: dict[str, list[str]] = {}
+    for path, estimate in fitted.items():
+        unit = estimate["unit"]
+        if estimate["flag"] == NOT_TOLD_FROM_ZERO and any(e["unit"] == unit and not e["flag"] for e in fitted.values()):
+            found.setdefault(unit, []).append(path)
+    return found
+
+
+def _absence(parameters: Mapping[str, Mapping[str, Any]], unit: str, paths: Sequence[str]) -> str:
+    """Such parameters in one sentence."""
+    most = max(abs(end) for path in paths for end in parameters[path]["ci95"] if end is not None)
+    others = max(abs(e["value"]) for e in parameters.values() if e["unit"] == unit and not e.get("derived"))
+    names = paths[0] if len(paths) == 1 else f"{', '.join(paths[:-1])} and {paths[-1]}"
+    bound, size = (formatting.quantity(value, unit, digits=2) for value in (most, others))
+    verb = "is" if len(paths) == 1 else "are"
+    return f"{names} {verb} not told from zero: at most {bound}, where the largest of the kind is {size}."
 
 
 def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:

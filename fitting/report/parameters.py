@@ -10,9 +10,9 @@ from fitting import formatting
 from fitting.close_loop import Finding
 from fitting.compare import Account
 from fitting.derived import Derived, derived, drive_figures, effect_figures
-from fitting.report.limits import in_words_of_log, parameter_note
+from fitting.report.limits import NOT_TOLD_FROM_ZERO, in_words_of_log, parameter_note
 from fitting.report.outcome import Outcome
-from fitting.uncertainty import Uncertainty
+from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Model, ReducedModel
 from hdjax.effects import ActuatorEffect
 
@@ -59,6 +59,7 @@ def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start:
         "interval": estimate.interval,
         "unit": _unit_in_log(estimate.unit, path, account.model, units),
         "identifiable": estimate.identifiable,
+        "flag": _flag(path, estimate, path in account.identifiability.bounds),
         "std_classical": estimate.std_classical,
         "description": info.doc,
         "percent": _percent(estimate.value, estimate.std),
@@ -66,6 +67,17 @@ def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start:
         "at_bound": path in account.identifiability.bounds,
         "note": None if note is None else in_words_of_log(note, units),
     }
+
+
+def _flag(path: str, estimate: Estimate, at_bound: bool) -> str | None:
+    """What must be seen beside a parameter in two or three words; None where its number speaks for itself."""
+    if at_bound:
+        return "at bound"
+    if estimate.identifiable:
+        return None
+    low, high = estimate.ci95
+    # Of an effect that is zero where it is absent, that much may be known very well.
+    return NOT_TOLD_FROM_ZERO if "." in path and low <= 0.0 <= high else "not identifiable"
 
 
 def _percent(value: float, std: float) -> float:
@@ -117,13 +129,16 @@ def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) ->
 def _derived_dict(name: str, quantity: Derived) -> dict[str, Any]:
     low, high = quantity.ci95
     # An angle may well be zero; it is known when it is known to a quarter turn.
-    known = high - low < math.pi if name.startswith("ph") else not low <= 0.0 <= high
+    is_phase = name.startswith("ph")
+    known = high - low < math.pi if is_phase else not low <= 0.0 <= high
+    doubt = "not identifiable" if is_phase else NOT_TOLD_FROM_ZERO
     return {
         "value": quantity.value,
         "std": quantity.std,
         "ci95": [low, high],
         "unit": quantity.unit,
         "identifiable": bool(known),
+        "flag": None if known else doubt,
         "percent": _percent(quantity.value, quantity.std),
         "derived": True,
         "description": name.replace("_", " "),

@@ -34,7 +34,7 @@ def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[
                 "factor": factor,
                 "before": before,
                 "final": estimate,
-                "flagged": kind == "parameters" and (estimate["at_bound"] or not estimate["identifiable"]),
+                "flag": estimate["flag"] if kind == "parameters" else None,
             }
         )
     return rows

@@ -59,6 +59,6 @@ def _parameter_line(estimate: Mapping[str, Any]) -> str:
     ends = [plain(e, 6) for e in estimate["ci95"] if e is not None]
     span = f"[{', '.join(ends)}]" if len(ends) == 2 else open_interval(estimate["ci95"]).format(*ends)
     share = f" ({100 * std / abs(value):.2g} %)" if value and std is not None else ""
-    flag = "" if estimate["identifiable"] else "  NOT IDENTIFIABLE"
+    flag = f"  {estimate['flag'].upper()}" if estimate["flag"] else ""
     unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"
     return f"{plain(value, 6)} +/- {plain(std, 2)}{share}{unit}  {span}{flag}"
