@@ -24,6 +24,8 @@ from hdjax.where import where
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
 # across it, so it must go quickly where the model predicts well.
 _REGION = optx.ClassicalTrustRegion(high_cutoff=0.75, high_constant=30.0, low_constant=0.1)
+# Points between which an iteration must make progress.
+_LATEST = 6
 
 
 class Chains(eqx.Module):
@@ -233,6 +235,18 @@ class ArrowDescent(optx.AbstractDescent):
         return state.step(damping), optx.RESULTS.successful
 
 
+class Progress(eqx.Module):
+    """How far an iteration has come.
+
+    Attributes:
+        region: state of the trust region.
+        costs: half the sums of squares at the latest points, newest first; infinite where there were none.
+    """
+
+    region: Any
+    costs: Float[Array, " latest"]
+
+
 class GapTrustRegion(optx.AbstractSearch):
     """optimistix' trust region, but two kinds of step are taken in any case: one that hardly changes the sum of
     squares, and one that closes most of the gaps for a little more residual. No finite weight of the gaps repays what
@@ -245,30 +259,36 @@ class GapTrustRegion(optx.AbstractSearch):
     dearest: float = 1.5
 
     def init(self, y, f_info_struct):
-        return self.region.init(y, f_info_struct)
+        return Progress(self.region.init(y, f_info_struct), jnp.full(_LATEST, jnp.inf))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        size, accept, result, after = self.region.step(first_step, y, y_eval, f_info, f_eval_info, state)
+        old = state.region
+        size, accept, result, new = self.region.step(first_step, y, y_eval, f_info, f_eval_info, old)
         before = f_info.as_min()
         slight = jnp.abs(f_eval_info.as_min() - before) < self.slack * before
         rows, gap = (jnp.sum(part**2) for part in (f_info.residual.rows, f_info.residual.gap))
         new_rows, new_gap = (jnp.sum(part**2) for part in (f_eval_info.residual.rows, f_eval_info.residual.gap))
         closing = (new_gap < self.closed * gap) & (new_rows < self.dearest * rows)
         anyway = ~accept & (slight | closing)
-        after = jax.tree.map(lambda old, new: where(anyway, old, new), state, after)
-        return where(anyway, state.step_size, size), accept | anyway, result, after
+        new = jax.tree.map(lambda before, after: where(anyway, before, after), old, new)
+        accept = accept | anyway
+        costs = jnp.concatenate([f_eval_info.as_min()[None], state.costs[:-1]])
+        return where(anyway, old.step_size, size), accept, result, Progress(new, where(accept, costs, state.costs))
 
 
 class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):
     """optimistix' Levenberg-Marquardt with [`ArrowDescent`][] for its linear algebra.
 
     It ends where a step promises next to nothing: less than `rtol` of what one more degree of freedom explains of
-    noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) How many
-    steps it may take is data, so that one compiled program serves hasty fits and patient ones.
+    noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) Corners
+    of a nonsmooth model make steps promise what they do not keep: the iteration ends as well where the latest of them
+    together have taken off less than a share of the sum of squares, where one is given. How many steps it may take, and
+    that share, are data, so that one compiled program serves hasty fits and patient ones.
     """
 
     descent: ArrowDescent
     most_steps: Int[Array, ""]
+    least_progress: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
     rtol: float = 1e-3
     atol: float = 0.0
     norm: Callable[[Any], Array] = optx.max_norm
@@ -283,5 +303,9 @@ class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):
         cost = 0.5 * (jnp.sum(residual.rows**2) + jnp.sum(residual.gap**2))
         small = jnp.abs(promised) < self.rtol * cost / residual.rows.size
         done = small & ~state.first_step
+        costs, least = state.search_state.costs, self.least_progress
+        # To close gaps may cost more than it takes off: without a least progress none is asked for.
+        stalled = (least > 0) & (costs[-1] - costs[0] < least * costs[0])
+        done = done | stalled
         late = ~done & (state.num_steps >= self.most_steps)
         return done | late, optx.RESULTS.where(late, optx.RESULTS.nonlinear_max_steps_reached, state.result)

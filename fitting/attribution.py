@@ -125,7 +125,7 @@ def look(
     if leader is not None and leaves_white_noise(leader.training):
         look_ahead(leader.training)
         # What is to come near it in its first pass needs its steps.
-        fine = replace(setting, substeps=leader.training.substeps)
+        fine = setting.with_steps_of(leader.training)
         refit(possible_ties(worth, first), fine, _on_the_way(before, leader.training.objective, 1.0 - _NEAR_TIE))
     else:
         refit(first[1:], setting)

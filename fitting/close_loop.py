@@ -1,7 +1,6 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -243,7 +242,7 @@ def _add_effects(
         assert this.winner.trial is not None
         current = this.winner.trial
         found += 1
-        setting = replace(setting, substeps=current.training.substeps)
+        setting = setting.with_steps_of(current.training)
         # What a trial has not quite reached the next look would take for a further effect.
         current = attempt(current.model, data, current.hold, setting, start=current)
         rounds.append(this)
@@ -274,7 +273,7 @@ def _what_is_unknown(
     """
     if leaves_white_noise(named.training):
         return named, None
-    beside = learn(named, data, setting, seed=seed, progress=progress)
+    beside = learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
     if beside is None or not is_supported(beside):
         return named, None
     if named is base:

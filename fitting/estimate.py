@@ -94,6 +94,7 @@ def fit(
     states: Float[Array, "segments states"] | None = None,
     retry_states: bool = True,
     give_up_above: float = np.inf,
+    least_progress: float = 0.0,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
@@ -121,6 +122,7 @@ def fit(
         retry_states: whether a first pass that does not converge is begun anew, from the first samples of each segment,
             and so are segments that stand out: they may have ended in a wrong minimum.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
+        least_progress: see [`fitting.solve.solve`][].
 
     Returns:
         The fit.
@@ -146,16 +148,20 @@ def fit(
         covariance = evaluate(problem, unknowns).covariance if scale_matters else swing[None, None] ** 2
     objective, steps = np.inf, 0
     solution = None
+
+    def solved(begin: Unknowns, damping: float) -> Solution:
+        return solve(problem, begin, max_steps, damping, least_progress=least_progress)
+
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, swing)
-        solution = solve(problem, unknowns, max_steps, NEARBY_DAMPING if turn else FIRST_DAMPING)
+        solution = solved(unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and retry_states and horizon <= _LONGEST_RETRY * length:
             if not (solution.success or hold_parameters):
-                again = solve(problem, _grown(problem, unknowns), max_steps, NEARBY_DAMPING)
+                again = solved(_grown(problem, unknowns, least_progress), NEARBY_DAMPING)
                 solution = min(solution, again, key=lambda s: float(jnp.sum(s.squares)))
-            mended = _retry_states(problem, solution)
+            mended = _retry_states(problem, solution, least_progress)
             if mended is not None:
-                solution = solve(problem, mended, max_steps, NEARBY_DAMPING)
+                solution = solved(mended, NEARBY_DAMPING)
         unknowns, covariance = solution.unknowns, solution.covariance
         before, objective = objective, _half_log_determinant(covariance)
         steps += int(solution.steps)
@@ -186,7 +192,7 @@ def _weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
     return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, swing)))
 
 
-def _grown(problem: Problem, unknowns: Unknowns) -> Unknowns:
+def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
     """Fit the first samples of each segment, then ever more of them, until it is all of them.
 
     Over half a natural period a simulation depends on parameters and state so smoothly that the fit finds its way from
@@ -201,11 +207,11 @@ def _grown(problem: Problem, unknowns: Unknowns) -> Unknowns:
         part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
         # The program of the fit, where all is in the same places.
         part, unknowns = spread((part, unknowns), weight.shape[0])
-        unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING).unknowns
+        unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING, least_progress=least_progress).unknowns
     return unknowns
 
 
-def _retry_states(problem: Problem, found: Solution) -> Unknowns | None:
+def _retry_states(problem: Problem, found: Solution, least_progress: float) -> Unknowns | None:
     """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one; None where
     none is better.
 
@@ -218,7 +224,7 @@ def _retry_states(problem: Problem, found: Solution) -> Unknowns | None:
         return None
     held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
     model = problem.free.unpack(problem.model, parameters)
-    fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)))
+    fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)), least_progress)
     new = np.asarray(evaluate(problem, fresh).squares)
     better = (new < 0.99 * old) & suspect
     if not better.any():

@@ -41,7 +41,9 @@ class Solution(eqx.Module):
     steps: Int[Array, ""]
 
 
-def solve(problem: Problem, start: Unknowns, max_steps: int, damping: float) -> Solution:
+def solve(
+    problem: Problem, start: Unknowns, max_steps: int, damping: float, *, least_progress: float = 0.0
+) -> Solution:
     """Iterate to the least squares.
 
     Args:
@@ -49,13 +51,18 @@ def solve(problem: Problem, start: Unknowns, max_steps: int, damping: float) -> 
         start: where the iteration begins.
         max_steps: where it ends at the latest.
         damping: of the first step, see [`FIRST_DAMPING`][].
+        least_progress: share of the sum of squares that a few steps must take off it for the iteration to go on.
     """
-    return _solve(problem, start, *(jnp.asarray(np.asarray(a)) for a in (max_steps, damping)))
+    return _solve(problem, start, *_numbers(max_steps, damping, least_progress))
 
 
 def prepare(problem: Problem, start: Unknowns) -> Callable[[], object]:
     """Have the program for such a problem made beside what else is done; what is returned calls it off."""
-    return _solve.prepare(problem, start, *(jnp.asarray(np.asarray(a)) for a in (1, FIRST_DAMPING)))
+    return _solve.prepare(problem, start, *_numbers(1, FIRST_DAMPING, 0.0))
+
+
+def _numbers(max_steps: int, damping: float, least_progress: float) -> list[Array]:
+    return [jnp.asarray(np.asarray(a)) for a in (max_steps, damping, least_progress)]
 
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> Solution:
@@ -69,12 +76,12 @@ def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
 
 
 @jit_lanes
-def _solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array) -> Solution:
+def _solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array, least_progress: Array) -> Solution:
     joined = problem.segments.joined
     descent = ArrowDescent(joined, problem.gap_weight, damping)
     solution = optx.least_squares(
         residual_with_blocks,
-        ArrowLevenbergMarquardt(descent=descent, most_steps=max_steps),
+        ArrowLevenbergMarquardt(descent=descent, most_steps=max_steps, least_progress=least_progress),
         start,
         args=problem,
         max_steps=None,

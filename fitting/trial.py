@@ -22,6 +22,8 @@ LEAST_GAIN = 1e-3
 
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
+# A few steps that together lower the objective by less than half of this are not worth another.
+_LEAST_PROGRESS = 0.1 * LEAST_GAIN
 
 
 class Setting(eqx.Module):
@@ -43,6 +45,10 @@ class Setting(eqx.Module):
     def options(self) -> dict[str, Any]:
         """The same as options of [`fitting.estimate.fit`][]."""
         return {"horizon": self.horizon, "halo": self.halo, "substeps": self.substeps, "count": self.count}
+
+    def with_steps_of(self, found: Fit) -> "Setting":
+        """The same, with the solver steps of a fit."""
+        return replace(self, substeps=found.substeps)
 
     def fine_enough(self, found: Fit) -> "Setting":
         """The same, with as many solver steps as the fitted motion needs; itself where these are enough."""
@@ -185,6 +191,7 @@ def trained(
         states=states,
         retry_states=retry_states or not same,
         give_up_above=give_up_above,
+        least_progress=_LEAST_PROGRESS,
     )
 
 
@@ -212,6 +219,7 @@ def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
         covariance=training.covariance,
         max_steps=_TRIAL_STEPS,
         hold_parameters=True,
+        least_progress=_LEAST_PROGRESS,
     )
     return Trial(training.model, training, held_out, hold)
 

@@ -23,7 +23,8 @@ def found() -> Fit:
 
 
 def test_a_chaotic_motion_keeps_the_fit_of_short_segments(found: Fit):
-    assert found.converged and long_fit(found) is found
+    kept = long_fit(found)
+    assert found.converged and kept.horizon == HORIZON and kept.objective < found.objective + 1e-3
 
 
 def test_a_long_simulation_tells_more_of_a_smooth_motion():

@@ -229,7 +229,8 @@ def test_orders_that_are_not_there_are_told_in_one_sentence(loop: Loop):
     found = report_dict(loop)
     (effect,) = found["after"]["effects"]
     first, second = "motor_friction.c_1", "motor_friction.c_2"
-    entry = {"unit": "N m", "value": 1e-9, "ci95": [-2e-9, 4e-9], "note": "more samples", "flag": "not told from zero"}
+    entry = {"unit": "N m", "value": 1e-9, "std": 1.5e-9, "ci95": [-2e-9, 4e-9]}
+    entry |= {"note": "more samples", "flag": "not told from zero"}
     effect["parameters"] |= {first: entry, second: entry}
     found["identifiability"]["directions"] = [
         {"members": (first, second), "sentence": "the two"},
