@@ -16,6 +16,7 @@ from undeclared.equations import integrate
 from undeclared.hidden import FAMILIES, FORMS, Form, forms_of
 from undeclared.mechanism import Mechanism, read_encoders, table
 from undeclared.noise import Encoders
+from undeclared.predictability import own_error
 from undeclared.recording import record
 
 DT = 5e-4
@@ -279,6 +280,21 @@ def test_faint_cases_are_faint(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(drawing, "_SIZES", ((1000.0, (1200, 1200, 800)),) * 3)
     drawn = drawing.draw(drawing.Case("try-2", (forms_of("torque_sensor")[0],), 6, faint=True))
     assert drawing.LEAST <= drawn.detectable[0] < 1.5 * drawing.FAINT
+
+
+def test_only_a_motion_that_forgets_its_start_leaves_the_true_equations_astray():
+    """A linear drive is off in proportion to the noise that its start is told by; a rattling one by orders more."""
+    torque = shaking(4000)
+    still = np.zeros(torque.size)
+
+    def off(drive: Mechanism, noise: float) -> float:
+        encoders = Encoders((BASE.ratio * noise, noise), (0.0, 0.0), 0.0)
+        random = np.random.default_rng(1)
+        return own_error(drive, np.zeros(4), torque, encoders, random, dt=DT, substeps=20, brake=still, warm=still)
+
+    linear = BASE._replace(k3=0.0)
+    assert off(linear, 1e-6) == pytest.approx(10 * off(linear, 1e-7), rel=1e-3)
+    assert off(linear, 1e-6) < 1e-6 < 20e-6 < off(linear._replace(gap=2e-4), 1e-6)
 
 
 def test_lists_of_cases():

@@ -21,6 +21,7 @@ def result(truth: list[str], said: list[str], *, ties: tuple[str, ...] = (), dec
         "base": {"K": 7000.0, "alpha": 2000.0, "B_sp": 0.3},
         "undefined": [],
         "noise": 1e-6,
+        "own_error": 0.0,
         "coloured": False,
         "detection_limits": [100.0],
     }
@@ -88,7 +89,7 @@ def test_tables_count():
     assert pairs["both named"].startswith("50.0 %") and pairs["both named or tied"].startswith("100.0 %")
     assert told["Family left out of the catalogue"].rows[0][:2] == ("creep", "1")
     errors = {row[0]: row[1:] for row in told["Held-out free-run error over noise"].rows}
-    assert errors["one effect"] == ("5", "5", "1.1", "1.1")
+    assert errors["one effect"] == ("5", "5", "1.1", "1.1", "1", "1", "1.1", "1.1")
     bias = told["Bias of the base parameters"].rows
     assert bias[0][:6] == ("K", "before", "+14", "14", "+10 %", "10 %") and bias[0][6].startswith("0.0 %")
     assert bias[1][:6] == ("K", "after", "+1.4", "1.4", "+1 %", "1 %") and bias[1][6].startswith("100.0 %")
@@ -98,7 +99,14 @@ def test_tables_count():
 def test_what_left_the_numbers_counts_as_infinite():
     cases = [result(["creep"], ["creep"], held_out={"before": 5e-6, "after": None}) for _ in range(3)]
     (errors,) = [t for t in tables(cases) if t.title.startswith("Held-out")]
-    assert errors.rows[0][3:] == ("inf", "inf")
+    assert errors.rows[0][3:5] == ("inf", "inf")
+
+
+def test_an_error_is_measured_against_that_of_the_true_equations():
+    """Where their own start leaves them three quarters of it, and the noise the rest."""
+    case = result(["backlash"], ["backlash"], case={"own_error": 3e-6}, held_out={"before": 9e-6, "after": 3.2e-6})
+    (errors,) = [t for t in tables([case]) if t.title.startswith("Held-out")]
+    assert errors.rows[0][5::2] == ("3.16", "1.01")
 
 
 def linear_log(bias: float, seed: int) -> Log:

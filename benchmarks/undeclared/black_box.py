@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from undeclared.logs import Table
+from undeclared.predictability import WINDOW
 
 _ORDERS = (2, 4, 8)
 _RIDGES = (1e-10, 1e-8, 1e-6, 1e-4)
 _SAMPLES_A_PERIOD = 12
-_WINDOW = 50
 
 
 def black_box_error(tables: Sequence[Table], omega_0: float) -> float:
@@ -64,4 +64,4 @@ def _free_run_error(coefficients: np.ndarray, order: int, x: np.ndarray, f: np.n
         run[k] = _features(run[k - order : k], f[k - order : k]) @ coefficients
         if not abs(run[k]) < 1e3:
             return np.inf
-    return float(np.sqrt(np.mean((run - x)[min(_WINDOW, x.size // 2) :] ** 2)))
+    return float(np.sqrt(np.mean((run - x)[min(WINDOW, x.size // 2) :] ** 2)))

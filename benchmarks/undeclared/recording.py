@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from undeclared.drawing import LOGS, Drawn, stream
+from undeclared.drawing import FINEST, LOGS, Drawn, stream
 from undeclared.mechanism import Mechanism
+from undeclared.predictability import own_error
 
 ROOM = 25.0
 """The reference temperature [degC]."""
@@ -71,5 +72,22 @@ def _answer(drawn: Drawn, noise: float) -> dict:
         "excitation": [run.excitation.kind for run in drawn.runs],
         "sampling_rate": 1 / drawn.dt,
         "noise": noise,
+        "own_error": _own_error(drawn),
         "coloured": drawn.encoders.memory > 0,
     }
+
+
+def _own_error(drawn: Drawn) -> float:
+    """Of the free run along the held-out log."""
+    run = drawn.runs[-1]
+    return own_error(
+        drawn.base._replace(**drawn.changes),
+        run.states[0, :4],
+        run.torque,
+        drawn.encoders,
+        stream(drawn.case.seed, drawn.case.name + "/start"),
+        dt=drawn.dt,
+        substeps=int(np.ceil(drawn.dt / FINEST)),
+        brake=run.excitation.brake,
+        warm=run.warm,
+    )
