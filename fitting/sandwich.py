@@ -102,6 +102,9 @@ def linearised(fit: Fit) -> Linearised:
     """The regression that a fit is at its solution."""
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
     residual, projected, by_state = (np.asarray(a) for a in _columns(problem, linearise(problem, fit.unknowns)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        # Derivatives that leave the numbers, as over corners that the solver's steps do not resolve, tell nothing.
+        projected = np.where(np.isfinite(np.sum(projected**2, axis=(0, 1))), projected, 0.0)
     samples = problem.segments.measured.shape[1] * problem.segments.measured.shape[2]
     prior = projected[:, samples:]
     period = 2 * np.pi / natural_frequency(fit.model, fit.stretches) / fit.stretches[0].experiment.time_step

@@ -71,6 +71,11 @@ class ReducedDrive(eqx.Module):
     gain: Scalar = parameter(1.0, unit="[x]/s^2/[u]", doc="acceleration per unit of forcing", source="DESIGN eq. 2.1")
 
     @property
+    def c(self) -> float:
+        """What a unit of mesh torque takes off x'': one, since the torque is counted by that."""
+        return 1.0
+
+    @property
     def stiffness(self) -> Scalar:
         """What multiplies `f(x)`: omega_0^2 [1/s^2]."""
         return self.omega_0**2

@@ -167,9 +167,7 @@ class TwoInertiaModel(Model):
         for effect in self._of(MeshGeometryEffect):
             x = x + effect.error(theta_m)
             v = v + effect.slope(theta_m) * omega_m
-        return Motion(
-            x, v, theta_m, omega_m, theta_l, omega_l, time=conditions.time, temperature=conditions.temperature
-        )
+        return Motion(x, v, theta_m, omega_m, theta_l, omega_l, **vars(conditions))
 
     def component_rates(
         self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
@@ -214,7 +212,7 @@ class ReducedModel(Model):
                 raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
 
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
-        return Motion(x=state[0], v=state[1], time=conditions.time, temperature=conditions.temperature)
+        return Motion(x=state[0], v=state[1], **vars(conditions))
 
     def component_rates(
         self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()

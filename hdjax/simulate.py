@@ -240,7 +240,7 @@ def march(
         @jax.jit
         def rates(y, s):
             load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
-            conditions = Conditions(knot + s, None if warmth is None else polynomial(warmth, s))
+            conditions = Conditions(knot + s, None if warmth is None else polynomial(warmth, s), step=h)
             return model.component_rates(y, polynomial(coefficients, s), load, conditions)
 
         def step_in_a_loop(y, start):

@@ -25,6 +25,7 @@ class Motion(eqx.Module):
         omega_l: load rate [rad/s].
         time: since the log's start [s], or None where it is not known.
         temperature: of the drive [K], or None where it is not known.
+        step: of an explicit solver [s], or None where it adapts itself.
     """
 
     x: Array
@@ -35,6 +36,7 @@ class Motion(eqx.Module):
     omega_l: Array | None = None
     time: Array | None = None
     temperature: Array | None = None
+    step: Array | None = None
 
 
 class Conditions(eqx.Module):
@@ -43,10 +45,12 @@ class Conditions(eqx.Module):
     Attributes:
         time: since the log's start [s]; the clock of the torque's signal.
         temperature: of the drive [K].
+        step: of an explicit solver [s], where it is fixed: no corner can be sharper than that.
     """
 
     time: Array | None = None
     temperature: Array | None = None
+    step: Array | None = None
 
 
 class Scales(eqx.Module):

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
-from hdjax.effects.friction import motor_rate, smooth_sign
+from hdjax.effects.friction import dry, motor_rate
 from hdjax.effects.ripple import Term, amplitude_and_phase, amplitudes_and_phases, ripple, ripple_slope, ripples
 from hdjax.parameters import Scalar, parameter
 
@@ -99,7 +99,7 @@ class _MotorFrictionOverAngle(MotorSideEffect):
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         assert motion.theta_m is not None
         level = self.T_c + self._ripple(motion.theta_m)
-        return -level * smooth_sign(motor_rate(motion), self.transition)
+        return -dry(level, motor_rate(motion), self.transition, 1.0 / drive.J_m, motion)
 
 
 class PositionDependentMotorFriction(_MotorFrictionOverAngle):
@@ -180,7 +180,7 @@ class PositionDependentMeshFriction(MeshTorqueEffect):
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         assert motion.theta_m is not None
         level = self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
-        return level * smooth_sign(motion.v, self.v_0)
+        return dry(level, motion.v, self.v_0, drive.c, motion)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "N m")

@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
-from hdjax.effects.friction import motor_rate, smooth_sign
+from hdjax.effects.friction import dry, motor_rate
 from hdjax.parameters import Scalar, parameter
 
 _WOLF = "Wolf and Iskandar: viscous friction falls exponentially with temperature"
@@ -83,8 +83,8 @@ class ThermalMotorFriction(MotorSideEffect):
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         omega = motor_rate(motion)
-        fall = self.T_c_T * smooth_sign(omega, self.transition) + self.b_T * omega
-        return (_temperature(motion, self.name) - self.T_0) * fall
+        warmer = _temperature(motion, self.name) - self.T_0
+        return dry(self.T_c_T * warmer, omega, self.transition, 1.0 / drive.J_m, motion) + self.b_T * warmer * omega
 
 
 def _reference(scales: Scales) -> tuple[float, ...]:
