@@ -271,18 +271,21 @@ def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
     values = np.array([e.value for e in found.estimates.values()])
     relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
     classical = np.linalg.pinv(information, hermitian=True)
-    robust = np.diag(found.covariance) / np.maximum(np.diag(classical), 1e-300)
     made = []
     for i, path in enumerate(held):
         own = products[count + i, count + i] - coupling[:, i] @ classical @ coupling[:, i]
-        if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            # What the logs do not see at all has no bounds.
+            robust = np.diag(found.covariance) / np.diag(classical)
+            if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
+            std_if_free = np.nan_to_num(relative * np.sqrt(robust * if_free), nan=np.inf)
         change = _PERCENT * response[:, i] * np.sign(values) * relative
         made.append(
             _held_one(
                 fit,
                 path,
                 dict(zip(found.estimates, change.tolist(), strict=True)),
-                dict(zip(found.estimates, (relative * np.sqrt(robust * if_free)).tolist(), strict=True)),
+                dict(zip(found.estimates, std_if_free.tolist(), strict=True)),
             )
         )
     return tuple(made)
