@@ -161,8 +161,8 @@ def dry(level: Array, rate: Array, transition: Array, mobility: Array | float, m
     """Dry friction `level sgn(rate)`, its sign turning over +-transition so that it has a gradient.
 
     About rest it is a damper that brings the rate down within `transition / (level mobility)`. An explicit solver whose
-    step is longer than that rattles to and fro instead. So the corner is as sharp as the steps resolve, and finer steps
-    bring back the law as stated. (The larger of both widths, but rounded: a fit feels the corner on either side.)
+    step is longer than that rattles to and fro instead. So the corner is as sharp as the steps resolve (the root of the
+    sum of squares of both widths, which a fit feels on either side), and finer steps bring back the law as stated.
 
     Args:
         level: of the torque [N m].
@@ -172,9 +172,7 @@ def dry(level: Array, rate: Array, transition: Array, mobility: Array | float, m
         motion: tells the solver's step, where it is fixed.
     """
     if motion.step is not None:
-        resolved = jnp.abs(level) * mobility * motion.step / _STABLE
-        wide, narrow = jnp.maximum(transition, resolved), jnp.minimum(transition, resolved)
-        transition = wide * (1.0 + (narrow / wide) ** 4) ** 0.25
+        transition = jnp.hypot(transition, level * mobility * motion.step / _STABLE)
     return level * jnp.tanh(rate / transition)
 
 
