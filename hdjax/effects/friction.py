@@ -161,9 +161,8 @@ def dry(level: Array, rate: Array, transition: Array, mobility: Array | float, m
     """Dry friction `level sgn(rate)`, its sign turning over +-transition so that it has a gradient.
 
     About rest it is a damper that brings the rate down within `transition / (level mobility)`. An explicit solver whose
-    step is longer than that rattles to and fro instead. So the corner is as sharp as the steps resolve, and finer steps
-    bring back the law as stated. (Widths add by squares where the steps do not resolve it, so that a fit still feels
-    where the corner is; where they do, it is as stated to the sixth order.)
+    step is longer than that rattles to and fro instead. So the corner is as sharp as the steps resolve (the root of the
+    sum of squares of both widths, which a fit feels on either side), and finer steps bring back the law as stated.
 
     Args:
         level: of the torque [N m].
@@ -173,8 +172,7 @@ def dry(level: Array, rate: Array, transition: Array, mobility: Array | float, m
         motion: tells the solver's step, where it is fixed.
     """
     if motion.step is not None:
-        own, resolved = transition**2, (level * mobility * motion.step / _STABLE) ** 2
-        transition = jnp.sqrt(own + resolved**3 / (own**2 + resolved**2))
+        transition = jnp.hypot(transition, level * mobility * motion.step / _STABLE)
     return level * jnp.tanh(rate / transition)
 
 
