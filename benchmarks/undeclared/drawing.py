@@ -157,6 +157,11 @@ def stream(seed: int, name: str, attempt: int = 0) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode()), attempt])
 
 
+def substeps_of(dt: float) -> int:
+    """Solver steps in a sampling interval [s]."""
+    return int(np.ceil(dt / FINEST))
+
+
 def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
     dt, counts = _size(random)
     base = _base(random, dt)
@@ -166,9 +171,7 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
     encoders = draw_encoders(random, colour=by_chance if case.coloured is None else case.coloured)
     heats = any(form.heats for form in case.forms) or random.uniform() < 0.15
     turning = TURNING[:2] if any(form.family in _OF_ANGLE for form in case.forms) else TURNING
-    bench = _Bench(
-        base, encoders, dt, int(np.ceil(dt / FINEST)), _excitations(random, base, counts, dt, turning), heats
-    )
+    bench = _Bench(base, encoders, dt, substeps_of(dt), _excitations(random, base, counts, dt, turning), heats)
     warm = bench.temperatures(random)
     changes, strengths, detectable = {}, [], []
     for form in case.forms:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from undeclared.drawing import FINEST, LOGS, Drawn, stream
+from undeclared.drawing import LOGS, Drawn, stream, substeps_of
 from undeclared.mechanism import Mechanism
 from undeclared.predictability import own_error
 
@@ -87,7 +87,7 @@ def _own_error(drawn: Drawn) -> float:
         drawn.encoders,
         stream(drawn.case.seed, drawn.case.name + "/start"),
         dt=drawn.dt,
-        substeps=int(np.ceil(drawn.dt / FINEST)),
+        substeps=substeps_of(drawn.dt),
         brake=run.excitation.brake,
         warm=run.warm,
     )

@@ -103,14 +103,13 @@ def _absent(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]
     return found
 
 
-def _absence(parameters: Mapping[str, Mapping[str, Any]], unit: str, paths: Sequence[str]) -> str:
+def _absence(parameters: Mapping[str, Mapping[str, Any]], unit: str, paths: list[str]) -> str:
     """Such parameters in one sentence."""
     most = max(abs(end) for path in paths for end in parameters[path]["ci95"] if end is not None)
     others = max(abs(e["value"]) for e in parameters.values() if e["unit"] == unit and not e.get("derived"))
-    names = paths[0] if len(paths) == 1 else f"{', '.join(paths[:-1])} and {paths[-1]}"
     bound, size = (formatting.quantity(value, unit, digits=2) for value in (most, others))
-    verb = "is" if len(paths) == 1 else "are"
-    return f"{names} {verb} not told from zero: at most {bound}, where the largest of the kind is {size}."
+    subject = f"{formatting.words(paths)} {'is' if len(paths) == 1 else 'are'}"
+    return f"{subject} not told from zero: at most {bound}, where the largest of the kind is {size}."
 
 
 def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
