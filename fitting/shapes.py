@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from fitting.learned_curve import LearnedCurve
 from fitting.unknown import without
-from hdjax.effects.learned import ANGLES
+from hdjax.effects.learned import ANGLES, DRIFTS
 
 Kind = Literal["constant", "linear", "even", "odd", "magnitude", "knee", "sign", "stribeck", "order"]
 
@@ -129,6 +129,11 @@ def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:
             labels = (f"cos({times}{variable})", f"sin({times}{variable})")
             yield form("order", labels, np.cos(n * values), np.sin(n * values))
         return
+    if variable in DRIFTS:
+        middle = float(np.mean(values))
+        yield form("linear", (f"({variable} - {middle:.4g})",), values - middle)
+        yield form("even", (f"({variable} - {middle:.4g})^2",), (values - middle) ** 2)
+        return
     yield form("linear", (variable,), values)
     yield form("even", (f"{variable}^2",), values**2)
     yield form("odd", (f"|{variable}| {variable}",), np.abs(values) * values)
@@ -151,6 +156,8 @@ def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:
 
 def _family_of_product(curve: LearnedCurve, one: _Form, other: _Form) -> str | None:
     """What a product is called in the catalogue."""
+    if "temperature" in curve.variables:
+        return "temperature"
     if curve.place == "load" or not set(curve.variables) & set(ANGLES):
         return "nonlinear_damping" if curve.place == "mesh" and set(curve.variables) == {"x", "v"} else None
     names = {one.labels[0], other.labels[0]}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hdjax.elementary import cosine_and_sine, exponential, power
+from hdjax.elementary import cosine_and_sine, cosines_and_sines, exponential, power
 
 
 @given(turns=st.integers(-250_000, 250_000), rest=st.floats(-4.0, 4.0))
@@ -32,6 +32,25 @@ def test_derivatives_turn_one_into_the_other():
         np.testing.assert_allclose(by_angle, [-np.sin(0.7), np.cos(0.7)], rtol=1e-15)
     twice = jax.hessian(lambda a: cosine_and_sine(a)[1])(angle)
     assert float(twice) == pytest.approx(-np.sin(0.7), rel=1e-15)
+
+
+ORDERS = (4, 1, 3, 6)
+
+
+@given(st.floats(-1e3, 1e3))
+def test_multiples(angle: float):
+    for order, (cosine, sine) in zip(ORDERS, cosines_and_sines(jnp.asarray(angle), ORDERS), strict=True):
+        # Numpy is given the angle that counts: a rounded multiple is another one.
+        turned = np.exp(1j * angle) ** order
+        np.testing.assert_allclose([cosine, sine], [turned.real, turned.imag], atol=3e-15)
+
+
+def test_derivatives_of_multiples():
+    angle = jnp.asarray(-2.3)
+    wanted = [(-n * np.sin(n * angle), n * np.cos(n * angle)) for n in ORDERS]
+    for mode in (jax.jacfwd, jax.jacrev):
+        by_angle = mode(lambda a: cosines_and_sines(a, ORDERS))(angle)
+        np.testing.assert_allclose(by_angle, wanted, rtol=1e-13)
 
 
 @given(st.floats(-700.0, 50.0))

@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline
 import rig
 from fitting.errors import InputError
 from fitting.model_file import StoredModel, read_model, to_json
-from hdjax.effects import Effect, Motion, Scales
+from hdjax.effects import Conditions, Effect, Motion, Scales
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.learned import (
     ANGLES,
@@ -33,7 +33,7 @@ from hdjax.effects.learned import (
 
 @eqx.filter_jit
 def rates(model, state):
-    return model.rates(state, jnp.zeros(()), jnp.zeros(()))
+    return model.rates(state, jnp.zeros(()), jnp.zeros(()), Conditions(jnp.asarray(0.2), jnp.asarray(0.4)))
 
 
 @eqx.filter_jit

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,8 @@ NOISE = 1e-3
 FRICTION = (10.0, 0.3)
 SETTING = Setting(horizon=128, halo=4, substeps=2, count=16)
 TRUTH = rig.reduced_model()
+TIME = STEP * np.arange(COUNT)
+WARMTH = 300.0 + 4.0 * np.sin(4.0 * np.pi * TIME / TIME[-1])
 
 
 def hidden_motion(forcing: np.ndarray, torque) -> np.ndarray:
@@ -46,16 +49,18 @@ def silent(message: str) -> None:
     pass
 
 
-def base_trial(torque, seed: int = 0) -> tuple[Trial, dict]:
+def base_trial(torque, seed: int = 0, *, drift: np.ndarray | None = None) -> tuple[Trial, dict]:
     """The base model's fit of a motion with a hidden torque, from the truth of everything else."""
     forcing = rig.reduced_forcing(COUNT, seed=seed)
-    log = rig.reduced_log(hidden_motion(forcing, torque), forcing, noise=NOISE, seed=seed)
+    felt = forcing if drift is None else forcing - drift / rig.GAIN
+    log = rig.reduced_log(hidden_motion(felt, torque), forcing, noise=NOISE, seed=seed)
+    log = replace(log, temperature=WARMTH)
     data = {"zero-order": split([experiment_from_log(log, hold="zero-order")])}
     return attempt(TRUTH, data, "zero-order", SETTING), data
 
 
-def found_of(torque) -> Unknown:
-    trial, data = base_trial(torque)
+def found_of(torque, **drifting) -> Unknown:
+    trial, data = base_trial(torque, **drifting)
     found = learn(trial, data, SETTING, seed=0, progress=silent)
     assert found is not None
     return found
@@ -113,6 +118,21 @@ def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unkn
     # An error of the torque counts: here one that is not in the data.
     biased = right.with_effects(TorqueBias(bias=1.0))
     assert share_of(biased, rubbing) < 0.8 * share_of(right, rubbing)
+
+
+@pytest.mark.parametrize(("variable", "values"), [("time", TIME / TIME[-1] - 0.4), ("temperature", (WARMTH - 300) / 4)])
+def test_what_drifts_is_told_from_what_moves(variable: str, values: np.ndarray):
+    drift = 10 * NOISE * rig.OMEGA_0**2 * values
+    found = found_of(lambda x, v: 0.0, drift=drift)
+    assert is_supported(found)
+    assert found.chosen.variables == (variable,)
+    before, after = (np.sqrt(float(t.held_out.covariance[0, 0])) for t in (found.before, found.trial))
+    # The held-out stretch is the last one, so that a drift in time is extrapolated.
+    assert before > 2 * NOISE
+    assert after < 1.2 * NOISE
+    best = shapes(curve_of(found)).closest[0]
+    # A straight line about the mean, which need not be where the drift is zero.
+    assert variable in best.expression and best.explained > 0.9
 
 
 @pytest.mark.slow

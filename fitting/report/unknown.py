@@ -19,6 +19,8 @@ _WORDS = {
     "omega_m": "motor speed",
     "theta_l": "load angle",
     "omega_l": "load speed",
+    "time": "time",
+    "temperature": "temperature",
 }
 _PLACES = {"mesh": "torque in the mesh", "motor": "torque on the motor", "load": "torque on the load"}
 _TOLD = 6

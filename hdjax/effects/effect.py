@@ -98,8 +98,6 @@ class Effect(eqx.Module):
         name: the form's own name, prefix of its parameters' dotted paths.
         states: names of its internal states.
         needs_motor: whether it needs the motor's and load's own motion, which a reduced log lacks.
-        needs_time: whether it depends on the time since the log's start.
-        needs_temperature: whether it depends on the drive's temperature.
         drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
             single one shows it.
     """
@@ -108,8 +106,6 @@ class Effect(eqx.Module):
     name: ClassVar[str]
     states: ClassVar[tuple[str, ...]] = ()
     needs_motor: ClassVar[bool] = False
-    needs_time: ClassVar[bool] = False
-    needs_temperature: ClassVar[bool] = False
     drawn_against: ClassVar[str | None] = None
 
     @classmethod
@@ -127,6 +123,11 @@ class Effect(eqx.Module):
         For forms whose shape decides so much that the first-order view from zero strength can mislead.
         """
         return ()
+
+    @property
+    def needs_temperature(self) -> bool:
+        """Whether it depends on the drive's temperature."""
+        return False
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         """Further quantities that a reader expects, as name -> (value, unit)."""

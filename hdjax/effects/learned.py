@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
-from hdjax.elementary import cosine_and_sine
+from hdjax.elementary import cosines_and_sines
 from hdjax.parameters import Scalar, as_scalar, parameter
 
 FAMILY = "unknown"
@@ -91,14 +91,8 @@ class AngleAxis(Axis):
         return 1 + 2 * self.orders
 
     def functions(self, value: Array) -> Float[Array, " functions"]:
-        cosine, sine = cosine_and_sine(value)
-        turned = [jnp.ones_like(value), jnp.zeros_like(value)]
-        found = turned[:1]
-        for _ in range(self.orders):
-            # By rotation: a product is cheaper than a cosine.
-            turned = [turned[0] * cosine - turned[1] * sine, turned[0] * sine + turned[1] * cosine]
-            found += turned
-        return jnp.stack(found)
+        turned = cosines_and_sines(value, tuple(range(1, self.orders + 1)))
+        return jnp.stack([jnp.ones_like(value), *(part for pair in turned for part in pair)])
 
 
 def functions(axes: tuple[Axis, ...], motion: Motion) -> Float[Array, " functions"]:
@@ -149,8 +143,8 @@ def _products(found: Sequence[Array]) -> Float[Array, " functions"]:
     return whole
 
 
-class LearnedMeshTorque(MeshTorqueEffect):
-    """Learned torque in the mesh.
+class LearnedTorque(Effect):
+    """Learned torque, somewhere.
 
     Attributes:
         axes: what it depends on.
@@ -159,7 +153,6 @@ class LearnedMeshTorque(MeshTorqueEffect):
     """
 
     family: ClassVar[str] = FAMILY
-    name: ClassVar[str] = "learned_mesh_torque"
 
     axes: tuple[Axis, ...]
     mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
@@ -171,54 +164,34 @@ class LearnedMeshTorque(MeshTorqueEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         """None: what it may depend on is for the data to say."""
         return ()
+
+    @property
+    def needs_temperature(self) -> bool:
+        return any(axis.variable == "temperature" for axis in self.axes)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        """The torque [N m], along the positive direction of its place."""
         return combined(self.axes, self.mixing, self.c, motion)
 
 
-class LearnedMotorTorque(MotorSideEffect):
-    """Learned torque on the motor; attributes as in [`LearnedMeshTorque`][]."""
+class LearnedMeshTorque(LearnedTorque, MeshTorqueEffect):
+    """Learned torque in the mesh."""
 
-    family: ClassVar[str] = FAMILY
+    name: ClassVar[str] = "learned_mesh_torque"
+
+
+class LearnedMotorTorque(LearnedTorque, MotorSideEffect):
+    """Learned torque on the motor."""
+
     name: ClassVar[str] = "learned_motor_torque"
 
-    axes: tuple[Axis, ...]
-    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
-    c: tuple[Scalar, ...] = parameter(
-        unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
-    )
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        """None: what it may depend on is for the data to say."""
-        return ()
+class LearnedLoadTorque(LearnedTorque, LoadSideEffect):
+    """Learned torque on the load."""
 
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return combined(self.axes, self.mixing, self.c, motion)
-
-
-class LearnedLoadTorque(LoadSideEffect):
-    """Learned torque on the load; attributes as in [`LearnedMeshTorque`][]."""
-
-    family: ClassVar[str] = FAMILY
     name: ClassVar[str] = "learned_load_torque"
 
-    axes: tuple[Axis, ...]
-    mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
-    c: tuple[Scalar, ...] = parameter(
-        unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
-    )
 
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        """None: what it may depend on is for the data to say."""
-        return ()
-
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return combined(self.axes, self.mixing, self.c, motion)
-
-
-LearnedTorque = LearnedMeshTorque | LearnedMotorTorque | LearnedLoadTorque
 LEARNED: tuple[type[LearnedTorque], ...] = (LearnedMeshTorque, LearnedMotorTorque, LearnedLoadTorque)
 """A learned torque at each place where it can enter."""
 
@@ -229,11 +202,16 @@ UNITS = {
     "omega_m": "rad/s",
     "theta_l": "rad",
     "omega_l": "rad/s",
+    "time": "s",
+    "temperature": "K",
 }
 """What a learned torque may depend on, with its unit."""
 
 ANGLES = {"theta_m": 6, "theta_l": 3}
 """Those that are angles of a shaft, each with the highest order that it is given."""
+
+DRIFTS = ("time", "temperature")
+"""Those that are no motion: what depends on them drifts."""
 
 _RATES = ("v", "omega_m", "omega_l")
 # Share of the largest rate within which the knots are even.
@@ -248,10 +226,10 @@ def axis_over(variable: str, low: float, high: float, *, beside: str | None = No
         low: smallest value.
         high: largest value.
         beside: the other quantity, where there are two: a product must do with fewer functions of each. Friction may
-            depend on an angle, but what depends on a rate and on something else is damping, which is smooth.
+            depend on an angle, or drift, but what depends on a rate and on another motion is damping, which is smooth.
     """
     if variable in ANGLES:
         return AngleAxis(variable, ANGLES[variable] if beside is None else min(ANGLES[variable], 4))
-    turns = variable in _RATES and (beside is None or beside in ANGLES)
+    turns = variable in _RATES and (beside is None or beside in ANGLES or beside in DRIFTS)
     bend = _NEAR_STANDSTILL * max(abs(low), abs(high)) if turns else None
     return SplineAxis(variable, low=low, high=high, bend=bend, intervals=5 if beside else 17 if turns else 9)

@@ -66,7 +66,6 @@ class LoadDisturbance(LoadSideEffect):
 
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "load_disturbance"
-    needs_time: ClassVar[bool] = True
     drawn_against: ClassVar[str | None] = None
 
     constant: Scalar = parameter(0.0, unit="N m", doc="constant part", source="EFFECTS", role="strength")
@@ -91,7 +90,6 @@ class TwoLineDisturbance(LoadSideEffect):
 
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "two_line_disturbance"
-    needs_time: ClassVar[bool] = True
     drawn_against: ClassVar[str | None] = None
 
     constant: Scalar = parameter(0.0, unit="N m", doc="constant part", source="EFFECTS", role="strength")

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hdjax.elementary import cosine_and_sine
+from hdjax.elementary import cosine_and_sine, cosines_and_sines
 
 Angle = Float[Array, "*n"]
 Term = tuple[int | Array, Array, Array]
@@ -25,14 +25,21 @@ def ripple_slope(angle: Angle, order: float | int | Array, cosine: Array, sine: 
 
 def ripples(angle: Angle, terms: Sequence[Term]) -> Angle:
     """Sum of [`ripple`][] over several orders."""
-    first, *others = (ripple(angle, *term) for term in terms)
+    first, *others = (a * c + b * s for (_, a, b), (c, s) in zip(terms, _turned(angle, terms), strict=True))
     return sum(others, start=first)
 
 
 def ripple_slopes(angle: Angle, terms: Sequence[Term]) -> Angle:
-    """Sum of [`ripple_slope`][] over several orders."""
-    first, *others = (ripple_slope(angle, *term) for term in terms)
-    return sum(others, start=first)
+    """Derivative of [`ripples`][] with respect to the angle."""
+    return ripples(angle, [(n, n * b, -n * a) for n, a, b in terms])
+
+
+def _turned(angle: Angle, terms: Sequence[Term]) -> Sequence[tuple[Angle, Angle]]:
+    """Cosine and sine of each order's angle."""
+    orders = [n for n, _, _ in terms if isinstance(n, int)]
+    if len(orders) == len(terms):
+        return cosines_and_sines(angle, tuple(orders))
+    return [cosine_and_sine(n * angle) for n, _, _ in terms]
 
 
 def amplitude_and_phase(cosine: Array, sine: Array, unit: str, suffix: str = "") -> dict[str, tuple[Array, str]]:

@@ -13,12 +13,18 @@ from hdjax.parameters import Scalar, parameter
 _WOLF = "Wolf and Iskandar: viscous friction falls exponentially with temperature"
 
 
-class ThermalStiffness(MeshTorqueEffect):
+class _Thermal(Effect):
+    family: ClassVar[str] = "temperature"
+
+    @property
+    def needs_temperature(self) -> bool:
+        return True
+
+
+class ThermalStiffness(_Thermal, MeshTorqueEffect):
     """Torque `k_T (T - T_0) K f(x)`: the stiffness is `K (1 + k_T (T - T_0))`."""
 
-    family: ClassVar[str] = "temperature"
     name: ClassVar[str] = "thermal_stiffness"
-    needs_temperature: ClassVar[bool] = True
 
     k_T: Scalar = parameter(
         0.0,
@@ -39,12 +45,10 @@ class ThermalStiffness(MeshTorqueEffect):
         return self.k_T * warmer * drive.stiffness * restoring(motion.x, drive.alpha)
 
 
-class ThermalDamping(MeshTorqueEffect):
+class ThermalDamping(_Thermal, MeshTorqueEffect):
     """The mesh damping is `B_sp exp(-kappa (T - T_0))`."""
 
-    family: ClassVar[str] = "temperature"
     name: ClassVar[str] = "thermal_damping"
-    needs_temperature: ClassVar[bool] = True
     drawn_against: ClassVar[str | None] = "v"
 
     kappa: Scalar = parameter(0.0, unit="1/K", doc="decay of the damping per kelvin", source=_WOLF, role="strength")
@@ -60,15 +64,13 @@ class ThermalDamping(MeshTorqueEffect):
         return damping * jnp.expm1(-self.kappa * warmer)
 
 
-class ThermalMotorFriction(MotorSideEffect):
+class ThermalMotorFriction(_Thermal, MotorSideEffect):
     """Motor friction that falls with temperature: `(T - T_0) (T_c_T sgn(omega_m) + b_T omega_m)` with the motor.
 
     The change alone, to first order in the temperature, whatever law the friction itself follows.
     """
 
-    family: ClassVar[str] = "temperature"
     name: ClassVar[str] = "thermal_motor_friction"
-    needs_temperature: ClassVar[bool] = True
 
     T_c_T: Scalar = parameter(0.0, unit="N m/K", doc="fall of the Coulomb torque per kelvin", role="strength")
     b_T: Scalar = parameter(
