@@ -22,7 +22,7 @@ from hdjax.effects import (
     MotorSideEffect,
     Scales,
 )
-from hdjax.effects.learned import LEARNED, LearnedTorque
+from hdjax.effects.learned import LEARNED_TORQUES, LearnedTorque
 from hdjax.parameters import Scalar, parameter
 from hdjax.program_cache import jit_small
 from hdjax.signals import polynomial
@@ -143,7 +143,7 @@ def unit_pushes(
     of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
     mesh, and its slope."""
     whole = isinstance(model, TwoInertiaModel)
-    torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,)) for f in LEARNED if whole or not f.needs_motor]
+    torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,)) for f in LEARNED_TORQUES if whole or not f.needs_motor]
     geometry = [_UnitGeometry()] if whole else []
     probed = model.with_effects(*torques, *geometry)
     paths = [f"{f.name}.c_0" for f in torques] + [f"{g.name}.{n}" for g in geometry for n in ("e", "e_slope")]
@@ -163,7 +163,7 @@ def unit_pushes(
 def place_of(effect: Effect) -> type[LearnedTorque] | None:
     """The learned torque that acts where an effect does; None where that is no torque."""
     kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
-    return next((form for form, kind in zip(LEARNED, kinds, strict=True) if isinstance(effect, kind)), None)
+    return next((form for form, kind in zip(LEARNED_TORQUES, kinds, strict=True) if isinstance(effect, kind)), None)
 
 
 def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:

@@ -20,7 +20,7 @@ from hdjax.effects import (
     MotorSideEffect,
     SensorEffect,
 )
-from hdjax.effects.learned import ANGLES, LearnedTorque
+from hdjax.effects.learned import ANGLES, Learned, LearnedTorque
 
 # Values of the variable at which the data are asked, in each direction.
 _PLACES = 14
@@ -60,7 +60,7 @@ def evidence(fit: Fit) -> tuple[Evidence, ...]:
     Args:
         fit: of the model with the effects.
     """
-    drawn = [e for e in fit.model.effects if e.drawn_against is not None and not isinstance(e, LearnedTorque)]
+    drawn = [e for e in fit.model.effects if e.drawn_against is not None and not isinstance(e, Learned)]
     if not drawn:
         return ()
     look = look_along(fit)
@@ -140,7 +140,7 @@ def _told(
         places.append(nodes)
         middle.append(_nearby(value[there], does[there], nodes))
         hats.append(_hats(value, nodes) * there[..., None])
-    found = products(look, look.pushes[form.name], np.concatenate(hats, axis=-1))
+    found = products(look, (look.pushes[form.name],), (np.concatenate(hats, axis=-1),))
     own = slice(len(look.problem.free.paths), None)
     # The error is whitened: an equal sum over the outputs is the likelihood.
     gram = np.einsum("siipq->pq", found.gram[..., own, own])

@@ -1,4 +1,6 @@
-"""A learned torque as a curve (or a surface) with standard errors, over the range that the data have."""
+"""A learned function as a curve (or a surface) with standard errors, over the range that the data have."""
+
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -10,33 +12,35 @@ from fitting.uncertainty import Uncertainty
 from fitting.unknown import Unknown
 from hdjax import Model
 from hdjax.effects import Motion
-from hdjax.effects.learned import ANGLES, LEARNED, LearnedTorque, functions
+from hdjax.effects.learned import ANGLES, LEARNED, Learned, LearnedTorque, functions
 
-PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load"), strict=True))
-"""Where each learned torque acts."""
+PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load", "mesh angle"), strict=True))
+"""Where each learned function acts."""
 
 _POINTS = {1: 200, 2: 41}
 
 
 class LearnedCurve(eqx.Module):
-    """A learned torque.
+    """A learned function.
 
     Attributes:
-        place: "mesh", "motor" or "load".
+        place: "mesh", "motor" or "load" of a torque; "mesh angle" of an error there.
+        quantity: "torque" or "error".
         variables: what it depends on.
         at: variables at instants of the training data, by column; angles within one turn where the data have more.
-        torque: at those instants [N m].
+        value: at those instants [N m or rad].
         std: its standard error.
-        known: what the drive's own parameters stand for at those instants: the torque is without it.
+        known: what the drive's own parameters stand for at those instants: the function is without it.
         grid: evenly spaced values of each variable over the range of the data.
-        on_grid: the torque there, one axis for each variable.
+        on_grid: the value there, one axis for each variable.
         std_on_grid: its standard error.
     """
 
     place: str = eqx.field(static=True)
+    quantity: Literal["torque", "error"] = eqx.field(static=True)
     variables: tuple[str, ...] = eqx.field(static=True)
     at: Float[np.ndarray, "instants variables"]
-    torque: Float[np.ndarray, " instants"]
+    value: Float[np.ndarray, " instants"]
     std: Float[np.ndarray, " instants"]
     known: Float[np.ndarray, "instants known"]
     grid: tuple[Float[np.ndarray, " points"], ...]
@@ -45,16 +49,16 @@ class LearnedCurve(eqx.Module):
 
 
 def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> LearnedCurve:
-    """The curve of a learned torque.
+    """The curve of a learned function.
 
     Args:
-        found: the learned torque and the motion that it was learned from.
+        found: the learned function and the motion that it was learned from.
         model: with the final values.
         uncertainty: of them.
     """
     name = found.chosen.form.name
     effect = model.effect(name)
-    assert isinstance(effect, LearnedTorque)
+    assert isinstance(effect, Learned)
     covariance = _covariance(uncertainty, name)
     values = np.stack([np.asarray(getattr(found.motion, v)) for v in found.chosen.variables], axis=1)
     for column, variable in zip(values.T, found.chosen.variables, strict=True):
@@ -63,13 +67,14 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     points = _POINTS[values.shape[1]]
     grid = tuple(np.linspace(*_range(column), points) for column in values.T)
     mesh = np.stack([g.reshape(-1) for g in np.meshgrid(*grid, indexing="ij")], axis=1)
-    torque, std = _evaluated(effect, covariance, values)
+    value, std = _evaluated(effect, covariance, values)
     on_grid, std_on_grid = (a.reshape([points] * len(grid)) for a in _evaluated(effect, covariance, mesh))
     return LearnedCurve(
         PLACES[name],
+        "torque" if isinstance(effect, LearnedTorque) else "error",
         found.chosen.variables,
         values,
-        torque,
+        value,
         std,
         found.chosen.known,
         grid,
@@ -84,15 +89,15 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 
 def _covariance(uncertainty: Uncertainty, name: str) -> np.ndarray:
-    """Covariance of the learned torque's coefficients."""
+    """Covariance of the learned function's coefficients."""
     paths = list(uncertainty.estimates)
     own = [i for i, path in enumerate(paths) if path.startswith(f"{name}.")]
     std = np.array([uncertainty.estimates[paths[i]].std for i in own])
     return np.asarray(uncertainty.correlation)[np.ix_(own, own)] * np.outer(std, std)
 
 
-def _evaluated(effect: LearnedTorque, covariance: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Torque and standard error at rows of the variables."""
+def _evaluated(effect: Learned, covariance: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value and standard error at rows of the variables."""
     names = [axis.variable for axis in effect.axes]
 
     def at(row):

@@ -1,4 +1,4 @@
-"""What torques along a fitted motion would explain of what a fit leaves over, to first order."""
+"""What forces along a fitted motion would explain of what a fit leaves over, to first order."""
 
 import equinox as eqx
 import jax
@@ -18,6 +18,13 @@ from hdjax.where import where
 
 # Passes of "least squares, then weigh the outputs by what is left over".
 _REWEIGHTINGS = 2
+
+
+Pushes = tuple[Float[Array, "segments knots states"], ...]
+"""What a unit of each thing does to the state's rates."""
+
+Sizes = tuple[Float[Array | np.ndarray, "segments knots forces"], ...]
+"""How much of each thing there is."""
 
 
 class Look(eqx.Module):
@@ -48,9 +55,9 @@ class Look(eqx.Module):
 
 
 class Products(eqx.Module):
-    """Inner products of what torques would do to the outputs, for each segment and pair of outputs.
+    """Inner products of what forces would do to the outputs, for each segment and pair of outputs.
 
-    The free parameters' columns come first, then those of the torques; what each simulation's first state could do as
+    The free parameters' columns come first, then those of the forces; what each simulation's first state could do as
     well is taken off.
 
     Attributes:
@@ -117,32 +124,31 @@ def _parameter_torques(problem: Problem, states: Array, conditions: Conditions, 
     return where(there, torque, 0.0)
 
 
-def products(
-    look: Look, push: Float[Array, "segments knots states"], torques: Float[np.ndarray, "segments knots columns"]
-) -> Products:
-    """What torques at one place would do to the outputs.
+def products(look: Look, pushes: Pushes, sizes: Sizes) -> Products:
+    """What forces would do to the outputs.
 
     Args:
         look: the fit.
-        push: the place, one of the look's pushes.
-        torques: at each knot; in a straight line between.
+        pushes: what each force is made of, some of the look's pushes: a torque at one place, mostly.
+        sizes: how much of each, at each knot; in a straight line between.
     """
-    found = _products(look, push, jnp.asarray(torques))
+    found = _products(look, pushes, tuple(jnp.asarray(a) for a in sizes))
     return Products(*(np.asarray(a) for a in found))
 
 
 @eqx.filter_jit
-def _products(look: Look, push: Array, torques: Array) -> tuple[Array, Array, Array, Array]:
-    columns = _columns(look, push, torques)
+def _products(look: Look, pushes: Pushes, sizes: Sizes) -> tuple[Array, Array, Array, Array]:
+    columns = _columns(look, pushes, sizes)
     error = look.error
     gram = jnp.einsum("snip,snjq->sijpq", columns, columns)
     gradient = jnp.einsum("snip,snj->sijp", columns, error)
     return gram, gradient, jnp.einsum("sni,snj->sij", error, error), jnp.sum(look.problem.segments.weight, axis=1)
 
 
-def _columns(look: Look, push: Array, torques: Array) -> Float[Array, "segments samples outputs columns"]:
-    """The whitened outputs' derivative by the free parameters and by each torque."""
-    forces = push[..., None] * torques[:, :, None, :]
+def _columns(look: Look, pushes: Pushes, sizes: Sizes) -> Float[Array, "segments samples outputs columns"]:
+    """The whitened outputs' derivative by the free parameters and by each force."""
+    first, *others = (p[..., None] * s[:, :, None, :] for p, s in zip(pushes, sizes, strict=True))
+    forces = sum(others, start=first)
     segments = look.problem.segments
     return explained(
         look.blocks, look.followed, segments, look.problem.whitening, forces[:, :-1], forces[:, 1:], jnp.zeros(())
@@ -151,21 +157,21 @@ def _columns(look: Look, push: Array, torques: Array) -> Float[Array, "segments 
 
 def surrogate_gains(
     looks: tuple[Look, Look],
-    pushes: tuple[Array, Array],
-    torques: tuple[np.ndarray, np.ndarray],
+    pushes: tuple[Pushes, Pushes],
+    sizes: tuple[Sizes, Sizes],
     surrogates: tuple[np.ndarray, np.ndarray],
 ) -> Float[np.ndarray, " draws"]:
-    """What torques gain on unseen data where there is nothing to find.
+    """What forces gain on unseen data where there is nothing to find.
 
     Args:
         looks: at the data that are fitted, and at unseen data.
-        pushes: the place, likewise.
-        torques: likewise.
+        pushes: what the forces are made of, likewise.
+        sizes: likewise.
         surrogates: residuals of the same colour with random phases, by draw, segment and row.
     """
     (gram, gradient), (unseen_gram, unseen_gradient) = (
-        [np.asarray(a) for a in _against(look, p, jnp.asarray(t), jnp.asarray(s))]
-        for look, p, t, s in zip(looks, pushes, torques, surrogates, strict=True)
+        [np.asarray(a) for a in _against(look, p, tuple(jnp.asarray(one) for one in size), jnp.asarray(drawn))]
+        for look, p, size, drawn in zip(looks, pushes, sizes, surrogates, strict=True)
     )
     known = len(looks[0].problem.free.paths)
     loss = []
@@ -178,8 +184,8 @@ def surrogate_gains(
 
 
 @eqx.filter_jit
-def _against(look: Look, push: Array, torques: Array, surrogates: Array) -> tuple[Array, Array]:
-    columns = _columns(look, push, torques)
+def _against(look: Look, pushes: Pushes, sizes: Sizes, surrogates: Array) -> tuple[Array, Array]:
+    columns = _columns(look, pushes, sizes)
     rows = columns.reshape(columns.shape[0], -1, columns.shape[-1])
     return jnp.einsum("srp,srq->pq", rows, rows), jnp.einsum("srp,dsr->pd", rows, surrogates)
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME, Effect
-from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, SplineAxis
+from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, Learned, SplineAxis
 from hdjax.parameters import own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
@@ -79,8 +79,8 @@ def _values(module: eqx.Module) -> dict[str, float]:
 
 
 def _learned_content(effect: Effect) -> dict[str, Any]:
-    """What a learned torque has beside its coefficients."""
-    if not isinstance(effect, LearnedTorque):
+    """What a learned function has beside its coefficients."""
+    if not isinstance(effect, Learned):
         return {}
     axes = [
         {"variable": a.variable, "orders": a.orders}
@@ -102,9 +102,10 @@ def _effect(content: Any) -> Effect:
     learned = {form.name: form for form in LEARNED}
     if content["name"] not in learned:
         return BY_NAME[content["name"]](**content["parameters"])
+    form = learned[content["name"]]
     axes: tuple[Axis, ...] = tuple(AngleAxis(**a) if "orders" in a else SplineAxis(**a) for a in content["axes"])
     for axis in axes:
-        if axis.variable not in UNITS or axis.count > _MOST_FUNCTIONS:
+        if axis.variable not in UNITS or not form.may_depend_on(axis.variable) or axis.count > _MOST_FUNCTIONS:
             raise ValueError(f"{axis.variable} with {axis.count} functions")
         if isinstance(axis, SplineAxis) and not (axis.intervals >= 1 and axis.low < axis.high):
             raise ValueError(f"{axis.variable} from {axis.low} to {axis.high}")
@@ -113,7 +114,7 @@ def _effect(content: Any) -> Effect:
     wanted = (math.prod(a.count for a in axes), len(coefficients))
     if mixing.shape != wanted or not bool(jnp.all(jnp.isfinite(mixing))):
         raise ValueError(f"a mixing of shape {mixing.shape} where {wanted} was expected")
-    return learned[content["name"]](axes=axes, mixing=mixing, c=coefficients)
+    return form(axes=axes, mixing=mixing, c=coefficients)
 
 
 def _stored(content: Any) -> StoredModel:

@@ -1,4 +1,4 @@
-"""Which closed form a learned torque resembles: friction's sign, a dead zone, orders of an angle, powers."""
+"""Which closed form a learned function resembles: friction's sign, a dead zone, orders of an angle, powers."""
 
 import itertools
 from collections.abc import Iterator
@@ -30,6 +30,7 @@ _FAMILIES: dict[tuple[str, str, Kind], str] = {
     ("mesh", "v", "stribeck"): "coulomb_friction",
     ("mesh", "v", "odd"): "nonlinear_damping",
     ("mesh", "theta_m", "order"): "kinematic_error",
+    ("mesh angle", "theta_m", "order"): "kinematic_error",
     ("motor", "theta_m", "order"): "cogging",
     ("motor", "omega_m", "sign"): "motor_friction",
     ("motor", "omega_m", "linear"): "motor_friction",
@@ -46,11 +47,11 @@ _DEAD_ZONE = 0.2
 
 @dataclass(frozen=True)
 class Shape:
-    """A closed form beside a learned torque.
+    """A closed form beside a learned function.
 
     Attributes:
-        expression: the form with its coefficients, the torque in N m and the variables in SI units.
-        explained: share of the learned torque's mean square over the data that it accounts for.
+        expression: the form with its coefficients, all in SI units.
+        explained: share of the learned function's mean square over the data that it accounts for.
         families: families of the catalogue that look like it.
     """
 
@@ -61,7 +62,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Shapes:
-    """What a learned torque looks like.
+    """What a learned function looks like.
 
     Attributes:
         closest: single closed forms, best first.
@@ -82,8 +83,8 @@ class _Form:
 
 
 def shapes(curve: LearnedCurve) -> Shapes:
-    """Project a learned torque on closed forms, beside what the drive's own parameters can do."""
-    target = without(curve.torque, curve.known)
+    """Project a learned function on closed forms, beside what the drive's own parameters can do."""
+    target = without(curve.value, curve.known)
     forms = [f for f in _forms(curve) if _is_own(f, curve)]
     single = sorted((_projected(curve, target, (f,)), i) for i, f in enumerate(forms))[::-1]
     ranked = [forms[i] for _, i in single]
@@ -104,7 +105,7 @@ def _distinct(ranked: list[_Form]) -> list[_Form]:
 
 
 def _forms(curve: LearnedCurve) -> Iterator[_Form]:
-    count = len(curve.torque)
+    count = len(curve.value)
     yield _Form(("1",), np.ones((count, 1)), _FAMILIES.get((curve.place, "", "constant")))
     parts = [list(_of_one(curve.place, n, curve.at[:, i])) for i, n in enumerate(curve.variables)]
     for forms in parts:

@@ -1,7 +1,7 @@
-"""What is missing where the catalogue does not say: a learned torque inside the equations, of variables that matter.
+"""What is missing where the catalogue does not say: learned inside the equations, as a function of what matters.
 
 Which place and which variables is decided on training data alone, by leaving parts of them out in turn; the held-out
-stretches then judge one learned torque, like any other effect.
+stretches then judge one learned function, like any other effect.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,12 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import eigh, null_space
 
+from fitting.along import ERROR, SLOPE
 from fitting.attribution import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.linear_look import (
     Look,
     Products,
+    Pushes,
+    Sizes,
     best_step,
     left_after,
     look_along,
@@ -30,7 +33,17 @@ from fitting.surrogates import surrogates
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, ReducedModel, sampled
 from hdjax.effects import Conditions, Motion
-from hdjax.effects.learned import ANGLES, LEARNED, UNITS, AngleAxis, Axis, LearnedTorque, axis_over, combined
+from hdjax.effects.learned import (
+    ANGLES,
+    LEARNED,
+    UNITS,
+    AngleAxis,
+    Axis,
+    Learned,
+    LearnedMeshTorque,
+    LearnedTorque,
+    axis_over,
+)
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -58,23 +71,23 @@ class Candidate(eqx.Module):
 
     Attributes:
         form: the place.
-        variables: what the torque depends on.
+        variables: what the function depends on.
         gain: decrease of the objective on parts of the training data that were left out, to first order.
-        effect: the learned torque, at the coefficients that suit best to first order.
+        effect: the learned function, at the coefficients that suit best to first order.
         drive_step: change of the free vector that goes with it.
         known: functions of the variables that the free parameters stand for already, at the instants that are kept.
     """
 
-    form: type[LearnedTorque] = eqx.field(static=True)
+    form: type[Learned] = eqx.field(static=True)
     variables: tuple[str, ...] = eqx.field(static=True)
     gain: float
-    effect: LearnedTorque
+    effect: Learned
     drive_step: Float[np.ndarray, " parameters"]
     known: Float[np.ndarray, "instants known"]
 
 
 class Unknown(eqx.Module):
-    """A learned torque that the data support.
+    """A learned function that the data support.
 
     Attributes:
         before: the model without it.
@@ -83,7 +96,7 @@ class Unknown(eqx.Module):
         chosen: the one that was taken.
         states: of the model without it, at the instants that stand for the density of the data.
         conditions: time and temperature there.
-        push: what a unit of torque at its place adds to their rates.
+        push: what a unit of torque adds to their rates: at its place, or in the mesh for an error there.
         gain: decrease of the held-out objective.
         p_value: chance of such a gain where nothing is missing.
     """
@@ -103,26 +116,19 @@ class Unknown(eqx.Module):
         """The motion at the instants."""
         return jax.vmap(self.before.model.motion)(jnp.asarray(self.states), self.conditions)
 
-    @property
-    def torque(self) -> Float[np.ndarray, " instants"]:
-        """The learned torque at the instants."""
-        effect = self.trial.model.effect(self.chosen.form.name)
-        assert isinstance(effect, LearnedTorque)
-        return np.asarray(jax.vmap(lambda m: combined(effect.axes, effect.mixing, effect.c, m))(self.motion))
-
 
 class _Sight(eqx.Module):
     """A look, with what candidates share.
 
     Attributes:
         look: at the fit.
-        pushes: each place, by the form's name.
+        pushes: what each form's function adds, and its slope as well for an error of the mesh, by the form's name.
         values: variables at each knot.
         weight: of each knot.
     """
 
     look: Look
-    pushes: dict[str, Array]
+    pushes: dict[str, Pushes]
     values: dict[str, Float[np.ndarray, "segments knots"]]
     weight: Float[np.ndarray, "segments knots"]
 
@@ -165,7 +171,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     instants = _instants(sight)
     states, acting = (
         np.asarray(a).reshape(-1, a.shape[2])[instants]
-        for a in (sight.look.followed.states, sight.pushes[chosen.form.name])
+        for a in (sight.look.followed.states, _torque_push(sight, chosen.form))
     )
     conditions = jax.tree.map(lambda a: a.reshape(-1)[instants], sight.look.conditions)
     return Unknown(before, trial, tuple(found), chosen, states, conditions, acting, gain, p_value)
@@ -174,14 +180,12 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
 def _refined(
     best: tuple[Candidate, Trial], data: Data, setting: Setting, progress: Callable[[str], None]
 ) -> tuple[Candidate, Trial]:
-    """The same torque with as many coefficients as a second look calls for, along the motion that the first fit found:
-    the first look is but first order."""
+    """The same function with as many coefficients as a second look, along the motion that the first fit found, calls
+    for: the first look is but first order."""
     first, trial = best
     sight = _sight(trial.training, (first.form,))
-    acting = sight.pushes[first.form.name]
-    own = np.asarray(parameter_torques(sight.look, acting))
-    raw = _all_products([_evaluated(a, sight.values[a.variable]) for a in first.effect.axes])
-    again = _candidate(sight, first.form, first.variables, first.effect.axes, raw, own)
+    own = _own_functions(sight, first.form)
+    again = _candidate(sight, first.form, first.variables, first.effect.axes, own)
     if again is None:
         return best
     progress("learning its shape more closely")
@@ -204,23 +208,28 @@ def share_of(named: Model, found: Unknown) -> float:
 
     Args:
         named: the model with the effects.
-        found: the learned torque.
+        found: what was learned.
     """
-    bare = eqx.tree_at(lambda m: m.effects, named, found.before.model.effects)
-    hidden = jnp.asarray(named.rest())[found.states.shape[1] :]
+    theirs, learned = (without(_torques(m, found), found.chosen.known) for m in (named, found.trial.model))
+    return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))
+
+
+def _torques(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
+    """What the effects of a model, beyond those a function was learned with, are as a torque at the function's place,
+    at the instants."""
+    bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
+    hidden = jnp.asarray(model.rest())[found.states.shape[1] :]
     zero = jnp.zeros(())
     # An error of the torque is an effect as well: what acts where none is logged.
     silence = sampled(np.arange(2.0), np.zeros(2), hold="zero-order")
-    acting, before = (model.actuate(silence)(zero) for model in (named, bare))
+    acting, before = (m.actuate(silence)(zero) for m in (model, bare))
 
     def added(state: Array, conditions: Conditions) -> Array:
-        own = named.rates(jnp.concatenate([state, hidden]), acting, zero, conditions)
+        own = model.rates(jnp.concatenate([state, hidden]), acting, zero, conditions)
         return own[: state.shape[0]] - bare.rates(state, before, zero, conditions)
 
     rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states), found.conditions))
-    theirs = np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
-    theirs, learned = (without(a, found.chosen.known) for a in (theirs, found.torque))
-    return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))
+    return np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
 
 
 def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> np.ndarray:
@@ -228,7 +237,7 @@ def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> n
     return values - known @ np.linalg.lstsq(known, values, rcond=1e-10)[0]
 
 
-def _sight(fit: Fit, places: Sequence[type[LearnedTorque]] = LEARNED) -> _Sight:
+def _sight(fit: Fit, places: Sequence[type[Learned]] = LEARNED) -> _Sight:
     look = look_along(fit)
     reduced = isinstance(look.model, ReducedModel)
     forms = [f for f in places if not (f.needs_motor and reduced)]
@@ -237,7 +246,33 @@ def _sight(fit: Fit, places: Sequence[type[LearnedTorque]] = LEARNED) -> _Sight:
     finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
     # The last knot of a segment is the first one of the next.
     weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
-    return _Sight(look, {f.name: look.pushes[f.name] for f in forms}, values, weight)
+    return _Sight(look, {f.name: _pushes(look, f) for f in forms}, values, weight)
+
+
+def _pushes(look: Look, form: type[Learned]) -> Pushes:
+    names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
+    return tuple(look.pushes[name] for name in names)
+
+
+def _torque_push(sight: _Sight, form: type[Learned]) -> Array:
+    """What a unit of torque does at the place of a form."""
+    return sight.look.pushes[form.name if issubclass(form, LearnedTorque) else LearnedMeshTorque.name]
+
+
+def _own_functions(sight: _Sight, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
+    """The free parameters as torques at the place of a form; none of them is an error of the mesh."""
+    if issubclass(form, LearnedTorque):
+        return np.asarray(parameter_torques(sight.look, _torque_push(sight, form)))
+    return np.zeros((*sight.weight.shape, len(sight.look.problem.free.paths)))
+
+
+def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.ndarray]) -> Sizes:
+    """The functions of the axes, and their slopes for an error of the mesh."""
+    raw = _all_products([_evaluated(a, values[a.variable]) for a in axes])
+    if issubclass(form, LearnedTorque):
+        return (raw,)
+    (axis,) = axes
+    return raw, np.asarray(_all_slopes(axis, jnp.asarray(values[axis.variable])))
 
 
 def _candidates(sight: _Sight) -> list[Candidate]:
@@ -246,21 +281,20 @@ def _candidates(sight: _Sight) -> list[Candidate]:
     for form in LEARNED:
         if form.name not in sight.pushes:
             continue
-        acting = sight.pushes[form.name]
-        own = np.asarray(parameter_torques(sight.look, acting))
+        own = _own_functions(sight, form)
 
         def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
             axes = tuple(_axis(sight, n, b) for n, b in zip(variables, _others(variables), strict=True))
-            raw = _all_products([_evaluated(a, sight.values[a.variable]) for a in axes])
-            return _candidate(sight, form, variables, axes, raw, own)
+            return _candidate(sight, form, variables, axes, own)
 
-        alone = [c for c in (look_at((n,)) for n in sight.values) if c is not None]
+        may = [n for n in sight.values if form.may_depend_on(n)]
+        alone = [c for c in (look_at((n,)) for n in may) if c is not None]
         found += alone
         if alone:
             best = max(alone, key=lambda c: c.gain).variables[0]
             pairs = [
-                tuple(n for n in sight.values if n in (best, other))
-                for other in sight.values
+                tuple(n for n in may if n in (best, other))
+                for other in may
                 # The angles of both shafts are one and the same, but for the twist.
                 if other != best and not {best, other} <= set(ANGLES)
             ]
@@ -293,30 +327,35 @@ def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_jit
+def _all_slopes(axis: Axis, values: Array) -> Array:
+    return jax.vmap(jax.vmap(jax.jacfwd(axis.functions)))(values)
+
+
+@eqx.filter_jit
 def _all_functions(axis: Axis, values: Array) -> Array:
     return jax.vmap(jax.vmap(axis.functions))(values)
 
 
 def _candidate(
     sight: _Sight,
-    form: type[LearnedTorque],
+    form: type[Learned],
     variables: tuple[str, ...],
     axes: tuple[Axis, ...],
-    raw: Float[np.ndarray, "segments knots functions"],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
     """One place and choice of variables, with as many coefficients as parts of the data that were left out call for."""
     instants = _instants(sight)
-    flat = raw.reshape(-1, raw.shape[2])[instants]
+    raw = _functions(form, axes, sight.values)
+    flat = np.asarray(raw[0]).reshape(-1, raw[0].shape[2])[instants]
     parameters = own.shape[2] - _coefficients(sight.look.model, form)
     known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants][:, :parameters])
     sizes = _SIZES[len(variables)]
     mixing = _smooth_first(flat, known, _roughness(axes))[:, : max(sizes)]
     if mixing.shape[1] == 0:
         return None
-    torques = raw @ mixing
     # One width, one program.
-    padded = np.pad(torques, ((0, 0), (0, 0), (0, max(sizes) - torques.shape[2])))
+    width = ((0, 0), (0, 0), (0, max(sizes) - mixing.shape[1]))
+    padded = tuple(np.pad(part @ mixing, width) for part in raw)
     found = _instead_of_own(products(sight.look, sight.pushes[form.name], padded), sight.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
     base = _left_out(found, parameters)
@@ -332,8 +371,8 @@ def _candidate(
     return Candidate(form, variables, gain, effect, step[:parameters], known)
 
 
-def _coefficients(model: Model, form: type[LearnedTorque]) -> int:
-    """How many coefficients of a learned torque at this place a model has already; its last effect."""
+def _coefficients(model: Model, form: type[Learned]) -> int:
+    """How many coefficients of a learned function at this place a model has already; its last effect."""
     return next((len(e.c) for e in model.effects if isinstance(e, form)), 0)
 
 
@@ -440,14 +479,14 @@ def _penalised(trial: Trial) -> float:
 
 def _p_value(sight: _Sight, before: Trial, chosen: Candidate, gain: float, seed: int) -> float:
     unseen = _sight(before.held_out)
-    torques = []
+    mixing, sizes = np.asarray(chosen.effect.mixing), []
     for one in (sight, unseen):
-        raw = _all_products([_evaluated(a, np.nan_to_num(one.values[a.variable])) for a in chosen.effect.axes])
-        torques.append(raw @ np.asarray(chosen.effect.mixing))
+        values = {name: np.nan_to_num(value) for name, value in one.values.items()}
+        sizes.append(tuple(part @ mixing for part in _functions(chosen.form, chosen.effect.axes, values)))
     null = surrogate_gains(
         (sight.look, unseen.look),
         (sight.pushes[chosen.form.name], unseen.pushes[chosen.form.name]),
-        (torques[0], torques[1]),
+        (sizes[0], sizes[1]),
         (surrogates(before.training, seed), surrogates(before.held_out, seed + 1)),
     )
     return (1 + int(np.sum(null >= gain))) / (1 + null.size)

@@ -15,13 +15,16 @@ from fitting.errors import InputError
 from fitting.model_file import StoredModel, read_model, to_json
 from hdjax.effects import Conditions, Effect, Motion, Scales
 from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.learned import (
     ANGLES,
     LEARNED,
+    LEARNED_TORQUES,
     UNITS,
     AngleAxis,
     Axis,
     LearnedLoadTorque,
+    LearnedMeshError,
     LearnedMeshTorque,
     LearnedMotorTorque,
     SplineAxis,
@@ -116,7 +119,7 @@ def test_the_derivative_by_hand_is_that_of_the_formula():
             np.testing.assert_allclose(one, other, rtol=1e-10)
 
 
-@pytest.mark.parametrize("form", LEARNED, ids=lambda form: form.name)
+@pytest.mark.parametrize("form", LEARNED_TORQUES, ids=lambda form: form.name)
 def test_zero_coefficients_are_the_base_model(form: type[Effect]):
     base = rig.drive_model()
     whole = base.with_effects(learned(form, axis_over("omega_m", -10.0, 10.0), axis_over("x", -1e-3, 1e-3)))
@@ -144,10 +147,33 @@ def test_gradients_agree_with_differences(variable: str):
 def test_each_place_is_where_it_says():
     state = jnp.asarray([1.3, 0.025, 4.0, 0.05])
     base = rig.drive_model()
-    added = {f: rates(base.with_effects(learned(f, c=[2.0])), state) - rates(base, state) for f in LEARNED}
+    added = {f: rates(base.with_effects(learned(f, c=[2.0])), state) - rates(base, state) for f in LEARNED_TORQUES}
     np.testing.assert_allclose(added[LearnedMotorTorque], [0, 0, 2.0 / rig.J_M, 0], rtol=1e-9)
     np.testing.assert_allclose(added[LearnedLoadTorque], [0, 0, 0, 2.0 / rig.J_L], rtol=1e-9)
     np.testing.assert_allclose(added[LearnedMeshTorque], [0, 0, -2.0 / rig.N / rig.J_M, 2.0 / rig.J_L], rtol=1e-9)
+
+
+def test_a_learned_error_of_the_mesh_is_a_kinematic_error():
+    state = jnp.asarray([1.3, 0.025, 40.0, 0.05])
+    base = rig.drive_model()
+    axis = AngleAxis("theta_m", 4)
+    c = np.zeros(axis.count)
+    nothing = base.with_effects(learned(LearnedMeshError, axis, c=c))
+    np.testing.assert_allclose(rates(nothing, state), rates(base, state), rtol=1e-13)
+    # One, then cosine and sine of each order.
+    c[3], c[8] = 2e-4, -1e-4
+    found = base.with_effects(learned(LearnedMeshError, axis, c=c))
+    wanted = base.with_effects(KinematicError(cos_2=2e-4, sin_4=-1e-4))
+    np.testing.assert_allclose(rates(found, state), rates(wanted, state), rtol=1e-12)
+    scale = np.abs(slopes(wanted, state)).max()
+    np.testing.assert_allclose(slopes(found, state), slopes(wanted, state), rtol=1e-10, atol=1e-12 * scale)
+
+
+def test_an_error_of_the_mesh_of_anything_but_the_angle_is_refused(tmp_path: Path):
+    content = json.loads(written())
+    content["effects"][1]["name"] = LearnedMeshError.name
+    with pytest.raises(InputError, match=r"give the model\.json of a report"):
+        read(json.dumps(content), tmp_path)
 
 
 def test_nothing_is_proposed_without_data():

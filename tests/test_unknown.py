@@ -23,6 +23,8 @@ from hdjax import Model
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.learned import LearnedMeshError
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, STEP = 1600, 4e-3
@@ -74,7 +76,7 @@ def misfit(curve: LearnedCurve, wanted: np.ndarray) -> tuple[float, float]:
     """Rms difference from the truth, both without what the drive's own parameters can do, over the truth's rms; and
     the share of the data at which the truth is inside the 95 % band."""
     left = wanted - curve.known @ np.linalg.lstsq(curve.known, wanted, rcond=None)[0]
-    difference = curve.torque - left
+    difference = curve.value - left
     inside = np.mean(np.abs(difference) < 1.96 * curve.std + 0.02 * np.std(left))
     return float(np.sqrt(np.mean(difference**2) / np.mean(left**2))), float(inside)
 
@@ -133,6 +135,28 @@ def test_what_drifts_is_told_from_what_moves(variable: str, values: np.ndarray):
     best = shapes(curve_of(found)).closest[0]
     # A straight line about the mean, which need not be where the drift is zero.
     assert variable in best.expression and best.explained > 0.9
+
+
+def test_an_error_of_the_mesh_is_told_from_a_torque():
+    amplitude = 3e-4
+    experiment = rig.drive_experiment(COUNT, kinematic=(amplitude, 0.0))
+    data = {"zero-order": split([experiment])}
+    trial = attempt(rig.drive_model(), data, "zero-order", SETTING)
+    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    assert found is not None and is_supported(found)
+    assert found.chosen.form is LearnedMeshError and found.chosen.variables == ("theta_m",)
+    assert found.trial.held_out.dynamic_error_std < 0.1 * trial.held_out.dynamic_error_std
+    curve = curve_of(found)
+    assert (curve.place, curve.quantity) == ("mesh angle", "error")
+    error, inside = misfit(curve, amplitude * np.cos(2 * curve.at[:, 0]))
+    assert error < 0.05 and inside > 0.8
+    best = shapes(curve).closest[0]
+    assert best.families == ("kinematic_error",) and "cos(2 theta_m)" in best.expression
+    # The effect that it is, and one that it is not.
+    right = rig.drive_model().with_effects(KinematicError(cos_2=amplitude))
+    wrong = rig.drive_model().with_effects(CoulombFriction(T_c=2.0, v_0=0.01))
+    assert share_of(right, found) > 0.95
+    assert share_of(wrong, found) < 0.3
 
 
 @pytest.mark.slow

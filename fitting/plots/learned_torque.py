@@ -1,4 +1,4 @@
-"""A learned torque against what it depends on."""
+"""A learned torque, or error of an angle, against what it depends on."""
 
 import numpy as np
 
@@ -9,15 +9,20 @@ from fitting.plots.plot import Figure, Plot
 
 _BINS = 60
 _NORMAL_95 = 1.96
-_PLACE = {"mesh": "in the mesh", "motor": "on the motor", "load": "on the load"}
+_TITLE = {
+    "mesh": "The learned torque in the mesh",
+    "motor": "The learned torque on the motor",
+    "load": "The learned torque on the load",
+    "mesh angle": "The learned error of the mesh's angle",
+}
 
 
 def learned_torque(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Plot:
-    """The learned torque with its band and the density of the data.
+    """The learned function with its band and the density of the data.
 
     Args:
-        curve: the torque.
-        unit: of the torque.
+        curve: the function.
+        unit: of its value.
         units: of the variables, by name.
     """
     if len(curve.variables) == 1:
@@ -27,7 +32,7 @@ def learned_torque(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> 
 
 def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     name = curve.variables[0]
-    at, torque, reach = curve.grid[0], curve.on_grid, _NORMAL_95 * curve.std_on_grid
+    at, value, reach = curve.grid[0], curve.on_grid, _NORMAL_95 * curve.std_on_grid
     count, edges = np.histogram(curve.at[:, 0], _BINS, range=(float(at[0]), float(at[-1])))
     density = {
         "type": "bar",
@@ -43,7 +48,7 @@ def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
         "type": "scatter",
         "name": "95 % band",
         "x": numbers(np.concatenate([at, at[::-1]])),
-        "y": numbers(np.concatenate([torque + reach, (torque - reach)[::-1]])),
+        "y": numbers(np.concatenate([value + reach, (value - reach)[::-1]])),
         "fill": "toself",
         "fillcolor": "rgba(0, 114, 178, 0.2)",
         "line": {"width": 0},
@@ -51,12 +56,12 @@ def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     }
     layout = {
         "xaxis": axis(axis_label(name, pretty_unit(units[name])), exponentformat="power"),
-        "yaxis": axis(axis_label("torque", pretty_unit(unit)), exponentformat="power", overlaying="y2"),
+        "yaxis": axis(axis_label(curve.quantity, pretty_unit(unit)), exponentformat="power", overlaying="y2"),
         # The density needs no axis of its own.
         "yaxis2": {"range": [0, 4], "visible": False, "side": "right"},
         "bargap": 0,
     }
-    traces = [density, band, line_trace(at, torque, name="learned", color=AFTER, width=2.0)]
+    traces = [density, band, line_trace(at, value, name="learned", color=AFTER, width=2.0)]
     return _plot(curve, figure(traces, 360, **layout))
 
 
@@ -73,7 +78,7 @@ def _surface(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
         "z": [numbers(row) for row in shown.T],
         "colorscale": "RdBu",
         "zmid": 0,
-        "colorbar": {"title": {"text": axis_label("torque", pretty_unit(unit))}, "exponentformat": "power"},
+        "colorbar": {"title": {"text": axis_label(curve.quantity, pretty_unit(unit))}, "exponentformat": "power"},
     }
     layout = {
         "xaxis": axis(axis_label(one, pretty_unit(units[one])), exponentformat="power"),
@@ -91,7 +96,7 @@ def _plot(curve: LearnedCurve, drawn: Figure) -> Plot:
     return Plot(
         "learned-torque",
         "found",
-        f"The learned torque {_PLACE[curve.place]}",
+        _TITLE[curve.place],
         "What is missing, as learned inside the equations of motion, without what the drive's own parameters can do. "
         "The band is that of the standard errors; where there are few data, little is known."
         if len(curve.variables) == 1

@@ -1,4 +1,4 @@
-"""The learned torque, where the catalogue does not explain what is missing."""
+"""The learned function, where the catalogue does not explain what is missing."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,33 +22,40 @@ _WORDS = {
     "time": "time",
     "temperature": "temperature",
 }
-_PLACES = {"mesh": "torque in the mesh", "motor": "torque on the motor", "load": "torque on the load"}
+_PLACES = {
+    "mesh": "torque in the mesh",
+    "motor": "torque on the motor",
+    "load": "torque on the load",
+    "mesh angle": "error of the mesh's angle",
+}
+_QUANTITIES = {"torque": "N m", "error": "rad"}
 _TOLD = 6
 
 
 def curve_of(loop: Loop) -> LearnedCurve | None:
-    """The learned torque of a loop with its final values; None where there is none."""
+    """The learned function of a loop with its final values; None where there is none."""
     if loop.unknown is None:
         return None
     return learned_curve(loop.unknown, loop.after.model, loop.after.uncertainty)
 
 
 def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] | None:
-    """The learned torque: what it depends on, what it is worth, and what it looks like; None where there is none."""
+    """The learned function: what it depends on, what it is worth, and what it looks like; None where there is none."""
     if not isinstance(outcome, Loop) or outcome.unknown is None:
         return None
     curve = curve_of(outcome)
     assert curve is not None
     finding = next(f for f in outcome.findings if f.name == outcome.unknown.chosen.form.name)
     found = shapes(curve)
-    unit = unit_in_log("N m", outcome, units)
+    unit = unit_in_log(_QUANTITIES[curve.quantity], outcome, units)
     others = [c for c in outcome.unknown.candidates if len(c.variables) == 1][:_TOLD]
     return {
         "family": finding.family,
         "name": finding.name,
         "place": curve.place,
         "variables": list(curve.variables),
-        "units": {"torque": unit} | {n: unit_in_log(UNITS[n], outcome, units) for n in curve.variables},
+        "quantity": curve.quantity,
+        "units": {curve.quantity: unit} | {n: unit_in_log(UNITS[n], outcome, units) for n in curve.variables},
         "says": _sentence(curve, found.closest, outcome.doubted),
         "coefficients": len(outcome.unknown.chosen.effect.c),
         "validation_gain": finding.validation_gain,
@@ -65,14 +72,14 @@ def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] |
 
 
 def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
-    """A unit of the learned torque or of what it depends on; a reduced drive's come from the log."""
+    """A unit of the learned function or of what it depends on; a reduced drive's come from the log."""
     if not isinstance(loop.after.model, ReducedModel):
         return unit
     return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"])
 
 
 def place_and_variables(curve_place: str, variables: list[str]) -> str:
-    """Where a learned torque acts and what it depends on, in words."""
+    """Where a learned function acts and what it depends on, in words."""
     return f"{_PLACES[curve_place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
 
 
@@ -93,7 +100,7 @@ def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[st
         )
     if doubted:
         said.append(
-            f"{formatting.words(list(doubted))} explained a part, but the learned torque explains more and does not "
+            f"{formatting.words(list(doubted))} explained a part, but what was learned explains more and does not "
             "look like it: the name would be wrong."
         )
     return " ".join(said)

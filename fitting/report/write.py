@@ -117,6 +117,6 @@ def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperim
         found += [evidence_plot(seen, units=in_log) for seen in outcome.evidence]
         curve, told = curve_of(outcome), report["unknown"]
         if curve is not None:
-            found.append(learned_torque(curve, unit=told["units"]["torque"], units=told["units"]))
+            found.append(learned_torque(curve, unit=told["units"][curve.quantity], units=told["units"]))
         return found + last
     return fit_plots(outcome, units=units) + last

@@ -5,7 +5,7 @@ The function is linear in its coefficients, so that all coefficients at zero are
 
 import abc
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
+from hdjax.effects.effect import (
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+    Scales,
+)
 from hdjax.elementary import cosines_and_sines
 from hdjax.parameters import Scalar, as_scalar, parameter
 
@@ -143,8 +151,12 @@ def _products(found: Sequence[Array]) -> Float[Array, " functions"]:
     return whole
 
 
-class LearnedTorque(Effect):
-    """Learned torque, somewhere.
+def _coefficients(unit: str) -> Any:
+    return parameter(unit=unit, doc="coefficient of the learned function", source=SOURCE, role="strength", several=True)
+
+
+class Learned(Effect):
+    """A learned function, somewhere.
 
     Attributes:
         axes: what it depends on.
@@ -156,18 +168,25 @@ class LearnedTorque(Effect):
 
     axes: tuple[Axis, ...]
     mixing: Float[Array, "functions coefficients"] = eqx.field(converter=jnp.asarray)
-    c: tuple[Scalar, ...] = parameter(
-        unit="N m", doc="coefficient of the learned function", source=SOURCE, role="strength", several=True
-    )
+    c: tuple[Scalar, ...] = _coefficients("N m")
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         """None: what it may depend on is for the data to say."""
         return ()
 
+    @classmethod
+    def may_depend_on(cls, variable: str) -> bool:
+        """Whether it may be a function of a quantity of `UNITS`."""
+        return True
+
     @property
     def needs_temperature(self) -> bool:
         return any(axis.variable == "temperature" for axis in self.axes)
+
+
+class LearnedTorque(Learned):
+    """A learned torque."""
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         """The torque [N m], along the positive direction of its place."""
@@ -192,8 +211,31 @@ class LearnedLoadTorque(LearnedTorque, LoadSideEffect):
     name: ClassVar[str] = "learned_load_torque"
 
 
-LEARNED: tuple[type[LearnedTorque], ...] = (LearnedMeshTorque, LearnedMotorTorque, LearnedLoadTorque)
+class LearnedMeshError(Learned, MeshGeometryEffect):
+    """Learned error of the mesh's angle, over the motor's: what a torque of the angle can't stand for, since its force
+    grows with the speed as well."""
+
+    name: ClassVar[str] = "learned_mesh_error"
+
+    c: tuple[Scalar, ...] = _coefficients("rad")
+
+    @classmethod
+    def may_depend_on(cls, variable: str) -> bool:
+        return variable == "theta_m"
+
+    def error(self, theta_m: Array) -> Array:
+        nothing = jnp.zeros_like(theta_m)
+        return combined(self.axes, self.mixing, self.c, Motion(x=nothing, v=nothing, theta_m=theta_m))
+
+    def slope(self, theta_m: Array) -> Array:
+        return jax.jvp(self.error, (theta_m,), (jnp.ones_like(theta_m),))[1]
+
+
+LEARNED_TORQUES: tuple[type[LearnedTorque], ...] = (LearnedMeshTorque, LearnedMotorTorque, LearnedLoadTorque)
 """A learned torque at each place where it can enter."""
+
+LEARNED: tuple[type[Learned], ...] = (*LEARNED_TORQUES, LearnedMeshError)
+"""All that can be learned."""
 
 UNITS = {
     "x": "rad",
@@ -205,7 +247,7 @@ UNITS = {
     "time": "s",
     "temperature": "K",
 }
-"""What a learned torque may depend on, with its unit."""
+"""What a learned function may depend on, with its unit."""
 
 ANGLES = {"theta_m": 6, "theta_l": 3}
 """Those that are angles of a shaft, each with the highest order that it is given."""
