@@ -157,7 +157,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
         for candidate in _rivals([c for c in found if (len(c.variables) > 1) == several]):
             if several and best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE:
                 break
-            progress(f"learning a torque of {' and '.join(candidate.variables)}")
+            progress(f"learning a function of {' and '.join(candidate.variables)}")
             trial = _refitted(before, candidate, data, setting)
             if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
                 best = candidate, trial
