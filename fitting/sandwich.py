@@ -9,6 +9,7 @@ residuals are pooled with those of neighbouring frequencies.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -124,19 +125,24 @@ def covariance(found: Linearised) -> Covariance:
     their spectrum. Noise that comes and goes with what is estimated is not stationary: chunks of time then show more
     scatter than the spectrum promises, and overrule it.
     """
-    inverse, blind = _inverse(found.information)
-    square = sum(float(np.sum(r.residual**2)) for r in found.records)
+    # Each parameter in units of what the data tell of it: powers of what is hardly told would leave the numbers.
+    diagonal = np.diag(found.information)
+    unit = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    both = np.outer(unit, unit)
+    records = [replace(r, slopes=r.slopes * unit) for r in found.records]
+    inverse, blind = _inverse(found.information * both)
+    square = sum(float(np.sum(r.residual**2)) for r in records)
     classical = inverse * square / max(found.rows - found.fitted, 1)
-    simulations = sum(len(r.states) for r in found.records)
+    simulations = sum(len(r.states) for r in records)
     if simulations >= _MANY_CHAINS + inverse.shape[0]:
-        borders = [[start for start, _ in r.states] for r in found.records]
-        robust, freedom = _clustered(found.records, borders, inverse)
+        borders = [[start for start, _ in r.states] for r in records]
+        robust, freedom = _clustered(records, borders, inverse)
     else:
-        robust, freedom = _spectral(found.records, inverse)
-        chunks = [range(0, r.residual.shape[0], found.chunk) for r in found.records]
-        robust, freedom = _overruled(robust, freedom, *_clustered(found.records, chunks, inverse))
-    unseen = inverse @ found.prior @ inverse + blind
-    return Covariance(robust + unseen, classical, inverse, freedom)
+        robust, freedom = _spectral(records, inverse)
+        chunks = [range(0, r.residual.shape[0], found.chunk) for r in records]
+        robust, freedom = _overruled(robust, freedom, *_clustered(records, chunks, inverse))
+    unseen = inverse @ (found.prior * both) @ inverse + blind
+    return Covariance((robust + unseen) * both, classical * both, inverse * both, freedom)
 
 
 def directions(found: Float[np.ndarray, "parameters parameters"]) -> list[tuple[float, np.ndarray]]:
@@ -299,13 +305,9 @@ def _records(
 
 
 def _inverse(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse after scaling to unit diagonal, and the part of it that comes from directions that the data do not see;
-    they get a huge variance."""
-    diagonal = np.diag(information)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    both = np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(information * both)
+    """Inverse of an information of unit diagonal, and the part of it that comes from directions that the data do not
+    see; they get a huge variance."""
+    values, vectors = np.linalg.eigh(information)
     blind = values < _BLIND
     values = np.maximum(values, _BLIND)
-    unseen = vectors[:, blind] @ vectors[:, blind].T / _BLIND
-    return (vectors / values) @ vectors.T * both, unseen * both
+    return (vectors / values) @ vectors.T, vectors[:, blind] @ vectors[:, blind].T / _BLIND

@@ -180,6 +180,19 @@ def test_classical_is_the_textbook():
     np.testing.assert_allclose(covariance(drawn).classical, expected[:3, :3], rtol=1e-9)
 
 
+@pytest.mark.parametrize("simulations", [1, 40])
+def test_units_change_nothing_but_the_numbers(simulations: int):
+    given = broadband(1, count=40 * 64, simulations=simulations)
+    _, drawn = with_noise(given, np.random.default_rng(0).normal(size=given.records[0].residual.shape))
+    units = np.array([1.0, 1e90, 1e-90])
+    record = dataclasses.replace(drawn.records[0], slopes=drawn.records[0].slopes / units)
+    information = drawn.information / np.outer(units, units)
+    other = covariance(Linearised((record,), information, np.zeros_like(information), drawn.chunk))
+    wanted = covariance(drawn)
+    np.testing.assert_allclose(other.robust / units / units[:, None], wanted.robust, rtol=1e-9)
+    np.testing.assert_allclose(other.degrees_of_freedom, wanted.degrees_of_freedom, rtol=1e-9)
+
+
 def test_what_the_data_do_not_see_is_not_known():
     given = broadband(1)
     slopes = given.records[0].slopes
