@@ -11,6 +11,7 @@ from scipy.special import stdtrit
 from fitting.arrow import project
 from fitting.estimate import Fit
 from fitting.experiment import scales
+from fitting.formatting import words
 from fitting.residual import Blocks, Problem
 from fitting.sandwich import directions
 from fitting.solve import linearise
@@ -215,21 +216,17 @@ def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, flo
         for p, w in part.items()
     ]
     names = list(part)
-    sentence = f"The logs can't tell {_words(names)} apart: {_words(moves)} together hardly change the simulation"
+    sentence = f"The logs can't tell {words(names)} apart: {words(moves)} together hardly change the simulation"
     if len(relative) < len(part):
         return f"{sentence}."
     # The gentlest mover makes the others' products with its powers stand still.
     still = min(relative, key=lambda p: abs(relative[p]))
     known = [f"{p} {_power(still, -relative[p] / relative[still])}" for p in names if p != still]
-    return f"{sentence}. They determine {_words(known)}, but no factor alone."
+    return f"{sentence}. They determine {words(known)}, but no factor alone."
 
 
 def _power(path: str, exponent: float) -> str:
     return path if np.isclose(exponent, 1.0) else f"{path}^{exponent:.2g}"
-
-
-def _words(items: list[str]) -> str:
-    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> str | None:
@@ -295,9 +292,9 @@ def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[
     own = {p: c for p, c in changes.items() if "." not in p and p != "alpha"}
     sentence = f"{path} is taken from the drive file"
     if any(abs(c) > _MOST_LINEAR for c in own.values()):
-        sentence += f", and has to be right there: an error of 1 % is more than {_words(list(own))} could make up for."
+        sentence += f", and has to be right there: an error of 1 % is more than {words(list(own))} could make up for."
     elif own:
-        moved = _words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
+        moved = words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
         sentence += (
             ", since a log of angles and torque knows inertia and stiffness only in proportion to the torque: if it is "
             f"1 % too large there, that moves {moved}."
