@@ -173,7 +173,8 @@ def _share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:
 
 
 def _strength_is_determined(verdict: Verdict) -> bool:
-    """Whether the fit tells at least one of the effect's strengths from zero; another hold has none to tell.
+    """Whether the fit tells at least one of the effect's strengths from zero, of those that its name speaks of;
+    another hold has none to tell.
 
     With the effect's shape as fitted: where a strength is zero, its shape means nothing, and along a valley of shapes
     that explain the same (a creep's stiffness over its time) the strength may well be open.
@@ -190,7 +191,8 @@ def _strength_is_determined(verdict: Verdict) -> bool:
     explained = np.einsum("pi,ij,pj->p", across, np.linalg.pinv(across[shape], hermitian=True), across)
     total = np.diag(found.covariance)
     part = np.sqrt(np.clip(1.0 - explained / np.maximum(total, 1e-300), 0.0, 1.0))
-    return any(_is_known(found.estimates[p], float(part[paths.index(p)]), effect) for p in strengths)
+    told = [f"{effect.name}.{n}" for n in effect.named_for] or strengths
+    return any(_is_known(found.estimates[p], float(part[paths.index(p)]), effect) for p in told)
 
 
 def _is_known(estimate: Estimate, part: float, effect: Effect) -> bool:

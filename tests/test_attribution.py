@@ -17,6 +17,7 @@ from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
+from hdjax.effects.position import PositionDependentMotorFriction
 
 HOLD: Hold = "zero-order"
 
@@ -65,9 +66,10 @@ def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
 
 
 def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether a strength counts as determined beside K, by a fit with this covariance."""
-    model = rig.reduced_model().with_effects(effect)
-    paths = ("mu", *effect_paths(effect))
+    """Whether a strength counts as determined beside a parameter of the drive, by a fit with this covariance."""
+    drive, own = (rig.drive_model(), "B_sp") if effect.needs_motor else (rig.reduced_model(), "mu")
+    model = drive.with_effects(effect)
+    paths = (own, *effect_paths(effect))
     spread = np.sqrt(np.diag(covariance))
     values = {p: float(model.get(p)) for p in paths}
     estimates = {
@@ -89,3 +91,12 @@ def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: p
     assert told_from_zero(verdicts, creep, along_valley + np.diag([0.0, 50.0**2, 0.0]), monkeypatch)
     assert not told_from_zero(verdicts, creep, along_valley + np.diag([0.0, 400.0**2, 0.0]), monkeypatch)
     assert not told_from_zero(verdicts, creep, np.diag([1.0, 400.0**2, 1.0]), monkeypatch)
+
+
+def test_what_an_effect_is_named_for_must_be_there(verdicts, monkeypatch: pytest.MonkeyPatch):
+    """Rippling friction whose ripple may be zero is friction, however well that is known."""
+    rippling = PositionDependentMotorFriction(T_c=0.1, cosine=2e-3, sine=0.0, n=2.0, transition=0.1)
+    std = dict.fromkeys(effect_paths(rippling), 1e-4)
+    assert told_from_zero(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
+    std |= {f"{rippling.name}.{n}": 1e-3 for n in ("cosine", "sine")}
+    assert not told_from_zero(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)

@@ -98,6 +98,8 @@ class Effect(eqx.Module):
         name: the form's own name, prefix of its parameters' dotted paths.
         states: names of its internal states.
         needs_motor: whether it needs the motor's and load's own motion, which a reduced log lacks.
+        named_for: the strengths that its name speaks of, where it has others as well: without them it is something
+            else.
         drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
             single one shows it.
     """
@@ -106,6 +108,7 @@ class Effect(eqx.Module):
     name: ClassVar[str]
     states: ClassVar[tuple[str, ...]] = ()
     needs_motor: ClassVar[bool] = False
+    named_for: ClassVar[tuple[str, ...]] = ()
     drawn_against: ClassVar[str | None] = None
 
     @classmethod

@@ -106,6 +106,7 @@ class PositionDependentMotorFriction(_MotorFrictionOverAngle):
     """Of one order: the ripple is `cosine cos(n theta_m) + sine sin(n theta_m)`."""
 
     name: ClassVar[str] = "position_dependent_motor_friction"
+    named_for: ClassVar[tuple[str, ...]] = ("cosine", "sine")
 
     cosine: Scalar = parameter(0.0, unit="N m", doc="ripple, cosine", source="Tuttle 1992", role="strength")
     sine: Scalar = parameter(0.0, unit="N m", doc="ripple, sine", source="Tuttle 1992", role="strength")
@@ -127,6 +128,7 @@ class RipplingMotorFriction(_MotorFrictionOverAngle):
     """Of several orders: the ripple is the sum over n = 1, 2, 4 of `cos_n cos(n theta_m) + sin_n sin(n theta_m)`."""
 
     name: ClassVar[str] = "rippling_motor_friction"
+    named_for: ClassVar[tuple[str, ...]] = ("cos_1", "sin_1", "cos_2", "sin_2", "cos_4", "sin_4")
 
     cos_1: Scalar = parameter(0.0, unit="N m", doc="cosine, order 1", source="Tuttle 1992", role="strength")
     sin_1: Scalar = parameter(0.0, unit="N m", doc="sine, order 1", source="Tuttle 1992", role="strength")
@@ -156,6 +158,7 @@ class PositionDependentMeshFriction(MeshTorqueEffect):
 
     family: ClassVar[str] = "position_dependent_friction"
     name: ClassVar[str] = "position_dependent_mesh_friction"
+    named_for: ClassVar[tuple[str, ...]] = ("cosine", "sine")
     needs_motor: ClassVar[bool] = True
     drawn_against: ClassVar[str | None] = "theta_m"
 
