@@ -1,0 +1,326 @@
+"""The first look for what a learned function may depend on: places and variables, by what they would explain.
+
+Along the fitted motion everything is linear. How many coefficients a function is worth is decided on training data
+alone, by leaving parts of them out in turn.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.linalg import eigh, null_space
+
+from fitting.along import ERROR, SLOPE
+from fitting.estimate import Fit
+from fitting.linear_look import (
+    Look,
+    Products,
+    Pushes,
+    Sizes,
+    best_step,
+    left_after,
+    look_along,
+    parameter_torques,
+    products,
+)
+from hdjax import Model, ReducedModel
+from hdjax.effects.learned import (
+    ANGLES,
+    LEARNED,
+    UNITS,
+    AngleAxis,
+    Axis,
+    Learned,
+    LearnedMeshTorque,
+    LearnedTorque,
+    axis_over,
+)
+
+# Parts that training data are left out in, in turn.
+_FOLDS = 4
+# How many coefficients a function of one variable may have, and of two.
+_SIZES = {1: (1, 2, 3, 4, 5, 7, 9, 11, 13, 16), 2: (3, 5, 7, 9, 12, 16, 20, 24)}
+# A poorer error by this share (in the objective) is no reason for more coefficients.
+_WORTH_A_COEFFICIENT = 0.005
+# Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
+_SAME_FUNCTION = 0.99
+# Motions that so few samples reach are no part of the range.
+_RARE = 5e-4
+# Instants of the motion that stand for the density of the data.
+_INSTANTS = 3000
+
+
+class Candidate(eqx.Module):
+    """A place and variables, as the first look sees them.
+
+    Attributes:
+        form: the place.
+        variables: what the function depends on.
+        gain: decrease of the objective on parts of the training data that were left out, to first order.
+        effect: the learned function, at the coefficients that suit best to first order.
+        drive_step: change of the free vector that goes with it.
+        known: functions of the variables that the free parameters stand for already, at the instants that are kept.
+    """
+
+    form: type[Learned] = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
+    gain: float
+    effect: Learned
+    drive_step: Float[np.ndarray, " parameters"]
+    known: Float[np.ndarray, "instants known"]
+
+
+class LearnedLook(eqx.Module):
+    """A look at a fit, with what candidates share.
+
+    Attributes:
+        look: at the fit.
+        pushes: what each form's function adds, and its slope as well for an error of the mesh, by the form's name.
+        values: variables at each knot.
+        weight: of each knot.
+    """
+
+    look: Look
+    pushes: dict[str, Pushes]
+    values: dict[str, Float[np.ndarray, "segments knots"]]
+    weight: Float[np.ndarray, "segments knots"]
+
+    @property
+    def instants(self) -> Int[np.ndarray, " instants"]:
+        """Some of the knots with weight, evenly spread: they stand for the density of the data."""
+        kept = np.flatnonzero(self.weight.reshape(-1) > 0)
+        return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
+
+    def torque_push(self, form: type[Learned]) -> Float[Array, "segments knots states"]:
+        """What a unit of torque does at the place of a form: in the mesh for an error there."""
+        return self.look.pushes[form.name if issubclass(form, LearnedTorque) else LearnedMeshTorque.name]
+
+
+def learned_look(fit: Fit, places: Sequence[type[Learned]] = LEARNED) -> LearnedLook:
+    """Look at a fit along its motion.
+
+    Args:
+        fit: of the model that lacks something.
+        places: forms to look for.
+    """
+    look = look_along(fit)
+    reduced = isinstance(look.model, ReducedModel)
+    forms = [f for f in places if not (f.needs_motor and reduced)]
+    values = {n: np.asarray(getattr(look.motion, n)) for n in UNITS if getattr(look.motion, n) is not None}
+    weight = np.asarray(look.problem.segments.weight)
+    finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
+    # The last knot of a segment is the first one of the next.
+    weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
+    return LearnedLook(look, {f.name: _pushes(look, f) for f in forms}, values, weight)
+
+
+def candidates(seen: LearnedLook) -> list[Candidate]:
+    """Every place with every variable, and with the best one of them and another."""
+    found = []
+    for form in LEARNED:
+        if form.name not in seen.pushes:
+            continue
+        own = _own_functions(seen, form)
+
+        def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
+            axes = tuple(_axis(seen, n, b) for n, b in zip(variables, _others(variables), strict=True))
+            return _candidate(seen, form, variables, axes, own)
+
+        may = [n for n in seen.values if form.may_depend_on(n)]
+        alone = [c for c in (look_at((n,)) for n in may) if c is not None]
+        found += alone
+        if alone:
+            best = max(alone, key=lambda c: c.gain).variables[0]
+            pairs = [
+                tuple(n for n in may if n in (best, other))
+                for other in may
+                # The angles of both shafts are one and the same, but for the twist.
+                if other != best and not {best, other} <= set(ANGLES)
+            ]
+            found += [c for c in map(look_at, pairs) if c is not None]
+    return found
+
+
+def looked_again(first: Candidate, seen: LearnedLook) -> Candidate | None:
+    """A candidate of the same place and variables, with as many coefficients as another look calls for."""
+    return _candidate(seen, first.form, first.variables, first.effect.axes, _own_functions(seen, first.form))
+
+
+def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
+    """The functions that a candidate's coefficients multiply, along another fit's motion."""
+    values = {name: np.nan_to_num(value) for name, value in seen.values.items()}
+    mixing = np.asarray(chosen.effect.mixing)
+    return tuple(part @ mixing for part in _functions(chosen.form, chosen.effect.axes, values))
+
+
+def _pushes(look: Look, form: type[Learned]) -> Pushes:
+    names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
+    return tuple(look.pushes[name] for name in names)
+
+
+def _own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
+    """The free parameters as torques at the place of a form; none of them is an error of the mesh."""
+    if issubclass(form, LearnedTorque):
+        return np.asarray(parameter_torques(seen.look, seen.torque_push(form)))
+    return np.zeros((*seen.weight.shape, len(seen.look.problem.free.paths)))
+
+
+def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.ndarray]) -> Sizes:
+    """The functions of the axes, and their slopes for an error of the mesh."""
+    raw = _all_products([_evaluated(a, values[a.variable]) for a in axes])
+    if issubclass(form, LearnedTorque):
+        return (raw,)
+    (axis,) = axes
+    return raw, np.asarray(_all_slopes(axis, jnp.asarray(values[axis.variable])))
+
+
+def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """All products of one function of each part."""
+    found = parts[0]
+    for part in parts[1:]:
+        found = (found[..., :, None] * part[..., None, :]).reshape(*found.shape[:-1], -1)
+    return found
+
+
+def _others(variables: tuple[str, ...]) -> tuple[str | None, ...]:
+    """The variable beside each."""
+    return (None,) if len(variables) == 1 else (variables[1], variables[0])
+
+
+def _axis(seen: LearnedLook, variable: str, beside: str | None) -> Axis:
+    data = seen.values[variable][seen.weight > 0]
+    low, high = np.quantile(data, [_RARE, 1.0 - _RARE])
+    reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
+    return axis_over(variable, float(low), float(low + reach), beside=beside)
+
+
+def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
+    return np.asarray(_all_functions(axis, jnp.asarray(values)))
+
+
+@eqx.filter_jit
+def _all_slopes(axis: Axis, values: Array) -> Array:
+    return jax.vmap(jax.vmap(jax.jacfwd(axis.functions)))(values)
+
+
+@eqx.filter_jit
+def _all_functions(axis: Axis, values: Array) -> Array:
+    return jax.vmap(jax.vmap(axis.functions))(values)
+
+
+def _candidate(
+    seen: LearnedLook,
+    form: type[Learned],
+    variables: tuple[str, ...],
+    axes: tuple[Axis, ...],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> Candidate | None:
+    """One place and choice of variables, with as many coefficients as parts of the data that were left out call for."""
+    instants = seen.instants
+    raw = _functions(form, axes, seen.values)
+    flat = np.asarray(raw[0]).reshape(-1, raw[0].shape[2])[instants]
+    parameters = own.shape[2] - _coefficients(seen.look.model, form)
+    known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants][:, :parameters])
+    sizes = _SIZES[len(variables)]
+    mixing = _smooth_first(flat, known, _roughness(axes))[:, : max(sizes)]
+    if mixing.shape[1] == 0:
+        return None
+    # One width, one program.
+    width = ((0, 0), (0, 0), (0, max(sizes) - mixing.shape[1]))
+    padded = tuple(np.pad(part @ mixing, width) for part in raw)
+    found = _instead_of_own(products(seen.look, seen.pushes[form.name], padded), seen.look, parameters, own.shape[2])
+    best: tuple[float, int] | None = None
+    base = _left_out(found, parameters)
+    for size in (s for s in sizes if s <= mixing.shape[1]):
+        gain = base - _left_out(found, parameters + size)
+        if best is None or gain > best[0] + _WORTH_A_COEFFICIENT:
+            best = gain, size
+    if best is None or not best[0] > 0:
+        return None
+    gain, size = best
+    step = best_step(_first(found, parameters + size))
+    effect = form(axes=axes, mixing=mixing[:, :size], c=tuple(step[parameters:]))
+    return Candidate(form, variables, gain, effect, step[:parameters], known)
+
+
+def _coefficients(model: Model, form: type[Learned]) -> int:
+    """How many coefficients of a learned function at this place a model has already; its last effect."""
+    return next((len(e.c) for e in model.effects if isinstance(e, form)), 0)
+
+
+def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Products:
+    """Products with what the model's learned torque explains put back into the residual, and its columns left out."""
+    if kept == free:
+        return found
+    own = np.zeros(found.gram.shape[-1])
+    own[kept:free] = np.asarray(look.problem.free.pack(look.model))[kept:free]
+    moved = found.gram @ own
+    against = found.gradient @ own
+    others = np.delete(np.arange(own.size), np.s_[kept:free])
+    return Products(
+        found.gram[..., others[:, None], others],
+        (found.gradient + moved)[..., others],
+        found.square + against + np.swapaxes(against, 1, 2) + moved @ own,
+        found.samples,
+    )
+
+
+def _same_functions(raw: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Those free parameters that are functions of the same variables at the same place: the learned torque leaves what
+    they can do to them."""
+    size = np.sqrt(np.mean(own**2, axis=0))
+    own = own[:, size > 0] / size[size > 0]
+    coefficients = np.linalg.lstsq(raw, own, rcond=1e-10)[0]
+    left = np.mean((own - raw @ coefficients) ** 2, axis=0)
+    return own[:, left < 1.0 - _SAME_FUNCTION]
+
+
+def _roughness(axes: Sequence[Axis]) -> np.ndarray:
+    """Penalty on the curvature of a function over the unit range of each axis, per pair of products."""
+    parts = []
+    for axis in axes:
+        if isinstance(axis, AngleAxis):
+            order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
+            parts.append(np.diag((2 * np.pi * order) ** 4))
+        else:
+            bends = np.diff(np.eye(axis.count), 2, axis=0)
+            rises = np.diff(np.eye(axis.count), axis=0)
+            # The slope, counted little, puts the constant before the straight line.
+            parts.append(axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises)
+    total = np.zeros((1, 1))
+    for part in parts:
+        total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
+    return total
+
+
+def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Combinations of functions, smoothest first, each of unit rms on the data, uncorrelated with each other and with
+    what is known already (the basis of Demmler and Reinsch 1975)."""
+    moment = raw.T @ raw / len(raw)
+    free = null_space((raw.T @ known / len(raw)).T, rcond=1e-8) if known.shape[1] else np.eye(raw.shape[1])
+    inside = free.T @ moment @ free
+    seen, directions = np.linalg.eigh(inside)
+    # Where there are no data, nothing can be learned.
+    free = free @ directions[:, seen > 1e-6 * np.max(seen, initial=0.0)]
+    if free.shape[1] == 0:
+        return free
+    _, vectors = eigh(free.T @ roughness @ free, free.T @ moment @ free)
+    return free @ vectors
+
+
+def _first(found: Products, columns: int) -> Products:
+    return Products(found.gram[..., :columns, :columns], found.gradient[..., :columns], found.square, found.samples)
+
+
+def _left_out(found: Products, columns: int) -> float:
+    """The objective on each part of the data after least squares on the others, with the first columns free."""
+    part = np.arange(found.samples.size) * _FOLDS // found.samples.size
+    total = np.zeros(found.square.shape[1:])
+    first = _first(found, columns)
+    for fold in range(min(_FOLDS, found.samples.size)):
+        step = best_step(first.of(part != fold))
+        total += left_after(first.of(part == fold), step)
+    return 0.5 * float(np.linalg.slogdet(total / found.samples.sum())[1])
