@@ -39,7 +39,8 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
         if effect["family"] != "unknown":
             lines += _parameter_lines(effect["parameters"])
     if report["unknown"]:
-        lines += [f"[Learned torque: {report['unknown']['name']}]", f"    {report['unknown']['says']}"]
+        learned = report["unknown"]
+        lines += [f"[Learned {learned['quantity']}: {learned['name']}]", f"    {learned['says']}"]
     for other in report["alternatives"]:
         kind = "ruled out" if other["separable"] else "TIE"
         lines.append(f"[Alternative: {other['name']}] {kind}. {other['separating_experiment']}")

@@ -93,7 +93,7 @@ def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[st
     if closest:
         best = closest[0]
         like = " and ".join(plain_family(f) for f in best.families)
-        named = f", as of {like}" if like else ""
+        named = f", as of {like}," if like else ""
         said.append(
             f"Of the simple forms `{best.expression}`{named} is closest: it accounts for "
             f"{formatting.percent(best.explained)} of its mean square over the data."
