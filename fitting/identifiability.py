@@ -253,6 +253,8 @@ def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> s
     return None
 
 
+# What the logs do not see at all has no bounds.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
     """What the drive file states and the fit takes for granted."""
     if not isinstance(fit.model, TwoInertiaModel):
@@ -268,14 +270,12 @@ def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
     values = np.array([e.value for e in found.estimates.values()])
     relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
     classical = np.linalg.pinv(information, hermitian=True)
+    robust = np.diag(found.covariance) / np.diag(classical)
     made = []
     for i, path in enumerate(held):
         own = products[count + i, count + i] - coupling[:, i] @ classical @ coupling[:, i]
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            # What the logs do not see at all has no bounds.
-            robust = np.diag(found.covariance) / np.diag(classical)
-            if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
-            std_if_free = np.nan_to_num(relative * np.sqrt(robust * if_free), nan=np.inf)
+        if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
+        std_if_free = np.nan_to_num(relative * np.sqrt(robust * if_free), nan=np.inf)
         change = _PERCENT * response[:, i] * np.sign(values) * relative
         made.append(
             _held_one(

@@ -17,6 +17,14 @@ from hdjax.effects.learned import ANGLES, LEARNED, Learned, LearnedTorque, funct
 PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load", "mesh angle"), strict=True))
 """Where each learned function acts."""
 
+WORDS = {
+    "mesh": "torque in the mesh",
+    "motor": "torque on the motor",
+    "load": "torque on the load",
+    "mesh angle": "error of the mesh's angle",
+}
+"""What each place's learned function is, in words."""
+
 _POINTS = {1: 200, 2: 41}
 
 

@@ -78,13 +78,11 @@ class LearnedLook(eqx.Module):
 
     Attributes:
         look: at the fit.
-        pushes: what each form's function adds, and its slope as well for an error of the mesh, by the form's name.
         values: variables at each knot.
         weight: of each knot.
     """
 
     look: Look
-    pushes: dict[str, Pushes]
     values: dict[str, Float[np.ndarray, "segments knots"]]
     weight: Float[np.ndarray, "segments knots"]
 
@@ -94,35 +92,32 @@ class LearnedLook(eqx.Module):
         kept = np.flatnonzero(self.weight.reshape(-1) > 0)
         return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
 
+    def pushes(self, form: type[Learned]) -> Pushes:
+        """What a form's function adds, and its slope as well for an error of the mesh."""
+        names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
+        return tuple(self.look.pushes[name] for name in names)
+
     def torque_push(self, form: type[Learned]) -> Float[Array, "segments knots states"]:
         """What a unit of torque does at the place of a form: in the mesh for an error there."""
         return self.look.pushes[form.name if issubclass(form, LearnedTorque) else LearnedMeshTorque.name]
 
 
-def learned_look(fit: Fit, places: Sequence[type[Learned]] = LEARNED) -> LearnedLook:
-    """Look at a fit along its motion.
-
-    Args:
-        fit: of the model that lacks something.
-        places: forms to look for.
-    """
+def learned_look(fit: Fit) -> LearnedLook:
+    """Look at a fit, of a model that lacks something, along its motion."""
     look = look_along(fit)
-    reduced = isinstance(look.model, ReducedModel)
-    forms = [f for f in places if not (f.needs_motor and reduced)]
     values = {n: np.asarray(getattr(look.motion, n)) for n in UNITS if getattr(look.motion, n) is not None}
     weight = np.asarray(look.problem.segments.weight)
     finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
     # The last knot of a segment is the first one of the next.
     weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
-    return LearnedLook(look, {f.name: _pushes(look, f) for f in forms}, values, weight)
+    return LearnedLook(look, values, weight)
 
 
 def candidates(seen: LearnedLook) -> list[Candidate]:
     """Every place with every variable, and with the best one of them and another."""
     found = []
-    for form in LEARNED:
-        if form.name not in seen.pushes:
-            continue
+    reduced = isinstance(seen.look.model, ReducedModel)
+    for form in (f for f in LEARNED if not (f.needs_motor and reduced)):
         own = _own_functions(seen, form)
 
         def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
@@ -154,11 +149,6 @@ def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
     values = {name: np.nan_to_num(value) for name, value in seen.values.items()}
     mixing = np.asarray(chosen.effect.mixing)
     return tuple(part @ mixing for part in _functions(chosen.form, chosen.effect.axes, values))
-
-
-def _pushes(look: Look, form: type[Learned]) -> Pushes:
-    names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
-    return tuple(look.pushes[name] for name in names)
 
 
 def _own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
@@ -231,7 +221,7 @@ def _candidate(
     # One width, one program.
     width = ((0, 0), (0, 0), (0, max(sizes) - mixing.shape[1]))
     padded = tuple(np.pad(part @ mixing, width) for part in raw)
-    found = _instead_of_own(products(seen.look, seen.pushes[form.name], padded), seen.look, parameters, own.shape[2])
+    found = _instead_of_own(products(seen.look, seen.pushes(form), padded), seen.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
     base = _left_out(found, parameters)
     for size in (s for s in sizes if s <= mixing.shape[1]):

@@ -113,7 +113,7 @@ def _refined(
     """The same function with as many coefficients as a second look, along the motion that the first fit found, calls
     for: the first look is but first order."""
     first, trial = best
-    again = looked_again(first, learned_look(trial.training, (first.form,)))
+    again = looked_again(first, learned_look(trial.training))
     if again is None:
         return best
     progress("learning its shape more closely")
@@ -189,7 +189,7 @@ def _p_value(seen: LearnedLook, before: Trial, chosen: Candidate, gain: float, s
     unseen = learned_look(before.held_out)
     null = surrogate_gains(
         (seen.look, unseen.look),
-        (seen.pushes[chosen.form.name], unseen.pushes[chosen.form.name]),
+        (seen.pushes(chosen.form), unseen.pushes(chosen.form)),
         (sizes_along(chosen, seen), sizes_along(chosen, unseen)),
         (surrogates(before.training, seed), surrogates(before.held_out, seed + 1)),
     )

@@ -211,7 +211,9 @@ def test_steps_that_resolve_a_corner_leave_it_as_it_is():
 
     assert torque(None) == pytest.approx(-0.05 * np.tanh(1.0))
     assert torque(1e-4) == pytest.approx(torque(None), rel=1e-4)
+    assert torque(1e-9) == pytest.approx(torque(None))
     assert torque(1e-1) == pytest.approx(-0.05 * np.tanh(0.5 / (0.05 / J_M * 1e-1 / 2.0)), rel=0.01)
+    assert torque(2e-2) == pytest.approx(-0.05 * np.tanh(0.5 / np.hypot(0.5, 0.05 / J_M * 2e-2 / 2.0)))
 
 
 def test_what_a_model_is_not_told_it_asks_for():

@@ -3,18 +3,12 @@
 import numpy as np
 
 from fitting.formatting import axis_label, pretty_unit
-from fitting.learned_curve import LearnedCurve
+from fitting.learned_curve import WORDS, LearnedCurve
 from fitting.plots.look import AFTER, FAINT, axis, figure, line_trace, numbers
 from fitting.plots.plot import Figure, Plot
 
 _BINS = 60
 _NORMAL_95 = 1.96
-_TITLE = {
-    "mesh": "The learned torque in the mesh",
-    "motor": "The learned torque on the motor",
-    "load": "The learned torque on the load",
-    "mesh angle": "The learned error of the mesh's angle",
-}
 
 
 def learned_torque(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Plot:
@@ -96,7 +90,7 @@ def _plot(curve: LearnedCurve, drawn: Figure) -> Plot:
     return Plot(
         "learned-torque",
         "found",
-        _TITLE[curve.place],
+        f"The learned {WORDS[curve.place]}",
         "What is missing, as learned inside the equations of motion, without what the drive's own parameters can do. "
         "The band is that of the standard errors; where there are few data, little is known."
         if len(curve.variables) == 1

@@ -5,7 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.close_loop import Loop
-from fitting.learned_curve import LearnedCurve, learned_curve
+from fitting.learned_curve import WORDS, LearnedCurve, learned_curve
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from fitting.shapes import Shape, shapes
@@ -21,12 +21,6 @@ _WORDS = {
     "omega_l": "load speed",
     "time": "time",
     "temperature": "temperature",
-}
-_PLACES = {
-    "mesh": "torque in the mesh",
-    "motor": "torque on the motor",
-    "load": "torque on the load",
-    "mesh angle": "error of the mesh's angle",
 }
 _QUANTITIES = {"torque": "N m", "error": "rad"}
 _TOLD = 6
@@ -80,7 +74,7 @@ def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
 
 def place_and_variables(curve_place: str, variables: list[str]) -> str:
     """Where a learned function acts and what it depends on, in words."""
-    return f"{_PLACES[curve_place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
+    return f"{WORDS[curve_place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
 
 
 def _shape_dict(shape: Shape) -> dict[str, Any]:

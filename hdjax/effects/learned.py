@@ -272,6 +272,6 @@ def axis_over(variable: str, low: float, high: float, *, beside: str | None = No
     """
     if variable in ANGLES:
         return AngleAxis(variable, ANGLES[variable] if beside is None else min(ANGLES[variable], 4))
-    turns = variable in _RATES and (beside is None or beside in ANGLES or beside in DRIFTS)
+    turns = variable in _RATES and beside in (None, *ANGLES, *DRIFTS)
     bend = _NEAR_STANDSTILL * max(abs(low), abs(high)) if turns else None
     return SplineAxis(variable, low=low, high=high, bend=bend, intervals=5 if beside else 17 if turns else 9)

@@ -8,19 +8,18 @@ from jaxtyping import Array, Float
 from hdjax.elementary import cosine_and_sine, cosines_and_sines
 
 Angle = Float[Array, "*n"]
-Term = tuple[int | Array, Array, Array]
+Term = tuple[float | int | Array, Array, Array]
 """Order, and the amplitudes of its cosine and its sine."""
 
 
 def ripple(angle: Angle, order: float | int | Array, cosine: Array, sine: Array) -> Angle:
     """`cosine cos(order angle) + sine sin(order angle)`."""
-    along, across = cosine_and_sine(order * angle)
-    return cosine * along + sine * across
+    return ripples(angle, [(order, cosine, sine)])
 
 
 def ripple_slope(angle: Angle, order: float | int | Array, cosine: Array, sine: Array) -> Angle:
     """Derivative of [`ripple`][] with respect to the angle."""
-    return order * ripple(angle, order, sine, -cosine)
+    return ripple_slopes(angle, [(order, cosine, sine)])
 
 
 def ripples(angle: Angle, terms: Sequence[Term]) -> Angle:

@@ -14,6 +14,8 @@ _WOLF = "Wolf and Iskandar: viscous friction falls exponentially with temperatur
 
 
 class _Thermal(Effect):
+    """What the drive's temperature changes."""
+
     family: ClassVar[str] = "temperature"
 
     @property
