@@ -55,7 +55,7 @@ class _Pushed(Model):
     at_start: Float[Array, " states"]
     at_end: Float[Array, " states"]
     drive: Drive | ReducedDrive
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[Effect, ...]
     motion_states: ClassVar[tuple[str, ...]] = ()
 
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
@@ -71,6 +71,9 @@ class _Pushed(Model):
             for rate, start, end in zip(found, self.at_start, self.at_end, strict=True)
         ]
         return [*pushed, 1.0 / self.width]
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        return self.model.mobility(moved, opposed)
 
     def outputs(self, state: State) -> Array:
         return self.model.outputs(state[:-1])
@@ -91,7 +94,9 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
         knots = jnp.concatenate([states, end[None]])
 
         def through(start, at_start, at_end, begin, width, coefficients, load, warmth):
-            pushed = _Pushed(model=model, width=width, at_start=at_start, at_end=at_end, drive=model.drive)
+            pushed = _Pushed(
+                model=model, width=width, at_start=at_start, at_end=at_end, drive=model.drive, effects=model.effects
+            )
             interval = jnp.stack([begin, begin + width])
             piece = PiecewisePolynomial(interval, coefficients[None])
             on_load, warm = (None if c is None else PiecewisePolynomial(interval, c[None]) for c in (load, warmth))

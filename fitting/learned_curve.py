@@ -1,5 +1,6 @@
 """A learned function as a curve (or a surface) with standard errors, over the range that the data have."""
 
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -110,7 +111,7 @@ def _evaluated(effect: Learned, covariance: np.ndarray, values: np.ndarray) -> t
 
     def at(row):
         zero = jnp.zeros(())
-        return functions(effect.axes, Motion(**({"x": zero, "v": zero} | dict(zip(names, row, strict=True)))))
+        return functions(effect.axes, replace(Motion(x=zero, v=zero), **dict(zip(names, row, strict=True))))
 
     basis = np.asarray(jax.vmap(at)(jnp.asarray(values))) @ np.asarray(effect.mixing)
     variance = np.einsum("np,pq,nq->n", basis, covariance, basis)

@@ -61,6 +61,15 @@ class Model(eqx.Module):
         return jnp.stack(self.component_rates(tuple(state), torque, load_torque, conditions))
 
     @abc.abstractmethod
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        """Deceleration of one rate by a unit of friction torque against another, or against itself [1/(kg m^2)].
+
+        Args:
+            moved: the one rate, a field of [`hdjax.effects.Motion`][].
+            opposed: likewise the other.
+        """
+
+    @abc.abstractmethod
     def outputs(self, state: State) -> Float[Array, " outputs"]:
         """What the encoders read: (theta_m/N, dynamic error) [rad], or the dynamic error alone."""
 
@@ -185,12 +194,22 @@ class TwoInertiaModel(Model):
                 on_motor = on_motor + effect.reaction(motion, drive)
         for effect in self._of(MotorSideEffect):
             on_motor = on_motor + effect.torque(motion, drive, own[effect.name])
-        on_load, load_inertia = tau + load_torque, drive.J_l
+        on_load = tau + load_torque
         for effect in self._of(LoadSideEffect):
             on_load = on_load + effect.torque(motion, drive, own[effect.name])
-            load_inertia = load_inertia - effect.inertia_taken(drive)
-        rates = [state[2], state[3], on_motor / drive.J_m, on_load / load_inertia]
+        rates = [state[2], state[3], on_motor / drive.J_m, on_load / self._load_inertia]
         return self._with_own_rates(motion, rates, own)
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        by_rate = {"omega_m": (1.0, 0.0), "omega_l": (0.0, 1.0), "v": (1.0 / self.drive.N, -1.0)}
+        one, other = by_rate[moved], by_rate[opposed]
+        return one[0] * other[0] / self.drive.J_m + one[1] * other[1] / self._load_inertia
+
+    @property
+    def _load_inertia(self) -> Array:
+        """What the load's own rate has of the drive's J_l."""
+        taken = (effect.inertia_taken(self.drive) for effect in self._of(LoadSideEffect))
+        return self.drive.J_l - sum(taken, jnp.zeros_like(self.drive.J_l))
 
     def outputs(self, state: State) -> Float[Array, "2"]:
         theta_m, theta_l = state[0], state[1]
@@ -221,6 +240,9 @@ class ReducedModel(Model):
         own = self._own_states(state)
         rates = [state[1], self.drive.gain * torque - self._mesh_torque(motion, own)]
         return self._with_own_rates(motion, rates, own)
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        return 1.0
 
     def outputs(self, state: State) -> Float[Array, "1"]:
         return state[:1]

@@ -1,5 +1,6 @@
 """The only place that integrates the equations of motion."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from hdjax.dynamics import Model, State
 from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.results import Ending, SimulationError
+from hdjax.rubbing import over_step
 from hdjax.signals import PiecewisePolynomial, polynomial
 
 
@@ -236,14 +238,17 @@ def march(
         coefficients, load_coefficients, warmth, knot, width = inputs
         h = width / jnp.asarray(substeps, dtype=width.dtype)
 
+        def around(s, rubbing=None):
+            load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
+            conditions = Conditions(knot + s, None if warmth is None else polynomial(warmth, s), rubbing)
+            return polynomial(coefficients, s), load, conditions
+
         # Compiled once and called by every stage: it would be traced again for each.
         @jax.jit
-        def rates(y, s):
-            load = jnp.zeros_like(s) if load_coefficients is None else polynomial(load_coefficients, s)
-            conditions = Conditions(knot + s, None if warmth is None else polynomial(warmth, s), step=h)
-            return model.component_rates(y, polynomial(coefficients, s), load, conditions)
+        def rates_within(y, s, rubbing):
+            return model.component_rates(y, *around(s, rubbing))
 
-        def step_in_a_loop(y, start):
+        def step_in_a_loop(y, start, rates):
             def stage(slopes, inputs):
                 i, row, node = inputs
                 now = tuple(c + h * jnp.dot(row, k) for c, k in zip(y, slopes, strict=True))
@@ -256,8 +261,9 @@ def march(
             return tuple(c + h * jnp.dot(jnp.asarray(weights), k) for c, k in zip(y, slopes, strict=True))
 
         def step(y, start):
+            rates = functools.partial(rates_within, rubbing=over_step(model, y, *around(start), h).rubbing)
             if not unroll:
-                return step_in_a_loop(y, start)
+                return step_in_a_loop(y, start, rates)
             slopes = [rates(y, start)]
             for row, node in zip(lower, nodes[1:], strict=True):
                 slopes.append(rates(_advanced(y, h, row, slopes), start + float(node) * h))

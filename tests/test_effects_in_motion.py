@@ -1,9 +1,7 @@
 """Effects on angles, time and temperature against the equations of EFFECTS.md, written down again for scipy."""
 
-from dataclasses import replace
 from pathlib import Path
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +12,7 @@ from hdjax import Drive, Harmonic, ReducedDrive, ReducedModel, TwoInertiaModel, 
 from hdjax.effects import CATALOGUE, Conditions, Motion, Scales, applicable
 from hdjax.effects.cogging import Cogging, SingleOrderCogging
 from hdjax.effects.damping import CubicDamping
-from hdjax.effects.friction import LoadDependentFriction, LoadFriction, MotorFriction
+from hdjax.effects.friction import LoadDependentFriction, LoadFriction
 from hdjax.effects.kinematic import KinematicSidebands
 from hdjax.effects.load import LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
@@ -25,7 +23,6 @@ from hdjax.effects.position import (
 from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.effects.stiffness import SmoothKneeStiffness, ThreeSlopeStiffness
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
-from hdjax.simulate import march
 
 N, J_M, J_L, K, ALPHA, B = 50.0, 5.26e-4, 5.0e-2, 7160.0, 2e4, 2.0
 BASE = TwoInertiaModel(Drive(N=N, J_m=J_M, J_l=J_L, K=K, alpha=ALPHA, B_sp=B))
@@ -175,45 +172,6 @@ def test_friction_with_a_ripple_below_its_mean_dissipates():
             assert float(motor.torque(motion, BASE.drive, jnp.zeros(0))) * rate < 0
             # Torque on the load, which moves against v.
             assert float(mesh.torque(motion, BASE.drive, jnp.zeros(0))) * rate > 0
-
-
-LOOSE = Drive(N=N, J_m=J_M, J_l=J_L, K=1e-9)
-
-
-@pytest.mark.parametrize("substeps", [1, 4])
-def test_dry_friction_stops_a_motor_whatever_the_step(substeps):
-    """With no spring it comes to rest after J_m omega / T_c, having turned J_m omega^2 / (2 T_c), to within what a step
-    takes off; and there it stays, and its derivatives stay finite, though its corner is a millionth of that."""
-    count, dt, level, omega = 400, 1e-3, 0.05, 20.0
-    sharp = TwoInertiaModel(LOOSE).with_effects(MotorFriction(T_c=level, transition=1e-6))
-    torque = sampled(dt * np.arange(count), np.zeros(count), hold="zero-order")
-
-    def states(start):
-        return march(sharp, torque, None, jnp.asarray([0.0, 0.0, start, 0.0]), solver=dfx.Tsit5(), substeps=substeps)[0]
-
-    motion, slope = jax.jvp(states, (omega,), (1.0,))
-    stop, turned = J_M * omega / level, J_M * omega**2 / (2 * level)
-    a_step = level / J_M * dt / substeps
-    assert stop < 0.8 * count * dt
-    late = int(np.ceil(1.2 * stop / dt))
-    assert np.all(np.abs(motion[late:, 2]) < 1e-3 * a_step)
-    np.testing.assert_allclose(motion[late:, 0], turned, atol=a_step * dt / substeps)
-    np.testing.assert_allclose(slope[late:, 0], J_M * omega / level, rtol=2 * a_step / omega)
-
-
-def test_steps_that_resolve_a_corner_leave_it_as_it_is():
-    motion = Motion(x=jnp.zeros(()), v=jnp.asarray(0.01), omega_m=jnp.asarray(0.5))
-    friction = MotorFriction(T_c=0.05, transition=0.5)
-
-    def torque(step):
-        now = replace(motion, step=None if step is None else jnp.asarray(step))
-        return float(friction.torque(now, BASE.drive, jnp.zeros(0)))
-
-    assert torque(None) == pytest.approx(-0.05 * np.tanh(1.0))
-    assert torque(1e-4) == pytest.approx(torque(None), rel=1e-4)
-    assert torque(1e-9) == pytest.approx(torque(None))
-    assert torque(1e-1) == pytest.approx(-0.05 * np.tanh(0.5 / (0.05 / J_M * 1e-1 / 2.0)), rel=0.01)
-    assert torque(2e-2) == pytest.approx(-0.05 * np.tanh(0.5 / np.hypot(0.5, 0.05 / J_M * 2e-2 / 2.0)))
 
 
 def test_what_a_model_is_not_told_it_asks_for():

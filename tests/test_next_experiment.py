@@ -103,12 +103,8 @@ def test_the_response_is_that_of_the_simulator(rivals: tuple[Explanation, Explan
     time = np.arange(LIMITS.samples) * rig.STEP
     motion = simulate(truth.model, sampled(time, proposal.command, hold="zero-order"), time, rtol=1e-10, atol=1e-13)
     white = np.asarray(motion.outputs) / NOISE_STD
-    # Fixed steps, which widen the corner of dry friction a little: a fiftieth of the noise.
-    np.testing.assert_allclose(own.outputs.reshape(-1, 2), white, atol=2e-2)
-    fine = dataclasses.replace(BENCH, substeps=8)
-    shapes = signals(proposal.excitation, hold="zero-order", bench=fine)
-    finer = respond(truth, start(truth), proposal.evaluation.coefficients, signals=shapes, bench=fine)
-    np.testing.assert_allclose(finer.outputs.reshape(-1, 2), white, atol=1e-2)
+    # Fixed steps of a fifth-order solver: a hundredth of the noise.
+    np.testing.assert_allclose(own.outputs.reshape(-1, 2), white, atol=1e-2)
     np.testing.assert_allclose(own.motion[:, 0] * LIMITS.speed, np.asarray(motion.states)[:, 2], rtol=1e-6, atol=1e-6)
 
 

@@ -4,6 +4,9 @@ from hdjax.effects.catalogue import BY_NAME as BY_NAME
 from hdjax.effects.catalogue import CATALOGUE as CATALOGUE
 from hdjax.effects.catalogue import FAMILIES as FAMILIES
 from hdjax.effects.catalogue import applicable as applicable
+from hdjax.effects.dry import (
+    DryFriction as DryFriction,
+)
 from hdjax.effects.effect import (
     ActuatorEffect as ActuatorEffect,
 )
@@ -27,6 +30,9 @@ from hdjax.effects.effect import (
 )
 from hdjax.effects.effect import (
     MotorSideEffect as MotorSideEffect,
+)
+from hdjax.effects.effect import (
+    Rubbing as Rubbing,
 )
 from hdjax.effects.effect import (
     Scales as Scales,

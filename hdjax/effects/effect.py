@@ -11,6 +11,18 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.signals import PiecewisePolynomial
 
 
+class Rubbing(eqx.Module):
+    """How dry friction acts on a rate during one step of an explicit solver.
+
+    Attributes:
+        sign: of the rate, averaged over the step [1].
+        reach: by how much the friction can change the rate in the step [rad/s].
+    """
+
+    sign: Array
+    reach: Array
+
+
 class Motion(eqx.Module):
     """The instantaneous motion that an effect may look at.
 
@@ -25,7 +37,8 @@ class Motion(eqx.Module):
         omega_l: load rate [rad/s].
         time: since the log's start [s], or None where it is not known.
         temperature: of the drive [K], or None where it is not known.
-        step: of an explicit solver [s], or None where it adapts itself.
+        rubbing: how dry friction acts on each rate that it opposes, by the rate's name here; None where it follows its
+            law at every instant.
     """
 
     x: Array
@@ -36,7 +49,7 @@ class Motion(eqx.Module):
     omega_l: Array | None = None
     time: Array | None = None
     temperature: Array | None = None
-    step: Array | None = None
+    rubbing: dict[str, Rubbing] | None = None
 
 
 class Conditions(eqx.Module):
@@ -45,12 +58,12 @@ class Conditions(eqx.Module):
     Attributes:
         time: since the log's start [s]; the clock of the torque's signal.
         temperature: of the drive [K].
-        step: of an explicit solver [s], where it is fixed: no corner can be sharper than that.
+        rubbing: see [`Motion`][].
     """
 
     time: Array | None = None
     temperature: Array | None = None
-    step: Array | None = None
+    rubbing: dict[str, Rubbing] | None = None
 
 
 class Scales(eqx.Module):

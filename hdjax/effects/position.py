@@ -7,8 +7,8 @@ import equinox as eqx
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
-from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
-from hdjax.effects.friction import dry, motor_rate
+from hdjax.effects.dry import DryMeshFriction, DryMotorFriction
+from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.effects.ripple import Term, amplitude_and_phase, amplitudes_and_phases, ripple, ripple_slope, ripples
 from hdjax.parameters import Scalar, parameter
 
@@ -73,7 +73,7 @@ class ConservativePositionDependentStiffness(PositionDependentStiffness):
         return -stored * ripple_slope(motion.theta_m, self.n, self.cosine, self.sine)
 
 
-class _MotorFrictionOverAngle(MotorSideEffect):
+class _MotorFrictionOverAngle(DryMotorFriction):
     """Friction `(T_c + ripple(theta_m)) sgn(omega_m)` against the motor.
 
     The ripple changes its sign with the direction, unlike cogging. It dissipates where it is smaller than T_c.
@@ -96,10 +96,9 @@ class _MotorFrictionOverAngle(MotorSideEffect):
     def _ripple(self, theta_m: Array) -> Array:
         """What the angle adds to T_c [N m]."""
 
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+    def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         assert motion.theta_m is not None
-        level = self.T_c + self._ripple(motion.theta_m)
-        return -dry(level, motor_rate(motion), self.transition, 1.0 / drive.J_m, motion)
+        return self.T_c + self._ripple(motion.theta_m)
 
 
 class PositionDependentMotorFriction(_MotorFrictionOverAngle):
@@ -153,7 +152,7 @@ class RipplingMotorFriction(_MotorFrictionOverAngle):
         return amplitudes_and_phases(self._terms, "N m")
 
 
-class PositionDependentMeshFriction(MeshTorqueEffect):
+class PositionDependentMeshFriction(DryMeshFriction):
     """Friction `(T_c + cosine cos(n theta_m) + sine sin(n theta_m)) sgn(v)` between the mesh's two sides."""
 
     family: ClassVar[str] = "position_dependent_friction"
@@ -180,10 +179,9 @@ class PositionDependentMeshFriction(MeshTorqueEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n, v_0=0.03 * scales.v) for n in _ORDERS)
 
-    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+    def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         assert motion.theta_m is not None
-        level = self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
-        return dry(level, motion.v, self.v_0, drive.c, motion)
+        return self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "N m")

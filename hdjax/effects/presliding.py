@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.bristle import SETTLING, bristle_rate
+from hdjax.effects.dry import motor_rate
 from hdjax.effects.effect import Effect, Motion, MotorSideEffect, Scales
-from hdjax.effects.friction import motor_rate
 from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
-from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect, Scales
-from hdjax.effects.friction import dry, motor_rate
+from hdjax.effects.dry import DryMotorFriction, motor_rate
+from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
 _WOLF = "Wolf and Iskandar: viscous friction falls exponentially with temperature"
@@ -66,7 +66,7 @@ class ThermalDamping(_Thermal, MeshTorqueEffect):
         return damping * jnp.expm1(-self.kappa * warmer)
 
 
-class ThermalMotorFriction(_Thermal, MotorSideEffect):
+class ThermalMotorFriction(_Thermal, DryMotorFriction):
     """Motor friction that falls with temperature: `(T - T_0) (T_c_T sgn(omega_m) + b_T omega_m)` with the motor.
 
     The change alone, to first order in the temperature, whatever law the friction itself follows.
@@ -85,10 +85,14 @@ class ThermalMotorFriction(_Thermal, MotorSideEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(transition=0.01 * scales.omega_m, T_0=T_0) for T_0 in _reference(scales))
 
+    def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
+        return -self.T_c_T * self._warmer(motion)
+
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        omega = motor_rate(motion)
-        warmer = _temperature(motion, self.name) - self.T_0
-        return dry(self.T_c_T * warmer, omega, self.transition, 1.0 / drive.J_m, motion) + self.b_T * warmer * omega
+        return super().torque(motion, drive, state) + self.b_T * self._warmer(motion) * motor_rate(motion)
+
+    def _warmer(self, motion: Motion) -> Array:
+        return _temperature(motion, self.name) - self.T_0
 
 
 def _reference(scales: Scales) -> tuple[float, ...]:
