@@ -110,11 +110,16 @@ class ArrowSystem(eqx.Module):
         gradient = self.shared_gradient @ share - jnp.einsum("sqp,sq->p", self.coupling, own_step)
         return matrix, gradient, response, own_step
 
-    def step(self, damping: Array) -> Unknowns:
-        """The damped Gauss-Newton step; damping holds back the closing of the gaps as well."""
+    def step(self, damping: Array, longest: Float[Array, " parameters"] | float = jnp.inf) -> Unknowns:
+        """The damped Gauss-Newton step; damping holds back the closing of the gaps as well.
+
+        Args:
+            damping: relative to the diagonals, see [`ArrowSystem.eliminate`][].
+            longest: how far each shared parameter may go; the chains follow.
+        """
         closing = 1.0 / (1.0 + damping)
         matrix, gradient, response, own_step = self.eliminate(damping, closing)
-        shared = -_solve_scaled(matrix, gradient[:, None])[:, 0]
+        shared = jnp.clip(-_solve_scaled(matrix, gradient[:, None])[:, 0], -longest, longest)
         first = -own_step - jnp.einsum("sqp,p->sq", response, shared)
         path = self.chains
         states = jnp.einsum("sqp,p->sq", path.by_parameter, shared)
@@ -199,11 +204,13 @@ class ArrowDescent(optx.AbstractDescent):
         joined: whether a segment starts where the one before it ends.
         gap_weight: of each state, as in the problem.
         damping: at the start.
+        longest: how far a step may carry each shared parameter.
     """
 
     joined: Bool[Array, " segments"]
     gap_weight: Float[Array, " states"]
     damping: Float[Array, ""]
+    longest: Float[Array, " parameters"] | float = jnp.inf
 
     def init(self, y: Unknowns, f_info_struct) -> ArrowSystem:
         parameters = y.parameters.shape[0]
@@ -232,7 +239,7 @@ class ArrowDescent(optx.AbstractDescent):
 
     def step(self, step_size: Array, state: ArrowSystem) -> tuple[Unknowns, optx.RESULTS]:
         damping = self.damping / jnp.maximum(step_size, 1e-30)
-        return state.step(damping), optx.RESULTS.successful
+        return state.step(damping, self.longest), optx.RESULTS.successful
 
 
 class Progress(eqx.Module):

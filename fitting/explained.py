@@ -12,6 +12,9 @@ from fitting.followed import Followed, respond
 from fitting.residual import Blocks
 from hdjax.where import where
 
+# Numbers whose square leaves what a computer can hold.
+_NOTHING = 1e-200
+
 
 def explained(
     found: Blocks,
@@ -52,7 +55,12 @@ def explained(
 
 
 def solved(gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Least squares; directions without information do not move."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    """Least squares; directions without information do not move.
+
+    Nor do columns without any, as of a parameter that has gone to infinity: they would not explain, and what rounding
+    leaves of them on other data would be all that counts.
+    """
+    size = np.diag(gram)
+    scale = np.where(size > _NOTHING, 1.0 / np.sqrt(np.maximum(size, _NOTHING)), 0.0)
     inverse = np.linalg.pinv(gram * np.outer(scale, scale), rcond=1e-10, hermitian=True)
     return scale[:, None] * (inverse @ (scale[:, None] * gradient))

@@ -18,6 +18,10 @@ FIRST_DAMPING, NEARBY_DAMPING = 1e-3, 1e-9
 """Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other
 weights."""
 
+# A step that would carry a positive parameter farther (a factor e) was promised by a slope that does not reach so far:
+# a corner that leaps to zero shows no slope there, and never comes back.
+_LONGEST_LOG = 1.0
+
 
 class Solution(eqx.Module):
     """Where the iteration has come to.
@@ -78,7 +82,8 @@ def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
 @jit_lanes
 def _solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array, least_progress: Array) -> Solution:
     joined = problem.segments.joined
-    descent = ArrowDescent(joined, problem.gap_weight, damping)
+    longest = jnp.asarray(np.where(problem.free.logarithmic, _LONGEST_LOG, np.inf))
+    descent = ArrowDescent(joined, problem.gap_weight, damping, longest)
     solution = optx.least_squares(
         residual_with_blocks,
         ArrowLevenbergMarquardt(descent=descent, most_steps=max_steps, least_progress=least_progress),

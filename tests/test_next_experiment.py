@@ -108,6 +108,26 @@ def test_the_response_is_that_of_the_simulator(rivals: tuple[Explanation, Explan
     np.testing.assert_allclose(own.motion[:, 0] * LIMITS.speed, np.asarray(motion.states)[:, 2], rtol=1e-6, atol=1e-6)
 
 
+def test_friction_that_turns_within_no_time_has_derivatives():
+    """A motor that sticks and slides, with a sign as sharp as can be."""
+    blunt = with_friction("coulomb", 0.0)
+    model = blunt.model.replace({"stribeck_motor_friction.transition": 1e-12})
+    friction = "stribeck_motor_friction.T_c"
+    sharp = explanation("sharp", model, (friction,), hold="zero-order")
+    command = next(e for e in excitations(LIMITS, model, logged=np.zeros(10)) if "triangle" in e.name)
+    shapes = signals(command, hold="zero-order", bench=BENCH)
+    found = respond(sharp, start(sharp), command.coefficients, signals=shapes, bench=BENCH)
+    assert found.usable
+
+    def outputs(step: float) -> np.ndarray:
+        moved = start(sharp) + step * np.eye(start(sharp).size)[0]
+        return respond(sharp, moved, command.coefficients, signals=shapes, bench=BENCH).outputs
+
+    by_difference = (outputs(1e-4) - outputs(-1e-4)) / 2e-4
+    error = np.linalg.norm(found.by_unknown[:, 0] - by_difference)
+    assert error < 0.05 * np.linalg.norm(by_difference)
+
+
 def test_gradient_of_the_separation(rivals: tuple[Explanation, Explanation], monkeypatch: pytest.MonkeyPatch):
     # The envelope theorem holds at the minimum.
     monkeypatch.setattr(discrimination, "_ARRIVED", 1e-9)

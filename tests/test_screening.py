@@ -8,6 +8,7 @@ import pytest
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import split
+from fitting.explained import solved
 from fitting.free import base_paths
 from fitting.screening import Screen, screen
 from fitting.surrogates import DRAWS, surrogates
@@ -134,3 +135,14 @@ def test_surrogates_have_the_noise_and_not_the_line():
 def test_p_values_count_the_draws():
     found = Screen((), np.array([0.1, 0.2, 0.3]))
     assert [found.p_value(g) for g in (0.0, 0.1, 0.25, 0.4)] == [1.0, 1.0, 0.5, 0.25]
+
+
+def test_a_parameter_that_has_gone_to_infinity_explains_nothing():
+    """Its column is a hundred orders below what a number squared can hold, and something else on other data."""
+    columns = np.random.default_rng(0).normal(size=(50, 3)) * [1.0, 1e-125, 3.0]
+    residual = np.random.default_rng(1).normal(size=50)
+    with np.errstate(under="ignore"):
+        step = solved(columns.T @ columns, columns.T @ residual[:, None])[:, 0]
+    assert step[1] == 0.0
+    kept = np.linalg.lstsq(columns[:, [0, 2]], residual, rcond=None)[0]
+    np.testing.assert_allclose(step[[0, 2]], kept)
