@@ -208,7 +208,8 @@ def march(
 ) -> tuple[Float[Array, "n states"], State]:
     """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
 
-    Agrees with [`simulate`][] to the order of the solver. It steps by the solver's own tableau inside one scan, so
+    Agrees with [`simulate`][] to the order of the solver; dry friction that turns within less than a step is taken over
+    the step (see [`hdjax.rubbing`][]). It steps by the solver's own tableau inside one scan, so
     that segments, sensitivities and candidates are lanes of one program; it costs nothing per sample but the
     arithmetic. A signal's polynomial belongs to one sample interval, so no step crosses a jump.
 

@@ -17,7 +17,6 @@ class CoulombFriction(DryMeshFriction):
 
     family: ClassVar[str] = "coulomb_friction"
     name: ClassVar[str] = "coulomb_friction"
-    drawn_against: ClassVar[str | None] = "v"
 
     T_c: Scalar = parameter(
         0.0,
@@ -46,7 +45,6 @@ class LoadDependentFriction(DryMeshFriction):
 
     family: ClassVar[str] = "coulomb_friction"
     name: ClassVar[str] = "load_dependent_friction"
-    drawn_against: ClassVar[str | None] = "v"
 
     T_c: Scalar = parameter(
         0.0,

@@ -3,7 +3,6 @@
 import abc
 from typing import ClassVar
 
-import equinox as eqx
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
@@ -82,7 +81,6 @@ class _MotorFrictionOverAngle(DryMotorFriction):
     family: ClassVar[str] = "position_dependent_friction"
     drawn_against: ClassVar[str | None] = "theta_m"
 
-    transition: eqx.AbstractVar[Scalar]
     T_c: Scalar = parameter(
         0.0,
         unit="N m",
