@@ -54,7 +54,8 @@ def number(value: float | None, digits: int = 3) -> str:
         return "—"
     if value == 0:
         return "0"
-    power = math.floor(math.log10(abs(value)))
+    # As rounded: 9.996e-4 is 0.00100, not 10.00 x 10^-4.
+    power = int(f"{value:.{digits - 1}e}".partition("e")[2])
     if -4 < power < 6:
         return _fixed(value, digits - 1 - power)
     return f"{_fixed(value / 10.0**power, digits - 1)} × 10{_superscript(power)}"
