@@ -115,11 +115,16 @@ class ArrowSystem(eqx.Module):
 
         Args:
             damping: relative to the diagonals, see [`ArrowSystem.eliminate`][].
-            longest: how far each shared parameter may go; the chains follow.
+            longest: how far each shared parameter may go; where one would go farther, all else suits where it goes.
         """
         closing = 1.0 / (1.0 + damping)
         matrix, gradient, response, own_step = self.eliminate(damping, closing)
-        shared = jnp.clip(-_solve_scaled(matrix, gradient[:, None])[:, 0], -longest, longest)
+        wanted = -_solve_scaled(matrix, gradient[:, None])[:, 0]
+        held = jnp.abs(wanted) > longest
+        ends = where(held, jnp.sign(wanted) * longest, 0.0)
+        left = where(held, 0.0, gradient + matrix @ ends)
+        others = where(held[:, None] | held[None, :], 0.0, matrix)
+        shared = ends - _solve_scaled(others, left[:, None])[:, 0]
         first = -own_step - jnp.einsum("sqp,p->sq", response, shared)
         path = self.chains
         states = jnp.einsum("sqp,p->sq", path.by_parameter, shared)

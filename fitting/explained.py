@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from fitting.arrow import project
 from fitting.experiment import Segments
 from fitting.followed import Followed, respond
+from fitting.free import FreeParameters
 from fitting.residual import Blocks
 from hdjax.where import where
 
@@ -52,6 +53,18 @@ def explained(
     )
     projected = -project(extended, segments.joined)[:, :rows]
     return projected.reshape(*white.shape[:3], -1)
+
+
+def without_untold(found: Blocks, free: FreeParameters) -> Blocks:
+    """The same without the columns of positive parameters that the data do not tell to within a factor e (a corner too
+    sharp to be seen): what they would explain to first order lies far beyond where that reaches."""
+    by_parameter, before = np.asarray(found.by_parameter), np.asarray(found.before_by_parameter)
+    told = (np.sum(by_parameter**2, axis=(0, 1)) > 1.0) | ~np.asarray(free.logarithmic, dtype=bool)
+    return replace(
+        found,
+        by_parameter=jnp.asarray(np.where(told, by_parameter, 0.0)),
+        before_by_parameter=jnp.asarray(np.where(told, before, 0.0)),
+    )
 
 
 def solved(gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from fitting.along import conditions_at_knots, motions, unit_pushes
 from fitting.estimate import Fit
-from fitting.explained import explained, solved
+from fitting.explained import explained, solved, without_untold
 from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem
 from fitting.solve import linearise
@@ -88,7 +88,7 @@ def look_along(fit: Fit) -> Look:
     conditions = conditions_at_knots(problem.segments)
     return Look(
         problem,
-        linearise(problem, fit.unknowns),
+        without_untold(linearise(problem, fit.unknowns), problem.free),
         followed,
         motions(fit.model, followed.states, conditions),
         conditions,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from fitting.along import Along, along
 from fitting.estimate import Fit, lost
 from fitting.experiment import Segments
+from fitting.explained import without_untold
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
 from fitting.posing import STEP_ANGLE, suggested_substeps
@@ -60,7 +61,7 @@ def sight(fit: Fit, seed: int) -> Sight:
     """
     problem = _looked_at(fit)
     followed: Followed = _on_host(follow(problem, fit.unknowns))
-    found: Blocks = _on_host(linearise(problem, fit.unknowns))
+    found: Blocks = _on_host(without_untold(linearise(problem, fit.unknowns), problem.free))
     slopes = fit.free.slopes(fit.model)[None, None, :]
     found = replace(
         found,
