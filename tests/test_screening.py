@@ -8,8 +8,9 @@ import pytest
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import split
-from fitting.explained import solved
-from fitting.free import base_paths
+from fitting.explained import solved, without_untold
+from fitting.free import FreeParameters, base_paths
+from fitting.residual import Blocks
 from fitting.screening import Screen, screen
 from fitting.surrogates import DRAWS, surrogates
 from hdjax.effects import CATALOGUE, Effect
@@ -146,3 +147,16 @@ def test_a_parameter_that_has_gone_to_infinity_explains_nothing():
     assert step[1] == 0.0
     kept = np.linalg.lstsq(columns[:, [0, 2]], residual, rcond=None)[0]
     np.testing.assert_allclose(step[[0, 2]], kept)
+
+
+def test_only_a_positive_parameter_that_is_not_told_to_a_factor_e_is_left_out():
+    """Of two positive and one signed parameter, the latter two with information below one."""
+    size = np.array([30.0, 0.5, 0.5])
+    by_parameter = jnp.asarray(np.ones((2, 8, 3)) * size / 4.0)
+    before = jnp.ones((2, 4, 3))
+    other = jnp.zeros((2, 8)), by_parameter, jnp.zeros((2, 8, 4)), jnp.zeros((2, 4)), before, jnp.zeros((2, 4, 4))
+    free = FreeParameters(("K", "B_sp", "alpha"), (True, True, False), jnp.ones(3))
+    found = without_untold(Blocks(*other), free)
+    np.testing.assert_array_equal(np.linalg.norm(found.by_parameter, axis=(0, 1)), [30.0, 0.0, 0.5])
+    np.testing.assert_array_equal(found.before_by_parameter[..., 1], 0.0)
+    np.testing.assert_array_equal(found.before_by_parameter[..., [0, 2]], 1.0)
