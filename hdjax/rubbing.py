@@ -28,8 +28,8 @@ _SWEEPS = 2
 
 def over_step(
     model: Model, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions, step: Array
-) -> Conditions:
-    """What surrounds a drive, and how dry friction acts in it, during one step from here.
+) -> dict[str, Rubbing] | None:
+    """How dry friction acts in a drive during one step from here; None where it has none.
 
     Args:
         model: the equations.
@@ -41,7 +41,7 @@ def over_step(
     """
     dry = [effect for effect in model.effects if isinstance(effect, DryFriction)]
     if not dry:
-        return conditions
+        return None
     motion = model.motion(state, conditions)
     names = sorted({effect.opposes for effect in dry})
     against = [[effect for effect in dry if effect.opposes == name] for name in names]
@@ -50,17 +50,16 @@ def over_step(
     moved = [[step * model.mobility(name, other) for other in names] for name in names]
     reaches = [[move * level for move, level in zip(row, levels, strict=True)] for row in moved]
 
-    def rubbing(signs: Sequence[Array]) -> Conditions:
-        found = {n: Rubbing(s, row[i]) for i, (n, s, row) in enumerate(zip(names, signs, reaches, strict=True))}
-        return dataclasses.replace(conditions, rubbing=found)
+    def rubbing(signs: Sequence[Array]) -> dict[str, Rubbing]:
+        return {n: Rubbing(s, row[i]) for i, (n, s, row) in enumerate(zip(names, signs, reaches, strict=True))}
 
     # What the rates would do without the friction: what they do with any, and that taken back.
     some = rubbing([jnp.zeros_like(level) for level in levels])
-    slopes = model.component_rates(state, torque, load_torque, some)
+    slopes = model.component_rates(state, torque, load_torque, dataclasses.replace(conditions, rubbing=some))
     rates, accelerations = jax.jvp(
         lambda *now: [getattr(model.motion(now, conditions), name) for name in names], tuple(state), tuple(slopes)
     )
-    motion = dataclasses.replace(motion, rubbing=some.rubbing)
+    motion = dataclasses.replace(motion, rubbing=some)
     taken = [_total(effect.dry(motion, model.drive) for effect in same) for same in against]
     changes = [
         step * acceleration + _total(move * torque for move, torque in zip(row, taken, strict=True))

@@ -209,9 +209,9 @@ def march(
     """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
 
     Agrees with [`simulate`][] to the order of the solver; dry friction that turns within less than a step is taken over
-    the step (see [`hdjax.rubbing`][]). It steps by the solver's own tableau inside one scan, so
-    that segments, sensitivities and candidates are lanes of one program; it costs nothing per sample but the
-    arithmetic. A signal's polynomial belongs to one sample interval, so no step crosses a jump.
+    the step (see [`hdjax.rubbing`][]). It steps by the solver's own tableau inside one scan, so that segments,
+    sensitivities and candidates are lanes of one program; it costs nothing per sample but the arithmetic. A signal's
+    polynomial belongs to one sample interval, so no step crosses a jump.
 
     Args:
         model: the equations.
@@ -262,7 +262,7 @@ def march(
             return tuple(c + h * jnp.dot(jnp.asarray(weights), k) for c, k in zip(y, slopes, strict=True))
 
         def step(y, start):
-            rates = functools.partial(rates_within, rubbing=over_step(model, y, *around(start), h).rubbing)
+            rates = functools.partial(rates_within, rubbing=over_step(model, y, *around(start), h))
             if not unroll:
                 return step_in_a_loop(y, start, rates)
             slopes = [rates(y, start)]
