@@ -14,7 +14,7 @@ from fitting.experiment import experiment_from_log, split
 from fitting.free_run import free_run
 from fitting.learned_curve import LearnedCurve, learned_curve
 from fitting.model_file import StoredModel, read_model, to_json
-from fitting.plots.learned_torque import learned_torque
+from fitting.plots import learned_plot
 from fitting.report import report_dict, write_report
 from fitting.shapes import shapes
 from fitting.trial import Setting, Trial, attempt
@@ -153,7 +153,7 @@ def test_an_error_of_the_mesh_is_told_from_a_torque():
     assert error < 0.05 and inside > 0.8
     best = shapes(curve).closest[0]
     assert best.families == ("kinematic_error",) and "cos(2 theta_m)" in best.expression
-    drawn = learned_torque(curve, unit="rad", units={"theta_m": "rad"})
+    drawn = learned_plot(curve, unit="rad", units={"theta_m": "rad"})
     assert drawn.title == "The learned error of the mesh's angle"
     # The effect that it is, and one that it is not.
     right = rig.drive_model().with_effects(KinematicError(cos_2=amplitude))

@@ -11,7 +11,7 @@ from fitting.close_loop import Loop
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly
 from fitting.next_experiment import NextExperiment
-from fitting.plots import Plot, evidence_plot, fit_plots, learned_torque, next_experiment_plot, plots
+from fitting.plots import Plot, evidence_plot, fit_plots, learned_plot, next_experiment_plot, plots
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
@@ -117,6 +117,6 @@ def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperim
         found += [evidence_plot(seen, units=in_log) for seen in outcome.evidence]
         curve, told = curve_of(outcome), report["unknown"]
         if curve is not None:
-            found.append(learned_torque(curve, unit=told["units"][curve.quantity], units=told["units"]))
+            found.append(learned_plot(curve, unit=told["units"][curve.quantity], units=told["units"]))
         return found + last
     return fit_plots(outcome, units=units) + last

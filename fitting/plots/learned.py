@@ -1,4 +1,4 @@
-"""A learned torque, or error of an angle, against what it depends on."""
+"""What was learned, a torque or an error of an angle, against what it depends on."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _BINS = 60
 _NORMAL_95 = 1.96
 
 
-def learned_torque(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Plot:
+def learned_plot(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Plot:
     """The learned function with its band and the density of the data.
 
     Args:
