@@ -17,13 +17,17 @@ from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
 from fitting.outliers import without_glitches, without_lone_errors
 from fitting.posing import initial_states, segment_length, short_horizon, suggested_substeps
-from fitting.starting_values import starting_models
-from hdjax import Model
+from fitting.starting_values import apart, starting_models, starts_blind_to_loads
+from fitting.steady_load import SteadyLoad
+from hdjax import Drive, Model
 
 # Iterations that tell a start that leads somewhere from one that does not.
 _TRIAL_STEPS = 10
 # A start whose trial is this much worse than the best (in the objective: 10 % of the error) is given up.
 _HOPELESS = 0.1
+# A fit whose stiffness is off by so much (in its logarithm) from all weak forms that see no steady load may be in a
+# minimum that a large load has made; so it is where steady loads leave less than this share of its error.
+_OFF, _MUCH = 0.3, 0.5
 # Rounds of leaving out what stands alone; each tells the noise better, and so shows smaller outliers.
 _CLEANINGS = 3
 # Lags of the test for whiteness, and the chance that it takes white noise for anything else.
@@ -33,6 +37,9 @@ _FALSE_ALARM = 1e-3
 
 def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
     """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
+
+    Where a load that is not logged leaves the model no minimum near the drive's parameters, they are held (see
+    [`is_held`][]).
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -44,6 +51,9 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
     """
     training = without_glitches(training)
     best, start = _coarse_fit(starting_models(model, training), training, halo)
+    best = _beside_loads(best, training, halo)
+    if is_held(best):
+        return eqx.tree_at(lambda f: f.problem.model, best, start)
     horizon = short_horizon(best.model, training)
     if not best.horizon <= 2 * horizon <= 4 * best.horizon:
         best = _refined(best, training, halo)
@@ -93,6 +103,47 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
             if other.objective < best.objective:
                 best, begun = other, start
     return best, begun
+
+
+def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
+    """The minimum to which steady loads in each segment lead, where they explain most of what is left; else the same.
+
+    Under a large load that is not logged (a weight, a spring to the ground) the twist hardly follows the motor's
+    torque, and a drive with a wrong stiffness fits better than the right one. Where there is no minimum near the right
+    one, the parameters are held at what the steady loads tell.
+    """
+    drive = best.model.drive
+    if not isinstance(drive, Drive) or leaves_white_noise(best):
+        return best
+    starts = starts_blind_to_loads(best.model, training)
+    if not starts or min(apart(best.model, start) for start in starts) < _OFF:
+        return best
+    horizon = segment_length(short_horizon(starts[0], training))
+    substeps = suggested_substeps(starts[0], training)
+
+    def fitted(model: Model, *, hold_parameters: bool = False) -> Fit:
+        return fit(
+            model,
+            training,
+            base_paths(model),
+            horizon=horizon,
+            halo=halo,
+            substeps=substeps,
+            hold_parameters=hold_parameters,
+        )
+
+    reach = drive.N * max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in training)
+    loaded = fitted(starts[0].with_effects(SteadyLoad(reach=reach)))
+    bare = loaded.model.without_effect(SteadyLoad.name)
+    other = fitted(bare)
+    if not loaded.objective < other.objective + np.log(_MUCH):
+        return best
+    return other if apart(other.model, bare) < _OFF else fitted(bare, hold_parameters=True)
+
+
+def is_held(found: Fit) -> bool:
+    """Whether its parameters were held."""
+    return not np.any(np.asarray(found.problem.active))
 
 
 def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:

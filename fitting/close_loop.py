@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.attribution import Round, look
-from fitting.base_fit import base_fit, leaves_white_noise
+from fitting.base_fit import base_fit, is_held, leaves_white_noise
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
@@ -44,7 +44,8 @@ class Finding(eqx.Module):
         effect: with fitted values; None where the finding is another hold of the torque.
         name: its form.
         family: its family.
-        validation_gain: share of the held-out free-run error that it removes, against the same model without it.
+        validation_gain: share of the held-out free-run error that it removes, against the same model without it; of
+            what has a name, in the model before anything is learned beside it.
         p_value: chance that the best of the catalogue would gain as much on noise.
     """
 
@@ -62,11 +63,11 @@ class Loop(eqx.Module):
         decision: what the data say.
         before: the base model's account.
         after: the final model's account; the same where nothing was found.
-        findings: supported effects, largest gain first.
+        findings: supported effects, largest gain first; what was learned comes last.
         rounds: every look at the catalogue.
         dropped: effects that a later one made superfluous.
         doubted: effects that were found, but that a learned torque contradicts.
-        unknown: the learned torque, where the catalogue does not explain what is missing.
+        unknown: what was learned, where the catalogue does not explain what is missing, or not all of it.
         evidence: what each effect of the final model does, and what the data say of it.
         noise: covariance of the measurement noise of the outputs.
         residual_before: diagnostics of what the base model leaves over.
@@ -143,7 +144,8 @@ def close_loop(
     clock.lap("unknown effects")
     noise = measurement_noise((named if unknown is None else unknown.trial).training)
     decision = _decide(base, trusted, unknown, noise)
-    if decision == "effect_found":
+    if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < _EXCESS:
+        # What the names leave is hardly more than noise.
         unknown = None
     current = trusted if unknown is None else unknown.trial
     progress("final fit over long horizons")
@@ -155,11 +157,18 @@ def close_loop(
     before = after
     if current is not base:
         before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
-    if current is not named:
-        without = {}
-    findings = _findings(base, trusted, current, rounds, without, data, setting, before, after, noise)
+
+    def rmse_of(trial: Trial) -> float:
+        return validation_rmse(trial.training, *data[trial.hold], noise=noise, halo=setting.halo)
+
+    by_name = after.validation_rmse
     if unknown is not None:
-        findings = (*findings, _unknown_finding(unknown, trusted is base, data, setting, before, after, noise))
+        by_name = before.validation_rmse if trusted is base else rmse_of(trusted)
+    if trusted is not named:
+        without = {}
+    findings = _findings(base, trusted, after.model, rounds, without, data, setting, before, by_name, rmse_of)
+    if unknown is not None:
+        findings = (*findings, _unknown_finding(unknown, after, by_name))
     clock.lap("free runs")
     progress("asking the data for each effect")
     seen = evidence(current.training)
@@ -196,11 +205,14 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     count = segment_count(training, segment_length(best.horizon))
     setting = Setting(best.horizon, halo, best.substeps, count)
     holds: list[Hold] = list(data) if hold is None else [hold]
-    trials = [attempt(best.model, data, h, setting) for h in holds]
+    trials = [attempt(best.model, data, h, setting, hold_parameters=is_held(best)) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
     finer = setting.fine_enough(chosen.training)
     if finer is not setting:
-        setting, chosen = finer, attempt(chosen.model, data, chosen.hold, finer, start=chosen)
+        setting, chosen = (
+            finer,
+            attempt(chosen.model, data, chosen.hold, finer, start=chosen, hold_parameters=is_held(best)),
+        )
     if np.mean(lost(chosen.training)) > _MOST_LOST:
         raise DataError(
             "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
@@ -268,8 +280,9 @@ def _what_is_unknown(
 ) -> tuple[Trial, Unknown | None]:
     """The model whose names can be trusted, and the torque that is learned beside them.
 
-    A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data better,
-    and does not come out as the named effect. What a learned torque beside it hardly betters is in no doubt.
+    A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
+    as one beside it does, and does not come out as the named effect. What a learned torque beside it hardly betters is
+    in no doubt.
     """
     if leaves_white_noise(named.training):
         return named, None
@@ -283,7 +296,7 @@ def _what_is_unknown(
     instead = learn(base, data, setting, seed=seed, progress=progress)
     if instead is None or not is_supported(instead):
         return named, beside
-    if named.held_out.objective <= instead.trial.held_out.objective:
+    if beside.trial.held_out.objective < instead.trial.held_out.objective - LEAST_GAIN:
         return named, beside
     if named.hold == base.hold and share_of(named.model, instead) >= _EXPLAINED:
         return named, beside
@@ -305,55 +318,40 @@ def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[A
 def _findings(
     base: Trial,
     trusted: Trial,
-    current: Trial,
+    final: Model,
     rounds: Sequence[Round],
     without: Mapping[str, Trial],
     data: Data,
     setting: Setting,
     before: Account,
-    after: Account,
-    noise: Float[Array, "outputs outputs"],
+    rmse: float,
+    rmse_of: Callable[[Trial], float],
 ) -> tuple[Finding, ...]:
-    """The accepted effects, each with what the held-out error would be without it; `without` holds the models without
-    one of them that are fitted already."""
+    """The accepted effects with their final values, each with what the held-out error would be without it in place of
+    `rmse`; `without` holds the models without one of them that are fitted already."""
     names = [e.name for e in trusted.model.effects]
-    changed_hold = current.hold != base.hold
+    changed_hold = trusted.hold != base.hold
     found = []
     for this in rounds:
         winner = this.winner
         is_hold = winner.name.endswith(" hold")
         if not this.accepted or not (winner.name in names or (is_hold and changed_hold)):
             continue
-        if len(current.model.effects) + changed_hold == 1:
-            rmse = before.validation_rmse
+        if len(names) + changed_hold == 1:
+            poorer = before.validation_rmse
+        elif winner.name in without:
+            poorer = rmse_of(without[winner.name])
+        elif is_hold:
+            poorer = rmse_of(attempt(trusted.model, data, base.hold, setting, start=trusted))
         else:
-            poorer = without.get(winner.name)
-            if poorer is None:
-                model, hold = current.model, base.hold
-                if not is_hold:
-                    model, hold = current.model.without_effect(winner.name), current.hold
-                poorer = attempt(model, data, hold, setting, start=current)
-            rmse = validation_rmse(poorer.training, *data[poorer.hold], noise=noise, halo=setting.halo)
-        gain = 1.0 - after.validation_rmse / rmse
-        effect = None if is_hold else after.model.effect(winner.name)
-        found.append(Finding(effect, winner.name, winner.family, gain, winner.p_value))
+            model = trusted.model.without_effect(winner.name)
+            poorer = rmse_of(attempt(model, data, trusted.hold, setting, start=trusted))
+        effect = None if is_hold else final.effect(winner.name)
+        found.append(Finding(effect, winner.name, winner.family, 1.0 - rmse / poorer, winner.p_value))
     return tuple(sorted(found, key=lambda f: -f.validation_gain))
 
 
-def _unknown_finding(
-    unknown: Unknown,
-    alone: bool,
-    data: Data,
-    setting: Setting,
-    before: Account,
-    after: Account,
-    noise: Float[Array, "outputs outputs"],
-) -> Finding:
-    """The learned torque, with what the held-out error would be without it."""
-    name = unknown.chosen.form.name
-    poorer = unknown.before
-    without = before.validation_rmse
-    if not alone:
-        without = validation_rmse(poorer.training, *data[poorer.hold], noise=noise, halo=setting.halo)
-    effect = after.model.effect(name)
-    return Finding(effect, name, effect.family, 1.0 - after.validation_rmse / without, unknown.p_value)
+def _unknown_finding(unknown: Unknown, after: Account, by_name: float) -> Finding:
+    """The learned function, with what the held-out error is without it."""
+    effect = after.model.effect(unknown.chosen.form.name)
+    return Finding(effect, effect.name, effect.family, 1.0 - after.validation_rmse / by_name, unknown.p_value)

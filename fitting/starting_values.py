@@ -5,9 +5,11 @@ derivative of a measured signal,
 
     int phi'' x + mu int (-phi') x + omega_0^2 int phi x + omega_0^2 alpha int phi x^3 = gain int phi u,
 
-and is linear in what is sought (Schaeffer and McCalla 2017; Messenger and Bortz 2021).
+and is linear in what is sought (Schaeffer and McCalla 2017; Messenger and Bortz 2021). Test functions whose integral is
+zero do not see a constant load that the log does not contain.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -32,22 +34,38 @@ def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, 
     Raises:
         DataError: where no weak form gives a positive stiffness.
     """
-    found: list[Model] = []
-    for width in _WIDTHS:
-        for equation in _equations(model):
-            estimate = _weak_form(model, stretches, width, equation)
-            if estimate is None:
-                continue
-            stiffness = float(estimate.drive.stiffness)
-            if all(abs(np.log(stiffness / float(f.drive.stiffness))) > _DISTINCT for f in found):
-                found.append(estimate)
+    found = _estimates(model, stretches, blind=False)
     if not found:
         names = ", ".join(s.name for s in stretches)
         raise DataError(
             f"{names}: the dynamic error does not follow from the torque by any positive stiffness; check the signs "
             "and units of motor_torque, motor_angle and load_angle in the drive file"
         )
+    return _distinct([*found, *_estimates(model, stretches, blind=True)])
+
+
+def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Those of the weak forms that see no steady load; there may be none. Arguments as in [`starting_models`][]."""
+    return _distinct(_estimates(model, stretches, blind=True))
+
+
+def _estimates(model: Model, stretches: Sequence[Stretch], *, blind: bool) -> list[Model]:
+    forms = itertools.product(_WIDTHS, _equations(model))
+    estimates = (_weak_form(model, stretches, width, equation, blind=blind) for width, equation in forms)
+    return [estimate for estimate in estimates if estimate is not None]
+
+
+def _distinct(models: Sequence[Model]) -> tuple[Model, ...]:
+    found: list[Model] = []
+    for model in models:
+        if all(apart(model, other) > _DISTINCT for other in found):
+            found.append(model)
     return tuple(found)
+
+
+def apart(model: Model, other: Model) -> float:
+    """By how much the stiffness of two models differs, in its logarithm."""
+    return float(abs(np.log(float(model.drive.stiffness) / float(other.drive.stiffness))))
 
 
 def _equations(model: Model) -> tuple[str, ...]:
@@ -55,12 +73,14 @@ def _equations(model: Model) -> tuple[str, ...]:
     return ("error", "load") if isinstance(model, TwoInertiaModel) else ("error",)
 
 
-def _weak_form(model: Model, stretches: Sequence[Stretch], width: int, equation: str) -> Model | None:
+def _weak_form(
+    model: Model, stretches: Sequence[Stretch], width: int, equation: str, *, blind: bool = False
+) -> Model | None:
     rows, right = [], []
     for stretch in stretches:
         if len(stretch) < 3 * width:
             continue
-        a, b = _rows(model, stretch, width, equation)
+        a, b = _rows(model, stretch, width, equation, blind=blind)
         rows.append(a)
         right.append(b)
     if not rows:
@@ -91,7 +111,7 @@ def _model(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equ
     return model.replace({"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)})
 
 
-def _rows(model: Model, stretch: Stretch, width: int, equation: str) -> tuple[np.ndarray, np.ndarray]:
+def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: bool) -> tuple[np.ndarray, np.ndarray]:
     """Weak-form regressors (stiffness, cubic, damping, and gain of a reduced drive) and right-hand side."""
     experiment = stretch.experiment
     part = slice(stretch.start, stretch.stop)
@@ -100,7 +120,7 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str) -> tuple[np
     u = np.asarray(experiment.torque.coefficients)[part, 0]
     load = experiment.load_torque
     T_l = np.zeros_like(u) if load is None else np.asarray(load.coefficients)[part, 0]
-    tests, slopes, curvatures = _test_functions(width, dt)
+    tests, slopes, curvatures = _blind_functions(width, dt) if blind else _test_functions(width, dt)
     hop = max(1, width // 4)
 
     def against(signal: np.ndarray, functions: np.ndarray) -> np.ndarray:
@@ -138,3 +158,10 @@ def _test_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.n
             slopes.append(dp * c + p * dc)
             curvatures.append(ddp * c + 2 * dp * dc - w**2 * p * c)
     return np.stack(tests), np.stack(slopes), np.stack(curvatures)
+
+
+def _blind_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The modulations, each less so much of the bump that nothing is left of a constant."""
+    tests, slopes, curvatures = _test_functions(width, dt)
+    share = tests[1:].sum(axis=1, keepdims=True) / tests[0].sum()
+    return tests[1:] - share * tests[0], slopes[1:] - share * slopes[0], curvatures[1:] - share * curvatures[0]

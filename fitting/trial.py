@@ -82,7 +82,15 @@ Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
 """Training and held-out stretches for each assumption about the torque between samples."""
 
 
-def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Trial | None = None) -> Trial:
+def attempt(
+    model: Model,
+    data: Data,
+    hold: Hold,
+    setting: Setting,
+    *,
+    start: Trial | None = None,
+    hold_parameters: bool = False,
+) -> Trial:
     """Fit a model and look at it on held-out data.
 
     Args:
@@ -92,8 +100,10 @@ def attempt(model: Model, data: Data, hold: Hold, setting: Setting, *, start: Tr
         setting: how the data are cut.
         start: a trial near by, whose error covariance weighs the outputs at the start, and whose initial states it
             starts from.
+        hold_parameters: see [`fitting.estimate.fit`][].
     """
-    training = trained(model, data, hold, setting, None if start is None else start.training)
+    near = None if start is None else start.training
+    training = trained(model, data, hold, setting, near, hold_parameters=hold_parameters)
     return _judged(training, data, hold, setting)
 
 
@@ -159,6 +169,7 @@ def trained(
     retry_states: bool = False,
     max_steps: int = _TRIAL_STEPS,
     reweigh: bool = True,
+    hold_parameters: bool = False,
     own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Fit:
     """A fit that starts with the covariance of one near by, and from its states as far as the model has the same.
@@ -173,6 +184,7 @@ def trained(
         retry_states: likewise; so they are in any case where the model has other states.
         max_steps: likewise.
         reweigh: likewise.
+        hold_parameters: likewise.
         own_states: where the last effect's own states start, in each segment; as if they had long moved like this where
             not given.
     """
@@ -188,6 +200,7 @@ def trained(
         covariance=None if near is None else near.covariance,
         max_steps=max_steps,
         reweigh=reweigh,
+        hold_parameters=hold_parameters,
         states=states,
         retry_states=retry_states or not same,
         give_up_above=give_up_above,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.base_fit import _refined, base_fit, leaves_white_noise
+from fitting.base_fit import _refined, base_fit, is_held, leaves_white_noise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
 from fitting.free import base_paths
@@ -132,3 +132,19 @@ def test_a_noisy_oversampled_softening_drive():
     assert result.converged
     assert_recovered(result, {"mu": 10.0, "omega_0": rig.OMEGA_0, "alpha": alpha, "gain": rig.GAIN})
     assert float(result.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=0.1)
+
+
+def test_a_large_load_that_is_not_logged():
+    """A weight outweighs the motor's torque, and no minimum of the base model is near the drive's parameters."""
+    torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
+    log = rig.drive_log(rig.drive_motion(torque, gravity=20.0), torque, noise=0.1)
+    stretches = whole(experiment_from_log(log, hold="zero-order", N=rig.N))
+    placeholder = rig.drive_model(K=1.0, alpha=0.0, B_sp=1.0)
+    found = base_fit(placeholder, stretches, halo=4)
+    assert is_held(found)
+    assert float(found.model.get("K")) == pytest.approx(rig.K, rel=0.02)
+    assert float(found.model.get("alpha")) == pytest.approx(rig.ALPHA, rel=0.2)
+    assert found.model.effects == ()
+    # Set free, they run away.
+    loose = fit(found.model, stretches, base_paths(found.model), horizon=found.horizon, halo=4)
+    assert abs(np.log(float(loose.model.get("K")) / rig.K)) > 1.0

@@ -111,3 +111,14 @@ def test_a_log_shorter_than_the_windows_is_refused():
     experiment = rig.reduced_experiment(30)
     with pytest.raises(DataError):
         starting_models(REDUCED_PLACEHOLDER, whole(experiment))
+
+
+def test_forms_that_see_no_steady_load_see_through_a_weight():
+    """Under a weight that outweighs the motor's torque the others see a tenth of the stiffness, or noise."""
+    torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
+    log = rig.drive_log(rig.drive_motion(torque, gravity=20.0), torque, noise=0.1)
+    stretches = whole(experiment_from_log(log, hold="zero-order", N=rig.N))
+    for equation in ("error", "load"):
+        seeing, blind = (_weak_form(PLACEHOLDER, stretches, 24, equation, blind=b) for b in (False, True))
+        assert seeing is None or float(seeing.get("K")) < 0.5 * rig.K
+        assert blind is not None and float(blind.get("K")) == pytest.approx(rig.K, rel=0.2)

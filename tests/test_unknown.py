@@ -231,5 +231,30 @@ def test_the_report_tells_it(loop: Loop, tmp_path: Path):
     assert run.rmse == pytest.approx(loop.after.validation_rmse, rel=0.05)
 
 
+def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
+    """Friction and a lopsided spring; the catalogue knows friction alone. A function of the rate in its place, free to
+    be anything, explains no more than friction does, and a function of the twist beside it all of the rest."""
+    experiment = rig.reduced_experiment(COUNT, noise=NOISE, friction=(25.0, 0.3), quadratic=0.15)
+    placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
+    loop = close_loop(
+        placeholder, {"zero-order": (experiment,)}, catalogue=(CoulombFriction,), hold="zero-order", max_effects=1
+    )
+    assert loop.decision == "effect_found" and not loop.doubted
+    assert [f.name for f in loop.findings] == ["coulomb_friction", "learned_mesh_torque"]
+    assert loop.unknown is not None and loop.unknown.chosen.variables == ("x",)
+    assert float(loop.after.model.get("coulomb_friction.T_c")) == pytest.approx(25.0, rel=0.05)
+    assert loop.after.validation_rmse < 1.2 * NOISE
+    # Of the gains the second begins where the first ends.
+    left = loop.before.validation_rmse * np.prod([1.0 - f.validation_gain for f in loop.findings])
+    assert left == pytest.approx(loop.after.validation_rmse, rel=1e-6)
+    stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
+    units = {"dynamic_error": "V", "forcing": "V"}
+    paths = write_report(tmp_path, loop, model_json=to_json(stored), units=units)
+    report = json.loads(paths["report.json"].read_text())
+    assert "friction" in report["summary"] and "More than noise is left" in report["summary"]
+    assert report["unexplained"] is None and report["unknown"]["variables"] == ["x"]
+    assert "What the learned torque looks like" in paths["report.html"].read_text()
+
+
 def test_a_report_without_one_says_so(loop: Loop):
     assert report_dict(Loop(**(vars(loop) | {"unknown": None, "findings": ()})))["unknown"] is None

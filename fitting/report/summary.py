@@ -32,27 +32,32 @@ def summary(report: Mapping[str, Any]) -> str:
             if len(families) == 1
             else f"{_count(len(families))} missing effects were found"
         )
+        rest = ""
+        if report["unknown"]:
+            rest = f" More than noise is left, which has no name: a learned {_learned(report)}, stands for it."
+        remove = "Together they remove" if rest or len(families) > 1 else "It removes"
         return (
-            f"{opening}: {found}. {'It removes' if len(families) == 1 else 'Together they remove'} "
-            f"{_removed(before, after)} of the held-out error, which falls from {_rmse(before, unit)} to "
-            f"{_against_noise(after, noise, unit, like=before)}."
+            f"{opening}: {found}.{rest} {remove} {_removed(before, after)} of the held-out error, which falls from "
+            f"{_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
         )
     left = report["unexplained"]
     opening = "Something is missing that the catalogue does not explain."
     if families:
         opening = f"A part was found ({found}), but something else is missing that the catalogue does not explain."
     if report["unknown"]:
-        learned = report["unknown"]
-        words = place_and_variables(learned["place"], learned["variables"])
         return (
-            f"{opening} A learned {words}, removes {_removed(before, after)} of the held-out error, which falls from "
-            f"{_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
+            f"{opening} A learned {_learned(report)}, removes {_removed(before, after)} of the held-out error, which "
+            f"falls from {_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
         )
     return (
         f"{opening} What is left over is {formatting.number(left['times_noise'])} times the measurement noise, and "
         f"depends most on the {left['depends_on']} (which accounts for "
         f"{formatting.percent(left['explained_share'])} of it)."
     )
+
+
+def _learned(report: Mapping[str, Any]) -> str:
+    return place_and_variables(report["unknown"]["place"], report["unknown"]["variables"])
 
 
 def _count(number: int) -> str:
