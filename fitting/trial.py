@@ -104,6 +104,8 @@ def attempt(
     """
     near = None if start is None else start.training
     training = trained(model, data, hold, setting, near, hold_parameters=hold_parameters)
+    # What the data say of them is asked all the same.
+    training = eqx.tree_at(lambda t: t.problem.active, training, jnp.ones_like(training.problem.active))
     return _judged(training, data, hold, setting)
 
 

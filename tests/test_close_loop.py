@@ -6,7 +6,7 @@ import pytest
 
 import rig
 from fitting.close_loop import Loop, close_loop
-from fitting.experiment import Experiment
+from fitting.experiment import Experiment, experiment_from_log
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
@@ -113,6 +113,21 @@ def test_a_drive_without_effects_suffices():
     assert clean.decision == "model_sufficient"
     assert clean.findings == ()
     assert float(clean.before.model.get("K")) == pytest.approx(rig.K, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_a_weight_that_outweighs_the_motor_is_found():
+    """No minimum of the base model is near the drive; from where it is held, the weight is found."""
+    torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
+    log = rig.drive_log(rig.drive_motion(torque, gravity=20.0), torque, noise=0.1)
+    found = drive_loop(experiment_from_log(log, hold="zero-order", N=rig.N))
+    assert found.decision == "effect_found"
+    (finding,) = found.findings
+    assert finding.name == "gravity_load" and float(finding.effect.sine) == pytest.approx(20.0, rel=1e-4)
+    assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=1e-4)
+    before = found.before.uncertainty.estimates["K"]
+    assert abs(before.value / rig.K - 1) < 0.02
+    assert before.std < rig.K
 
 
 def test_single_precision_is_refused():
