@@ -6,7 +6,9 @@ it has found.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -79,18 +81,7 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
 
-    def fitted(model: Model, *, max_steps: int = 60, hold_parameters: bool = False) -> Fit:
-        return fit(
-            model,
-            training,
-            base_paths(model),
-            horizon=horizon,
-            halo=halo,
-            substeps=substeps,
-            max_steps=max_steps,
-            hold_parameters=hold_parameters,
-        )
-
+    fitted = functools.partial(_fitted, training=training, horizon=horizon, halo=halo, substeps=substeps)
     if len(starts) > 1:
         starts = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
     best, begun = fitted(starts[0]), starts[0]
@@ -103,6 +94,11 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
             if other.objective < best.objective:
                 best, begun = other, start
     return best, begun
+
+
+def _fitted(model: Model, *, training: Sequence[Stretch], **options: Any) -> Fit:
+    """The fit of all that the model has of its own, from where it stands; options as for [`fitting.estimate.fit`][]."""
+    return fit(model, training, base_paths(model), **options)
 
 
 def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
@@ -120,18 +116,7 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
         return best
     horizon = segment_length(short_horizon(starts[0], training))
     substeps = suggested_substeps(starts[0], training)
-
-    def fitted(model: Model, *, hold_parameters: bool = False) -> Fit:
-        return fit(
-            model,
-            training,
-            base_paths(model),
-            horizon=horizon,
-            halo=halo,
-            substeps=substeps,
-            hold_parameters=hold_parameters,
-        )
-
+    fitted = functools.partial(_fitted, training=training, horizon=horizon, halo=halo, substeps=substeps)
     reach = drive.N * max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in training)
     loaded = fitted(starts[0].with_effects(SteadyLoad(reach=reach)))
     bare = loaded.model.without_effect(SteadyLoad.name)

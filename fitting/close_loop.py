@@ -209,10 +209,8 @@ def _base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Set
     chosen = min(trials, key=lambda t: t.training.objective)
     finer = setting.fine_enough(chosen.training)
     if finer is not setting:
-        setting, chosen = (
-            finer,
-            attempt(chosen.model, data, chosen.hold, finer, start=chosen, hold_parameters=is_held(best)),
-        )
+        chosen = attempt(chosen.model, data, chosen.hold, finer, start=chosen, hold_parameters=is_held(best))
+        setting = finer
     if np.mean(lost(chosen.training)) > _MOST_LOST:
         raise DataError(
             "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
