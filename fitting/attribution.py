@@ -15,7 +15,7 @@ from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, trained
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, long_gain, trained
 from fitting.uncertainty import Estimate, uncertainty
 from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
@@ -33,8 +33,10 @@ _BEST_OF_MANY = 3.9
 # Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
 # one finds the way.
 _HOLD_STEPS = 3
-# What can only be tied with the best must come as close as this share of its gain in its first pass.
+# What is tied with the best gains as much but for this share; so it must in its first pass to be worth another.
 _NEAR_TIE = 0.1
+# Gains that differ by less than this share are the same.
+_SAME_GAIN = 0.02
 # A rival that explains less than this share of what the best one so far does, in its first pass, is given up.
 _HOPELESS = 0.3
 
@@ -147,7 +149,8 @@ def look(
         gain = -np.inf if trial is None else trial.gain_over(before)
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    verdicts, accepted = _supported_first(_simplest_first(_with_separability(found)), before, base)
+    ordered = _simplest_first(_with_separability(found), before, data, setting)
+    verdicts, accepted = _supported_first(ordered, before, base)
     return Round(before, screened, tuple(verdicts), accepted)
 
 
@@ -314,15 +317,25 @@ def _p_worse(difference: np.ndarray) -> float:
     return float(np.asarray(wilcoxon(difference, alternative="greater"))[1])
 
 
-def _simplest_first(verdicts: list[Verdict]) -> list[Verdict]:
-    """Among competitors that can't be told apart, one with plausible values and the fewest parameters leads."""
+def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting: Setting) -> list[Verdict]:
+    """Among competitors that can't be told apart, one with plausible values and the fewest parameters leads, as long as
+    it gains nearly as much in free runs along whole stretches: short segments hide what adds up slowly."""
     tied = [v for v in verdicts if v.trial is not None and not v.separable]
-    if len(tied) < 2:
+    near = [v for v in tied if v.gain > (1.0 - _NEAR_TIE) * verdicts[0].gain - LEAST_GAIN]
+    if len(near) < 2:
         return verdicts
-    best_gain = verdicts[0].gain
-    close = [v for v in tied if v.gain > best_gain - max(LEAST_GAIN, 0.02 * best_gain)]
+    gains = _gains_told_apart(near, before, data, setting)
+    least = max(gains) - max(LEAST_GAIN, _SAME_GAIN * max(gains))
+    close = [v for v, gain in zip(near, gains, strict=True) if gain >= least]
     leader = min(close, key=lambda v: (_beyond_real_drives(v), _size(v), -v.gain))
     return [leader] + [v for v in verdicts if v is not leader]
+
+
+def _gains_told_apart(verdicts: list[Verdict], before: Trial, data: Data, setting: Setting) -> list[float]:
+    """Their gains in free runs, or over short segments where free runs tell nothing."""
+    gains = [long_gain(before, v.trial, data, setting) for v in verdicts if v.trial is not None]
+    told = [gain for gain in gains if gain is not None]
+    return told if len(told) == len(verdicts) else [v.gain for v in verdicts]
 
 
 def _beyond_real_drives(verdict: Verdict) -> bool:

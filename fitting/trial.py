@@ -248,13 +248,20 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial, data: Data, setti
     if not effect.states:
         return 1.0
     short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
+    long = long_gain(before, trial, data, setting)
+    return 1.0 if short <= 0.0 or long is None else float(np.clip(long / short, 0.0, 1.0))
+
+
+def long_gain(before: Trial, trial: Trial, data: Data, setting: Setting) -> float | None:
+    """What a trial gains over the model before it in free runs along whole held-out stretches: log of the ratio of
+    their errors. None where free runs tell nothing: neither follows the drive for long, or the model before runs away.
+    """
     old, new = (_free_runs(t, data, setting) for t in (before, trial))
     before_long, after_long = rms_error(old), rms_error(new)
     moves = float(np.std(np.concatenate([run.measured for run in old])))
-    # Where neither is followed for long, free runs tell nothing.
-    if short <= 0.0 or min(before_long, after_long) > 0.5 * moves:
-        return 1.0
-    return float(np.clip(np.log(before_long / after_long) / short, 0.0, 1.0))
+    if min(before_long, after_long) > 0.5 * moves or not np.isfinite(before_long):
+        return None
+    return float(np.log(before_long / after_long))
 
 
 def _free_runs(trial: Trial, data: Data, setting: Setting) -> tuple[FreeRun, ...]:

@@ -20,6 +20,7 @@ from hdjax.effects.creep import Creep
 from hdjax.effects.position import PositionDependentMotorFriction
 
 HOLD: Hold = "zero-order"
+SETTING = Setting(horizon=32, halo=4, substeps=2, count=8)
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,28 @@ def test_memory_that_stands_for_something_else_does_not_last(verdicts):
     before, found = verdicts
     creep = found["creep"]
     assert 0.0 <= creep.gain < 0.7 * short_gain(before, creep.trial)
+
+
+@pytest.mark.parametrize(
+    ("bias_long", "creep_long", "leader"),
+    [
+        (2.00, 2.01, "torque_bias"),  # the same: the simpler one
+        (1.00, 2.00, "creep"),
+        (2.00, 1.00, "torque_bias"),
+        (None, 2.00, "creep"),  # free runs tell nothing: what short segments tell
+        (-np.inf, -np.inf, "torque_bias"),
+    ],
+)
+def test_free_runs_tell_apart_what_short_segments_cannot(
+    verdicts, bias_long: float | None, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
+):
+    before, found = verdicts
+    gains = {"torque_bias": 0.95, "creep": 1.0}
+    tied = [Verdict(n, found[n].family, found[n].trial, g, 0.005, False) for n, g in gains.items()]
+    tied.sort(key=lambda v: -v.gain)
+    long = {id(found["torque_bias"].trial): bias_long, id(found["creep"].trial): creep_long}
+    monkeypatch.setattr(attribution, "long_gain", lambda before, trial, data, setting: long[id(trial)])
+    assert attribution._simplest_first(tied, before, {}, SETTING)[0].name == leader
 
 
 def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
