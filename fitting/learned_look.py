@@ -36,7 +36,10 @@ from hdjax.effects.learned import (
     Learned,
     LearnedMeshTorque,
     LearnedTorque,
+    PowerAxis,
+    SplineAxis,
     axis_over,
+    simple_axis,
 )
 
 # Parts that training data are left out in, in turn.
@@ -49,6 +52,8 @@ _WORTH_A_COEFFICIENT = 0.005
 _SAME_FUNCTION = 0.99
 # Motions that so few samples reach are no part of the range.
 _RARE = 5e-4
+# Points at which the curvature of powers is taken.
+_POINTS = 41
 # Instants of the motion that stand for the density of the data.
 _INSTANTS = 3000
 
@@ -121,8 +126,7 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
         own = _own_functions(seen, form)
 
         def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
-            axes = tuple(_axis(seen, n, b) for n, b in zip(variables, _others(variables), strict=True))
-            return _candidate(seen, form, variables, axes, own)
+            return _simplest(seen, form, variables, own)
 
         may = [n for n in seen.values if form.may_depend_on(n)]
         alone = [c for c in (look_at((n,)) for n in may) if c is not None]
@@ -139,9 +143,14 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
     return found
 
 
+def may_be_simpler(candidate: Candidate) -> bool:
+    """Whether a few powers might do in the place of a smooth function."""
+    return len(candidate.variables) == 1 and isinstance(candidate.effect.axes[0], SplineAxis)
+
+
 def looked_again(first: Candidate, seen: LearnedLook) -> Candidate | None:
-    """A candidate of the same place and variables, with as many coefficients as another look calls for."""
-    return _candidate(seen, first.form, first.variables, first.effect.axes, _own_functions(seen, first.form))
+    """A candidate of the same place and variables, with the coefficients that another look calls for."""
+    return _simplest(seen, first.form, first.variables, _own_functions(seen, first.form))
 
 
 def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
@@ -180,11 +189,11 @@ def _others(variables: tuple[str, ...]) -> tuple[str | None, ...]:
     return (None,) if len(variables) == 1 else (variables[1], variables[0])
 
 
-def _axis(seen: LearnedLook, variable: str, beside: str | None) -> Axis:
-    data = seen.values[variable][seen.weight > 0]
-    low, high = np.quantile(data, [_RARE, 1.0 - _RARE])
+def _range(seen: LearnedLook, variable: str) -> tuple[float, float]:
+    """Between which values the data have a quantity."""
+    low, high = np.quantile(seen.values[variable][seen.weight > 0], [_RARE, 1.0 - _RARE])
     reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
-    return axis_over(variable, float(low), float(low + reach), beside=beside)
+    return float(low), float(low + reach)
 
 
 def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
@@ -199,6 +208,26 @@ def _all_slopes(axis: Axis, values: Array) -> Array:
 @eqx.filter_jit
 def _all_functions(axis: Axis, values: Array) -> Array:
     return jax.vmap(jax.vmap(axis.functions))(values)
+
+
+def _simplest(
+    seen: LearnedLook,
+    form: type[Learned],
+    variables: tuple[str, ...],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> Candidate | None:
+    """One place and choice of variables: any smooth function, or a few powers where these explain as much with no more
+    coefficients."""
+    ranges = [_range(seen, name) for name in variables]
+    named = zip(variables, ranges, _others(variables), strict=True)
+    free = _candidate(seen, form, variables, tuple(axis_over(n, *r, beside=b) for n, r, b in named), own)
+    simple = simple_axis(variables[0], *ranges[0]) if len(variables) == 1 else None
+    if free is None or simple is None:
+        return free
+    powers = _candidate(seen, form, variables, (simple,), own)
+    if powers is None or len(powers.effect.c) > len(free.effect.c):
+        return free
+    return powers if powers.gain > free.gain - _WORTH_A_COEFFICIENT else free
 
 
 def _candidate(
@@ -276,14 +305,21 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
             order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
             parts.append(np.diag((2 * np.pi * order) ** 4))
         else:
-            bends = np.diff(np.eye(axis.count), 2, axis=0)
-            rises = np.diff(np.eye(axis.count), axis=0)
+            shapes = _on_even_points(axis) if isinstance(axis, PowerAxis) else np.eye(axis.count)
+            bends = np.diff(shapes, 2, axis=0)
+            rises = np.diff(shapes, axis=0)
             # The slope, counted little, puts the constant before the straight line.
             parts.append(axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises)
     total = np.zeros((1, 1))
     for part in parts:
         total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
     return total
+
+
+def _on_even_points(axis: PowerAxis) -> np.ndarray:
+    """Its functions where the data may have its quantity, a column each."""
+    values = float(axis.largest) * np.linspace(-1.0, 1.0, _POINTS)
+    return np.asarray(jax.vmap(axis.functions)(jnp.asarray(values)))
 
 
 def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:

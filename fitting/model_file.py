@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME, Effect
-from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, Learned, SplineAxis
+from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, Learned, PowerAxis, SplineAxis
 from hdjax.parameters import own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
@@ -82,20 +82,18 @@ def _learned_content(effect: Effect) -> dict[str, Any]:
     """What a learned function has beside its coefficients."""
     if not isinstance(effect, Learned):
         return {}
-    axes = [
-        {"variable": a.variable, "orders": a.orders}
-        if isinstance(a, AngleAxis)
-        else {
-            "variable": a.variable,
-            "low": float(a.low),
-            "high": float(a.high),
-            "bend": None if a.bend is None else float(a.bend),
-            "intervals": a.intervals,
-        }
-        for a in effect.axes
-        if isinstance(a, AngleAxis | SplineAxis)
-    ]
+    axes = [_axis_content(a) for a in effect.axes]
     return {"axes": axes, "mixing": np.asarray(effect.mixing).tolist()}
+
+
+def _axis_content(axis: Axis) -> dict[str, Any]:
+    own = {name: value for name, value in vars(axis).items() if value is not None}
+    return {n: v if isinstance(v, str | int) else float(v) for n, v in own.items()}
+
+
+def _axis(content: dict[str, Any]) -> Axis:
+    form = AngleAxis if "orders" in content else PowerAxis if "largest" in content else SplineAxis
+    return form(**content)
 
 
 def _effect(content: Any) -> Effect:
@@ -103,12 +101,14 @@ def _effect(content: Any) -> Effect:
     if content["name"] not in learned:
         return BY_NAME[content["name"]](**content["parameters"])
     form = learned[content["name"]]
-    axes: tuple[Axis, ...] = tuple(AngleAxis(**a) if "orders" in a else SplineAxis(**a) for a in content["axes"])
+    axes = tuple(_axis(a) for a in content["axes"])
     for axis in axes:
         if axis.variable not in UNITS or not form.may_depend_on(axis.variable) or axis.count > _MOST_FUNCTIONS:
             raise ValueError(f"{axis.variable} with {axis.count} functions")
         if isinstance(axis, SplineAxis) and not (axis.intervals >= 1 and axis.low < axis.high):
             raise ValueError(f"{axis.variable} from {axis.low} to {axis.high}")
+        if isinstance(axis, PowerAxis) and not axis.largest > 0:
+            raise ValueError(f"{axis.variable} up to {axis.largest}")
     mixing = jnp.asarray(content["mixing"], dtype=float)
     coefficients = tuple(content["parameters"][f"c_{i}"] for i in range(len(content["parameters"])))
     wanted = (math.prod(a.count for a in axes), len(coefficients))

@@ -14,7 +14,15 @@ from jaxtyping import Array, Float
 
 from fitting.attribution import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
-from fitting.learned_look import Candidate, LearnedLook, candidates, learned_look, looked_again, sizes_along
+from fitting.learned_look import (
+    Candidate,
+    LearnedLook,
+    candidates,
+    learned_look,
+    looked_again,
+    may_be_simpler,
+    sizes_along,
+)
 from fitting.linear_look import surrogate_gains
 from fitting.surrogates import surrogates
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
@@ -93,7 +101,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
                 best = candidate, trial
     if best is None:
         return None
-    if not leaves_white_noise(best[1].training):
+    if may_be_simpler(best[0]) or not leaves_white_noise(best[1].training):
         best = _refined(best, data, setting, progress)
     chosen, trial = best
     gain = before.held_out.objective - trial.held_out.objective
@@ -110,8 +118,8 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
 def _refined(
     best: tuple[Candidate, Trial], data: Data, setting: Setting, progress: Callable[[str], None]
 ) -> tuple[Candidate, Trial]:
-    """The same function with as many coefficients as a second look, along the motion that the first fit found, calls
-    for: the first look is but first order."""
+    """The same function with those coefficients, and as many, that a second look calls for, along the motion that the
+    first fit found: the first look is but first order."""
     first, trial = best
     again = looked_again(first, learned_look(trial.training))
     if again is None:

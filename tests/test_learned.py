@@ -27,10 +27,12 @@ from hdjax.effects.learned import (
     LearnedMeshError,
     LearnedMeshTorque,
     LearnedMotorTorque,
+    PowerAxis,
     SplineAxis,
     axis_over,
     combined,
     functions,
+    simple_axis,
 )
 
 
@@ -69,6 +71,21 @@ def test_beyond_the_data_a_spline_goes_on_straight():
     end, before, far = np.asarray(evaluated(axis, jnp.asarray([1.0, 1.0 - 1e-6, 4.0])))
     # Of a slope from a step of 1e-6, over three units.
     np.testing.assert_allclose(far, end + 3.0 * (end - before) / 1e-6, atol=1e-4)
+
+
+def test_powers_are_those_of_the_formula():
+    axis = simple_axis("v", -2.0, 1.0)
+    assert isinstance(axis, PowerAxis)
+    values = np.linspace(-3.0, 3.0, 7)
+    share = values / 2.0
+    wanted = np.stack([np.ones(7), share, share * np.abs(share), share**2, share**3], axis=1)
+    np.testing.assert_allclose(evaluated(axis, jnp.asarray(values)), wanted, rtol=1e-14)
+
+
+@pytest.mark.parametrize("variable", ["theta_m", "theta_l", "time", "temperature"])
+def test_nobody_knows_how_a_drift_goes_on(variable: str):
+    """And an angle comes back."""
+    assert simple_axis(variable, 0.0, 1.0) is None
 
 
 def test_rates_have_their_knots_near_zero():

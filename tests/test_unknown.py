@@ -5,12 +5,13 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 import rig
 from fitting.close_loop import Loop, close_loop
-from fitting.experiment import experiment_from_log, split
+from fitting.experiment import Stretch, experiment_from_log, split
 from fitting.free_run import free_run
 from fitting.learned_curve import LearnedCurve, learned_curve
 from fitting.model_file import StoredModel, read_model, to_json
@@ -25,7 +26,7 @@ from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.learned import LearnedMeshError
+from hdjax.effects.learned import LearnedMeshError, PowerAxis, SplineAxis
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, STEP = 1600, 4e-3
@@ -92,6 +93,8 @@ def test_a_function_of_one_variable_is_recovered(rubbing: Unknown):
     assert rubbing.chosen.variables == ("v",)
     curve = curve_of(rubbing)
     assert (curve.place, curve.known.shape[1]) == ("mesh", 1)
+    # No powers turn so sharply.
+    assert [type(axis) for axis in rubbing.chosen.effect.axes] == [SplineAxis]
     error, inside = misfit(curve, FRICTION[0] * np.tanh(curve.at[:, 0] / FRICTION[1]))
     assert error < 0.15
     assert inside > 0.8
@@ -111,6 +114,28 @@ def test_the_shape_is_named(rubbing: Unknown):
     assert best.families == ("coulomb_friction",)
     assert best.explained > 0.95
     assert [s.explained for s in found.closest] == sorted((s.explained for s in found.closest), reverse=True)
+
+
+def test_powers_go_on_beyond_the_data():
+    """A lopsided spring, and a log that twists it half as far again."""
+
+    def lopsided(x: float, v: float) -> float:
+        return 0.2 * rig.OMEGA_0**2 * x**2
+
+    found = found_of(lopsided)
+    assert is_supported(found) and found.chosen.variables == ("x",)
+    assert [type(axis) for axis in found.chosen.effect.axes] == [PowerAxis]
+    forcing = 1.5 * rig.reduced_forcing(COUNT, seed=1)
+    motion = hidden_motion(forcing, lopsided)
+    assert np.ptp(motion) > 1.3 * np.ptp(found.motion.x)
+    experiment = experiment_from_log(rig.reduced_log(motion, forcing, noise=NOISE, seed=1), hold="zero-order")
+
+    def error(trial: Trial) -> float:
+        (run,) = free_run(trial.model, [Stretch(experiment, 0, COUNT)], covariance=trial.training.covariance, halo=4)
+        return run.rmse
+
+    assert error(found.before) > 5 * NOISE
+    assert error(found.trial) < 1.5 * NOISE
 
 
 def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unknown):
@@ -254,6 +279,7 @@ def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     assert "friction" in report["summary"] and "More than noise is left" in report["summary"]
     assert report["unexplained"] is None and report["unknown"]["variables"] == ["x"]
     assert "What the learned torque looks like" in paths["report.html"].read_text()
+    assert eqx.tree_equal(read_model(paths["model.json"]).model, loop.after.model, rtol=1e-12)
 
 
 def test_a_report_without_one_says_so(loop: Loop):

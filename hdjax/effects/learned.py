@@ -83,6 +83,26 @@ class SplineAxis(Axis):
         return (far**3 - 4.0 * near**3) / 6.0 + (place - inside) * slope
 
 
+class PowerAxis(Axis):
+    """Powers of a quantity, which go on beyond the data as they do within.
+
+    Attributes:
+        variable: the quantity.
+        largest: its largest size in the data.
+    """
+
+    variable: str = eqx.field(static=True)
+    largest: Scalar = eqx.field(converter=as_scalar)
+
+    @property
+    def count(self) -> int:
+        return 5
+
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        share = value / self.largest
+        return jnp.stack([jnp.ones_like(share), share, share * jnp.abs(share), share**2, share**3])
+
+
 class AngleAxis(Axis):
     """One, and cosine and sine of the whole orders of an angle.
 
@@ -258,6 +278,20 @@ DRIFTS = ("time", "temperature")
 _RATES = ("v", "omega_m", "omega_l")
 # Share of the largest rate within which the knots are even.
 _NEAR_STANDSTILL = 0.005
+
+
+def simple_axis(variable: str, low: float, high: float) -> Axis | None:
+    """An axis of few functions that go on beyond the data, for a quantity which the data have between two values; None
+    for an angle, which comes back, and for what drifts, of which nobody knows how it goes on.
+
+    Args:
+        variable: the quantity.
+        low: smallest value.
+        high: largest value.
+    """
+    if variable in ANGLES or variable in DRIFTS:
+        return None
+    return PowerAxis(variable, largest=max(abs(low), abs(high)))
 
 
 def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:
