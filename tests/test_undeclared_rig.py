@@ -56,6 +56,11 @@ def test_smooth_effects_against_scipy():
         weight=1.5,
         weight_phase=0.3,
         tether=3.0,
+        lobes=0.7,
+        lobes_phase=0.9,
+        sag=0.1,
+        sag_speed=5.0,
+        drift=0.5,
         push=0.1,
         push_amplitude=np.array([0.5, 0.0]),
         push_rate=np.array([200.0, 0.0]),
@@ -72,12 +77,22 @@ def test_smooth_effects_against_scipy():
         e_b = (2e-4 * np.cos(2 * a + 0.7) + 1e-4 * np.cos(a - 0.4)) * -0.3 * np.sin(b + 0.2)
         x, v = a / 50 + e - b, w * (1 / 50 + e_a) + r * (e_b - 1)
         spring = 7000 * x + 3e5 * x**2 + 2e7 * x**3 + 1e12 * x**5 - 700 * x * np.exp(-((x / 4e-4) ** 2))
-        tau = spring * (1 - 1e-3 * heat) * (1 + 0.05 * np.cos(2 * a + 0.5)) + 0.3 * np.exp(-0.02 * heat) * v
+        spring = spring * (1 - 1e-3 * heat) - 0.1 * 7000 * x * w**2 / (w**2 + 25)
+        tau = spring * (1 + 0.05 * np.cos(2 * a + 0.5)) + 0.3 * np.exp(-0.02 * heat) * v
         tau += 2.0 * v**3 + 5e4 * x**2 * v + 300 * (x - z)
         reaction = 0.1 * np.sin(2 * a + 0.5) * (3500 * x**2 + 0.25 * 2e7 * x**4)
         third = 3000 * (b - c) + 0.2 * (r - q)
-        motor = s - (1 / 50 + e_a) * tau + reaction - 1e-3 * w + 0.02 * np.cos(4 * a)
-        load = (1 - e_b) * tau + 0.1 + 0.5 * np.sin(200 * t) - 0.05 * r - 3 * b - 1.5 * np.sin(b + 0.3) - third
+        motor = s - (1 / 50 + e_a) * tau + reaction - 1e-3 * w + 0.02 * np.cos(4 * a) + 0.5 * t
+        load = (
+            (1 - e_b) * tau
+            + 0.1
+            + 0.5 * np.sin(200 * t)
+            - 0.05 * r
+            - 3 * b
+            - 1.5 * np.sin(b + 0.3)
+            - 0.7 * np.sin(3 * b + 0.9)
+            - third
+        )
         return [w, motor / 5e-4, r, load / 5e-2, q, third / 0.01, (x - z) / 0.05, (0.95 * u + 0.02 - s) / 1e-3]
 
     states, commanded = integrate(p, START, torque, dt=DT, substeps=100, warm=np.full(60, heat))
@@ -114,7 +129,7 @@ def test_bouc_wen_and_bristles_against_scipy():
 
 
 def energy(p: Mechanism, states: np.ndarray) -> np.ndarray:
-    """Of a drive with any spring, wobbling teeth, stiffness ripple, weight, tether and third inertia [J]."""
+    """Of a drive with any spring, wobbling teeth, stiffness ripple, weight, tether, lobes and third inertia [J]."""
     a, w, b, r, c, q = states[:, :6].T
     x = a / p.ratio + 2e-4 * np.cos(2 * a) * (1 + p.wobble * np.cos(b)) * np.any(p.teeth) - b
     bent = np.maximum(np.abs(x) - p.gap, 0.0)
@@ -128,14 +143,14 @@ def energy(p: Mechanism, states: np.ndarray) -> np.ndarray:
         spring = 0.5 * p.k1 * bent**2 + 0.25 * p.k3 * bent**4
     spring = spring * (1 + p.ripple_k * np.cos(p.ripple_k_order * a + p.ripple_k_phase))
     moving = 0.5 * p.motor_inertia * w**2 + 0.5 * p.load_inertia * r**2 + 0.5 * p.third_inertia * q**2
-    held = 0.5 * p.tether * b**2 - p.weight * np.cos(b + p.weight_phase) + 0.5 * p.third_stiffness * (b - c) ** 2
-    return moving + spring + held
+    held = 0.5 * p.tether * b**2 - p.weight * np.cos(b + p.weight_phase) - p.lobes * np.cos(3 * b + p.lobes_phase) / 3
+    return moving + spring + held + 0.5 * p.third_stiffness * (b - c) ** 2
 
 
 CONSERVATIVE = {
     "teeth": table({2: (2e-4, 0.0)}) | {"wobble": 0.4},
     "ripple": {"ripple_k": 0.1, "ripple_k_phase": 0.3},
-    "load": {"weight": 2.0, "weight_phase": 0.4, "tether": 5.0},
+    "load": {"weight": 2.0, "weight_phase": 0.4, "tether": 5.0, "lobes": 1.0, "lobes_phase": 0.2},
     "third": {"third_inertia": 0.01, "third_stiffness": 3000.0},
     "gap": {"gap": 1e-4, "gap_damps": 0.0},
     "slopes": {"k3": 0.0, "slope_2": 9000.0, "slope_3": 12000.0, "knee_1": 4e-4, "knee_2": 9e-4},

@@ -51,11 +51,13 @@ def _spring(x, p):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mesh(x, v, phi, y, warm, p, out):
+def _mesh(x, v, phi, w, y, warm, p, out):
     """Torque between the sides, and what its change with the motor angle does to the motor; its memory's rates."""
     torque = _spring(x, p)
     if p.warm_k != 0.0:
         torque *= 1.0 + p.warm_k * warm
+    if p.sag != 0.0:
+        torque -= p.sag * p.k1 * x * w * w / (w * w + p.sag_speed * p.sag_speed)
     reaction = 0.0
     if p.ripple_k != 0.0:
         angle = p.ripple_k_order * phi + p.ripple_k_phase
@@ -127,8 +129,8 @@ def _pulls(t, y, u, brake, warm, p, out):
     over_motor = 1.0 / p.ratio + de * swing
     over_load = 1.0 + e * p.wobble * math.sin(lam + p.wobble_phase)
     x = phi / p.ratio + e * swing - lam
-    torque, reaction = _mesh(x, w * over_motor - r * over_load, phi, y, warm, p, out)
-    motor = acting - over_motor * torque + reaction - w * (p.drag_m + p.windage * abs(w))
+    torque, reaction = _mesh(x, w * over_motor - r * over_load, phi, w, y, warm, p, out)
+    motor = acting + p.drift * t - over_motor * torque + reaction - w * (p.drag_m + p.windage * abs(w))
     for i in range(3):
         if p.cog[i] != 0.0:
             motor += p.cog[i] * math.cos(p.cog_order[i] * phi + p.cog_phase[i])
@@ -138,6 +140,8 @@ def _pulls(t, y, u, brake, warm, p, out):
     load = over_load * torque + brake + p.push - p.drag_l * r - p.tether * lam
     if p.weight != 0.0:
         load -= p.weight * math.sin(lam + p.weight_phase)
+    if p.lobes != 0.0:
+        load -= p.lobes * math.sin(3.0 * lam + p.lobes_phase)
     for i in range(2):
         if p.push_amplitude[i] != 0.0:
             load += p.push_amplitude[i] * math.sin(p.push_rate[i] * t + p.push_phase[i])

@@ -327,6 +327,26 @@ def _windage(s, random, base):
     return {"windage": s * base.motor_inertia}
 
 
+def _tether(s, random, base):
+    """Strength: its stiffness over K."""
+    return {"tether": s * base.k1}
+
+
+def _lobes(s, random, base):
+    """Strength: share of the load torque."""
+    return {"lobes": s * base.load_torque, "lobes_phase": _phase(random)}
+
+
+def _sag(s, random, base):
+    """Strength: share of K that a fast motor loses."""
+    return {"sag": s, "sag_speed": _between(random, 3.0, 30.0)}
+
+
+def _drift(s, random, base):
+    """Strength: share of the motor torque in a second."""
+    return {"drift": _sign(random) * s * base.motor_torque}
+
+
 FORMS = (
     Form("kinematic_error", "two lobes", 7.5e-5, 2.9e-4, _teeth({2: 1.0})),
     Form("kinematic_error", "orders 1, 2, 4", 7.5e-5, 2.9e-4, _teeth({2: 1.0, 1: 0.4, 4: 0.3})),
@@ -384,7 +404,10 @@ FORMS = (
     Form("creep", "one time", 0.01, 0.1, _creep(False)),
     Form("creep", "two times", 0.01, 0.08, _creep(True), ("K", "B_sp")),
     Form("unknown", "windage of the motor", 0.01, 0.3, _windage),
-    Form("unknown", "tethered load", 1e-4, 3e-3, lambda s, random, base: {"tether": s * base.k1}),
+    Form("unknown", "tethered load", 1e-4, 3e-3, _tether),
+    Form("unknown", "three lobes on the load", 0.03, 0.6, _lobes),
+    Form("unknown", "stiffness that sags with speed", 0.02, 0.2, _sag),
+    Form("unknown", "drifting torque", 0.01, 0.2, _drift),
 )
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))

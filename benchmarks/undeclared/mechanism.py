@@ -35,7 +35,7 @@ class Mechanism(NamedTuple):
     lag: float = 0.0
     ramp: float = 0.0
     # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; drag,
-    # windage; cogging lines.
+    # windage; a torque that drifts [N m/s]; cogging lines.
     hold_m: float = 0.0
     slide_m: float = 0.0
     sink_m: float = 1.0
@@ -47,6 +47,7 @@ class Mechanism(NamedTuple):
     bristle_drag_m: float = 0.0
     drag_m: float = 0.0
     windage: float = 0.0
+    drift: float = 0.0
     cog: np.ndarray = _NONE_3
     cog_order: np.ndarray = _NONE_3
     cog_phase: np.ndarray = _NONE_3
@@ -55,7 +56,8 @@ class Mechanism(NamedTuple):
     teeth_slope: np.ndarray = np.zeros(KNOTS)
     wobble: float = 0.0
     wobble_phase: float = 0.0
-    # Spring: gap, other powers, lopsidedness, soft centre, three slopes, ripple over the motor angle.
+    # Spring: gap, other powers, lopsidedness, soft centre, three slopes, ripple over the motor's angle, sag with its
+    # speed.
     gap: float = 0.0
     gap_damps: float = 1.0
     k2: float = 0.0
@@ -71,6 +73,8 @@ class Mechanism(NamedTuple):
     ripple_k_order: float = 2.0
     ripple_k_phase: float = 0.0
     ripple_k_reacts: float = 1.0
+    sag: float = 0.0
+    sag_speed: float = 1.0
     # Losses of the mesh: dry with a sharp sign (saturated within rub_rate), growing with load, rippled; powers of rate.
     rub: float = 0.0
     rub_load: float = 0.0
@@ -93,7 +97,7 @@ class Mechanism(NamedTuple):
     # Heat, per kelvin above the reference.
     warm_k: float = 0.0
     warm_c: float = 0.0
-    # Load: friction likewise, weight, tether to the ground, unlogged pushes, a third inertia.
+    # Load: friction likewise, weight, tether to the ground, three lobes in a turn, unlogged pushes, a third inertia.
     hold_l: float = 0.0
     slide_l: float = 0.0
     sink_l: float = 1.0
@@ -103,6 +107,8 @@ class Mechanism(NamedTuple):
     weight: float = 0.0
     weight_phase: float = 0.0
     tether: float = 0.0
+    lobes: float = 0.0
+    lobes_phase: float = 0.0
     push: float = 0.0
     push_amplitude: np.ndarray = _NONE_2
     push_rate: np.ndarray = _NONE_2
