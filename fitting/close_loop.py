@@ -31,8 +31,10 @@ Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 _EXCESS = 1.5
 # Share of segments in which the base model may run away.
 _MOST_LOST = 0.5
-# Share of the unexplained variance that found effects must remove to be called the explanation.
-_EXPLAINED = 0.75
+# Share of the unexplained variance that found effects must remove to be called the explanation: two thirds of its rms.
+_EXPLAINED = 0.9
+# Share of a learned torque's mean square that named effects must make up for it to have come out as them.
+_COME_OUT = 0.75
 # A learned torque that adds less than this share to the gain of named effects casts no doubt on them.
 _LITTLE = 0.05
 
@@ -159,14 +161,13 @@ def close_loop(
         before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
 
     def rmse_of(trial: Trial) -> float:
+        if trial is base:
+            return before.validation_rmse
         return validation_rmse(trial.training, *data[trial.hold], noise=noise, halo=setting.halo)
 
-    by_name = after.validation_rmse
-    if unknown is not None:
-        by_name = before.validation_rmse if trusted is base else rmse_of(trusted)
-    if trusted is not named:
-        without = {}
-    findings = _findings(base, trusted, after.model, rounds, without, data, setting, before, by_name, rmse_of)
+    by_name = after.validation_rmse if unknown is None else rmse_of(trusted)
+    rmse_without = {} if trusted is base else {name: rmse_of(trial) for name, trial in without.items()}
+    findings = _findings(rounds, after.model, by_name, rmse_without)
     if unknown is not None:
         findings = (*findings, _unknown_finding(unknown, after, by_name))
     clock.lap("free runs")
@@ -231,8 +232,7 @@ def _add_effects(
 ) -> tuple[Trial, tuple[Round, ...], tuple[str, ...], dict[str, Trial]]:
     """Add the best effect, refit, look again; then drop what a later effect has made superfluous.
 
-    Returns the model, the rounds, the names of what was dropped, and the model without each of its effects as far as
-    that was fitted.
+    Returns the model, the rounds, the names of what was dropped, and the model without each of what was kept.
     """
     current, rounds = base, []
     found = 0
@@ -259,18 +259,26 @@ def _add_effects(
         progress(f"found {this.winner.name}")
     dropped = []
     without = {}
-    names = [e.name for e in current.model.effects]
-    for name in names[:-1]:
+    for name in [e.name for e in current.model.effects][:-1]:
         poorer = attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
         if poorer.held_out.objective - current.held_out.objective < LEAST_GAIN:
             dropped.append(name)
             current, without = poorer, {}
         else:
             without[name] = poorer
-    if not dropped:
-        last = next((this for this in reversed(rounds) if this.accepted), None)
-        without |= {} if last is None else {last.winner.name: last.before}
+    kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
+    if kept and not dropped:
+        without[kept[-1].winner.name] = kept[-1].before
+    for name in (this.winner.name for this in kept if this.winner.name not in without):
+        without[name] = base if len(kept) == 1 else _without(name, current, base, data, setting)
     return current, tuple(rounds), tuple(dropped), without
+
+
+def _without(name: str, current: Trial, base: Trial, data: Data, setting: Setting) -> Trial:
+    """The model refitted without one of its effects, or under the base model's hold where that is the effect."""
+    if name in {e.name for e in current.model.effects}:
+        return attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
+    return attempt(current.model, data, base.hold, setting, start=current)
 
 
 def _what_is_unknown(
@@ -296,7 +304,7 @@ def _what_is_unknown(
         return named, beside
     if beside.trial.held_out.objective < instead.trial.held_out.objective - LEAST_GAIN:
         return named, beside
-    if named.hold == base.hold and share_of(named.model, instead) >= _EXPLAINED:
+    if named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT:
         return named, beside
     return base, instead
 
@@ -314,38 +322,16 @@ def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[A
 
 
 def _findings(
-    base: Trial,
-    trusted: Trial,
-    final: Model,
-    rounds: Sequence[Round],
-    without: Mapping[str, Trial],
-    data: Data,
-    setting: Setting,
-    before: Account,
-    rmse: float,
-    rmse_of: Callable[[Trial], float],
+    rounds: Sequence[Round], final: Model, rmse: float, rmse_without: Mapping[str, float]
 ) -> tuple[Finding, ...]:
     """The accepted effects with their final values, each with what the held-out error would be without it in place of
-    `rmse`; `without` holds the models without one of them that are fitted already."""
-    names = [e.name for e in trusted.model.effects]
-    changed_hold = trusted.hold != base.hold
-    found = []
-    for this in rounds:
-        winner = this.winner
-        is_hold = winner.name.endswith(" hold")
-        if not this.accepted or not (winner.name in names or (is_hold and changed_hold)):
-            continue
-        if len(names) + changed_hold == 1:
-            poorer = before.validation_rmse
-        elif winner.name in without:
-            poorer = rmse_of(without[winner.name])
-        elif is_hold:
-            poorer = rmse_of(attempt(trusted.model, data, base.hold, setting, start=trusted))
-        else:
-            model = trusted.model.without_effect(winner.name)
-            poorer = rmse_of(attempt(model, data, trusted.hold, setting, start=trusted))
-        effect = None if is_hold else final.effect(winner.name)
-        found.append(Finding(effect, winner.name, winner.family, 1.0 - rmse / poorer, winner.p_value))
+    `rmse`; those that were not kept are not in `rmse_without`."""
+    effects = {e.name: e for e in final.effects}
+    found = [
+        Finding(effects.get(w.name), w.name, w.family, 1.0 - rmse / rmse_without[w.name], w.p_value)
+        for w in (this.winner for this in rounds if this.accepted)
+        if w.name in rmse_without
+    ]
     return tuple(sorted(found, key=lambda f: -f.validation_gain))
 
 
