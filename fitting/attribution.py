@@ -348,6 +348,7 @@ def _beyond_real_drives(verdict: Verdict) -> bool:
     return any(info.implausibly_large(float(value)) for value, info in own)
 
 
-def _size(verdict: Verdict) -> int:
+def _size(verdict: Verdict) -> tuple[int, int]:
+    """How many parameters a competitor has, and how many states."""
     assert verdict.trial is not None
-    return len(verdict.trial.training.free.paths)
+    return len(verdict.trial.training.free.paths), len(verdict.trial.model.state_names)

@@ -15,9 +15,12 @@ from fitting.posing import segment_length
 from fitting.trial import Setting, Trial, attempt, halo_for
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
+from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
+from hdjax.effects.friction import MotorFriction
 from hdjax.effects.position import PositionDependentMotorFriction
+from hdjax.effects.presliding import DahlMotorFriction
 
 HOLD: Hold = "zero-order"
 SETTING = Setting(horizon=32, halo=4, substeps=2, count=8)
@@ -74,6 +77,21 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
     long = {id(found["torque_bias"].trial): bias_long, id(found["creep"].trial): creep_long}
     monkeypatch.setattr(attribution, "long_gain", lambda before, trial, data, setting: long[id(trial)])
     assert attribution._simplest_first(tied, before, {}, SETTING)[0].name == leader
+
+
+def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monkeypatch: pytest.MonkeyPatch):
+    _, found = verdicts
+    monkeypatch.setattr(attribution, "long_gain", lambda before, trial, data, setting: 1.0)
+
+    def verdict(effect: Effect) -> Verdict:
+        model = rig.drive_model().with_effects(effect)
+        trial = eqx.tree_at(lambda t: t.model, found["torque_bias"].trial, model)
+        return Verdict(effect.name, effect.family, trial, 1.0, 0.005, False)
+
+    dahl, dry = DahlMotorFriction(T_c=0.1, bend=0.1, settling=1e-3), MotorFriction(T_c=0.1, transition=0.1)
+    assert len(effect_paths(dahl)) == len(effect_paths(dry))
+    ordered = attribution._simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, {}, SETTING)
+    assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 
 def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
