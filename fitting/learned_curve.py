@@ -13,7 +13,7 @@ from fitting.uncertainty import Uncertainty
 from fitting.unknown import Unknown
 from hdjax import Model
 from hdjax.effects import Motion
-from hdjax.effects.learned import ANGLES, LEARNED, Learned, LearnedTorque, functions
+from hdjax.effects.learned import LEARNED, AngleAxis, Learned, LearnedTorque, functions
 
 PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load", "mesh angle"), strict=True))
 """Where each learned function acts."""
@@ -70,8 +70,8 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     assert isinstance(effect, Learned)
     covariance = _covariance(uncertainty, name)
     values = np.stack([np.asarray(getattr(found.motion, v)) for v in found.chosen.variables], axis=1)
-    for column, variable in zip(values.T, found.chosen.variables, strict=True):
-        if variable in ANGLES and np.ptp(column) > 2 * np.pi:
+    for column, axis in zip(values.T, effect.axes, strict=True):
+        if isinstance(axis, AngleAxis) and np.ptp(column) > 2 * np.pi:
             column[:] = np.mod(column, 2 * np.pi)
     points = _POINTS[values.shape[1]]
     grid = tuple(np.linspace(*_range(column), points) for column in values.T)

@@ -216,8 +216,8 @@ def _simplest(
     variables: tuple[str, ...],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
-    """One place and choice of variables: any smooth function, or a few powers where these explain as much with no more
-    coefficients."""
+    """One place and choice of variables: any smooth function, of any period, or a few powers where these explain as
+    much with no more coefficients."""
     ranges = [_range(seen, name) for name in variables]
     named = zip(variables, ranges, _others(variables), strict=True)
     free = _candidate(seen, form, variables, tuple(axis_over(n, *r, beside=b) for n, r, b in named), own)

@@ -129,6 +129,10 @@ def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:
             times = "" if n == 1 else f"{n} "
             labels = (f"cos({times}{variable})", f"sin({times}{variable})")
             yield form("order", labels, np.cos(n * values), np.sin(n * values))
+        if variable == "theta_l":
+            # What ties the load to the ground does not come back after a turn.
+            yield form("linear", (variable,), values)
+            yield form("odd", (f"{variable}^3",), values**3)
         return
     if variable in DRIFTS:
         middle = float(np.mean(values))

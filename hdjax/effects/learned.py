@@ -282,14 +282,16 @@ _NEAR_STANDSTILL = 0.005
 
 def simple_axis(variable: str, low: float, high: float) -> Axis | None:
     """An axis of few functions that go on beyond the data, for a quantity which the data have between two values; None
-    for an angle, which comes back, and for what drifts, of which nobody knows how it goes on.
+    for the motor's angle, which comes back, and for what drifts, of which nobody knows how it goes on.
+
+    The load's angle comes back as well, but what is tied to the load need not.
 
     Args:
         variable: the quantity.
         low: smallest value.
         high: largest value.
     """
-    if variable in ANGLES or variable in DRIFTS:
+    if variable == "theta_m" or variable in DRIFTS:
         return None
     return PowerAxis(variable, largest=max(abs(low), abs(high)))
 
