@@ -65,6 +65,7 @@ def drive_motion(
     torque_bias: float = 0.0,
     kinematic: tuple[float, float] = (0.0, 0.0),
     gravity: float = 0.0,
+    tether: float = 0.0,
     gap: float = 0.0,
     step: float = STEP,
     substeps: int = 6,
@@ -82,6 +83,7 @@ def drive_motion(
         torque_bias: what acts beyond the logged torque [N m].
         kinematic: cosine and sine part of a second-order kinematic error [rad].
         gravity: m g r of the load [N m].
+        tether: stiffness of a spring from the load to the ground [N m/rad].
         gap: half-width of the dead zone in the mesh [rad].
         step: sampling interval [s].
         substeps: Runge-Kutta steps in each.
@@ -97,7 +99,7 @@ def drive_motion(
         spring = x - min(max(x, -gap), gap)
         tau = stiffness * (spring + alpha * spring**3) + damping * v + T_mesh * math.tanh(v / v_0)
         on_motor = T + torque_bias - T_motor * math.tanh(omega_m / w_0) - (1 / N + slope) * tau
-        return omega_m, omega_l, on_motor / J_M, (tau - gravity * math.sin(theta_l)) / J_L
+        return omega_m, omega_l, on_motor / J_M, (tau - gravity * math.sin(theta_l) - tether * theta_l) / J_L
 
     return rk4(rates, state, torque, step, substeps)
 
