@@ -117,7 +117,7 @@ class _Score(eqx.Module):
         gram: of the projected columns: of what was free already, then of strengths.
         gradient: columns against the residual.
         surrogate_gradients: columns against each surrogate.
-        rows: number of measured values.
+        rows: number of measured values, at least one.
     """
 
     gram: np.ndarray
@@ -128,7 +128,8 @@ class _Score(eqx.Module):
 
 def _score(sight: Sight, forces: Regressors) -> _Score:
     seen = sight.seen
-    rows = float(np.sum(seen.segments.weight)) * sight.residual.shape[-1]
+    # Where the model runs away in every segment, nothing is told.
+    rows = max(float(np.sum(seen.segments.weight)) * sight.residual.shape[-1], 1.0)
     products = _inner_products(
         sight.found, seen.followed, seen.segments, sight.whitening, forces, sight.residual, sight.surrogates
     )
