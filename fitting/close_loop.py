@@ -287,8 +287,8 @@ def _what_is_unknown(
     """The model whose names can be trusted, and the torque that is learned beside them.
 
     A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
-    as one beside it does, and does not come out as the named effect; so are several names that make up such a torque,
-    where it is simpler than they are. What a learned torque beside it hardly betters is in no doubt.
+    as one beside it does, and either does not come out as the named effect or does better still with fewer parameters.
+    What a learned torque beside it hardly betters is in no doubt.
     """
     if leaves_white_noise(named.training):
         return named, None
@@ -305,13 +305,9 @@ def _what_is_unknown(
     if beside.trial.held_out.objective < instead.trial.held_out.objective - LEAST_GAIN:
         return named, beside
     come_out = named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT
-    # One function that takes fewer parameters than several names and what is left beside them is what they stand for.
-    simpler = len(named.model.effects) > 1 and _parameters(instead) < _parameters(beside)
-    return (named, beside) if come_out and not simpler else (base, instead)
-
-
-def _parameters(learned: Unknown) -> int:
-    return len(learned.trial.training.free.paths)
+    better = beside.trial.held_out.objective - instead.trial.held_out.objective > _LITTLE * instead.gain
+    fewer = len(instead.trial.training.free.paths) < len(beside.trial.training.free.paths)
+    return (named, beside) if come_out and not (better and fewer) else (base, instead)
 
 
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:

@@ -52,8 +52,8 @@ _WORTH_A_COEFFICIENT = 0.005
 _SAME_FUNCTION = 0.99
 # Motions that so few samples reach are no part of the range.
 _RARE = 5e-4
-# Points at which the curvature of powers is taken.
-_POINTS = 41
+# What the functions of a `PowerAxis` count as rough: so much apart that they come in the order of their degree.
+_ROUGHNESS_OF_POWERS = (0.0, 1e-8, 1.0, 1.0, 1e4)
 # Instants of the motion that stand for the density of the data.
 _INSTANTS = 3000
 
@@ -304,22 +304,17 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
         if isinstance(axis, AngleAxis):
             order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
             parts.append(np.diag((2 * np.pi * order) ** 4))
+        elif isinstance(axis, PowerAxis):
+            parts.append(np.diag(_ROUGHNESS_OF_POWERS))
         else:
-            shapes = _on_even_points(axis) if isinstance(axis, PowerAxis) else np.eye(axis.count)
-            bends = np.diff(shapes, 2, axis=0)
-            rises = np.diff(shapes, axis=0)
+            bends = np.diff(np.eye(axis.count), 2, axis=0)
+            rises = np.diff(np.eye(axis.count), axis=0)
             # The slope, counted little, puts the constant before the straight line.
             parts.append(axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises)
     total = np.zeros((1, 1))
     for part in parts:
         total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
     return total
-
-
-def _on_even_points(axis: PowerAxis) -> np.ndarray:
-    """Its functions where the data may have its quantity, a column each."""
-    values = float(axis.largest) * np.linspace(-1.0, 1.0, _POINTS)
-    return np.asarray(jax.vmap(axis.functions)(jnp.asarray(values)))
 
 
 def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:

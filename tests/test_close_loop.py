@@ -130,6 +130,19 @@ def test_a_weight_that_outweighs_the_motor_is_found():
     assert before.std < rig.K
 
 
+@pytest.mark.slow
+def test_a_spring_to_the_ground_is_no_weight():
+    """The catalogue lacks it: a weight and what stands beside it come near, and one simple function nearer."""
+    torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
+    log = rig.drive_log(rig.drive_motion(torque, tether=2.0), torque, noise=0.1)
+    found = drive_loop(experiment_from_log(log, hold="zero-order", N=rig.N))
+    assert found.decision == "unexplained" and found.unknown is not None
+    chosen = found.unknown.chosen
+    assert (chosen.form.name, chosen.variables) == ("learned_load_torque", ("theta_l",))
+    assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=1e-3)
+    assert found.after.validation_rmse < 0.01 * found.before.validation_rmse
+
+
 def test_single_precision_is_refused():
     experiment = rig.reduced_experiment(200)
     jax.config.update("jax_enable_x64", False)
