@@ -52,8 +52,8 @@ _WORTH_A_COEFFICIENT = 0.005
 _SAME_FUNCTION = 0.99
 # Motions that so few samples reach are no part of the range.
 _RARE = 5e-4
-# What the functions of a `PowerAxis` count as rough: so much apart that they come in the order of their degree.
-_ROUGHNESS_OF_POWERS = (0.0, 1e-8, 1.0, 1.0, 1e4)
+# What the functions of a `PowerAxis` count as rough: so much apart that they come one by one, by their degree.
+_ROUGHNESS_OF_POWERS = (0.0, 1e-8, 1.0, 1e-4, 1e4)
 # Instants of the motion that stand for the density of the data.
 _INSTANTS = 3000
 
@@ -244,7 +244,10 @@ def _candidate(
     parameters = own.shape[2] - _coefficients(seen.look.model, form)
     known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants][:, :parameters])
     sizes = _SIZES[len(variables)]
-    mixing = _smooth_first(flat, known, _roughness(axes))[:, : max(sizes)]
+    roughness = _roughness(axes)
+    if isinstance(axes[0], PowerAxis):
+        roughness = _but_for(known, flat, roughness)
+    mixing = _smooth_first(flat, known, roughness)[:, : max(sizes)]
     if mixing.shape[1] == 0:
         return None
     # One width, one program.
@@ -315,6 +318,13 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
     for part in parts:
         total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
     return total
+
+
+def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """The penalty, where any part of what is known already costs nothing: it is among the functions."""
+    own = np.linalg.lstsq(raw, known / np.sqrt(np.mean(known**2, axis=0)), rcond=1e-10)[0]
+    pulled = roughness @ own
+    return roughness - pulled @ np.linalg.pinv(own.T @ pulled, hermitian=True) @ pulled.T
 
 
 def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
