@@ -15,7 +15,7 @@ from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, long_gain, trained
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, long_gains, trained
 from fitting.uncertainty import Estimate, uncertainty
 from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
@@ -324,18 +324,12 @@ def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting:
     near = [v for v in tied if v.gain > (1.0 - _NEAR_TIE) * verdicts[0].gain - LEAST_GAIN]
     if len(near) < 2:
         return verdicts
-    gains = _gains_told_apart(near, before, data, setting)
+    trials = [v.trial for v in near if v.trial is not None]
+    gains = long_gains(before, trials, data, setting) or [v.gain for v in near]
     least = max(gains) - max(LEAST_GAIN, _SAME_GAIN * max(gains))
     close = [v for v, gain in zip(near, gains, strict=True) if gain >= least]
     leader = min(close, key=lambda v: (_beyond_real_drives(v), _size(v), -v.gain))
     return [leader] + [v for v in verdicts if v is not leader]
-
-
-def _gains_told_apart(verdicts: list[Verdict], before: Trial, data: Data, setting: Setting) -> list[float]:
-    """Their gains in free runs, or over short segments where free runs tell nothing."""
-    gains = [long_gain(before, v.trial, data, setting) for v in verdicts if v.trial is not None]
-    told = [gain for gain in gains if gain is not None]
-    return told if len(told) == len(verdicts) else [v.gain for v in verdicts]
 
 
 def _beyond_real_drives(verdict: Verdict) -> bool:

@@ -35,7 +35,8 @@ _MOST_LOST = 0.5
 _EXPLAINED = 0.9
 # Share of a learned torque's mean square that named effects must make up for it to have come out as them.
 _COME_OUT = 0.75
-# A learned torque that adds less than this share to the gain of named effects casts no doubt on them.
+# A learned torque that adds less than this share to the gain of named effects casts no doubt on them; one in their
+# place must do better by this share of its own gain to outdo them.
 _LITTLE = 0.05
 
 
@@ -260,7 +261,7 @@ def _add_effects(
     dropped = []
     without = {}
     for name in [e.name for e in current.model.effects][:-1]:
-        poorer = attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
+        poorer = _without(name, current, base, data, setting)
         if poorer.held_out.objective - current.held_out.objective < LEAST_GAIN:
             dropped.append(name)
             current, without = poorer, {}
@@ -302,12 +303,13 @@ def _what_is_unknown(
     instead = learn(base, data, setting, seed=seed, progress=progress)
     if instead is None or not is_supported(instead):
         return named, beside
-    if beside.trial.held_out.objective < instead.trial.held_out.objective - LEAST_GAIN:
+    better_by = beside.trial.held_out.objective - instead.trial.held_out.objective
+    if better_by < -LEAST_GAIN:
         return named, beside
     come_out = named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT
-    better = beside.trial.held_out.objective - instead.trial.held_out.objective > _LITTLE * instead.gain
     fewer = len(instead.trial.training.free.paths) < len(beside.trial.training.free.paths)
-    return (named, beside) if come_out and not (better and fewer) else (base, instead)
+    simpler = fewer and better_by > _LITTLE * instead.gain
+    return (named, beside) if come_out and not simpler else (base, instead)
 
 
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:

@@ -248,20 +248,22 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial, data: Data, setti
     if not effect.states:
         return 1.0
     short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
-    long = long_gain(before, trial, data, setting)
-    return 1.0 if short <= 0.0 or long is None else float(np.clip(long / short, 0.0, 1.0))
+    long = long_gains(before, [trial], data, setting)
+    return 1.0 if short <= 0.0 or long is None else float(np.clip(long[0] / short, 0.0, 1.0))
 
 
-def long_gain(before: Trial, trial: Trial, data: Data, setting: Setting) -> float | None:
-    """What a trial gains over the model before it in free runs along whole held-out stretches: log of the ratio of
-    their errors. None where free runs tell nothing: neither follows the drive for long, or the model before runs away.
+def long_gains(before: Trial, trials: Sequence[Trial], data: Data, setting: Setting) -> list[float] | None:
+    """What trials gain over the model before them in free runs along whole held-out stretches: logs of the ratios of
+    the errors. None where free runs tell nothing: the model before runs away, or neither it nor one of the trials
+    follows the drive for long.
     """
-    old, new = (_free_runs(t, data, setting) for t in (before, trial))
-    before_long, after_long = rms_error(old), rms_error(new)
+    old = _free_runs(before, data, setting)
+    before_long = rms_error(old)
+    after_long = [rms_error(_free_runs(trial, data, setting)) for trial in trials]
     moves = float(np.std(np.concatenate([run.measured for run in old])))
-    if min(before_long, after_long) > 0.5 * moves or not np.isfinite(before_long):
+    if not np.isfinite(before_long) or min(before_long, max(after_long)) > 0.5 * moves:
         return None
-    return float(np.log(before_long / after_long))
+    return [float(np.log(before_long / after)) for after in after_long]
 
 
 def _free_runs(trial: Trial, data: Data, setting: Setting) -> tuple[FreeRun, ...]:

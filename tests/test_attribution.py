@@ -75,13 +75,18 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
     tied = [Verdict(n, found[n].family, found[n].trial, g, 0.005, False) for n, g in gains.items()]
     tied.sort(key=lambda v: -v.gain)
     long = {id(found["torque_bias"].trial): bias_long, id(found["creep"].trial): creep_long}
-    monkeypatch.setattr(attribution, "long_gain", lambda before, trial, data, setting: long[id(trial)])
+
+    def long_gains(before, trials, data, setting):
+        gains = [long[id(trial)] for trial in trials]
+        return None if None in gains else gains
+
+    monkeypatch.setattr(attribution, "long_gains", long_gains)
     assert attribution._simplest_first(tied, before, {}, SETTING)[0].name == leader
 
 
 def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monkeypatch: pytest.MonkeyPatch):
     _, found = verdicts
-    monkeypatch.setattr(attribution, "long_gain", lambda before, trial, data, setting: 1.0)
+    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, data, setting: [1.0] * len(trials))
 
     def verdict(effect: Effect) -> Verdict:
         model = rig.drive_model().with_effects(effect)

@@ -83,16 +83,8 @@ def test_smooth_effects_against_scipy():
         reaction = 0.1 * np.sin(2 * a + 0.5) * (3500 * x**2 + 0.25 * 2e7 * x**4)
         third = 3000 * (b - c) + 0.2 * (r - q)
         motor = s - (1 / 50 + e_a) * tau + reaction - 1e-3 * w + 0.02 * np.cos(4 * a) + 0.5 * t
-        load = (
-            (1 - e_b) * tau
-            + 0.1
-            + 0.5 * np.sin(200 * t)
-            - 0.05 * r
-            - 3 * b
-            - 1.5 * np.sin(b + 0.3)
-            - 0.7 * np.sin(3 * b + 0.9)
-            - third
-        )
+        held = 3 * b + 1.5 * np.sin(b + 0.3) + 0.7 * np.sin(3 * b + 0.9)
+        load = (1 - e_b) * tau + 0.1 + 0.5 * np.sin(200 * t) - 0.05 * r - held - third
         return [w, motor / 5e-4, r, load / 5e-2, q, third / 0.01, (x - z) / 0.05, (0.95 * u + 0.02 - s) / 1e-3]
 
     states, commanded = integrate(p, START, torque, dt=DT, substeps=100, warm=np.full(60, heat))
