@@ -37,7 +37,6 @@ from hdjax.effects.learned import (
     LearnedMeshTorque,
     LearnedTorque,
     PowerAxis,
-    SplineAxis,
     axis_over,
     simple_axis,
 )
@@ -45,7 +44,7 @@ from hdjax.effects.learned import (
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
 # How many coefficients a function of one variable may have, and of two.
-_SIZES = {1: (1, 2, 3, 4, 5, 7, 9, 11, 13, 16), 2: (3, 5, 7, 9, 12, 16, 20, 24)}
+_SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (3, 5, 7, 9, 12, 16, 20, 24)}
 # A poorer error by this share (in the objective) is no reason for more coefficients.
 _WORTH_A_COEFFICIENT = 0.005
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
@@ -143,11 +142,6 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
     return found
 
 
-def may_be_simpler(candidate: Candidate) -> bool:
-    """Whether a few powers might do in the place of a smooth function."""
-    return len(candidate.variables) == 1 and isinstance(candidate.effect.axes[0], SplineAxis)
-
-
 def looked_again(first: Candidate, seen: LearnedLook) -> Candidate | None:
     """A candidate of the same place and variables, with the coefficients that another look calls for."""
     return _simplest(seen, first.form, first.variables, _own_functions(seen, first.form))
@@ -225,9 +219,10 @@ def _simplest(
     if free is None or simple is None:
         return free
     powers = _candidate(seen, form, variables, (simple,), own)
-    if powers is None or len(powers.effect.c) > len(free.effect.c):
+    if powers is None:
         return free
-    return powers if powers.gain > free.gain - _WORTH_A_COEFFICIENT else free
+    fewer, more = sorted((powers, free), key=lambda c: len(c.effect.c))
+    return more if more.gain > fewer.gain + _WORTH_A_COEFFICIENT else fewer
 
 
 def _candidate(
@@ -335,7 +330,7 @@ def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> 
     inside = free.T @ moment @ free
     seen, directions = np.linalg.eigh(inside)
     # Where there are no data, nothing can be learned.
-    free = free @ directions[:, seen > 1e-6 * np.max(seen, initial=0.0)]
+    free = free @ directions[:, seen > 1e-12 * np.max(seen, initial=0.0)]
     if free.shape[1] == 0:
         return free
     _, vectors = eigh(free.T @ roughness @ free, free.T @ moment @ free)

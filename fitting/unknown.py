@@ -20,7 +20,6 @@ from fitting.learned_look import (
     candidates,
     learned_look,
     looked_again,
-    may_be_simpler,
     sizes_along,
 )
 from fitting.linear_look import surrogate_gains
@@ -101,9 +100,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
                 best = candidate, trial
     if best is None:
         return None
-    if may_be_simpler(best[0]) or not leaves_white_noise(best[1].training):
-        best = _refined(best, data, setting, progress)
-    chosen, trial = best
+    chosen, trial = _refined(best, data, setting, progress)
     gain = before.held_out.objective - trial.held_out.objective
     p_value = _p_value(seen, before, chosen, gain, seed)
     instants = seen.instants
@@ -140,14 +137,22 @@ def is_supported(found: Unknown | None) -> bool:
 def share_of(named: Model, found: Unknown) -> float:
     """Share of a learned torque's mean square that the effects of a model, beyond those it was learned with, make up.
 
-    Near one the learned torque, which was free to be anything, has come out as those effects.
+    Near one the learned torque, which was free to be anything, has come out as those effects. Effects that cancel each
+    other count with what they are apart: they are terms of a series.
 
     Args:
         named: the model with the effects.
         found: what was learned.
     """
-    theirs, learned = (without(_torques(m, found), found.chosen.known) for m in (named, found.trial.model))
-    return float((theirs @ learned) ** 2 / max((theirs @ theirs) * (learned @ learned), 1e-300))
+    known = found.before.model.effects
+    apart = [
+        without(_torques(eqx.tree_at(lambda m: m.effects, named, (*known, e)), found), found.chosen.known)
+        for e in named.effects
+        if e.name not in {k.name for k in known}
+    ]
+    learned = without(_torques(found.trial.model, found), found.chosen.known)
+    alike = float(sum(part @ learned for part in apart) ** 2)
+    return alike / max(float(sum(part @ part for part in apart)) * float(learned @ learned), 1e-300)
 
 
 def _torques(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
