@@ -143,20 +143,20 @@ def unit_pushes(
     of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
     mesh, and its slope."""
     whole = isinstance(model, TwoInertiaModel)
-    torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(0.0,)) for f in LEARNED_TORQUES if whole or not f.needs_motor]
-    geometry = [_UnitGeometry()] if whole else []
-    probed = model.with_effects(*torques, *geometry)
-    paths = [f"{f.name}.c_0" for f in torques] + [f"{g.name}.{n}" for g in geometry for n in ("e", "e_slope")]
-    names = [f.name for f in torques] + ([ERROR, SLOPE] if whole else [])
+    forms = [f for f in LEARNED_TORQUES if whole or not f.needs_motor]
+    names = [f.name for f in forms] + ([ERROR, SLOPE] if whole else [])
 
     def rates(strengths: Array, torque: Array, state: Array, conditions: Conditions) -> Array:
-        changed = probed.replace(dict(zip(paths, strengths, strict=True)))
-        return changed.rates(state, torque, jnp.zeros_like(torque), conditions)
+        # Added afresh, not set by name: the model may have something learned already.
+        torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(s,)) for f, s in zip(forms, strengths, strict=False)]
+        geometry = [_UnitGeometry(e=strengths[-2], e_slope=strengths[-1])] if whole else []
+        probed = model.with_effects(*torques, *geometry)
+        return probed.rates(state, torque, jnp.zeros_like(torque), conditions)
 
     find = jax.jacfwd(rates, argnums=(0, 1))
     for _ in states.shape[:-1]:
         find = jax.vmap(find, in_axes=(None, None, 0, 0))
-    by_strength, by_input = find(jnp.zeros(len(paths)), jnp.zeros(()), states, conditions)
+    by_strength, by_input = find(jnp.zeros(len(names)), jnp.zeros(()), states, conditions)
     return {name: by_strength[..., i] for i, name in enumerate(names)} | {INPUT: by_input}
 
 

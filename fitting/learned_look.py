@@ -4,7 +4,8 @@ Along the fitted motion everything is linear. How many coefficients a function i
 alone, by leaving parts of them out in turn.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 import equinox as eqx
 import jax
@@ -36,15 +37,15 @@ from hdjax.effects.learned import (
     Learned,
     LearnedMeshTorque,
     LearnedTorque,
+    LinearAxis,
     PowerAxis,
-    axis_over,
-    simple_axis,
+    axes_over,
 )
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
 # How many coefficients a function of one variable may have, and of two.
-_SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (3, 5, 7, 9, 12, 16, 20, 24)}
+_SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (1, 2, 3, 5, 7, 9, 12, 16, 20, 24)}
 # A poorer error by this share (in the objective) is no reason for more coefficients.
 _WORTH_A_COEFFICIENT = 0.005
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
@@ -118,27 +119,25 @@ def learned_look(fit: Fit) -> LearnedLook:
 
 
 def candidates(seen: LearnedLook) -> list[Candidate]:
-    """Every place with every variable, and with the best one of them and another."""
-    found = []
+    """Every place with every variable, and with pairs of them: the best one and another, or any two where no variable
+    alone explains anything."""
     reduced = isinstance(seen.look.model, ReducedModel)
-    for form in (f for f in LEARNED if not (f.needs_motor and reduced)):
-        own = _own_functions(seen, form)
+    forms = [form for form in LEARNED if not (form.needs_motor and reduced)]
+    own = {form: _own_functions(seen, form) for form in forms}
 
-        def look_at(variables: tuple[str, ...], form=form, own=own) -> Candidate | None:
-            return _simplest(seen, form, variables, own)
+    def look_at(form: type[Learned], choices: Iterable[tuple[str, ...]]) -> list[Candidate]:
+        found = (_simplest(seen, form, variables, own[form]) for variables in choices)
+        return [candidate for candidate in found if candidate is not None]
 
-        may = [n for n in seen.values if form.may_depend_on(n)]
-        alone = [c for c in (look_at((n,)) for n in may) if c is not None]
-        found += alone
-        if alone:
-            best = max(alone, key=lambda c: c.gain).variables[0]
-            pairs = [
-                tuple(n for n in may if n in (best, other))
-                for other in may
-                # The angles of both shafts are one and the same, but for the twist.
-                if other != best and not {best, other} <= set(ANGLES)
-            ]
-            found += [c for c in map(look_at, pairs) if c is not None]
+    alone = {form: look_at(form, [(n,) for n in seen.values if form.may_depend_on(n)]) for form in forms}
+    found = [candidate for those in alone.values() for candidate in those]
+    any_two = all(candidate.gain < _WORTH_A_COEFFICIENT for candidate in found)
+    for form, those in alone.items():
+        best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
+        pairs = combinations([n for n in seen.values if form.may_depend_on(n)], 2)
+        # The angles of both shafts are one and the same, but for the twist.
+        wanted = [p for p in pairs if (any_two or best & set(p)) and not set(p) <= set(ANGLES)]
+        found += look_at(form, wanted)
     return found
 
 
@@ -178,16 +177,14 @@ def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
     return found
 
 
-def _others(variables: tuple[str, ...]) -> tuple[str | None, ...]:
-    """The variable beside each."""
-    return (None,) if len(variables) == 1 else (variables[1], variables[0])
-
-
-def _range(seen: LearnedLook, variable: str) -> tuple[float, float]:
-    """Between which values the data have a quantity."""
-    low, high = np.quantile(seen.values[variable][seen.weight > 0], [_RARE, 1.0 - _RARE])
-    reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
-    return float(low), float(low + reach)
+def _ranges(seen: LearnedLook, variables: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Between which values the data have each quantity."""
+    found = {}
+    for variable in variables:
+        low, high = np.quantile(seen.values[variable][seen.weight > 0], [_RARE, 1.0 - _RARE])
+        reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
+        found[variable] = (float(low), float(low + reach))
+    return found
 
 
 def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
@@ -210,19 +207,13 @@ def _simplest(
     variables: tuple[str, ...],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
-    """One place and choice of variables: any smooth function, of any period, or a few powers where these explain as
-    much with no more coefficients."""
-    ranges = [_range(seen, name) for name in variables]
-    named = zip(variables, ranges, _others(variables), strict=True)
-    free = _candidate(seen, form, variables, tuple(axis_over(n, *r, beside=b) for n, r, b in named), own)
-    simple = simple_axis(variables[0], *ranges[0]) if len(variables) == 1 else None
-    if free is None or simple is None:
-        return free
-    powers = _candidate(seen, form, variables, (simple,), own)
-    if powers is None:
-        return free
-    fewer, more = sorted((powers, free), key=lambda c: len(c.effect.c))
-    return more if more.gain > fewer.gain + _WORTH_A_COEFFICIENT else fewer
+    """One place and choice of variables, by the simplest function that explains as much as any."""
+    choices = (_candidate(seen, form, variables, axes, own) for axes in axes_over(_ranges(seen, variables)))
+    best: Candidate | None = None
+    for candidate in sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c)):
+        if best is None or candidate.gain > best.gain + _WORTH_A_COEFFICIENT:
+            best = candidate
+    return best
 
 
 def _candidate(
@@ -304,6 +295,8 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
             parts.append(np.diag((2 * np.pi * order) ** 4))
         elif isinstance(axis, PowerAxis):
             parts.append(np.diag(_ROUGHNESS_OF_POWERS))
+        elif isinstance(axis, LinearAxis):
+            parts.append(np.zeros((1, 1)))
         else:
             bends = np.diff(np.eye(axis.count), 2, axis=0)
             rises = np.diff(np.eye(axis.count), axis=0)

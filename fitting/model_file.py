@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME, Effect
-from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, Learned, PowerAxis, SplineAxis
+from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, Learned, LinearAxis, PowerAxis, SplineAxis
 from hdjax.parameters import own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
@@ -92,7 +92,8 @@ def _axis_content(axis: Axis) -> dict[str, Any]:
 
 
 def _axis(content: dict[str, Any]) -> Axis:
-    form = AngleAxis if "orders" in content else PowerAxis if "largest" in content else SplineAxis
+    own = {"orders": AngleAxis, "largest": PowerAxis, "low": SplineAxis}
+    form = next((form for name, form in own.items() if name in content), LinearAxis)
     return form(**content)
 
 

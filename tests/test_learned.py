@@ -11,6 +11,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 import rig
+from fitting.along import unit_pushes
 from fitting.errors import InputError
 from fitting.model_file import StoredModel, read_model, to_json
 from hdjax.effects import Conditions, Effect, Motion, Scales
@@ -27,12 +28,13 @@ from hdjax.effects.learned import (
     LearnedMeshError,
     LearnedMeshTorque,
     LearnedMotorTorque,
+    LinearAxis,
     PowerAxis,
     SplineAxis,
+    axes_over,
     axis_over,
     combined,
     functions,
-    simple_axis,
 )
 
 
@@ -74,18 +76,42 @@ def test_beyond_the_data_a_spline_goes_on_straight():
 
 
 def test_powers_are_those_of_the_formula():
-    axis = simple_axis("v", -2.0, 1.0)
-    assert isinstance(axis, PowerAxis)
+    axis = PowerAxis("v", largest=2.0)
     values = np.linspace(-3.0, 3.0, 7)
     share = values / 2.0
     wanted = np.stack([np.ones(7), share, share * np.abs(share), share**2, share**3], axis=1)
     np.testing.assert_allclose(evaluated(axis, jnp.asarray(values)), wanted, rtol=1e-14)
 
 
+def forms_over(**ranges: tuple[float, float]) -> list[tuple[type, ...]]:
+    return [tuple(type(axis) for axis in axes) for axes in axes_over(ranges)]
+
+
 @pytest.mark.parametrize("variable", ["theta_m", "time", "temperature"])
 def test_nobody_knows_how_a_drift_goes_on(variable: str):
     """And an angle comes back."""
-    assert simple_axis(variable, 0.0, 1.0) is None
+    assert all(PowerAxis not in axes for axes in forms_over(**{variable: (0.0, 1.0)}))
+
+
+def test_the_simplest_choice_comes_first():
+    (powers,), (spline,) = axes_over({"v": (-2.0, 1.0)})
+    assert isinstance(powers, PowerAxis) and float(powers.largest) == 2.0
+    assert isinstance(spline, SplineAxis) and (float(spline.low), float(spline.high)) == (-2.0, 1.0)
+    # A stiffness that changes with speed, damping that changes with twist, any function.
+    assert forms_over(x=(-1.0, 1.0), omega_m=(-9.0, 9.0)) == [
+        (LinearAxis, SplineAxis),
+        (SplineAxis, LinearAxis),
+        (SplineAxis, SplineAxis),
+    ]
+    assert forms_over(x=(-1.0, 1.0), theta_m=(0.0, 9.0)) == [(LinearAxis, AngleAxis), (SplineAxis, AngleAxis)]
+    assert forms_over(theta_l=(0.0, 1.0), time=(0.0, 9.0)) == [(AngleAxis, SplineAxis)]
+
+
+def test_a_quantity_in_proportion_is_that_quantity():
+    axes = LinearAxis("x"), axis_over("omega_m", -9.0, 9.0)
+    motion = Motion(x=jnp.asarray(0.3), v=jnp.zeros(()), omega_m=jnp.asarray(2.0))
+    wanted = 0.3 * np.asarray(axes[1].functions(jnp.asarray(2.0)))
+    np.testing.assert_allclose(functions(axes, motion), wanted, rtol=1e-15)
 
 
 def test_rates_have_their_knots_near_zero():
@@ -159,6 +185,17 @@ def test_gradients_agree_with_differences(variable: str):
     wanted = np.stack([(after - before) / (2 * step) for after, before in ends], axis=1)
     # Central differences of a cubic: the third derivative times the step squared, and rounding.
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-4 * np.abs(wanted).max())
+
+
+def test_a_unit_of_torque_is_one_whatever_is_learned_already():
+    states = jnp.asarray([[1.3, 0.025, 4.0, 0.05], [0.3, 0.003, -2.0, -0.04]])
+    conditions = Conditions(jnp.zeros(2), None)
+    base = rig.drive_model()
+    effects = [learned(form, axis_over("x", -1e-3, 1e-3), c=-0.1 * np.ones(12)) for form in LEARNED_TORQUES]
+    found, wanted = (unit_pushes(m, states, conditions) for m in (base.with_effects(*effects), base))
+    for place in (form.name for form in LEARNED_TORQUES):
+        assert np.any(np.asarray(wanted[place]))
+        np.testing.assert_allclose(found[place], wanted[place], rtol=1e-12, err_msg=place)
 
 
 def test_each_place_is_where_it_says():

@@ -26,7 +26,7 @@ from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.learned import LearnedMeshError, PowerAxis, SplineAxis
+from hdjax.effects.learned import LearnedMeshError, LinearAxis, PowerAxis, SplineAxis
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, STEP = 1600, 4e-3
@@ -197,6 +197,8 @@ def test_a_function_of_two_variables_is_found():
     found = found_of(torque)
     assert is_supported(found)
     assert found.chosen.variables == ("x", "v")
+    # Damping that depends on the twist.
+    assert [type(axis) for axis in found.chosen.effect.axes] == [SplineAxis, LinearAxis]
     before, after = (np.sqrt(float(t.held_out.covariance[0, 0])) for t in (found.before, found.trial))
     assert before > 10 * NOISE
     assert after < 1.3 * NOISE

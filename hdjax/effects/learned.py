@@ -4,7 +4,7 @@ The function is linear in its coefficients, so that all coefficients at zero are
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -101,6 +101,23 @@ class PowerAxis(Axis):
     def functions(self, value: Array) -> Float[Array, " functions"]:
         share = value / self.largest
         return jnp.stack([jnp.ones_like(share), share, share * jnp.abs(share), share**2, share**3])
+
+
+class LinearAxis(Axis):
+    """The quantity itself.
+
+    Attributes:
+        variable: the quantity.
+    """
+
+    variable: str = eqx.field(static=True)
+
+    @property
+    def count(self) -> int:
+        return 1
+
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        return value[None]
 
 
 class AngleAxis(Axis):
@@ -280,20 +297,31 @@ _RATES = ("v", "omega_m", "omega_l")
 _NEAR_STANDSTILL = 0.005
 
 
-def simple_axis(variable: str, low: float, high: float) -> Axis | None:
-    """An axis of few functions that go on beyond the data, for a quantity which the data have between two values; None
-    for the motor's angle, which comes back, and for what drifts, of which nobody knows how it goes on.
+def axes_over(ranges: Mapping[str, tuple[float, float]]) -> list[tuple[Axis, ...]]:
+    """What a function of one or two quantities may be made of, the simplest first.
 
-    The load's angle comes back as well, but what is tied to the load need not.
+    Of one quantity: a few powers, which go on beyond the data; any smooth function. Of two: one of them times any
+    function of the other (a stiffness or a damping that something changes); any smooth function of both.
+
+    The load's angle comes back after a turn, but what is tied to the load need not, so that it has powers as well. The
+    motor's angle has none, nor has what drifts, of which nobody knows how it goes on.
 
     Args:
-        variable: the quantity.
-        low: smallest value.
-        high: largest value.
+        ranges: between which values the data have each quantity.
     """
-    if variable == "theta_m" or variable in DRIFTS:
-        return None
-    return PowerAxis(variable, largest=max(abs(low), abs(high)))
+    if len(ranges) == 1:
+        ((variable, (low, high)),) = ranges.items()
+        any_function = (axis_over(variable, low, high),)
+        if variable == "theta_m" or variable in DRIFTS:
+            return [any_function]
+        return [(PowerAxis(variable, largest=max(abs(low), abs(high))),), any_function]
+    one, other = ranges
+    scaled = [
+        tuple(LinearAxis(n) if n == by else axis_over(n, *ranges[n]) for n in ranges)
+        for by in ranges
+        if by == "x" or by in _RATES
+    ]
+    return [*scaled, (axis_over(one, *ranges[one], beside=other), axis_over(other, *ranges[other], beside=one))]
 
 
 def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:
@@ -304,10 +332,11 @@ def axis_over(variable: str, low: float, high: float, *, beside: str | None = No
         low: smallest value.
         high: largest value.
         beside: the other quantity, where there are two: a product must do with fewer functions of each. Friction may
-            depend on an angle, or drift, but what depends on a rate and on another motion is damping, which is smooth.
+            depend on an angle, or drift, and a stiffness on speed, but of two rates a smooth function must do.
     """
     if variable in ANGLES:
         return AngleAxis(variable, ANGLES[variable] if beside is None else min(ANGLES[variable], 4))
-    turns = variable in _RATES and beside in (None, *ANGLES, *DRIFTS)
+    turns = variable in _RATES and beside not in _RATES
     bend = _NEAR_STANDSTILL * max(abs(low), abs(high)) if turns else None
-    return SplineAxis(variable, low=low, high=high, bend=bend, intervals=5 if beside else 17 if turns else 9)
+    intervals = 17 if turns and beside is None else 9 if turns or beside is None else 5
+    return SplineAxis(variable, low=low, high=high, bend=bend, intervals=intervals)
