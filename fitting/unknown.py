@@ -188,8 +188,10 @@ def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting)
     # The coefficients of a learned torque that is there already come last.
     change = np.pad(step, (0, len(free.paths) - step.size))
     change = np.where(free.logarithmic, np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE), change)
-    moved = free.unpack(before.model, free.pack(before.model) + change).without_effect(candidate.form.name)
-    return challenge([moved.with_effects(candidate.effect)], data, before.hold, setting, champion=before)
+    moved = free.unpack(before.model, free.pack(before.model) + change)
+    # First-order changes may overshoot: a spring may soften until it is none.
+    starts = (m.without_effect(candidate.form.name).with_effects(candidate.effect) for m in (moved, before.model))
+    return challenge(list(starts), data, before.hold, setting, champion=before)
 
 
 def _penalised(trial: Trial) -> float:
