@@ -288,27 +288,28 @@ def _what_is_unknown(
     """The model whose names can be trusted, and the torque that is learned beside them.
 
     A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
-    as one beside it does, and either does not come out as the named effect or does better still with fewer parameters.
-    What a learned torque beside it hardly betters is in no doubt.
+    as one beside it does (where nothing can be learned beside it: by far better than it does), and either does not come
+    out as the named effect or does better by far with fewer parameters. What a learned torque beside it hardly betters
+    is in no doubt.
     """
     if leaves_white_noise(named.training):
         return named, None
     beside = learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
-    if beside is None or not is_supported(beside):
-        return named, None
+    beside = beside if is_supported(beside) else None
     if named is base:
         return base, beside
-    if beside.gain < _LITTLE * named.gain_over(base):
+    if beside is not None and beside.gain < _LITTLE * named.gain_over(base):
         return named, beside
     instead = learn(base, data, setting, seed=seed, progress=progress)
     if instead is None or not is_supported(instead):
         return named, beside
-    better_by = beside.trial.held_out.objective - instead.trial.held_out.objective
-    if better_by < -LEAST_GAIN:
+    rival = named if beside is None else beside.trial
+    better_by = rival.held_out.objective - instead.trial.held_out.objective
+    by_far = better_by > _LITTLE * instead.gain
+    if not by_far and (beside is None or better_by < -LEAST_GAIN):
         return named, beside
     come_out = named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT
-    fewer = len(instead.trial.training.free.paths) < len(beside.trial.training.free.paths)
-    simpler = fewer and better_by > _LITTLE * instead.gain
+    simpler = by_far and len(instead.trial.training.free.paths) < len(rival.training.free.paths)
     return (named, beside) if come_out and not simpler else (base, instead)
 
 

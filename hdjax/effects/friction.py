@@ -111,7 +111,15 @@ class StribeckMotorFriction(DryMotorFriction):
         bounds=(0.0, 1e3),
         role="strength",
     )
-    T_excess: Scalar = parameter(0.0, unit="N m", doc="static torque above Coulomb", source="EFFECTS", role="strength")
+    # Not negative: friction that falls towards standstill below zero would drive.
+    T_excess: Scalar = parameter(
+        0.0,
+        unit="N m",
+        doc="static torque above Coulomb",
+        source="EFFECTS",
+        bounds=(0.0, 1e3),
+        role="strength",
+    )
     b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
     transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e4), role="shape")
     omega_s: Scalar = parameter(
