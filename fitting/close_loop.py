@@ -304,13 +304,31 @@ def _what_is_unknown(
     if instead is None or not is_supported(instead):
         return named, beside
     rival = named if beside is None else beside.trial
-    better_by = rival.held_out.objective - instead.trial.held_out.objective
-    by_far = better_by > _LITTLE * instead.gain
-    if not by_far and (beside is None or better_by < -LEAST_GAIN):
-        return named, beside
-    come_out = named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT
-    simpler = by_far and len(instead.trial.training.free.paths) < len(rival.training.free.paths)
-    return (named, beside) if come_out and not simpler else (base, instead)
+    stands = _names_stand(
+        better_by=rival.held_out.objective - instead.trial.held_out.objective,
+        gain=instead.gain,
+        beside=beside is not None,
+        come_out=named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT,
+        fewer=len(instead.trial.training.free.paths) < len(rival.training.free.paths),
+    )
+    return (named, beside) if stands else (base, instead)
+
+
+def _names_stand(*, better_by: float, gain: float, beside: bool, come_out: bool, fewer: bool) -> bool:
+    """Whether names are in no doubt.
+
+    Args:
+        better_by: decrease of the held-out objective by a learned torque in their place, against what they explain with
+            what is learned beside them.
+        gain: what that torque explains.
+        beside: whether anything is learned beside them.
+        come_out: whether it has come out as what they name.
+        fewer: whether it has fewer parameters.
+    """
+    by_far = better_by > _LITTLE * gain
+    as_good = by_far or (beside and better_by >= -LEAST_GAIN)
+    simpler = by_far and fewer
+    return not as_good or (come_out and not simpler)
 
 
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:

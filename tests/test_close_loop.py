@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.close_loop import Loop, close_loop
+from fitting.close_loop import Loop, _names_stand, close_loop
 from fitting.experiment import Experiment, experiment_from_log
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
@@ -130,11 +130,30 @@ def test_a_weight_that_outweighs_the_motor_is_found():
     assert before.std < rig.K
 
 
+@pytest.mark.parametrize(
+    ("better_by", "beside", "come_out", "fewer", "stands"),
+    [
+        (-0.5, True, False, True, True),  # what stands in their place is poorer
+        (0.0, True, False, False, False),  # as good as with what is learned beside them, and something else
+        (0.0, True, True, True, True),  # as good, and what they name
+        (0.9, True, True, False, True),
+        (0.9, True, True, True, False),  # better by far and simpler
+        (0.0, False, False, True, True),  # as good as they are alone
+        (0.9, False, False, False, False),
+        (0.9, False, True, True, False),
+    ],
+)
+def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer: bool, stands: bool):
+    found = _names_stand(better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer)
+    assert found == stands
+
+
 @pytest.mark.slow
-def test_a_spring_to_the_ground_is_no_weight():
+@pytest.mark.parametrize("stiffness", [2.0, 10.0])
+def test_a_spring_to_the_ground_is_no_weight(stiffness: float):
     """The catalogue lacks it: a weight and what stands beside it come near, and one simple function nearer."""
     torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
-    log = rig.drive_log(rig.drive_motion(torque, tether=2.0), torque, noise=0.1)
+    log = rig.drive_log(rig.drive_motion(torque, tether=stiffness), torque, noise=0.1)
     found = drive_loop(experiment_from_log(log, hold="zero-order", N=rig.N))
     assert found.decision == "unexplained" and found.unknown is not None
     chosen = found.unknown.chosen
