@@ -309,12 +309,17 @@ def _what_is_unknown(
         gain=instead.gain,
         beside=beside is not None,
         come_out=named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT,
-        fewer=len(instead.trial.training.free.paths) < len(rival.training.free.paths),
+        fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
+        out_of_shape=beside is not None
+        and beside.chosen.of == instead.chosen.of
+        and any(e.has_one_shape for e in named.model.effects),
     )
     return (named, beside) if stands else (base, instead)
 
 
-def _names_stand(*, better_by: float, gain: float, beside: bool, come_out: bool, fewer: bool) -> bool:
+def _names_stand(
+    *, better_by: float, gain: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool
+) -> bool:
     """Whether names are in no doubt.
 
     Args:
@@ -323,11 +328,13 @@ def _names_stand(*, better_by: float, gain: float, beside: bool, come_out: bool,
         gain: what that torque explains.
         beside: whether anything is learned beside them.
         come_out: whether it has come out as what they name.
-        fewer: whether it has fewer parameters.
+        fewer: how many parameters fewer it has.
+        out_of_shape: whether one of them stands for one shape of a function, and what is learned beside them is a
+            function of the same quantities at the same place.
     """
     by_far = better_by > _LITTLE * gain
     as_good = by_far or (beside and better_by >= -LEAST_GAIN)
-    simpler = by_far and fewer
+    simpler = (by_far and fewer > 0) or (out_of_shape and fewer >= 0)
     return not as_good or (come_out and not simpler)
 
 

@@ -77,6 +77,11 @@ class Candidate(eqx.Module):
     drive_step: Float[np.ndarray, " parameters"]
     known: Float[np.ndarray, "instants known"]
 
+    @property
+    def of(self) -> tuple[type[Learned], tuple[str, ...]]:
+        """Place and variables."""
+        return self.form, self.variables
+
 
 class LearnedLook(eqx.Module):
     """A look at a fit, with what candidates share.

@@ -131,20 +131,24 @@ def test_a_weight_that_outweighs_the_motor_is_found():
 
 
 @pytest.mark.parametrize(
-    ("better_by", "beside", "come_out", "fewer", "stands"),
+    ("better_by", "beside", "come_out", "fewer", "out_of_shape", "stands"),
     [
-        (-0.5, True, False, True, True),  # what stands in their place is poorer
-        (0.0, True, False, False, False),  # as good as with what is learned beside them, and something else
-        (0.0, True, True, True, True),  # as good, and what they name
-        (0.9, True, True, False, True),
-        (0.9, True, True, True, False),  # better by far and simpler
-        (0.0, False, False, True, True),  # as good as they are alone
-        (0.9, False, False, False, False),
-        (0.9, False, True, True, False),
+        (-0.5, True, False, 1, True, True),  # what stands in their place is poorer
+        (0.0, True, False, 0, False, False),  # as good as with what is learned beside them, and something else
+        (0.0, True, True, 1, False, True),  # as good, and what they name
+        (0.0, True, True, 0, True, False),  # what they name has another shape
+        (0.0, True, True, -1, True, True),  # another shape, for more parameters
+        (0.9, True, True, 0, False, True),
+        (0.9, True, True, 1, False, False),  # better by far and simpler
+        (0.0, False, False, 1, False, True),  # as good as they are alone
+        (0.9, False, False, 0, False, False),
+        (0.9, False, True, 1, False, False),
     ],
 )
-def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer: bool, stands: bool):
-    found = _names_stand(better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer)
+def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool, stands: bool):
+    found = _names_stand(
+        better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer, out_of_shape=out_of_shape
+    )
     assert found == stands
 
 

@@ -115,6 +115,7 @@ class Effect(eqx.Module):
             else.
         drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
             single one shows it.
+        has_one_shape: whether another function of the same quantity at the same place would be something else.
     """
 
     family: ClassVar[str]
@@ -123,6 +124,7 @@ class Effect(eqx.Module):
     needs_motor: ClassVar[bool] = False
     named_for: ClassVar[tuple[str, ...]] = ()
     drawn_against: ClassVar[str | None] = None
+    has_one_shape: ClassVar[bool] = False
 
     @classmethod
     @abc.abstractmethod
