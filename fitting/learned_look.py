@@ -129,20 +129,20 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
     reduced = isinstance(seen.look.model, ReducedModel)
     forms = [form for form in LEARNED if not (form.needs_motor and reduced)]
     own = {form: _own_functions(seen, form) for form in forms}
+    may = {form: [name for name in seen.values if form.may_depend_on(name)] for form in forms}
 
     def look_at(form: type[Learned], choices: Iterable[tuple[str, ...]]) -> list[Candidate]:
         found = (_simplest(seen, form, variables, own[form]) for variables in choices)
         return [candidate for candidate in found if candidate is not None]
 
-    alone = {form: look_at(form, [(n,) for n in seen.values if form.may_depend_on(n)]) for form in forms}
+    alone = {form: look_at(form, [(name,) for name in may[form]]) for form in forms}
     found = [candidate for those in alone.values() for candidate in those]
     any_two = all(candidate.gain < _WORTH_A_COEFFICIENT for candidate in found)
     for form, those in alone.items():
         best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
-        pairs = combinations([n for n in seen.values if form.may_depend_on(n)], 2)
+        pairs = (p for p in combinations(may[form], 2) if any_two or best & set(p))
         # The angles of both shafts are one and the same, but for the twist.
-        wanted = [p for p in pairs if (any_two or best & set(p)) and not set(p) <= set(ANGLES)]
-        found += look_at(form, wanted)
+        found += look_at(form, (p for p in pairs if not set(p) <= set(ANGLES)))
     return found
 
 

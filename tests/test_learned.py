@@ -259,6 +259,17 @@ def test_round_trip(tmp_path: Path):
     assert np.isfinite(rates(found.model, jnp.asarray([1.0, 0.02, 3.0, 0.1]))).all()
 
 
+@pytest.mark.parametrize(
+    "axis", [AngleAxis("theta_l", 3), LinearAxis("v"), PowerAxis("v", 1 / 3), SplineAxis("v", -1 / 3, 2.0, 0.1)]
+)
+def test_every_axis_comes_back_from_a_file(axis: Axis, tmp_path: Path):
+    model = rig.drive_model().with_effects(learned(LearnedMeshTorque, axis))
+    written = to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+    effect = read(written, tmp_path).model.effect("learned_mesh_torque")
+    assert isinstance(effect, LearnedMeshTorque)
+    assert eqx.tree_equal(effect.axes, (axis,))
+
+
 BROKEN = {
     "no axes": lambda e: e.pop("axes"),
     "unknown variable": lambda e: e["axes"][0].update(variable="colour"),

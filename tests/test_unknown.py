@@ -136,6 +136,10 @@ def test_powers_go_on_beyond_the_data():
 
     assert error(found.before) > 5 * NOISE
     assert error(found.trial) < 2 * NOISE
+    # Most of what is left is how well any fit knows its parameters.
+    _, data = base_trial(lopsided)
+    true_form = attempt(TRUTH.with_effects(QuadraticStiffness(k2=0.1)), data, "zero-order", SETTING)
+    assert error(found.trial) < 1.1 * error(true_form)
 
 
 def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unknown):
