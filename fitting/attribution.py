@@ -261,7 +261,7 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
     )
     if trial is None:
         return None
-    return replace(trial, lasting=lasting_share(lead.effect, before, trial, data, setting))
+    return replace(trial, lasting=lasting_share(lead.effect, before, trial))
 
 
 def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:

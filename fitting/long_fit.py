@@ -37,13 +37,19 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=whole, substeps=substeps)
     explains = long.objective <= start.objective + _freedom_of_states(start) + _LOSS
-    if not (_follows(long) and (explains or (long.converged and not must_explain))):
+    if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
-    check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True)
+    check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
     return long if check.objective < start.objective + _LOSS else start
 
 
-def _follows(found: Fit) -> bool:
+def over_whole_stretches(found: Fit) -> Fit:
+    """The same parameters over horizons as long as the stretches; only initial states are fitted."""
+    whole = max(len(s) for s in found.stretches)
+    return _again(found, found.model, horizon=whole, substeps=found.substeps, hold_parameters=True)
+
+
+def follows(found: Fit) -> bool:
     """Whether the simulation errs by less than half of how much each output moves."""
     segments = found.problem.segments
     measured = np.asarray(segments.measured)[np.asarray(segments.weight) > 0]
@@ -63,8 +69,11 @@ def _fine_enough(found: Fit) -> int:
     return needed_substeps(found, shift=_SHIFT, most=_MOST_SUBSTEPS)
 
 
-def _again(found: Fit, model: Model, *, horizon: int, substeps: int, hold_parameters: bool = False) -> Fit:
-    """A fit of the same data, from its states and on segments of its length, which share its compiled program."""
+def _again(
+    found: Fit, model: Model, *, horizon: int, substeps: int, hold_parameters: bool = False, afresh: bool = False
+) -> Fit:
+    """A fit of the same data on segments of the same length, which share its compiled program; from its states or, for
+    a model that these don't suit, afresh."""
     segments = found.problem.segments
     count, length = segments.weight.shape
     return fit(
@@ -77,8 +86,8 @@ def _again(found: Fit, model: Model, *, horizon: int, substeps: int, hold_parame
         substeps=substeps,
         covariance=found.covariance,
         count=count,
-        states=None if hold_parameters else found.unknowns.states,
-        retry_states=hold_parameters,
+        states=None if afresh else found.unknowns.states,
+        retry_states=afresh,
         max_steps=_STEPS,
         hold_parameters=hold_parameters,
     )

@@ -13,6 +13,7 @@ from fitting.estimate import Fit, fit, needed_substeps
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.free_run import FreeRun, free_run, rms_error
+from fitting.long_fit import follows, over_whole_stretches
 from fitting.posing import pose_ahead, states_from
 from hdjax import Hold, Model
 from hdjax.effects import Effect
@@ -239,17 +240,20 @@ def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
     return Trial(training.model, training, held_out, hold)
 
 
-def lasting_share(effect: Effect, before: Trial, trial: Trial, data: Data, setting: Setting) -> float:
-    """The share of an effect's gain that lasts over whole stretches; all of it for an effect without memory.
+def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
+    """The share of an effect's gain that lasts over whole held-out stretches; all of it for an effect without memory,
+    and where neither model follows the drive for so long.
 
     Hidden states are fitted to each short segment, where they can stand for what something else leaves there: an
-    offset, say. In a free run they have to follow from the motion.
+    offset, say. Over a whole stretch they have to follow from the motion.
     """
-    if not effect.states:
+    short = before.held_out.objective - trial.held_out.objective
+    if not effect.states or short <= 0.0:
         return 1.0
-    short = np.log(before.held_out.dynamic_error_std / trial.held_out.dynamic_error_std)
-    long = long_gains(before, [trial], data, setting)
-    return 1.0 if short <= 0.0 or long is None else float(np.clip(long[0] / short, 0.0, 1.0))
+    long_before, long_after = (over_whole_stretches(t.held_out) for t in (before, trial))
+    if not (follows(long_before) or follows(long_after)):
+        return 1.0
+    return float(np.clip((long_before.objective - long_after.objective) / short, 0.0, 1.0))
 
 
 def long_gains(before: Trial, trials: Sequence[Trial], data: Data, setting: Setting) -> list[float] | None:

@@ -1,5 +1,7 @@
 """Competitors of one round: what a gain is worth."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import rig
 from fitting import attribution
+from fitting import trial as of_a_trial
 from fitting.attribution import Verdict, look
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
@@ -55,6 +58,34 @@ def test_memory_that_stands_for_something_else_does_not_last(verdicts):
     before, found = verdicts
     creep = found["creep"]
     assert 0.0 <= creep.gain < 0.7 * short_gain(before, creep.trial)
+
+
+@pytest.mark.parametrize(
+    ("long_before", "long_after", "share"),
+    [
+        (-2.0, -2.6, 0.6),
+        (-2.0, -9.0, 1.0),
+        (-2.0, -1.0, 0.0),  # as of a resonance that stood for a torque that is off: it moved the motor alone
+        (-2.0, 3.0, 0.0),
+        (3.0, -2.0, 1.0),
+        (3.0, 3.0, 1.0),  # neither follows the drive: nothing is told
+    ],
+)
+def test_what_lasts_is_what_whole_stretches_gain(
+    verdicts, long_before: float, long_after: float, share: float, monkeypatch: pytest.MonkeyPatch
+):
+    trial, _ = verdicts
+
+    def with_objective(value: float) -> Trial:
+        return replace(trial, held_out=replace(trial.held_out, objective=value))
+
+    before, after = with_objective(0.0), with_objective(-1.0)
+    long = {0.0: long_before, -1.0: long_after}
+    monkeypatch.setattr(of_a_trial, "over_whole_stretches", lambda f: replace(f, objective=long[f.objective]))
+    monkeypatch.setattr(of_a_trial, "follows", lambda f: f.objective < 0.0)
+    assert of_a_trial.lasting_share(Creep(k=1.0, tau=1.0, span=1.0), before, after) == pytest.approx(share)
+    assert of_a_trial.lasting_share(TorqueBias(), before, after) == 1.0
+    assert of_a_trial.lasting_share(Creep(k=1.0, tau=1.0, span=1.0), after, before) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,8 @@ def test_smooth_effects_against_scipy():
         creep_time=np.array([0.05, 1.0]),
         warm_k=-1e-3,
         warm_c=0.02,
+        nothing_below=0.05,
+        saturates=1.5,
         lag=1e-3,
         gain=0.95,
         bias=0.02,
@@ -58,6 +60,8 @@ def test_smooth_effects_against_scipy():
         tether=3.0,
         lobes=0.7,
         lobes_phase=0.9,
+        swing=0.2,
+        swing_phase=0.4,
         sag=0.1,
         sag_speed=5.0,
         drift=0.5,
@@ -69,6 +73,13 @@ def test_smooth_effects_against_scipy():
         third_damping=0.2,
     )
     torque, heat = shaking(60), 12.0
+
+    def acting(u):
+        u = np.sign(u) * max(abs(u) - 0.05, 0.0)
+        return 0.95 * u / np.sqrt(1 + (1.5 * u) ** 2) + 0.02
+
+    def inertia(b):
+        return 5e-2 * (1 + 0.2 * np.cos(b + 0.4))
 
     def rates(t, y, u):
         a, w, b, r, c, q, z, s = y
@@ -85,11 +96,12 @@ def test_smooth_effects_against_scipy():
         motor = s - (1 / 50 + e_a) * tau + reaction - 1e-3 * w + 0.02 * np.cos(4 * a) + 0.5 * t
         held = 3 * b + 1.5 * np.sin(b + 0.3) + 0.7 * np.sin(3 * b + 0.9)
         load = (1 - e_b) * tau + 0.1 + 0.5 * np.sin(200 * t) - 0.05 * r - held - third
-        return [w, motor / 5e-4, r, load / 5e-2, q, third / 0.01, (x - z) / 0.05, (0.95 * u + 0.02 - s) / 1e-3]
+        load += 0.5 * 5e-2 * 0.2 * np.sin(b + 0.4) * r**2
+        return [w, motor / 5e-4, r, load / inertia(b), q, third / 0.01, (x - z) / 0.05, (acting(u) - s) / 1e-3]
 
     states, commanded = integrate(p, START, torque, dt=DT, substeps=100, warm=np.full(60, heat))
     assert np.array_equal(commanded, torque)
-    y = np.array([*START, START[2], START[3], 0.0, 0.95 * torque[0] + 0.02])
+    y = np.array([*START, START[2], START[3], 0.0, acting(torque[0])])
     for k, u in enumerate(torque):
         assert states[k, [0, 1, 2, 3, 4, 5, 13, 15]] == pytest.approx(y, rel=1e-9, abs=1e-9)
         y = solve_ivp(rates, (k * DT, (k + 1) * DT), y, args=(u,), method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
@@ -99,7 +111,7 @@ def test_bouc_wen_and_bristles_against_scipy():
     """Both have a kink where the rate turns: scipy's steps find it by their error control."""
     p = BASE._replace(
         bouc_k=2000.0, bouc_yield=3e-4, bouc_power=1.5, bouc_share=0.7,
-        slide_m=0.03, hold_m=0.05, sink_m=2.0, bristle_m=5.0, bristle_drag_m=0.01,
+        c_lean=0.1, slide_m=0.03, hold_m=0.05, sink_m=2.0, bristle_m=5.0, bristle_drag_m=0.01,
     )  # fmt: skip
     torque = shaking(40)
 
@@ -109,7 +121,7 @@ def test_bouc_wen_and_bristles_against_scipy():
         bent = (abs(z) / 3e-4) ** 1.5
         turn = v - bent * (0.7 * abs(v) * np.sign(z) + 0.3 * v)
         slip = w - 5.0 * abs(w) * s / (0.03 + 0.02 * np.exp(-((w / 2.0) ** 2)))
-        tau = 7000 * x + 2e7 * x**3 + 0.3 * v + 2000 * z
+        tau = 7000 * x + 2e7 * x**3 + 0.3 * v + 0.1 * abs(v) + 2000 * z
         return [w, (u - tau / 50 - 5.0 * s - 0.01 * slip) / 5e-4, r, tau / 5e-2, turn, slip]
 
     states, _ = integrate(p, START, torque, dt=DT, substeps=100)
@@ -121,7 +133,7 @@ def test_bouc_wen_and_bristles_against_scipy():
 
 
 def energy(p: Mechanism, states: np.ndarray) -> np.ndarray:
-    """Of a drive with any spring, wobbling teeth, stiffness ripple, weight, tether, lobes and third inertia [J]."""
+    """Of any spring, wobbling teeth, stiffness ripple, weight, tether, lobes, swinging load and third inertia [J]."""
     a, w, b, r, c, q = states[:, :6].T
     x = a / p.ratio + 2e-4 * np.cos(2 * a) * (1 + p.wobble * np.cos(b)) * np.any(p.teeth) - b
     bent = np.maximum(np.abs(x) - p.gap, 0.0)
@@ -134,7 +146,8 @@ def energy(p: Mechanism, states: np.ndarray) -> np.ndarray:
     else:
         spring = 0.5 * p.k1 * bent**2 + 0.25 * p.k3 * bent**4
     spring = spring * (1 + p.ripple_k * np.cos(p.ripple_k_order * a + p.ripple_k_phase))
-    moving = 0.5 * p.motor_inertia * w**2 + 0.5 * p.load_inertia * r**2 + 0.5 * p.third_inertia * q**2
+    load_inertia = p.load_inertia * (1 + p.swing * np.cos(b + p.swing_phase))
+    moving = 0.5 * p.motor_inertia * w**2 + 0.5 * load_inertia * r**2 + 0.5 * p.third_inertia * q**2
     held = 0.5 * p.tether * b**2 - p.weight * np.cos(b + p.weight_phase) - p.lobes * np.cos(3 * b + p.lobes_phase) / 3
     return moving + spring + held + 0.5 * p.third_stiffness * (b - c) ** 2
 
@@ -143,6 +156,7 @@ CONSERVATIVE = {
     "teeth": table({2: (2e-4, 0.0)}) | {"wobble": 0.4},
     "ripple": {"ripple_k": 0.1, "ripple_k_phase": 0.3},
     "load": {"weight": 2.0, "weight_phase": 0.4, "tether": 5.0, "lobes": 1.0, "lobes_phase": 0.2},
+    "swing": {"swing": 0.2, "swing_phase": 0.4},
     "third": {"third_inertia": 0.01, "third_stiffness": 3000.0},
     "gap": {"gap": 1e-4, "gap_damps": 0.0},
     "slopes": {"k3": 0.0, "slope_2": 9000.0, "slope_3": 12000.0, "knee_1": 4e-4, "knee_2": 9e-4},

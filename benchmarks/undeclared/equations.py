@@ -68,7 +68,7 @@ def _mesh(x, v, phi, w, y, warm, p, out):
     viscous = p.c1 * (math.exp(-p.warm_c * warm) if p.warm_c != 0.0 else 1.0)
     if p.gap_damps > 0.0 or abs(x) >= p.gap:
         torque += viscous * v
-    torque += v * (p.c2 * abs(v) + p.c3 * v * v + p.cx * x * x)
+    torque += v * (p.c2 * abs(v) + p.c3 * v * v + p.cx * x * x) + p.c_lean * abs(v)
     if p.rub > 0.0:
         level = p.rub * (1.0 + p.rub_load * abs(elastic))
         level *= 1.0 + p.rub_ripple * math.cos(p.rub_order * phi + p.rub_phase)
@@ -116,11 +116,25 @@ def _level_l(w, p):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _amplified(u, p):
+    """Torque that the amplifier makes of a command."""
+    u = math.copysign(max(abs(u) - p.nothing_below, 0.0), u)
+    return p.gain * u / math.sqrt(1.0 + (p.saturates * u) ** 2) + p.bias
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _load_inertia(lam, p):
+    """Of the load at an angle, and its derivative."""
+    angle = lam + p.swing_phase
+    return p.load_inertia * (1.0 + p.swing * math.cos(angle)), -p.load_inertia * p.swing * math.sin(angle)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _pulls(t, y, u, brake, warm, p, out):
     """Torques on motor and load without their dry friction; rates of all but the two sides' own to `out`."""
     phi, w, lam, r = y[0], y[1], y[2], y[3]
     out[:] = 0.0
-    acting = p.gain * u + p.bias
+    acting = _amplified(u, p)
     if p.lag > 0.0:
         out[15] = (acting - y[15]) / p.lag
         acting = y[15]
@@ -142,6 +156,8 @@ def _pulls(t, y, u, brake, warm, p, out):
         load -= p.weight * math.sin(lam + p.weight_phase)
     if p.lobes != 0.0:
         load -= p.lobes * math.sin(3.0 * lam + p.lobes_phase)
+    if p.swing != 0.0:
+        load -= 0.5 * _load_inertia(lam, p)[1] * r * r
     for i in range(2):
         if p.push_amplitude[i] != 0.0:
             load += p.push_amplitude[i] * math.sin(p.push_rate[i] * t + p.push_phase[i])
@@ -164,7 +180,7 @@ def rates(t, y, u, brake, warm, side_m, side_l, p, out):
     if side_l != 2:
         load = 0.0 if side_l == 0 else load - side_l * _level_l(y[3], p)
     out[0], out[1] = y[1], motor / p.motor_inertia
-    out[2], out[3] = y[3], load / p.load_inertia
+    out[2], out[3] = y[3], load / _load_inertia(y[2], p)[0]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -240,7 +256,7 @@ def _integrate(p, start, shaking, follow, pull, brake, warm, dt, substeps):
             if side_m != 2 and y[1] * side_m < 0.0:
                 y[1] = _turned(at_start_m, y[1], side_m, h * _level_m(0.0, y[0], -side_m, p) / p.motor_inertia)
             if side_l != 2 and y[3] * side_l < 0.0:
-                y[3] = _turned(at_start_l, y[3], side_l, h * _level_l(0.0, p) / p.load_inertia)
+                y[3] = _turned(at_start_l, y[3], side_l, h * _level_l(0.0, p) / _load_inertia(y[2], p)[0])
             for i in range(4):
                 if p.slip_k[i] > 0.0:
                     y[7 + i] = min(max(y[7 + i], -p.slip_d[i]), p.slip_d[i])
@@ -281,9 +297,10 @@ def integrate(
     y[:4] = start
     y[4:6] = start[2:]
     first = shaking[0] + (0.0 if follow is None else pull[0] * (follow[0, 0] - y[0]) + pull[1] * (follow[0, 1] - y[1]))
-    y[15] = mechanism.gain * first + mechanism.bias
+    record = np.array([tuple(mechanism)], _RECORD)[0]
+    y[15] = _amplified(first, record)
     return _integrate(
-        np.array([tuple(mechanism)], _RECORD)[0],
+        record,
         y,
         np.ascontiguousarray(shaking, float),
         np.zeros((count, 2)) if follow is None else np.ascontiguousarray(follow, float),

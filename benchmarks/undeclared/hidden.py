@@ -347,6 +347,26 @@ def _drift(s, random, base):
     return {"drift": _sign(random) * s * base.motor_torque}
 
 
+def _saturation(s, random, base):
+    """Strength: motor torque over the torque at which the amplifier saturates."""
+    return {"saturates": s / base.motor_torque}
+
+
+def _dead_zone(s, random, base):
+    """Strength: torque below which nothing comes out, over the motor torque."""
+    return {"nothing_below": s * base.motor_torque}
+
+
+def _swing(s, random, base):
+    """Strength: share of the load's inertia that comes and goes over a turn."""
+    return {"swing": s, "swing_phase": _phase(random)}
+
+
+def _leaning_damping(s, random, base):
+    """Strength: how much more the mesh damps one way, over B_sp."""
+    return {"c_lean": _sign(random) * s * base.c1}
+
+
 FORMS = (
     Form("kinematic_error", "two lobes", 7.5e-5, 2.9e-4, _teeth({2: 1.0})),
     Form("kinematic_error", "orders 1, 2, 4", 7.5e-5, 2.9e-4, _teeth({2: 1.0, 1: 0.4, 4: 0.3})),
@@ -408,6 +428,10 @@ FORMS = (
     Form("unknown", "three lobes on the load", 0.03, 0.6, _lobes),
     Form("unknown", "stiffness that sags with speed", 0.02, 0.2, _sag),
     Form("unknown", "drifting torque", 0.01, 0.2, _drift),
+    Form("unknown", "saturating amplifier", 0.3, 10.0, _saturation),
+    Form("unknown", "dead zone of the amplifier", 3e-3, 0.1, _dead_zone),
+    Form("unknown", "load inertia that swings", 0.03, 0.3, _swing),
+    Form("unknown", "damping that leans", 0.1, 0.8, _leaning_damping),
 )
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))

@@ -28,9 +28,12 @@ class Mechanism(NamedTuple):
     k1: float = 7000.0
     k3: float = 0.0
     c1: float = 0.3
-    # Amplifier: gain u + bias, behind a dead time [s], a lag [s], a ramp between commands (0 or 1).
+    # Amplifier: gain u + bias, where nothing comes of a u below a threshold [N m] and a large one saturates [1/(N m)];
+    # behind a dead time [s], a lag [s], a ramp between commands (0 or 1).
     gain: float = 1.0
     bias: float = 0.0
+    saturates: float = 0.0
+    nothing_below: float = 0.0
     dead_time: float = 0.0
     lag: float = 0.0
     ramp: float = 0.0
@@ -75,7 +78,8 @@ class Mechanism(NamedTuple):
     ripple_k_reacts: float = 1.0
     sag: float = 0.0
     sag_speed: float = 1.0
-    # Losses of the mesh: dry with a sharp sign (saturated within rub_rate), growing with load, rippled; powers of rate.
+    # Losses of the mesh: dry with a sharp sign (saturated within rub_rate), growing with load, rippled; powers of rate;
+    # more one way.
     rub: float = 0.0
     rub_load: float = 0.0
     rub_rate: float = 5e-4
@@ -85,6 +89,7 @@ class Mechanism(NamedTuple):
     c2: float = 0.0
     c3: float = 0.0
     cx: float = 0.0
+    c_lean: float = 0.0
     # Memory of the mesh: Bouc-Wen, four slipping springs, two relaxing ones.
     bouc_k: float = 0.0
     bouc_yield: float = 1.0
@@ -97,7 +102,8 @@ class Mechanism(NamedTuple):
     # Heat, per kelvin above the reference.
     warm_k: float = 0.0
     warm_c: float = 0.0
-    # Load: friction likewise, weight, tether to the ground, three lobes in a turn, unlogged pushes, a third inertia.
+    # Load: friction likewise, weight, tether to the ground, three lobes in a turn, an inertia that swings,
+    # unlogged pushes, a third inertia.
     hold_l: float = 0.0
     slide_l: float = 0.0
     sink_l: float = 1.0
@@ -109,6 +115,8 @@ class Mechanism(NamedTuple):
     tether: float = 0.0
     lobes: float = 0.0
     lobes_phase: float = 0.0
+    swing: float = 0.0
+    swing_phase: float = 0.0
     push: float = 0.0
     push_amplitude: np.ndarray = _NONE_2
     push_rate: np.ndarray = _NONE_2
