@@ -74,7 +74,7 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     firsts = np.cumsum(pieces) - pieces
     ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
     conditions = conditions_between(segments)
-    at_knots = motions(model, followed.states, conditions_at_knots(segments))
+    at_knots = motions(model, followed.states, conditions_at_knots(model, segments))
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
     goes_on = jnp.asarray(continues(segments))
@@ -82,10 +82,20 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
 
 
 @jit_small
-def conditions_at_knots(segments: Segments) -> Conditions:
-    """Time and temperature at each knot, the end of the last interval included."""
+def conditions_at_knots(model: Model, segments: Segments) -> Conditions:
+    """Time, temperature and the motor's torque at each knot, the end of the last interval included."""
     time = segments.torque.knots[:, segments.halo :]
-    return Conditions(time, _at_knots(segments.temperature, jnp.diff(time)))
+    torque = acting_at_knots(model, segments) if isinstance(model, TwoInertiaModel) else None
+    warmth = None if segments.temperature is None else _at_knots(segments.temperature.coefficients, jnp.diff(time))
+    return Conditions(time, warmth, T_m=torque)
+
+
+def acting_at_knots(model: Model, segments: Segments) -> Float[Array, "segments knots"]:
+    """The torque that acts on a drive, or the forcing, at each knot; where it jumps the middle, so that a straight line
+    from knot to knot is not late."""
+    acting = jax.vmap(model.actuate)(segments.torque)
+    width = jnp.diff(acting.knots[:, segments.halo :])
+    return _at_knots(acting.coefficients[:, segments.halo :], width)
 
 
 def at_nodes(signal: PiecewisePolynomial) -> Float[Array, "segments samples nodes"]:
@@ -174,9 +184,9 @@ def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
     return np.append(False, np.abs(late) < 0.5 * step)
 
 
-def _at_knots(signal: PiecewisePolynomial | None, width: Float[Array, "segments samples"]) -> Array | None:
-    """A signal's values at the samples and at the end of the last interval."""
-    if signal is None:
-        return None
-    last = polynomial(signal.coefficients[:, -1], width[:, -1])
-    return jnp.concatenate([signal.coefficients[:, :, 0], last[:, None]], axis=1)
+def _at_knots(
+    coefficients: Float[Array, "segments samples order"], width: Float[Array, "segments samples"]
+) -> Float[Array, "segments knots"]:
+    """A signal's values at the samples and at the end of the last interval; where it jumps the middle."""
+    after, before = coefficients[:, :, 0], polynomial(coefficients, width)
+    return jnp.concatenate([after[:, :1], 0.5 * (before[:, :-1] + after[:, 1:]), before[:, -1:]], axis=1)

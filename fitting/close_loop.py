@@ -312,7 +312,7 @@ def _what_is_unknown(
         fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
         out_of_shape=beside is not None
         and beside.chosen.of == instead.chosen.of
-        and any(e.has_one_shape for e in named.model.effects),
+        and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
     )
     return (named, beside) if stands else (base, instead)
 
@@ -329,8 +329,8 @@ def _names_stand(
         beside: whether anything is learned beside them.
         come_out: whether it has come out as what they name.
         fewer: how many parameters fewer it has.
-        out_of_shape: whether one of them stands for one shape of a function, and what is learned beside them is a
-            function of the same quantities at the same place.
+        out_of_shape: whether one of them stands for one shape of a function of a quantity, and what is learned beside
+            them is a function of that as well.
     """
     by_far = better_by > _LITTLE * gain
     as_good = by_far or (beside and better_by >= -LEAST_GAIN)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.along import conditions_at_knots, motions, unit_pushes
+from fitting.along import acting_at_knots, conditions_at_knots, motions, unit_pushes
 from fitting.estimate import Fit
 from fitting.explained import explained, solved, without_untold
 from fitting.followed import Followed, follow
@@ -85,7 +85,7 @@ def look_along(fit: Fit) -> Look:
     """Linearise a fit along its motion."""
     problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
     followed = follow(problem, fit.unknowns)
-    conditions = conditions_at_knots(problem.segments)
+    conditions = conditions_at_knots(fit.model, problem.segments)
     return Look(
         problem,
         without_untold(linearise(problem, fit.unknowns), problem.free),
@@ -112,11 +112,12 @@ def _parameter_torques(problem: Problem, states: Array, conditions: Conditions, 
     zero = jnp.zeros(())
     vector = problem.free.pack(problem.model)
 
-    def rates(vector: Array, state: Array, conditions: Conditions) -> Array:
-        return problem.free.unpack(problem.model, vector).rates(state, zero, zero, conditions)
+    def rates(vector: Array) -> Array:
+        model = problem.free.unpack(problem.model, vector)
+        acting = acting_at_knots(model, problem.segments)
+        return jax.vmap(jax.vmap(lambda s, T, c: model.rates(s, T, zero, c)))(states, acting, conditions)
 
-    find = jax.vmap(jax.vmap(jax.jacfwd(rates), in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
-    found = find(vector, states, conditions)
+    found = jax.jacfwd(rates)(vector)
     square = jnp.sum(push**2, axis=-1)[..., None]
     torque = jnp.einsum("skq,skqp->skp", push, found) / square
     elsewhere = jnp.sum((found - push[..., None] * torque[:, :, None, :]) ** 2, axis=(0, 1, 2))

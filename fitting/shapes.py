@@ -34,6 +34,7 @@ _FAMILIES: dict[tuple[str, str, Kind], str] = {
     ("motor", "theta_m", "order"): "cogging",
     ("motor", "omega_m", "sign"): "motor_friction",
     ("motor", "omega_m", "linear"): "motor_friction",
+    ("motor", "T_m", "linear"): "torque_sensor",
     ("motor", "omega_m", "stribeck"): "motor_friction",
     ("load", "omega_l", "sign"): "load_friction",
     ("load", "omega_l", "linear"): "load_friction",
@@ -148,7 +149,7 @@ def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:
     for fraction in _FRACTIONS:
         turn = fraction * size
         at = f"{turn:.3g}"
-        if variable == "x":
+        if variable in ("x", "T_m"):
             family = "backlash" if fraction < _DEAD_ZONE else "stiffness_shape"
             columns = np.clip(values, -turn, turn)
             yield form("knee", (f"clip({variable}, ±{at})",), columns, family=family if place == "mesh" else None)

@@ -161,11 +161,12 @@ def _torques(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
     bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
     hidden = jnp.asarray(model.rest())[found.states.shape[1] :]
     zero = jnp.zeros(())
-    # An error of the torque is an effect as well: what acts where none is logged.
     silence = sampled(np.arange(2.0), np.zeros(2), hold="zero-order")
-    acting, before = (m.actuate(silence)(zero) for m in (model, bare))
 
     def added(state: Array, conditions: Conditions) -> Array:
+        # An error of the torque is an effect as well.
+        steady = silence.affine(jnp.ones(()), zero if conditions.T_m is None else conditions.T_m)
+        acting, before = (m.actuate(steady)(zero) for m in (model, bare))
         own = model.rates(jnp.concatenate([state, hidden]), acting, zero, conditions)
         return own[: state.shape[0]] - bare.rates(state, before, zero, conditions)
 

@@ -182,7 +182,7 @@ class TwoInertiaModel(Model):
         self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
     ) -> list[Array]:
         drive = self.drive
-        motion = self.motion(state, conditions)
+        motion = self.motion(state, dataclasses.replace(conditions, T_m=torque))
         own = self._own_states(state)
         tau = self._mesh_torque(motion, own)
         transmission = 1.0 / drive.N

@@ -11,10 +11,12 @@ import pytest
 from scipy.interpolate import BSpline
 
 import rig
-from fitting.along import unit_pushes
+from fitting.along import acting_at_knots, unit_pushes
 from fitting.errors import InputError
+from fitting.experiment import cut, experiment_from_log, split
 from fitting.model_file import StoredModel, read_model, to_json
 from hdjax.effects import Conditions, Effect, Motion, Scales
+from hdjax.effects.actuation import TorqueGain
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.learned import (
@@ -205,6 +207,30 @@ def test_each_place_is_where_it_says():
     np.testing.assert_allclose(added[LearnedMotorTorque], [0, 0, 2.0 / rig.J_M, 0], rtol=1e-9)
     np.testing.assert_allclose(added[LearnedLoadTorque], [0, 0, 0, 2.0 / rig.J_L], rtol=1e-9)
     np.testing.assert_allclose(added[LearnedMeshTorque], [0, 0, -2.0 / rig.N / rig.J_M, 2.0 / rig.J_L], rtol=1e-9)
+
+
+def test_the_torque_that_comes_in_is_the_motors():
+    """A function of it knows the torque that is simulated, behind whatever comes before the drive."""
+    assert [f for f in LEARNED if f.may_depend_on("T_m")] == [LearnedMotorTorque]
+    state, zero = jnp.asarray([1.3, 0.025, 4.0, 0.05]), jnp.zeros(())
+    base = rig.drive_model()
+    added = learned(LearnedMotorTorque, PowerAxis("T_m", largest=2.0), c=[0.0, 0.0, 0.0, 3.0, 0.0])
+    for torque in (0.0, -1.5):
+        own, wanted = (m.rates(state, jnp.asarray(torque), zero) for m in (base.with_effects(added), base))
+        np.testing.assert_allclose(own - wanted, [0, 0, 3.0 * (torque / 2.0) ** 2 / rig.J_M, 0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("gain_error", [0.0, 0.1])
+def test_where_the_torque_jumps_a_look_takes_the_middle(gain_error: float):
+    torque = np.random.default_rng(0).normal(size=64)
+    log = rig.drive_log(np.zeros((64, 4)), torque)
+    (stretch, *_), _ = split([experiment_from_log(log, hold="zero-order", N=rig.N)])
+    segments = cut([stretch], 16, halo=4, count=4)
+    found = np.asarray(acting_at_knots(rig.drive_model().with_effects(TorqueGain(gain_error=gain_error)), segments))
+    first = (1.0 + gain_error) * torque[stretch.start :][:16]
+    np.testing.assert_allclose(found[0, 0], first[0])
+    np.testing.assert_allclose(found[0, 1:-1], 0.5 * (first[1:] + first[:-1]))
+    np.testing.assert_allclose(found[0, -1], first[-1])
 
 
 def test_a_learned_error_of_the_mesh_is_a_kinematic_error():

@@ -19,6 +19,7 @@ _WORDS = {
     "omega_m": "motor speed",
     "theta_l": "load angle",
     "omega_l": "load speed",
+    "T_m": "motor torque",
     "time": "time",
     "temperature": "temperature",
 }

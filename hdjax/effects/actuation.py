@@ -40,6 +40,7 @@ class TorqueGain(ActuatorEffect):
     family: ClassVar[str] = "torque_sensor"
     name: ClassVar[str] = "torque_gain"
     needs_motor: ClassVar[bool] = True
+    one_shape_of: ClassVar[str | None] = "T_m"
 
     gain_error: Scalar = parameter(
         0.0,

@@ -39,6 +39,7 @@ class Motion(eqx.Module):
         temperature: of the drive [K], or None where it is not known.
         rubbing: how dry friction acts on each rate that it opposes, by the rate's name here; None where it follows its
             law at every instant.
+        T_m: torque that comes in at the motor [N m], or None where it is not known.
     """
 
     x: Array
@@ -50,20 +51,23 @@ class Motion(eqx.Module):
     time: Array | None = None
     temperature: Array | None = None
     rubbing: dict[str, Rubbing] | None = None
+    T_m: Array | None = None
 
 
 class Conditions(eqx.Module):
-    """What surrounds a drive and is no torque: it acts on the effects that ask for it.
+    """What surrounds a drive: it acts on the effects that ask for it.
 
     Attributes:
         time: since the log's start [s]; the clock of the torque's signal.
         temperature: of the drive [K].
         rubbing: see [`Motion`][].
+        T_m: likewise; the equations of a drive with a motor fill in the torque that they are given.
     """
 
     time: Array | None = None
     temperature: Array | None = None
     rubbing: dict[str, Rubbing] | None = None
+    T_m: Array | None = None
 
 
 class Scales(eqx.Module):
@@ -115,7 +119,7 @@ class Effect(eqx.Module):
             else.
         drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
             single one shows it.
-        has_one_shape: whether another function of the same quantity at the same place would be something else.
+        one_shape_of: the quantity that it is a function of, where another function of that would be something else.
     """
 
     family: ClassVar[str]
@@ -124,7 +128,7 @@ class Effect(eqx.Module):
     needs_motor: ClassVar[bool] = False
     named_for: ClassVar[tuple[str, ...]] = ()
     drawn_against: ClassVar[str | None] = None
-    has_one_shape: ClassVar[bool] = False
+    one_shape_of: ClassVar[str | None] = None
 
     @classmethod
     @abc.abstractmethod

@@ -215,7 +215,7 @@ class Learned(Effect):
     @classmethod
     def may_depend_on(cls, variable: str) -> bool:
         """Whether it may be a function of a quantity of `UNITS`."""
-        return True
+        return variable != "T_m"
 
     @property
     def needs_temperature(self) -> bool:
@@ -240,6 +240,10 @@ class LearnedMotorTorque(LearnedTorque, MotorSideEffect):
     """Learned torque on the motor."""
 
     name: ClassVar[str] = "learned_motor_torque"
+
+    @classmethod
+    def may_depend_on(cls, variable: str) -> bool:
+        return True
 
 
 class LearnedLoadTorque(LearnedTorque, LoadSideEffect):
@@ -281,6 +285,7 @@ UNITS = {
     "omega_m": "rad/s",
     "theta_l": "rad",
     "omega_l": "rad/s",
+    "T_m": "N m",
     "time": "s",
     "temperature": "K",
 }
@@ -319,7 +324,7 @@ def axes_over(ranges: Mapping[str, tuple[float, float]]) -> list[tuple[Axis, ...
     scaled = [
         tuple(LinearAxis(n) if n == by else axis_over(n, *ranges[n]) for n in ranges)
         for by in ranges
-        if by == "x" or by in _RATES
+        if by in ("x", "T_m", *_RATES)
     ]
     return [*scaled, (axis_over(one, *ranges[one], beside=other), axis_over(other, *ranges[other], beside=one))]
 

@@ -21,7 +21,7 @@ class GravityLoad(LoadSideEffect):
     family: ClassVar[str] = "gravity_load"
     name: ClassVar[str] = "gravity_load"
     drawn_against: ClassVar[str | None] = "theta_l"
-    has_one_shape: ClassVar[bool] = True
+    one_shape_of: ClassVar[str | None] = "theta_l"
 
     sine: Scalar = parameter(0.0, unit="N m", doc="m g r cos(phi)", source="EFFECTS", role="strength")
     cosine: Scalar = parameter(0.0, unit="N m", doc="m g r sin(phi)", source="EFFECTS", role="strength")
