@@ -74,7 +74,7 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     firsts = np.cumsum(pieces) - pieces
     ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
     conditions = conditions_between(segments)
-    at_knots = motions(model, followed.states, conditions_at_knots(model, segments))
+    at_knots = motions(model, followed.states, conditions_at_knots(segments))
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
     goes_on = jnp.asarray(continues(segments))
@@ -82,14 +82,14 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
 
 
 @jit_small
-def conditions_at_knots(model: Model, segments: Segments) -> Conditions:
-    """Time, temperature and the motor's torque at each knot, the end of the last interval included."""
+def conditions_at_knots(segments: Segments) -> Conditions:
+    """Time and temperature at each knot, the end of the last interval included."""
     time = segments.torque.knots[:, segments.halo :]
-    torque = acting_at_knots(model, segments) if isinstance(model, TwoInertiaModel) else None
     warmth = None if segments.temperature is None else _at_knots(segments.temperature.coefficients, jnp.diff(time))
-    return Conditions(time, warmth, T_m=torque)
+    return Conditions(time, warmth)
 
 
+@jit_small
 def acting_at_knots(model: Model, segments: Segments) -> Float[Array, "segments knots"]:
     """The torque that acts on a drive, or the forcing, at each knot; where it jumps the middle, so that a straight line
     from knot to knot is not late."""

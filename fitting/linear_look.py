@@ -1,5 +1,7 @@
 """What forces along a fitted motion would explain of what a fit leaves over, to first order."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from fitting.explained import explained, solved, without_untold
 from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem
 from fitting.solve import linearise
-from hdjax import Model
+from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
 from hdjax.where import where
 
@@ -85,7 +87,9 @@ def look_along(fit: Fit) -> Look:
     """Linearise a fit along its motion."""
     problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
     followed = follow(problem, fit.unknowns)
-    conditions = conditions_at_knots(fit.model, problem.segments)
+    conditions = conditions_at_knots(problem.segments)
+    if isinstance(fit.model, TwoInertiaModel):
+        conditions = replace(conditions, T_m=acting_at_knots(fit.model, problem.segments))
     return Look(
         problem,
         without_untold(linearise(problem, fit.unknowns), problem.free),

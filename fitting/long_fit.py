@@ -30,12 +30,11 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     if substeps > start.substeps:
         # A corner that is sharper than its steps resolved has moved by then.
         start = _again(start, start.model, horizon=start.horizon, substeps=substeps)
-    whole = max(len(s) for s in start.stretches)
-    long = _again(start, start.model, horizon=whole, substeps=substeps)
+    long = _again(start, start.model, horizon=_longest(start), substeps=substeps)
     # Long horizons know the parameters better, and so ask for finer steps.
     substeps = _fine_enough(long)
     if substeps > long.substeps:
-        long = _again(long, long.model, horizon=whole, substeps=substeps)
+        long = _again(long, long.model, horizon=_longest(start), substeps=substeps)
     explains = long.objective <= start.objective + _freedom_of_states(start) + _LOSS
     if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
@@ -45,8 +44,7 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
 
 def over_whole_stretches(found: Fit) -> Fit:
     """The same parameters over horizons as long as the stretches; only initial states are fitted."""
-    whole = max(len(s) for s in found.stretches)
-    return _again(found, found.model, horizon=whole, substeps=found.substeps, hold_parameters=True)
+    return _again(found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=True)
 
 
 def follows(found: Fit) -> bool:
@@ -54,6 +52,11 @@ def follows(found: Fit) -> bool:
     segments = found.problem.segments
     measured = np.asarray(segments.measured)[np.asarray(segments.weight) > 0]
     return bool(np.all(np.diag(np.asarray(found.covariance)) < 0.25 * measured.var(axis=0)))
+
+
+def _longest(found: Fit) -> int:
+    """Samples of the longest stretch."""
+    return max(len(s) for s in found.stretches)
 
 
 def _freedom_of_states(found: Fit) -> float:

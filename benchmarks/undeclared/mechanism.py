@@ -102,8 +102,8 @@ class Mechanism(NamedTuple):
     # Heat, per kelvin above the reference.
     warm_k: float = 0.0
     warm_c: float = 0.0
-    # Load: friction likewise, weight, tether to the ground, three lobes in a turn, an inertia that swings,
-    # unlogged pushes, a third inertia.
+    # Load: friction likewise, weight, tether to the ground, three lobes in a turn, an inertia that swings, unlogged
+    # pushes, a third inertia.
     hold_l: float = 0.0
     slide_l: float = 0.0
     sink_l: float = 1.0
