@@ -1,5 +1,6 @@
 """A fitted motion as effects look at it, and what a unit of each thing that they can add does there."""
 
+import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitting.experiment import Segments, Stretch
 from fitting.followed import NODES, Followed
+from fitting.instants import at_instants
 from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
 from hdjax.effects import (
     Conditions,
@@ -116,13 +118,14 @@ def conditions_between(segments: Segments) -> Conditions:
     return Conditions(time[:, :-1, None] + _late(time), warmth)
 
 
-@jit_small
 def motions(model: Model, states: Float[Array, "*many states"], conditions: Conditions) -> Motion:
     """The motion that each of many states means."""
-    find = model.motion
-    for _ in states.shape[:-1]:
-        find = jax.vmap(find)
-    return find(states, conditions)
+    return at_instants(functools.partial(_motions, model), states.shape[:-1], states, conditions)
+
+
+@jit_small
+def _motions(model: Model, states: Float[Array, "instants states"], conditions: Conditions) -> Motion:
+    return jax.vmap(model.motion)(states, conditions)
 
 
 class _UnitGeometry(MeshGeometryEffect):
@@ -145,13 +148,19 @@ class _UnitGeometry(MeshGeometryEffect):
         return self.e_slope
 
 
-@jit_small
 def unit_pushes(
     model: Model, states: Float[Array, "*many states"], conditions: Conditions
 ) -> dict[str, Float[Array, "*many states"]]:
     """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
     of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
     mesh, and its slope."""
+    return at_instants(functools.partial(_unit_pushes, model), states.shape[:-1], states, conditions)
+
+
+@jit_small
+def _unit_pushes(
+    model: Model, states: Float[Array, "instants states"], conditions: Conditions
+) -> dict[str, Float[Array, "instants states"]]:
     whole = isinstance(model, TwoInertiaModel)
     forms = [f for f in LEARNED_TORQUES if whole or not f.needs_motor]
     names = [f.name for f in forms] + ([ERROR, SLOPE] if whole else [])
@@ -163,9 +172,7 @@ def unit_pushes(
         probed = model.with_effects(*torques, *geometry)
         return probed.rates(state, torque, jnp.zeros_like(torque), conditions)
 
-    find = jax.jacfwd(rates, argnums=(0, 1))
-    for _ in states.shape[:-1]:
-        find = jax.vmap(find, in_axes=(None, None, 0, 0))
+    find = jax.vmap(jax.jacfwd(rates, argnums=(0, 1)), in_axes=(None, None, 0, 0))
     by_strength, by_input = find(jnp.zeros(len(names)), jnp.zeros(()), states, conditions)
     return {name: by_strength[..., i] for i, name in enumerate(names)} | {INPUT: by_input}
 

@@ -20,6 +20,7 @@ from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
+from fitting.screening import programs_ahead
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
 from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Hold, Model
@@ -137,7 +138,8 @@ def close_loop(
     clock = Clock()
     data: Data = {h: split(e) for h, e in experiments.items()}
     progress("finding starting values")
-    base, setting, hold, data = _base_trial(model, data, hold)
+    with programs_ahead(model, next(iter(data.values()))[0], catalogue):
+        base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
     named, rounds, dropped, without = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress

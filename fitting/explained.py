@@ -67,13 +67,15 @@ def without_untold(found: Blocks, free: FreeParameters) -> Blocks:
     )
 
 
-def solved(gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+def solved(
+    gram: Float[np.ndarray, "*many columns columns"], gradient: Float[np.ndarray, "*many columns sides"]
+) -> Float[np.ndarray, "*many columns sides"]:
     """Least squares; directions without information do not move.
 
     Nor do columns without any, as of a parameter that has gone to infinity: they would not explain, and what rounding
     leaves of them on other data would be all that counts.
     """
-    size = np.diag(gram)
-    scale = np.where(size > _NOTHING, 1.0 / np.sqrt(np.maximum(size, _NOTHING)), 0.0)
-    inverse = np.linalg.pinv(gram * np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    return scale[:, None] * (inverse @ (scale[:, None] * gradient))
+    size = np.diagonal(gram, axis1=-2, axis2=-1)
+    scale = np.where(size > _NOTHING, 1.0 / np.sqrt(np.maximum(size, _NOTHING)), 0.0)[..., None]
+    inverse = np.linalg.pinv(gram * scale * np.swapaxes(scale, -1, -2), rcond=1e-10, hermitian=True)
+    return scale * (inverse @ (scale * gradient))

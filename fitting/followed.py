@@ -154,14 +154,19 @@ def respond(
     """
 
     def one(followed: Followed, at_start, at_end):
-        pushed = followed.from_start @ at_start + followed.from_end @ at_end
+        pushed = _times(followed.from_start, at_start) + _times(followed.from_end, at_end)
 
         def step(deviation, inputs):
             transition, push = inputs
-            return transition @ deviation + push, deviation
+            return _times(transition, deviation) + push, deviation
 
         undisturbed = jnp.zeros(pushed.shape[1:])
         end, deviations = jax.lax.scan(step, undisturbed, (followed.transition, pushed))
-        return followed.readout @ deviations, end
+        return _times(followed.readout, deviations), end
 
     return jax.vmap(one)(followed, at_start, at_end)
+
+
+def _times(matrices: Array, columns: Array) -> Array:
+    """Their product, written out: one of many tiny matrices is slow."""
+    return sum((matrices[..., :, j, None] * columns[..., None, j, :] for j in range(matrices.shape[-1])), jnp.zeros(()))

@@ -21,7 +21,7 @@ from fitting.linear_look import (
     Products,
     Pushes,
     Sizes,
-    best_step,
+    best_steps,
     left_after,
     look_along,
     parameter_torques,
@@ -244,7 +244,8 @@ def _candidate(
     # One width, one program.
     width = ((0, 0), (0, 0), (0, max(sizes) - mixing.shape[1]))
     padded = tuple(np.pad(part @ mixing, width) for part in raw)
-    found = _instead_of_own(products(seen.look, seen.pushes(form), padded), seen.look, parameters, own.shape[2])
+    found = products(seen.look, seen.pushes(form), padded).in_parts(_FOLDS)
+    found = _instead_of_own(found, seen.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
     base = _left_out(found, parameters)
     for size in (s for s in sizes if s <= mixing.shape[1]):
@@ -254,7 +255,7 @@ def _candidate(
     if best is None or not best[0] > 0:
         return None
     gain, size = best
-    step = best_step(_first(found, parameters + size))
+    (step,) = best_steps(found.first(parameters + size).in_parts(1))
     effect = form(axes=axes, mixing=mixing[:, :size], c=tuple(step[parameters:]))
     return Candidate(form, variables, gain, effect, step[:parameters], known)
 
@@ -286,6 +287,8 @@ def _same_functions(raw: np.ndarray, own: np.ndarray) -> np.ndarray:
     they can do to them."""
     size = np.sqrt(np.mean(own**2, axis=0))
     own = own[:, size > 0] / size[size > 0]
+    if own.shape[1] == 0:
+        return own
     coefficients = np.linalg.lstsq(raw, own, rcond=1e-10)[0]
     left = np.mean((own - raw @ coefficients) ** 2, axis=0)
     return own[:, left < 1.0 - _SAME_FUNCTION]
@@ -315,6 +318,8 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
 
 def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """The penalty, where any part of what is known already costs nothing: it is among the functions."""
+    if known.shape[1] == 0:
+        return roughness
     own = np.linalg.lstsq(raw, known / np.sqrt(np.mean(known**2, axis=0)), rcond=1e-10)[0]
     pulled = roughness @ own
     return roughness - pulled @ np.linalg.pinv(own.T @ pulled, hermitian=True) @ pulled.T
@@ -335,16 +340,8 @@ def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> 
     return free @ vectors
 
 
-def _first(found: Products, columns: int) -> Products:
-    return Products(found.gram[..., :columns, :columns], found.gradient[..., :columns], found.square, found.samples)
-
-
 def _left_out(found: Products, columns: int) -> float:
     """The objective on each part of the data after least squares on the others, with the first columns free."""
-    part = np.arange(found.samples.size) * _FOLDS // found.samples.size
-    total = np.zeros(found.square.shape[1:])
-    first = _first(found, columns)
-    for fold in range(min(_FOLDS, found.samples.size)):
-        step = best_step(first.of(part != fold))
-        total += left_after(first.of(part == fold), step)
-    return 0.5 * float(np.linalg.slogdet(total / found.samples.sum())[1])
+    first = found.first(columns)
+    left = np.sum(left_after(first, best_steps(first.others())), axis=0)
+    return 0.5 * float(np.linalg.slogdet(left / found.samples.sum())[1])

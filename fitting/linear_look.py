@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.along import acting_at_knots, conditions_at_knots, motions, unit_pushes
 from fitting.estimate import Fit
@@ -57,7 +57,8 @@ class Look(eqx.Module):
 
 
 class Products(eqx.Module):
-    """Inner products of what forces would do to the outputs, for each segment and pair of outputs.
+    """Inner products of what forces would do to the outputs, for each part of the data (a segment, or several) and pair
+    of outputs.
 
     The free parameters' columns come first, then those of the forces; what each simulation's first state could do as
     well is taken off.
@@ -69,18 +70,26 @@ class Products(eqx.Module):
         samples: number of samples with weight.
     """
 
-    gram: Float[np.ndarray, "segments outputs outputs columns columns"]
-    gradient: Float[np.ndarray, "segments outputs outputs columns"]
-    square: Float[np.ndarray, "segments outputs outputs"]
-    samples: Float[np.ndarray, " segments"]
+    gram: Float[np.ndarray, "parts outputs outputs columns columns"]
+    gradient: Float[np.ndarray, "parts outputs outputs columns"]
+    square: Float[np.ndarray, "parts outputs outputs"]
+    samples: Float[np.ndarray, " parts"]
 
-    def of(self, which: np.ndarray) -> "Products":
-        """Those of some segments, added up."""
-        return Products(*(np.sum(a[which], axis=0, keepdims=True) for a in vars(self).values()))
+    def in_parts(self, many: int) -> "Products":
+        """Added up in parts of what follows one another, so many at most."""
+        size = self.samples.size
+        return self._added(np.arange(size) * many // size == np.arange(many)[:, None])
 
-    def mixed(self, mixing: Float[np.ndarray, "columns fewer"]) -> "Products":
-        """Those of combinations of the columns."""
-        return Products(mixing.T @ self.gram @ mixing, self.gradient @ mixing, self.square, self.samples)
+    def others(self) -> "Products":
+        """For each part all the others, added up."""
+        return self._added(~np.eye(self.samples.size, dtype=bool))
+
+    def first(self, columns: int) -> "Products":
+        """Those of the first columns alone."""
+        return Products(self.gram[..., :columns, :columns], self.gradient[..., :columns], self.square, self.samples)
+
+    def _added(self, which: Bool[np.ndarray, "sums parts"]) -> "Products":
+        return Products(*(np.tensordot(which.astype(float), a, axes=1) for a in vars(self).values()))
 
 
 def look_along(fit: Fit) -> Look:
@@ -195,21 +204,24 @@ def _against(look: Look, pushes: Pushes, sizes: Sizes, surrogates: Array) -> tup
     return jnp.einsum("srp,srq->pq", rows, rows), jnp.einsum("srp,dsr->pd", rows, surrogates)
 
 
-def best_step(found: Products) -> Float[np.ndarray, " columns"]:
-    """The step that leaves the smallest determinant of the outputs' error covariance: least squares that weigh the
-    outputs by what is left over."""
-    total = found if found.square.shape[0] == 1 else found.of(np.arange(found.square.shape[0]))
-    weight = np.eye(total.square.shape[1])
-    step = np.zeros(total.gram.shape[-1])
+def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:
+    """For each part of the data the step that leaves the smallest determinant of the outputs' error covariance there:
+    least squares that weigh the outputs by what is left over."""
+    samples = np.maximum(found.samples, 1.0)[:, None, None]
+    weight = np.broadcast_to(np.eye(found.square.shape[1]), found.square.shape)
+    steps = np.zeros((found.samples.size, found.gram.shape[-1]))
     for _ in range(_REWEIGHTINGS):
-        step = solved(
-            np.einsum("ij,ijpq->pq", weight, total.gram[0]), np.einsum("ij,ijp->p", weight, total.gradient[0])[:, None]
-        )[:, 0]
-        weight = np.linalg.pinv(left_after(total, step) / total.samples[0], hermitian=True)
-    return step
+        gram = np.einsum("sij,sijpq->spq", weight, found.gram)
+        gradient = np.einsum("sij,sijp->sp", weight, found.gradient)
+        steps = solved(gram, gradient[..., None])[..., 0]
+        weight = np.linalg.pinv(left_after(found, steps) / samples, hermitian=True)
+    return steps
 
 
-def left_after(found: Products, step: Float[np.ndarray, " columns"]) -> Float[np.ndarray, "outputs outputs"]:
-    """Squares of the outputs' errors after a step, added up."""
-    against = np.sum(found.gradient, axis=0) @ step
-    return np.sum(found.square, axis=0) - against - against.T + np.sum(found.gram, axis=0) @ step @ step
+def left_after(
+    found: Products, steps: Float[np.ndarray, "parts columns"]
+) -> Float[np.ndarray, "parts outputs outputs"]:
+    """Squares of the outputs' errors in each part of the data after a step for it."""
+    against = np.einsum("sijp,sp->sij", found.gradient, steps)
+    explained = np.einsum("sijpq,sp,sq->sij", found.gram, steps, steps, optimize=True)
+    return found.square - against - np.swapaxes(against, 1, 2) + explained

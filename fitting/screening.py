@@ -6,7 +6,8 @@ each effect's strength and gain to first order (a score test), on held-out data 
 surrogates of the residual gives the law of the best gain where there is nothing to find.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import equinox as eqx
@@ -15,17 +16,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimate import Fit
-from fitting.experiment import Segments, scales
+from fitting.experiment import Segments, Stretch, scales
 from fitting.explained import explained, solved
 from fitting.followed import Followed
 from fitting.free import strength_paths
-from fitting.regressors import Regressors
+from fitting.regressors import Regressors, prepare
 from fitting.residual import Blocks
 from fitting.sight import Sight, batches, follow_on, sight
 from fitting.spectral_lines import spectral_lines
 from fitting.surrogates import DRAWS
-from hdjax import TwoInertiaModel
-from hdjax.effects import CATALOGUE, Effect, applicable
+from hdjax import Model, TwoInertiaModel
+from hdjax.effects import CATALOGUE, Effect, Scales, applicable
 from hdjax.program_cache import jit_kept
 
 
@@ -79,11 +80,8 @@ def screen(
     """
     model = training.model
     present = {e.name for e in model.effects}
-    found = applicable(
-        [form for form in catalogue if form.name not in present],
-        replace(scales(training.stretches, model), residual_frequencies=spectral_lines(training)),
-        has_motor=isinstance(model, TwoInertiaModel),
-    )
+    lines = replace(scales(training.stretches, model), residual_frequencies=spectral_lines(training))
+    found = _applicable([form for form in catalogue if form.name not in present], lines, model)
     proposals = tuple(effect for effects in found.values() for effect in effects)
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
@@ -108,6 +106,30 @@ def screen(
             leads[effect.name] = Lead(filled, changes, gain, batch.own_states[index])
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), null_gains)
+
+
+def _applicable(
+    catalogue: Sequence[type[Effect]], scales: Scales, model: Model
+) -> dict[type[Effect], tuple[Effect, ...]]:
+    return applicable(catalogue, scales, has_motor=isinstance(model, TwoInertiaModel))
+
+
+@contextmanager
+def programs_ahead(model: Model, stretches: Sequence[Stretch], catalogue: Sequence[type[Effect]]) -> Iterator[None]:
+    """Have those programs of a first look that are the same for all logs made beside what is done meanwhile; what has
+    not begun then is called off.
+
+    Args:
+        model: the equations; the values don't matter.
+        stretches: of the logs.
+        catalogue: forms to look at.
+    """
+    found = _applicable(catalogue, scales(stretches, model), model)
+    warm = all(s.experiment.temperature is not None for s in stretches)
+    with ExitStack() as stack:
+        for call_off in prepare(model, found.values(), has_temperature=warm):
+            stack.callback(call_off)
+        yield
 
 
 class _Score(eqx.Module):

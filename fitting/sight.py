@@ -18,8 +18,9 @@ from fitting.experiment import Segments
 from fitting.explained import without_untold
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
+from fitting.memory import Memory
 from fitting.posing import STEP_ANGLE, suggested_substeps
-from fitting.regressors import Memory, Regressors, regressors
+from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks, Problem
 from fitting.solve import linearise
 from fitting.surrogates import surrogates
