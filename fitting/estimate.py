@@ -92,6 +92,7 @@ def fit(
     hold_parameters: bool = False,
     count: int | None = None,
     states: Float[Array, "segments states"] | None = None,
+    begin_anew: bool = True,
     retry_states: bool = True,
     give_up_above: float = np.inf,
     least_progress: float = 0.0,
@@ -119,8 +120,8 @@ def fit(
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         count: number of segments, see [`fitting.experiment.cut`][].
         states: initial states of the segments to start from; from their first samples where not given.
-        retry_states: whether a first pass that does not converge is begun anew, from the first samples of each segment,
-            and so are segments that stand out: they may have ended in a wrong minimum.
+        begin_anew: whether a first pass that does not converge is begun anew, from the first samples of each segment.
+        retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
         least_progress: see [`fitting.solve.solve`][].
 
@@ -155,11 +156,11 @@ def fit(
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
         problem = _weighed(problem, covariance, swing)
         solution = solved(unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
-        if turn == 0 and retry_states and horizon <= _LONGEST_RETRY * length:
-            if not (solution.success or hold_parameters):
+        if turn == 0 and horizon <= _LONGEST_RETRY * length:
+            if begin_anew and not (solution.success or hold_parameters):
                 again = solved(_grown(problem, unknowns, least_progress), NEARBY_DAMPING)
                 solution = min(solution, again, key=lambda s: float(jnp.sum(s.squares)))
-            mended = _retry_states(problem, solution, least_progress)
+            mended = _retry_states(problem, solution, least_progress) if retry_states else None
             if mended is not None:
                 solution = solved(mended, NEARBY_DAMPING)
         unknowns, covariance = solution.unknowns, solution.covariance

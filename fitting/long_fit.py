@@ -90,6 +90,7 @@ def _again(
         covariance=found.covariance,
         count=count,
         states=None if afresh else found.unknowns.states,
+        begin_anew=afresh,
         retry_states=afresh,
         max_steps=_STEPS,
         hold_parameters=hold_parameters,

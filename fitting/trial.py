@@ -142,7 +142,7 @@ def challenge(
             setting,
             champion.training,
             give_up_above=-np.inf,
-            retry_states=True,
+            begin_anew=True,
             own_states=own_states if model is models[0] else None,
         )
 
@@ -151,7 +151,8 @@ def challenge(
     if first.objective > limit:
         return None
     setting = setting.fine_enough(first)
-    best = trained(first.model, data, hold, setting, first, give_up_above=limit)
+    # A segment that lost its way while the parameters were far off would now hold them there.
+    best = trained(first.model, data, hold, setting, first, give_up_above=limit, retry_states=True)
     if best.objective > limit:
         return None
     # Where a corner is sharper than the steps resolve, a fit rounds it until they do.
@@ -169,6 +170,7 @@ def trained(
     near: Fit | None,
     *,
     give_up_above: float = np.inf,
+    begin_anew: bool = False,
     retry_states: bool = False,
     max_steps: int = _TRIAL_STEPS,
     reweigh: bool = True,
@@ -184,7 +186,8 @@ def trained(
         setting: how the data are cut.
         near: the fit near by, if there is one.
         give_up_above: see [`fitting.estimate.fit`][], as for the rest.
-        retry_states: likewise; so they are in any case where the model has other states.
+        begin_anew: likewise; so it is in any case where the model has other states.
+        retry_states: likewise; so they are in any case where a fit may begin anew.
         max_steps: likewise.
         reweigh: likewise.
         hold_parameters: likewise.
@@ -205,7 +208,8 @@ def trained(
         reweigh=reweigh,
         hold_parameters=hold_parameters,
         states=states,
-        retry_states=retry_states or not same,
+        begin_anew=begin_anew or not same,
+        retry_states=retry_states or begin_anew or not same,
         give_up_above=give_up_above,
         least_progress=_LEAST_PROGRESS,
     )

@@ -80,7 +80,9 @@ def test_the_program_of_a_coming_fit_is_made_beside(tmp_path: Path, monkeypatch:
         options = {"horizon": 128, "halo": 0, "substeps": 2, "count": 3}
         model = model.with_effects(BoucWen(k=10.0, memory_twist=1e-3))
         pose_ahead(model, stretches, ("mu", "bouc_wen.k"), **options)
-        found = fit(model, stretches, ("mu", "bouc_wen.k"), max_steps=2, retry_states=False, **options)
+        found = fit(
+            model, stretches, ("mu", "bouc_wen.k"), max_steps=2, begin_anew=False, retry_states=False, **options
+        )
         assert made.count("_solve") == 1 and np.isfinite(found.objective)
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
