@@ -34,7 +34,7 @@ from hdjax.parameters import own_value
 from hdjax.program_cache import jit_small
 
 # What a sensor effect adds.
-READING = "reading"
+_READING = "reading"
 
 
 class Regressors(eqx.Module):
@@ -87,8 +87,8 @@ def regressors(
     added = {name: _finite(np.asarray(values)) for name, values in added.items()}
     columns = next(iter(added.values())).shape[-1]
     nothing = np.zeros((*shape[:2], seen.followed.states.shape[-1], columns))
-    if READING in added:
-        return Regressors(nothing, nothing, added[READING]), None
+    if _READING in added:
+        return Regressors(nothing, nothing, added[_READING]), None
     at_start, at_end = nothing, nothing
     for name, values in added.items():
         starts, ends = at_instants(_straight_lines, shape[:2], seen.pushes[name], _padded(values))
@@ -172,7 +172,7 @@ def _columns(
             assert motion.theta_m is not None and motion.theta_l is not None
             still = jnp.zeros_like(motion.x)
             states = jnp.stack([motion.theta_m, motion.theta_l, still, still], axis=-1)
-            return {READING: jax.vmap(bare.with_effects(effect).outputs)(states)}
+            return {_READING: jax.vmap(bare.with_effects(effect).outputs)(states)}
         if isinstance(effect, MeshGeometryEffect):
             assert motion.theta_m is not None
             return {ERROR: effect.error(motion.theta_m), SLOPE: effect.slope(motion.theta_m)}
