@@ -73,7 +73,7 @@ def regressors(
         start, end = own_states(seen, stacked, count, before)
         memory = memory_of(seen, start, end)
     own = own_between(start, end)
-    if isinstance(stacked, LoadSideEffect) and stacked.takes_inertia():
+    if _takes_inertia(stacked):
         found = _regressors(seen.model, stacked, seen.followed, segments, *(jnp.asarray(a) for a in (start, own)))
         return jax.tree.map(lambda a: _finite(np.asarray(a)), found), memory
     if isinstance(stacked, ActuatorEffect):
@@ -116,7 +116,7 @@ def prepare(model: Model, alike: Iterable[Sequence[Effect]], *, has_temperature:
         stacked, count = _stacked(proposals), len(proposals)
         if stacked.states:
             called_off.append(prepare_own(stacked, count, motion))
-        if isinstance(stacked, ActuatorEffect) or (isinstance(stacked, LoadSideEffect) and stacked.takes_inertia()):
+        if _takes_inertia(stacked) or isinstance(stacked, ActuatorEffect):
             continue
         own = jnp.asarray(np.zeros((INSTANTS, len(stacked.states), count)))
         called_off.append(_columns.prepare(bare, stacked, motion, own))
@@ -125,6 +125,10 @@ def prepare(model: Model, alike: Iterable[Sequence[Effect]], *, has_temperature:
 
 def _stacked(proposals: Sequence[Effect]) -> Effect:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *proposals)
+
+
+def _takes_inertia(effect: Effect) -> bool:
+    return isinstance(effect, LoadSideEffect) and effect.takes_inertia()
 
 
 def _padded(values: np.ndarray) -> Array:
