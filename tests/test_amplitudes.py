@@ -39,6 +39,7 @@ MU, ALPHA = 0.02, 0.05
 DRIVE = ReducedDrive(mu=MU, omega_0=1.0, alpha=ALPHA)
 
 
+@pytest.mark.slow
 def test_slow_forcing_is_stable():
     # A hundred natural oscillations within a period of the forcing.
     (row,) = check_amplitudes(DRIVE, 0.05, 0.01).rows
@@ -46,7 +47,9 @@ def test_slow_forcing_is_stable():
     assert row.verdict == "holds to 1%"
 
 
-@pytest.mark.parametrize("omega", (0.34, 0.5, 1.02, 3.05))
+@pytest.mark.parametrize(
+    "omega", [pytest.param(0.34, marks=pytest.mark.slow), 0.5, 1.02, pytest.param(3.05, marks=pytest.mark.slow)]
+)
 def test_all_routes_agree_on_a_linear_drive(omega):
     A = 0.05
     (row,) = check_amplitudes(ReducedDrive(mu=MU, omega_0=1.0), A, omega).rows
@@ -148,6 +151,7 @@ def branch() -> Branch:
     return frequency_response(ReducedModel(DRIVE), harmonic_series(1.0, 0.05), 0.8, 1.3, points=150, harmonics=5)
 
 
+@pytest.mark.slow
 def test_a_range_that_ends_within_the_fold_has_two_branches():
     def ends(fast: float) -> tuple[Branch, ...]:
         return from_both_ends(ReducedModel(DRIVE), harmonic_series(1.0, 0.05), 0.8, fast, points=150, harmonics=5)

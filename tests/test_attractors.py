@@ -18,6 +18,7 @@ def basins() -> Basins:
     return attractors(RICH, harmonic_series(*SHAKEN), (-3.0, 3.0), (-6.0, 6.0), 40)
 
 
+@pytest.mark.slow
 def test_coexisting_attractors_are_orbits(basins):
     """Each is a stable orbit that shooting confirms, of just its period."""
     assert sorted(a.period for a in basins.attractors) == [1, 1, 2, 2, 3, 5]

@@ -102,6 +102,7 @@ def test_spikes_cost_no_more_than_their_samples(found: Fit, clean, size: float):
     assert spoiled.dynamic_error_std == pytest.approx(found.dynamic_error_std, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_frequency_that_the_torque_has_does_not_pass_for_the_drive_s_own():
     """An undriven oscillator at the frequency of a harmonic torque follows the log better, at first sight, than the
     drive with a damping that is far off."""
@@ -119,6 +120,7 @@ def test_a_frequency_that_the_torque_has_does_not_pass_for_the_drive_s_own():
     assert float(result.model.get("gain")) == pytest.approx(rig.GAIN, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_noisy_oversampled_softening_drive():
     """Speeds guessed from a few noisy samples would throw the simulation over its saddle."""
     step, count = PERIOD / 150, 1500
@@ -134,6 +136,7 @@ def test_a_noisy_oversampled_softening_drive():
     assert float(result.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_large_load_that_is_not_logged():
     """A weight outweighs the motor's torque, and no minimum of the base model is near the drive's parameters."""
     torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)

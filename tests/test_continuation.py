@@ -262,6 +262,7 @@ def test_folds_of_a_weak_nonlinearity_are_those_of_one_term(lanes):
     np.testing.assert_allclose(shifts, one_term_folds(WEAK_ZETA, KAPPA, 1.6 * CRITICAL), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_folds_meet_in_the_cusp_of_one_term(lanes):
     """At sigma = sqrt(3) zeta, kappa A^2 / 4 = 8 zeta^3 / (3 sqrt(3))."""
     branch, found = lane(lanes, "weak")

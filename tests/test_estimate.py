@@ -173,6 +173,7 @@ def test_measurement_noise_needs_no_good_model():
     assert noise[1.02] < 0.2 * fits[1.02].dynamic_error_std
 
 
+@pytest.mark.slow
 def test_a_dead_zone_is_recovered_from_afar():
     """Long segments of a nonsmooth drive have many minima; windows that grow lead past them."""
     gap = 1.5e-4

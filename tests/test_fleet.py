@@ -176,6 +176,7 @@ def test_why_a_parameter_is_not_told():
     assert (columns["alpha_low"], columns["alpha_identifiable"]) == (-3.0, False)
 
 
+@pytest.mark.slow
 def test_a_cluster_makes_the_same_table(tmp_path: Path, drive: Path):
     pytest.importorskip("distributed", reason="needs the extra `sweep`, which is not installed")
     for i in range(3):

@@ -67,6 +67,7 @@ def test_its_motions_and_multipliers_are_those_of_time_integration(subharmonic):
 K_2, K_5, OMEGA = 0.3, 0.4, 1.5
 
 
+@pytest.mark.slow
 def test_follow_the_forcing_amplitude_of_a_quintic_and_lopsided_spring():
     """An S: two folds. The even term bends the motion to one side."""
     model = duffing(MU, 0.3).with_effects(QuinticStiffness(k5=K_5), QuadraticStiffness(k2=K_2))
@@ -94,6 +95,7 @@ def test_follow_the_forcing_amplitude_of_a_quintic_and_lopsided_spring():
     assert float(found.value[1]) < float(found.value[0])
 
 
+@pytest.mark.slow
 def test_follow_the_stiffness_of_two_inertias():
     """Linear: a closed form."""
     drive = Drive(N=2.0, J_m=1.0, J_l=3.0, K=5.0, B_sp=0.6)

@@ -165,7 +165,7 @@ def turning_drive(c_2: float) -> TwoInertiaModel:
     return TwoInertiaModel(drive, effects)
 
 
-@pytest.mark.parametrize("c_2, tolerance", [(0.0, 1e-9), (C_2, 1e-6)])
+@pytest.mark.parametrize("c_2, tolerance", [pytest.param(0.0, 1e-9, marks=pytest.mark.slow), (C_2, 1e-6)])
 def test_a_turning_drive_with_effects(c_2, tolerance):
     """`v |v|` has corners, for which the harmonics fall with a power only."""
     torque, load = harmonic_series(1.0, np.array([0.3, 0.5])), harmonic_series(1.0, 20.0, 0.4, mean=-30.0)
@@ -206,6 +206,7 @@ def test_a_turning_drive_with_effects(c_2, tolerance):
         assert abs(end[2] - expected[2]) < tolerance * OMEGA
 
 
+@pytest.mark.slow
 def test_a_turning_drive_over_two_revolutions_is_that_over_one():
     torque, load = harmonic_series(1.0, np.array([0.3, 0.5])), harmonic_series(1.0, 20.0, 0.4, mean=-30.0)
     once, twice = (

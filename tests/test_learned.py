@@ -142,6 +142,7 @@ def test_two_variables_are_products():
     np.testing.assert_array_equal(functions((one, other), motion), wanted)
 
 
+@pytest.mark.slow
 def test_the_derivative_by_hand_is_that_of_the_formula():
     axes = axis_over("x", -1.0, 1.0, beside="theta_m"), axis_over("theta_m", 0.0, 1.0, beside="x")
     count = int(np.prod([axis.count for axis in axes]))

@@ -14,7 +14,11 @@ COUNT, HORIZON, GAP = 8000, 128, 2e-4
 PATHS = ("K", "alpha", "B_sp", "backlash.b")
 
 
-@pytest.fixture(scope="module", params=[0.1, 0.3], ids=["long simulations lose their way", "gaps stay open"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(0.1, marks=pytest.mark.slow), 0.3],
+    ids=["long simulations lose their way", "gaps stay open"],
+)
 def found(request: pytest.FixtureRequest) -> Fit:
     """A drive with a dead zone: its motion is chaotic."""
     logged = rig.drive_experiment(COUNT, gap=GAP, rms=request.param)

@@ -212,7 +212,10 @@ def test_subharmonic_exists_between_its_limits(sign):
     assert not bool(jnp.any(made.existence(made.omega(-least)).A))
 
 
-@pytest.mark.parametrize(("kind", "derivative"), [(PrimaryResonance, jax.jacrev), (SuperharmonicResonance, jax.jacfwd)])
+@pytest.mark.parametrize(
+    ("kind", "derivative"),
+    [pytest.param(PrimaryResonance, jax.jacrev, marks=pytest.mark.slow), (SuperharmonicResonance, jax.jacfwd)],
+)
 def test_slopes_with_respect_to_parameters(kind, derivative):
     mu, alpha, A, sigma = BENT[kind]
 

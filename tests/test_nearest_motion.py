@@ -26,6 +26,7 @@ def motion(found: NearestMotions, i: int) -> FourierSeries:
     return jax.tree.map(lambda leaf: leaf[i], found.motion)
 
 
+@pytest.mark.slow
 def test_they_are_stable_motions(found):
     assert np.asarray(found.exists).all()
     for i, omega in enumerate(OMEGA):

@@ -76,6 +76,7 @@ def test_period_doubling_to_chaos_and_a_window_of_three():
     assert not np.asarray(diagram.escaped).any()
 
 
+@pytest.mark.slow
 def test_the_doubling_is_where_a_multiplier_leaves_through_minus_one():
     def multiplier(force: float, guess: Array) -> tuple[float, Array]:
         orbit = shoot(PARLITZ, harmonic_series(1.0, force), guess)

@@ -262,7 +262,7 @@ def test_a_value_beyond_real_drives_is_told(loop: Loop, gap: float, said: bool):
     assert parameter_note(b, loop.after.identifiability) is None
 
 
-@pytest.mark.parametrize("kind", ["loop", "fitted"])
+@pytest.mark.parametrize("kind", ["loop", pytest.param("fitted", marks=pytest.mark.slow)])
 def test_a_browser_draws_every_picture_offline(kind: str, request: pytest.FixtureRequest, tmp_path: Path):
     outcome = request.getfixturevalue(kind)
     write_page(tmp_path, outcome)

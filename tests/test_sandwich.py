@@ -217,6 +217,7 @@ def drive_fit(experiment, horizon: int) -> Fit:
     return fit(rig.drive_model(), [stretch], PATHS, horizon=horizon, substeps=1)
 
 
+@pytest.mark.slow
 def test_a_fit_is_put_back_in_the_order_of_time():
     """A log of one and a half segments, fitted as one simulation."""
     found = drive_fit(rig.drive_experiment(384), 10**6)

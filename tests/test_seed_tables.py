@@ -92,6 +92,7 @@ def test_nothing_fits_table_2():
     assert "no parameters of the stated model" in text and "a sub-harmonic motion" in text
 
 
+@pytest.mark.slow
 def test_a_consistent_table_is_fitted():
     """Amplitudes of a linear response, far from its resonance: the same search finds parameters that give them."""
     omega = tuple(case.omega for case in TABLE_2)

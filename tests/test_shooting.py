@@ -162,6 +162,7 @@ def orbit_slope(values: Array) -> Array:
     return jax.jacfwd(orbit_state)(values)
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_unstable_orbit():
     h = 1e-5
     ends = np.stack([[np.asarray(orbit_state(jnp.asarray(AT + s * h * e))) for s in (1, -1)] for e in np.eye(6)])

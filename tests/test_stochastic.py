@@ -410,6 +410,7 @@ def test_a_key_gives_one_motion_in_a_lane_in_a_jit_and_alone():
     np.testing.assert_allclose(compiled.states, lanes.states[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_along_one_motion():
     """Of the last twist, in everything; forward, reverse and by differences, at the same noise."""
     values = np.array([MU, OMEGA_0, 0.8, S / GAIN**2])

@@ -113,9 +113,9 @@ def requested(tolerance: float, outputs=("final",)) -> Request:
 @pytest.mark.parametrize(
     ("case", "tolerance", "method"),
     [
-        (drive_case(alpha=0.1), 1e-3, "strang"),
+        pytest.param(drive_case(alpha=0.1), 1e-3, "strang", marks=pytest.mark.slow),
         (drive_case(), 1e-6, "aba864"),
-        (drive_case(alpha=2e5), 1e-6, "srkn14"),
+        pytest.param(drive_case(alpha=2e5), 1e-6, "srkn14", marks=pytest.mark.slow),
         (drive_case(BY_NAME["quadratic_damping"](c2=0.1)), 1e-6, "tsit5"),
     ],
     ids=["next to linear, loosely", "nonlinear a little", "strongly nonlinear", "damping by the rate"],

@@ -70,6 +70,7 @@ def test_a_sweep_has_names_units_and_the_points_own_values():
     assert np.array_equal(np.flatnonzero(found.fold[1]), edges) and edges.size == 2
 
 
+@pytest.mark.slow
 def test_a_settled_transient_has_the_steady_peak_and_a_settling_time():
     points = Points({"forcing.omega": np.array([0.4, 0.6, 1.9])})
     request = Request(points, "transient", ("peak", "settling_time", "trace"), periods=40.0, windows=40)
@@ -130,6 +131,7 @@ def marks(store: Store) -> dict[str, tuple[int, int]]:
     return {p.name: (int(p.read_text().split()[-1]), p.stat().st_mtime_ns) for p in found}
 
 
+@pytest.mark.slow
 def test_killed_workers_and_a_killed_client_leave_the_same_bits(tmp_path):
     store, address_file = begun(tmp_path / "store"), tmp_path / "scheduler.json"
     module, joins = "distributed.cli.dask_", ("--scheduler-file", str(address_file))

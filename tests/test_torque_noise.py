@@ -68,6 +68,7 @@ def test_white_noise_of_the_encoder_is_as_in_textbooks():
         np.testing.assert_allclose(described, classical, rtol=0.3)
 
 
+@pytest.mark.slow
 def test_another_colour_is_not_torque_noise():
     found = fitted(output=2e-3, count=2000)
     drift = np.cumsum(np.random.default_rng(1).normal(size=found.error.shape[:2]).ravel())

@@ -31,6 +31,7 @@ def with_friction(model, T_c: float, v_0: float):
     return model.with_effects(CoulombFriction(T_c=T_c, v_0=v_0))
 
 
+@pytest.mark.slow
 def test_a_sharp_corner_takes_finer_steps(begun):
     """The base model has no corner and keeps its steps; with friction in it the trial finds out what it needs."""
     before, data, setting = begun

@@ -28,6 +28,7 @@ def shaking(count: int, *, rms: float = 0.3, seed: int = 0) -> np.ndarray:
     return rms * np.random.default_rng(seed).normal(size=count)
 
 
+@pytest.mark.slow
 def test_smooth_effects_against_scipy():
     """All that has a smooth right side, at once; its equations are written anew here."""
     p = BASE._replace(

@@ -116,6 +116,7 @@ def test_the_shape_is_named(rubbing: Unknown):
     assert [s.explained for s in found.closest] == sorted((s.explained for s in found.closest), reverse=True)
 
 
+@pytest.mark.slow
 def test_powers_go_on_beyond_the_data():
     """A lopsided spring, and a log that twists it half as far again."""
 
@@ -152,7 +153,10 @@ def test_a_learned_torque_knows_the_effect_that_it_has_come_out_as(rubbing: Unkn
     assert share_of(biased, rubbing) < 0.8 * share_of(right, rubbing)
 
 
-@pytest.mark.parametrize(("variable", "values"), [("time", TIME / TIME[-1] - 0.4), ("temperature", (WARMTH - 300) / 4)])
+@pytest.mark.parametrize(
+    ("variable", "values"),
+    [("time", TIME / TIME[-1] - 0.4), pytest.param("temperature", (WARMTH - 300) / 4, marks=pytest.mark.slow)],
+)
 def test_what_drifts_is_told_from_what_moves(variable: str, values: np.ndarray):
     drift = 10 * NOISE * rig.OMEGA_0**2 * values
     found = found_of(lambda x, v: 0.0, drift=drift)
@@ -167,6 +171,7 @@ def test_what_drifts_is_told_from_what_moves(variable: str, values: np.ndarray):
     assert variable in best.expression and best.explained > 0.9
 
 
+@pytest.mark.slow
 def test_an_error_of_the_mesh_is_told_from_a_torque():
     amplitude = 3e-4
     experiment = rig.drive_experiment(COUNT, kinematic=(amplitude, 0.0))
@@ -191,6 +196,7 @@ def test_an_error_of_the_mesh_is_told_from_a_torque():
     assert share_of(wrong, found) < 0.3
 
 
+@pytest.mark.slow
 def test_an_amplifier_that_saturates_is_a_function_of_its_torque():
     torque = rig.drive_torque(COUNT)
     missing = torque / np.sqrt(1.0 + (0.5 * torque) ** 2) - torque
@@ -285,6 +291,7 @@ def test_the_report_tells_it(loop: Loop, tmp_path: Path):
     assert run.rmse == pytest.approx(loop.after.validation_rmse, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     """Friction and a lopsided spring; the catalogue knows friction alone. A function of the rate in its place, free to
     be anything, explains no more than friction does, and a function of the twist beside it all of the rest."""
