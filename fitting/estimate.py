@@ -159,13 +159,13 @@ def fit(
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
             if begin_anew and not (solution.success or hold_parameters):
                 again = solved(_grown(problem, unknowns, least_progress), NEARBY_DAMPING)
-                solution = min(solution, again, key=lambda s: float(jnp.sum(s.squares)))
+                solution = min(solution, again, key=lambda s: float(jnp.sum(s.left_over.squares)))
             mended = _retry_states(problem, solution, least_progress) if retry_states else None
             if mended is not None:
                 solution = solved(mended, NEARBY_DAMPING)
-        unknowns, covariance = solution.unknowns, solution.covariance
+        unknowns, covariance = solution.unknowns, solution.left_over.covariance
         before, objective = objective, _half_log_determinant(covariance)
-        steps += int(solution.steps)
+        steps += solution.steps
         settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
         if settled or objective > give_up_above or steps >= 2 * max_steps:
             break
@@ -176,12 +176,12 @@ def fit(
         model=problem.free.unpack(model, values),
         problem=_weighed(problem, covariance, swing) if reweigh else problem,
         unknowns=unknowns,
-        error=solution.error,
+        error=solution.left_over.error,
         covariance=covariance,
         objective=objective,
         stretches=tuple(stretches),
         horizon=horizon,
-        converged=bool(solution.success),
+        converged=solution.success,
         steps=steps,
     )
 
@@ -219,7 +219,7 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
     A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
     segments would dominate the sum of squares.
     """
-    parameters, old = found.unknowns.parameters, np.asarray(found.squares)
+    parameters, old = found.unknowns.parameters, np.asarray(found.left_over.squares)
     suspect = old > _OUTLIER * np.median(old[np.asarray(problem.segments.weight).any(axis=1)])
     if not suspect.any():
         return None
@@ -304,7 +304,7 @@ def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
         for turn in range(_REWEIGHTINGS):
             part = _weighed(part, covariance, swing)
             solution = solve(part, unknowns, _NOISE_STEPS, NEARBY_DAMPING if turn else FIRST_DAMPING)
-            unknowns, covariance = solution.unknowns, solution.covariance
+            unknowns, covariance = solution.unknowns, solution.left_over.covariance
         total, samples = total + np.asarray(covariance) * head.sum(), samples + float(head.sum())
         freedom += _states_freedom(part, unknowns)
     rows = samples * total.shape[0]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import free_parameters
 from fitting.residual import Problem, Unknowns
-from fitting.solve import prepare
+from fitting.solve import linearise
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import spread
 
@@ -79,7 +79,7 @@ def pose_ahead(
         count=count,
         states=states,
     )
-    return prepare(problem, unknowns)
+    return linearise.prepare(problem, unknowns)
 
 
 def segment_length(horizon: int) -> int:

@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
@@ -205,16 +205,26 @@ def _residual_jvp(primals, tangents):
     unknowns, problem = primals
     tangent, _ = tangents
     found = blocks(problem, unknowns)
+    joined, weight = problem.segments.joined, problem.gap_weight
+    return seen_residual(found, weight), moved_residual(found, weight, joined, tangent)
+
+
+def seen_residual(found: Blocks, gap_weight: Float[Array, " states"]) -> LinearisedResidual:
+    """What [`residual_with_blocks`][] is where the blocks are of."""
+    return LinearisedResidual(found.residual, found.gap * gap_weight[None])
+
+
+def moved_residual(
+    found: Blocks, gap_weight: Float[Array, " states"], joined: Bool[Array, " segments"], tangent: Unknowns
+) -> LinearisedResidual:
+    """How [`residual_with_blocks`][] changes there along a tangent, parts of which may be None."""
     rows, gap = jnp.zeros_like(found.residual), jnp.zeros_like(found.gap)
     if tangent.parameters is not None:
         rows = rows + jnp.einsum("srp,p->sr", found.by_parameter, tangent.parameters)
         gap = gap - jnp.einsum("sqp,p->sq", found.before_by_parameter, tangent.parameters)
     if tangent.states is not None:
         before = jnp.roll(tangent.states, 1, axis=0)
-        own = where(problem.segments.joined[:, None], tangent.states, 0.0)
+        own = where(joined[:, None], tangent.states, 0.0)
         rows = rows + jnp.einsum("srq,sq->sr", found.by_state, tangent.states)
         gap = gap + own - jnp.einsum("sqk,sk->sq", found.before_by_state, before)
-    return (
-        LinearisedResidual(found.residual, found.gap * problem.gap_weight[None]),
-        LinearisedResidual(rows, gap * problem.gap_weight[None]),
-    )
+    return LinearisedResidual(rows, gap * gap_weight[None])

@@ -1,18 +1,20 @@
-"""One program a model: it iterates to the least squares, and looks at any point on the way."""
+"""Least squares of one problem: the model's program looks at a point, another one says where to look next.
 
-from collections.abc import Callable
+That one has nothing of the model in it, so that models with as many parameters and states share it; within the model's
+own program it would be compiled again for each, and take longer than the rest of it.
+"""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, blocks_seen
-from fitting.experiment import Segments
-from fitting.residual import Blocks, Problem, Unknowns, residual_with_blocks
-from hdjax.lanes import jit_lanes
-from hdjax.where import where
+from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
+from fitting.residual import Blocks, LinearisedResidual, Problem, Unknowns, blocks, moved_residual, seen_residual
+from hdjax.lanes import jit_lanes, on_one_device, placed_like
+from hdjax.program_cache import jit_small
 
 FIRST_DAMPING, NEARBY_DAMPING = 1e-3, 1e-9
 """Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other
@@ -23,26 +25,58 @@ weights."""
 _LONGEST_LOG = 1.0
 
 
+class LeftOver(eqx.Module):
+    """What the model leaves over at some point.
+
+    Attributes:
+        error: measured minus simulated.
+        covariance: of the error.
+        squares: each segment's sum of squares.
+    """
+
+    error: Float[Array, "segments samples outputs"]
+    covariance: Float[Array, "outputs outputs"]
+    squares: Float[Array, " segments"]
+
+
 class Solution(eqx.Module):
     """Where the iteration has come to.
 
     Attributes:
         unknowns: the fitted ones.
-        error: measured minus simulated.
-        covariance: of the error.
-        squares: each segment's sum of squares.
-        blocks: residual and Jacobian.
+        left_over: by the model there.
         success: whether the next step promised next to nothing.
         steps: how many were taken.
     """
 
     unknowns: Unknowns
-    error: Float[Array, "segments samples outputs"]
-    covariance: Float[Array, "outputs outputs"]
-    squares: Float[Array, " segments"]
-    blocks: Blocks
-    success: Bool[Array, ""]
-    steps: Int[Array, ""]
+    left_over: LeftOver
+    success: bool = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+
+
+class _Rules(eqx.Module):
+    """What an iteration goes by, beside what it sees.
+
+    Attributes:
+        joined: whether a segment starts where the one before it ends.
+        gap_weight: of each state, as in the problem.
+        longest: how far a step may carry each parameter.
+        most_steps: where the iteration ends at the latest.
+        damping: of the first step.
+        least_progress: see [`solve`][].
+    """
+
+    joined: Bool[Array, " segments"]
+    gap_weight: Float[Array, " states"]
+    longest: Float[Array, " parameters"]
+    most_steps: Int[Array, ""]
+    damping: Float[Array, ""]
+    least_progress: Float[Array, ""]
+
+    def solver(self) -> ArrowLevenbergMarquardt:
+        descent = ArrowDescent(self.joined, self.gap_weight, self.damping, self.longest)
+        return ArrowLevenbergMarquardt(descent=descent, most_steps=self.most_steps, least_progress=self.least_progress)
 
 
 def solve(
@@ -57,64 +91,124 @@ def solve(
         damping: of the first step, see [`FIRST_DAMPING`][].
         least_progress: share of the sum of squares that a few steps must take off it for the iteration to go on.
     """
-    return _solve(problem, start, *_numbers(max_steps, damping, least_progress))
+    longest = np.where(problem.free.logarithmic, _LONGEST_LOG, np.inf)
+    numbers = (jnp.asarray(np.asarray(a)) for a in (longest, max_steps, damping, least_progress))
+    rules = _Rules(*on_one_device((problem.segments.joined, problem.gap_weight)), *numbers)
+    unknowns = ahead = on_one_device(start)
+    rows = carried = None
+    steps, done, success = 0, False, False
+    while not done:
+        seen = on_one_device(linearise(problem, placed_like(ahead, start)))
+        if carried is None:
+            carried = _begin(unknowns, seen, rules)
+        unknowns, ahead, carried, *flags = _step(unknowns, carried, seen, rules)
+        accepted, done, success = map(bool, flags)
+        rows = seen.residual if accepted or rows is None else rows
+        steps += 1
+    assert rows is not None
+    return Solution(placed_like(unknowns, start), _left_over(problem, rows), success, steps)
 
 
-def prepare(problem: Problem, start: Unknowns) -> Callable[[], object]:
-    """Have the program for such a problem made beside what else is done; what is returned calls it off."""
-    return _solve.prepare(problem, start, *_numbers(1, FIRST_DAMPING, 0.0))
-
-
-def _numbers(max_steps: int, damping: float, least_progress: float) -> list[Array]:
-    return [jnp.asarray(np.asarray(a)) for a in (max_steps, damping, least_progress)]
-
-
-def evaluate(problem: Problem, unknowns: Unknowns) -> Solution:
-    """What there is at the given unknowns, by the program of the fit: its first step looks where it starts."""
-    return solve(problem, unknowns, 1, FIRST_DAMPING)
-
-
-def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
-    """[`fitting.residual.blocks`][] at the given unknowns, by the program of the fit."""
-    return evaluate(problem, unknowns).blocks
+def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
+    """What is left over at the given unknowns, by the program of the fit."""
+    return _left_over(problem, on_one_device(linearise(problem, unknowns).residual))
 
 
 @jit_lanes
-def _solve(problem: Problem, start: Unknowns, max_steps: Array, damping: Array, least_progress: Array) -> Solution:
-    joined = problem.segments.joined
-    longest = jnp.asarray(np.where(problem.free.logarithmic, _LONGEST_LOG, np.inf))
-    descent = ArrowDescent(joined, problem.gap_weight, damping, longest)
-    solution = optx.least_squares(
-        residual_with_blocks,
-        ArrowLevenbergMarquardt(descent=descent, most_steps=max_steps, least_progress=least_progress),
-        start,
-        args=problem,
-        max_steps=None,
-        throw=False,
-    )
-    success = solution.result == optx.RESULTS.successful
-    seen = blocks_seen(solution.state.f_info, solution.value, problem.gap_weight, joined)
-    # An iteration that is given up before its first step, as from a start that is no number, has seen nothing.
-    steps = solution.stats["num_steps"]
-    rows = where(steps > 0, seen.residual, jnp.inf)
-    error, squares = _error_of_rows(problem, rows), jnp.sum(rows**2, axis=1)
-    covariance = _covariance(error, problem.segments)
-    return Solution(solution.value, error, covariance, squares, seen, success, steps)
+def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
+    """[`fitting.residual.blocks`][] at the given unknowns, by the program of the fit."""
+    return blocks(problem, unknowns)
 
 
-def _error_of_rows(problem: Problem, rows: Array) -> Array:
-    """The output error behind the rows of a residual."""
-    shape = problem.segments.measured.shape
-    white = rows[:, : shape[1] * shape[2]].reshape(shape)
-    return jnp.einsum("ij,snj->sni", jnp.linalg.inv(problem.whitening), white)
+class _Sight(eqx.Module):
+    """What is seen of a residual from one point."""
+
+    found: Blocks
+    rules: _Rules
 
 
-def _covariance(error: Array, segments: Segments) -> Array:
+@eqx.filter_custom_jvp
+def _in_sight(unknowns: Unknowns, sight: _Sight) -> LinearisedResidual:
+    return seen_residual(sight.found, sight.rules.gap_weight)
+
+
+@_in_sight.def_jvp
+def _in_sight_jvp(primals, tangents):
+    _, sight = primals
+    tangent, _ = tangents
+    rules = sight.rules
+    moved = moved_residual(sight.found, rules.gap_weight, rules.joined, tangent)
+    return seen_residual(sight.found, rules.gap_weight), moved
+
+
+def _function(unknowns: Unknowns, sight: _Sight) -> tuple[LinearisedResidual, None]:
+    return _in_sight(unknowns, sight), None
+
+
+@jit_small
+def _begin(start: Unknowns, seen: Blocks, rules: _Rules) -> list[Array]:
+    """What the first step carries on."""
+    return _arrays(_fresh(start, seen, rules))
+
+
+@jit_small
+def _step(
+    unknowns: Unknowns, carried: list[Array], seen: Blocks, rules: _Rules
+) -> tuple[Unknowns, Unknowns, list[Array], Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """One step of optimistix' solver, as its own loop takes it.
+
+    Args:
+        unknowns: the best so far.
+        carried: see [`_begin`][].
+        seen: at the point that was to be looked at next.
+        rules: what the iteration goes by.
+
+    Returns:
+        The best now, where to look next, and what is carried on; whether the point that was seen is the best, whether
+        the iteration ends, and whether it has succeeded.
+    """
+    solver, sight, tags = rules.solver(), _Sight(seen, rules), frozenset()
+    # What of the solver's state is no array is the same every time.
+    arrays, rest = eqx.partition(_fresh(unknowns, seen, rules), eqx.is_array)
+    state = eqx.combine(jax.tree.unflatten(jax.tree.structure(arrays), carried), rest)
+    best, state, _ = solver.step(_function, unknowns, sight, {}, state, tags)
+    done, result = solver.terminate(_function, best, sight, {}, state, tags)
+    finite = jnp.all(jnp.isfinite(best.parameters)) & jnp.all(jnp.isfinite(best.states))
+    good = (result == optx.RESULTS.successful) & finite
+    accepted = state.num_steps_since_acceptance == 0
+    return best, state.y_eval, _arrays(state), accepted, done | ~good, done & good
+
+
+def _fresh(unknowns: Unknowns, seen: Blocks, rules: _Rules):
+    """The state that optimistix' solver begins with."""
+    sight = _Sight(seen, rules)
+    shapes, aux = eqx.filter_eval_shape(_function, unknowns, sight)
+    return rules.solver().init(_function, unknowns, sight, {}, shapes, aux, frozenset())
+
+
+def _arrays(state) -> list[Array]:
+    """Those of a solver's state, of types that every step brings back."""
+    return [jax.lax.convert_element_type(a, a.dtype) for a in jax.tree.leaves(eqx.filter(state, eqx.is_array))]
+
+
+def _left_over(problem: Problem, rows: Float[Array, "segments rows"]) -> LeftOver:
+    segments = problem.segments
+    return _of_rows(rows, *on_one_device((problem.whitening, segments.measured, segments.weight)))
+
+
+@jit_small
+def _of_rows(rows: Array, whitening: Array, measured: Array, weight: Array) -> LeftOver:
+    """What the rows of a residual say."""
+    white = rows[:, : measured[0].size].reshape(measured.shape)
+    error = jnp.einsum("ij,snj->sni", jnp.linalg.inv(whitening), white)
+    return LeftOver(error, _covariance(error, measured, weight[:, :, None]), jnp.sum(rows**2, axis=1))
+
+
+def _covariance(error: Array, measured: Array, weight: Array) -> Array:
     """Covariance of the output error. Runaway simulations count as large, not as unknown."""
-    weight = segments.weight[:, :, None]
     samples = jnp.sum(weight)
-    mean = jnp.sum(segments.measured * weight, axis=(0, 1), keepdims=True) / samples
-    variance = jnp.sum((segments.measured - mean) ** 2 * weight, axis=(0, 1), keepdims=True) / samples
+    mean = jnp.sum(measured * weight, axis=(0, 1), keepdims=True) / samples
+    variance = jnp.sum((measured - mean) ** 2 * weight, axis=(0, 1), keepdims=True) / samples
     span = jnp.sqrt(variance)
     rows = jnp.clip(jnp.nan_to_num(error, nan=jnp.inf), -10 * span, 10 * span) * weight
     # The floor keeps an output that the model follows to the last bit from becoming infinitely certain.

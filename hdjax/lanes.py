@@ -6,6 +6,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
@@ -64,6 +65,20 @@ def _together(tree: _Tree) -> _Tree:
 
 def _is_shared(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and isinstance(leaf.sharding, NamedSharding)
+
+
+def on_one_device(tree: _Tree) -> _Tree:
+    """The same arrays for what is too little work to be shared."""
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)) if _is_shared(leaf) else leaf, tree)
+
+
+def placed_like(tree: _Tree, like: _Tree) -> _Tree:
+    """The same arrays, each where another tree has its own."""
+
+    def placed(leaf: Any, other: Any) -> Any:
+        return jax.device_put(np.asarray(leaf), other.sharding) if _is_shared(other) else leaf
+
+    return jax.tree.map(placed, tree, like)
 
 
 def spread(tree: _Tree, lanes: int) -> _Tree:

@@ -14,6 +14,8 @@ from fitting.experiment import Stretch, cut
 from fitting.free import base_paths, free_parameters
 from fitting.posing import initial_states
 from fitting.residual import Blocks, Problem, Unknowns, blocks, residual, residual_with_blocks
+from fitting.solve import evaluate
+from fitting.solve import solve as solve_by_steps
 
 SEGMENTS, ROWS, PARAMETERS, STATES = 4, 11, 3, 2
 
@@ -209,6 +211,28 @@ def test_a_simulation_may_run_away_where_there_are_no_data(small):
     np.testing.assert_array_equal(found.residual[3], 0.0)
     np.testing.assert_array_equal(found.by_parameter[3], 0.0)
     assert np.isfinite(np.asarray(found.residual)).all()
+
+
+def test_steps_of_a_program_of_their_own_end_where_those_of_one_program_do(small):
+    problem, start = small
+    whole, stepped = solve(problem, start), solve_by_steps(problem, start, 60, 1e-3)
+    assert stepped.success
+    system = normal_equations(eqx.filter_jit(blocks)(problem, whole.value), problem.segments.joined)
+    information, _, _, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
+    spread = np.sqrt(np.diag(np.linalg.inv(np.asarray(information))))
+    # It ends where less than a thousandth of what one more parameter explains of noise is promised.
+    difference = np.asarray(stepped.unknowns.parameters - whole.value.parameters) / spread
+    assert np.max(np.abs(difference)) < 0.05
+    rows = np.asarray(residual(problem, stepped.unknowns)[0])
+    np.testing.assert_allclose(np.sum(rows**2, axis=1), stepped.left_over.squares, rtol=1e-9)
+    assert np.sum(rows**2) == pytest.approx(np.sum(np.asarray(whole.state.f_info.residual.rows) ** 2), rel=1e-4)
+
+
+def test_a_fit_that_has_no_time_to_converge_says_so(small):
+    problem, start = small
+    got = solve_by_steps(problem, start, 2, 1e-3)
+    assert not got.success and got.steps == 2
+    assert float(jnp.sum(got.left_over.squares)) < float(jnp.sum(evaluate(problem, start).squares))
 
 
 def test_the_minimum_is_that_of_scipy(small):
