@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
 from fitting.residual import Blocks, LinearisedResidual, Problem, Unknowns, blocks, moved_residual, seen_residual
@@ -23,6 +23,10 @@ weights."""
 # A step that would carry a positive parameter farther (a factor e) was promised by a slope that does not reach so far:
 # a corner that leaps to zero shows no slope there, and never comes back.
 _LONGEST_LOG = 1.0
+
+
+# What steps are made by is compiled for multiples of so many parameters.
+_WIDTH = 4
 
 
 class LeftOver(eqx.Module):
@@ -91,14 +95,21 @@ def solve(
         damping: of the first step, see [`FIRST_DAMPING`][].
         least_progress: share of the sum of squares that a few steps must take off it for the iteration to go on.
     """
-    longest = np.where(problem.free.logarithmic, _LONGEST_LOG, np.inf)
+    count = start.parameters.shape[0]
+    longest = np.where(_widened(np.array(problem.free.logarithmic)), _LONGEST_LOG, np.inf)
     numbers = (jnp.asarray(np.asarray(a)) for a in (longest, max_steps, damping, least_progress))
     rules = _Rules(*on_one_device((problem.segments.joined, problem.gap_weight)), *numbers)
-    unknowns = ahead = on_one_device(start)
+    unknowns = ahead = Unknowns(_widened(start.parameters), on_one_device(start.states))
     rows = carried = None
     steps, done, success = 0, False, False
+
+    def at(wide: Unknowns) -> Unknowns:
+        return placed_like(Unknowns(jnp.asarray(np.asarray(wide.parameters)[:count]), wide.states), start)
+
     while not done:
-        seen = on_one_device(linearise(problem, placed_like(ahead, start)))
+        seen = on_one_device(linearise(problem, at(ahead)))
+        wide = _widened(seen.by_parameter), _widened(seen.before_by_parameter)
+        seen = eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), seen, wide)
         if carried is None:
             carried = _begin(unknowns, seen, rules)
         unknowns, ahead, carried, *flags = _step(unknowns, carried, seen, rules)
@@ -106,7 +117,14 @@ def solve(
         rows = seen.residual if accepted or rows is None else rows
         steps += 1
     assert rows is not None
-    return Solution(placed_like(unknowns, start), _left_over(problem, rows), success, steps)
+    return Solution(at(unknowns), _left_over(problem, rows), success, steps)
+
+
+def _widened(by_parameter: Shaped[Array | np.ndarray, "*before parameters"]) -> Shaped[Array, "*before wide"]:
+    """With zeros for parameters that there are not, so that there are few numbers of them, and few programs."""
+    array = np.asarray(by_parameter)
+    more = -array.shape[-1] % _WIDTH
+    return jnp.asarray(np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, more)]))
 
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
