@@ -107,9 +107,9 @@ def solve(
         return placed_like(Unknowns(jnp.asarray(np.asarray(wide.parameters)[:count]), wide.states), start)
 
     while not done:
-        seen = on_one_device(linearise(problem, at(ahead)))
+        seen = linearise(problem, at(ahead))
         wide = _widened(seen.by_parameter), _widened(seen.before_by_parameter)
-        seen = eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), seen, wide)
+        seen = on_one_device(eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), seen, wide))
         if carried is None:
             carried = _begin(unknowns, seen, rules)
         unknowns, ahead, carried, *flags = _step(unknowns, carried, seen, rules)
@@ -121,7 +121,7 @@ def solve(
 
 
 def _widened(by_parameter: Shaped[Array | np.ndarray, "*before parameters"]) -> Shaped[Array, "*before wide"]:
-    """With zeros for parameters that there are not, so that there are few numbers of them, and few programs."""
+    """On one device, with zeros for parameters that there are not: few numbers of them make few programs."""
     array = np.asarray(by_parameter)
     more = -array.shape[-1] % _WIDTH
     return jnp.asarray(np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, more)]))

@@ -83,7 +83,7 @@ def test_the_program_of_a_coming_fit_is_made_beside(tmp_path: Path, monkeypatch:
         found = fit(
             model, stretches, ("mu", "bouc_wen.k"), max_steps=2, begin_anew=False, retry_states=False, **options
         )
-        assert made.count("_solve") == 1 and np.isfinite(found.objective)
+        assert made.count("linearise") == 1 and np.isfinite(found.objective)
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
         program_cache.forget()
