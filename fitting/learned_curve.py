@@ -13,7 +13,7 @@ from fitting.uncertainty import Uncertainty
 from fitting.unknown import Unknown
 from hdjax import Model
 from hdjax.effects import Motion
-from hdjax.effects.learned import LEARNED, AngleAxis, Learned, LearnedTorque, functions
+from hdjax.effects.learned import LEARNED, AngleAxis, Learned, LearnedTorque
 
 PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load", "mesh angle"), strict=True))
 """Where each learned function acts."""
@@ -68,7 +68,6 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     name = found.chosen.form.name
     effect = model.effect(name)
     assert isinstance(effect, Learned)
-    covariance = _covariance(uncertainty, name)
     values = np.stack([np.asarray(getattr(found.motion, v)) for v in found.chosen.variables], axis=1)
     for column, axis in zip(values.T, effect.axes, strict=True):
         if isinstance(axis, AngleAxis) and np.ptp(column) > 2 * np.pi:
@@ -76,8 +75,8 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     points = _POINTS[values.shape[1]]
     grid = tuple(np.linspace(*_range(column), points) for column in values.T)
     mesh = np.stack([g.reshape(-1) for g in np.meshgrid(*grid, indexing="ij")], axis=1)
-    value, std = _evaluated(effect, covariance, values)
-    on_grid, std_on_grid = (a.reshape([points] * len(grid)) for a in _evaluated(effect, covariance, mesh))
+    value, std = _evaluated(model, name, uncertainty, values)
+    on_grid, std_on_grid = (a.reshape([points] * len(grid)) for a in _evaluated(model, name, uncertainty, mesh))
     return LearnedCurve(
         PLACES[name],
         "torque" if isinstance(effect, LearnedTorque) else "error",
@@ -97,22 +96,23 @@ def _range(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _covariance(uncertainty: Uncertainty, name: str) -> np.ndarray:
-    """Covariance of the learned function's coefficients."""
-    paths = list(uncertainty.estimates)
-    own = [i for i, path in enumerate(paths) if path.startswith(f"{name}.")]
-    std = np.array([uncertainty.estimates[paths[i]].std for i in own])
-    return np.asarray(uncertainty.correlation)[np.ix_(own, own)] * np.outer(std, std)
+def _evaluated(model: Model, name: str, uncertainty: Uncertainty, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value and standard error of a model's learned function at rows of its variables."""
+    known = list(uncertainty.estimates)
+    own = [i for i, path in enumerate(known) if path.startswith(f"{name}.")]
+    paths = [known[i] for i in own]
+    std = np.array([uncertainty.estimates[path].std for path in paths])
+    covariance = np.asarray(uncertainty.correlation)[np.ix_(own, own)] * np.outer(std, std)
 
-
-def _evaluated(effect: Learned, covariance: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value and standard error at rows of the variables."""
-    names = [axis.variable for axis in effect.axes]
-
-    def at(row):
+    def at(parameters, row):
+        effect = model.replace(dict(zip(paths, parameters, strict=True))).effect(name)
+        assert isinstance(effect, Learned)
         zero = jnp.zeros(())
-        return functions(effect.axes, replace(Motion(x=zero, v=zero), **dict(zip(names, row, strict=True))))
+        names = [axis.variable for axis in effect.axes]
+        return effect.value(replace(Motion(x=zero, v=zero), **dict(zip(names, row, strict=True))))
 
-    basis = np.asarray(jax.vmap(at)(jnp.asarray(values))) @ np.asarray(effect.mixing)
-    variance = np.einsum("np,pq,nq->n", basis, covariance, basis)
-    return basis @ np.asarray(jnp.stack(effect.c)), np.sqrt(np.maximum(variance, 0.0))
+    parameters = jnp.stack([model.get(path) for path in paths])
+    along = jax.vmap(jax.value_and_grad(at), in_axes=(None, 0))
+    value, slopes = (np.asarray(a) for a in along(parameters, jnp.asarray(values)))
+    variance = np.einsum("np,pq,nq->n", slopes, covariance, slopes)
+    return value, np.sqrt(np.maximum(variance, 0.0))

@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.linalg import eigh, null_space
+from scipy.linalg import block_diag, eigh, null_space
 
 from fitting.along import ERROR, SLOPE
 from fitting.estimate import Fit
+from fitting.free import effect_paths
 from fitting.linear_look import (
     Look,
     Products,
@@ -39,6 +40,7 @@ from hdjax.effects.learned import (
     LearnedTorque,
     LinearAxis,
     PowerAxis,
+    SignAxis,
     axes_over,
 )
 
@@ -48,12 +50,16 @@ _FOLDS = 4
 _SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (1, 2, 3, 5, 7, 9, 12, 16, 20, 24)}
 # A poorer error by this share (in the objective) is no reason for more coefficients.
 _WORTH_A_COEFFICIENT = 0.005
+# What explains this share of what the best one does, to first order, may be the better one after all.
+NEARLY = 0.8
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
 _SAME_FUNCTION = 0.99
 # Motions that so few samples reach are no part of the range.
 _RARE = 5e-4
 # What the functions of a `PowerAxis` count as rough: so much apart that they come one by one, by their degree.
 _ROUGHNESS_OF_POWERS = (0.0, 1e-8, 1.0, 1e-4, 1e4)
+# A sign comes after the constant and before all else.
+_ROUGHNESS_OF_A_SIGN = 1e-10
 # Instants of the motion that stand for the density of the data.
 _INSTANTS = 3000
 
@@ -146,9 +152,17 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
     return found
 
 
-def looked_again(first: Candidate, seen: LearnedLook) -> Candidate | None:
-    """A candidate of the same place and variables, with the coefficients that another look calls for."""
-    return _simplest(seen, first.form, first.variables, _own_functions(seen, first.form))
+def looked_again(first: Candidate, seen: LearnedLook) -> list[Candidate]:
+    """A candidate's place and variables again, with the coefficients that another look calls for: the function that
+    explains most, and before it the simplest one that explains nearly as much.
+
+    To first order a steep slope is as good as a jump along a motion that was found with a slope."""
+    found = _functions_of(seen, first.form, first.variables, _own_functions(seen, first.form))
+    if not found:
+        return []
+    best = max(found, key=lambda c: c.gain)
+    simplest = next(c for c in found if c.gain > NEARLY * best.gain)
+    return [simplest] if simplest is best else [simplest, best]
 
 
 def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
@@ -213,18 +227,29 @@ def _simplest(
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
     """One place and choice of variables, by the simplest function that explains as much as any."""
-    choices = (_candidate(seen, form, variables, axes, own) for axes in axes_over(_ranges(seen, variables)))
     best: Candidate | None = None
-    for candidate in sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c)):
+    for candidate in _functions_of(seen, form, variables, own):
         if best is None or candidate.gain > best.gain + _WORTH_A_COEFFICIENT:
             best = candidate
     return best
 
 
-def _candidate(
+def _functions_of(
     seen: LearnedLook,
     form: type[Learned],
     variables: tuple[str, ...],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> list[Candidate]:
+    """One place and choice of variables with all that a function of them may be made of, fewest coefficients first."""
+    jumps_with = next((name for name in variables if form.may_jump_with(name)), None)
+    axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with)
+    choices = (_candidate(seen, form, each, own) for each in axes)
+    return sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c))
+
+
+def _candidate(
+    seen: LearnedLook,
+    form: type[Learned],
     axes: tuple[Axis, ...],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
@@ -232,11 +257,12 @@ def _candidate(
     instants = seen.instants
     raw = _functions(form, axes, seen.values)
     flat = np.asarray(raw[0]).reshape(-1, raw[0].shape[2])[instants]
-    parameters = own.shape[2] - _coefficients(seen.look.model, form)
+    parameters = own.shape[2] - _of_its_own(seen.look.model, form)
     known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants][:, :parameters])
-    sizes = _SIZES[len(variables)]
+    sizes = _SIZES[len(axes)]
     roughness = _roughness(axes)
-    if isinstance(axes[0], PowerAxis):
+    first = axes[0]
+    if isinstance(first.beside if isinstance(first, SignAxis) else first, PowerAxis):
         roughness = _but_for(known, flat, roughness)
     mixing = _smooth_first(flat, known, roughness)[:, : max(sizes)]
     if mixing.shape[1] == 0:
@@ -256,13 +282,13 @@ def _candidate(
         return None
     gain, size = best
     (step,) = best_steps(found.first(parameters + size).in_parts(1))
-    effect = form(axes=axes, mixing=mixing[:, :size], c=tuple(step[parameters:]))
-    return Candidate(form, variables, gain, effect, step[:parameters], known)
+    effect = form.made_of(axes, mixing[:, :size], step[parameters:])
+    return Candidate(form, tuple(axis.variable for axis in axes), gain, effect, step[:parameters], known)
 
 
-def _coefficients(model: Model, form: type[Learned]) -> int:
-    """How many coefficients of a learned function at this place a model has already; its last effect."""
-    return next((len(e.c) for e in model.effects if isinstance(e, form)), 0)
+def _of_its_own(model: Model, form: type[Learned]) -> int:
+    """How many free parameters a learned function at this place has that a model has already; its last effect."""
+    return next((len(effect_paths(e)) for e in model.effects if isinstance(e, form)), 0)
 
 
 def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Products:
@@ -270,7 +296,9 @@ def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Produc
     if kept == free:
         return found
     own = np.zeros(found.gram.shape[-1])
-    own[kept:free] = np.asarray(look.problem.free.pack(look.model))[kept:free]
+    # What is no coefficient, only moves the corner of a jump.
+    linear = [i for i in range(kept, free) if not look.problem.free.logarithmic[i]]
+    own[linear] = np.asarray(look.problem.free.pack(look.model))[linear]
     moved = found.gram @ own
     against = found.gradient @ own
     others = np.delete(np.arange(own.size), np.s_[kept:free])
@@ -296,24 +324,27 @@ def _same_functions(raw: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 def _roughness(axes: Sequence[Axis]) -> np.ndarray:
     """Penalty on the curvature of a function over the unit range of each axis, per pair of products."""
-    parts = []
-    for axis in axes:
-        if isinstance(axis, AngleAxis):
-            order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
-            parts.append(np.diag((2 * np.pi * order) ** 4))
-        elif isinstance(axis, PowerAxis):
-            parts.append(np.diag(_ROUGHNESS_OF_POWERS))
-        elif isinstance(axis, LinearAxis):
-            parts.append(np.zeros((1, 1)))
-        else:
-            bends = np.diff(np.eye(axis.count), 2, axis=0)
-            rises = np.diff(np.eye(axis.count), axis=0)
-            # The slope, counted little, puts the constant before the straight line.
-            parts.append(axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises)
     total = np.zeros((1, 1))
-    for part in parts:
+    for part in (_roughness_along(axis) for axis in axes):
         total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
     return total
+
+
+def _roughness_along(axis: Axis) -> np.ndarray:
+    if isinstance(axis, SignAxis):
+        beside = [] if axis.beside is None else [_roughness_along(axis.beside)]
+        return np.asarray(block_diag(_ROUGHNESS_OF_A_SIGN, *beside))
+    if isinstance(axis, AngleAxis):
+        order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
+        return np.diag((2 * np.pi * order) ** 4)
+    if isinstance(axis, PowerAxis):
+        return np.diag(_ROUGHNESS_OF_POWERS)
+    if isinstance(axis, LinearAxis):
+        return np.zeros((1, 1))
+    bends = np.diff(np.eye(axis.count), 2, axis=0)
+    rises = np.diff(np.eye(axis.count), axis=0)
+    # The slope, counted little, puts the constant before the straight line.
+    return axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises
 
 
 def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """A fitted model on disk: `model.json`, what `hdjax predict` reads."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -13,8 +14,19 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME, Effect
-from hdjax.effects.learned import LEARNED, UNITS, AngleAxis, Axis, Learned, LinearAxis, PowerAxis, SplineAxis
-from hdjax.parameters import own_parameters, own_value
+from hdjax.effects.learned import (
+    LEARNED,
+    UNITS,
+    AngleAxis,
+    Axis,
+    Learned,
+    LearnedFriction,
+    LinearAxis,
+    PowerAxis,
+    SignAxis,
+    SplineAxis,
+)
+from hdjax.parameters import as_scalar, own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
 
@@ -88,10 +100,16 @@ def _learned_content(effect: Effect) -> dict[str, Any]:
 
 def _axis_content(axis: Axis) -> dict[str, Any]:
     own = {name: value for name, value in vars(axis).items() if value is not None}
-    return {n: v if isinstance(v, str | int) else float(v) for n, v in own.items()}
+    return {
+        n: _axis_content(v) if isinstance(v, Axis) else v if isinstance(v, str | int) else float(v)
+        for n, v in own.items()
+    }
 
 
 def _axis(content: dict[str, Any]) -> Axis:
+    if "corner" in content:
+        beside = content.get("beside")
+        return SignAxis(content["variable"], content["corner"], None if beside is None else _axis(beside))
     own = {"orders": AngleAxis, "largest": PowerAxis, "low": SplineAxis}
     form = next((form for name, form in own.items() if name in content), LinearAxis)
     return form(**content)
@@ -103,7 +121,10 @@ def _effect(content: Any) -> Effect:
         return BY_NAME[content["name"]](**content["parameters"])
     form = learned[content["name"]]
     axes = tuple(_axis(a) for a in content["axes"])
-    for axis in axes:
+    for i, axis in enumerate(axes):
+        if isinstance(axis, SignAxis) and not (i == 0 and form.may_jump_with(axis.variable) and axis.corner > 0):
+            raise ValueError(f"a jump with {axis.variable} over {axis.corner}")
+    for axis in itertools.chain.from_iterable(map(_parts, axes)):
         if axis.variable not in UNITS or not form.may_depend_on(axis.variable) or axis.count > _MOST_FUNCTIONS:
             raise ValueError(f"{axis.variable} with {axis.count} functions")
         if isinstance(axis, SplineAxis) and not (axis.intervals >= 1 and axis.low < axis.high):
@@ -111,11 +132,21 @@ def _effect(content: Any) -> Effect:
         if isinstance(axis, PowerAxis) and not axis.largest > 0:
             raise ValueError(f"{axis.variable} up to {axis.largest}")
     mixing = jnp.asarray(content["mixing"], dtype=float)
-    coefficients = tuple(content["parameters"][f"c_{i}"] for i in range(len(content["parameters"])))
+    own = dict(content["parameters"])
+    transition = own.pop("transition", None)
+    coefficients = tuple(own[f"c_{i}"] for i in range(len(own)))
     wanted = (math.prod(a.count for a in axes), len(coefficients))
     if mixing.shape != wanted or not bool(jnp.all(jnp.isfinite(mixing))):
         raise ValueError(f"a mixing of shape {mixing.shape} where {wanted} was expected")
-    return form(axes=axes, mixing=mixing, c=coefficients)
+    effect = form.made_of(axes, mixing, coefficients)
+    if isinstance(effect, LearnedFriction) and not (transition is not None and transition > 0):
+        raise ValueError(f"a jump over {transition} rad/s")
+    return eqx.tree_at(lambda e: e.transition, effect, as_scalar(transition)) if transition is not None else effect
+
+
+def _parts(axis: Axis) -> tuple[Axis, ...]:
+    """An axis and what is beside its sign."""
+    return (axis,) if not isinstance(axis, SignAxis) or axis.beside is None else (axis, *_parts(axis.beside))
 
 
 def _stored(content: Any) -> StoredModel:

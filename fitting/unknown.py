@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from fitting.attribution import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
 from fitting.learned_look import (
+    NEARLY,
     Candidate,
     LearnedLook,
     candidates,
@@ -30,8 +31,6 @@ from hdjax.effects import Conditions, Motion
 
 # A poorer error by this share (in the objective) is no reason for a second variable.
 _WORTH_A_VARIABLE = 0.03
-# A rival that gains this share of what the best one does, to first order, is refitted as well.
-_NEARLY = 0.8
 # What explains less than this share of the error, to first order, is not refitted: of what the base model leaves,
 # and beside effects that have a name already.
 _LEAST_SHARE, _LEAST_SHARE_BESIDE = 0.005, 0.02
@@ -115,18 +114,15 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
 def _refined(
     best: tuple[Candidate, Trial], data: Data, setting: Setting, progress: Callable[[str], None]
 ) -> tuple[Candidate, Trial]:
-    """The same function with those coefficients, and as many, that a second look calls for, along the motion that the
-    first fit found: the first look is but first order."""
+    """The same variables with those functions of them, and as many, that a second look calls for, along the motion that
+    the first fit found: the first look is but first order."""
     first, trial = best
-    again = looked_again(first, learned_look(trial.training))
-    if again is None:
-        return best
-    progress("learning its shape more closely")
-    finer = _refitted(trial, again, data, setting)
-    if finer is None or not _penalised(finer) < _penalised(trial):
-        return best
-    again = eqx.tree_at(lambda c: c.gain, again, first.gain)
-    return again, finer
+    for candidate in looked_again(first, learned_look(trial.training)):
+        progress("learning its shape more closely")
+        finer = _refitted(trial, candidate, data, setting)
+        if finer is not None and _penalised(finer) < _penalised(best[1]):
+            best = eqx.tree_at(lambda c: c.gain, candidate, first.gain), finer
+    return best
 
 
 def is_supported(found: Unknown | None) -> bool:
@@ -181,7 +177,7 @@ def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> n
 
 def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
     """The candidates, best first, that are worth a refit: the best one, and another one that gains nearly as much."""
-    return [c for c in found[:2] if c.gain > _NEARLY * found[0].gain]
+    return [c for c in found[:2] if c.gain > NEARLY * found[0].gain]
 
 
 def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial | None:

@@ -4,15 +4,18 @@ The function is linear in its coefficients, so that all coefficients at zero are
 """
 
 import abc
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
+from hdjax.effects.dry import DryFriction
 from hdjax.effects.effect import (
     Effect,
     LoadSideEffect,
@@ -120,6 +123,28 @@ class LinearAxis(Axis):
         return value[None]
 
 
+class SignAxis(Axis):
+    """The sign of a rate, and beside it further functions of the same rate.
+
+    Attributes:
+        variable: the rate.
+        corner: rate over which the sign turns, for a look; a fit may move it (see [`LearnedFriction`][]) [rad/s].
+        beside: the further functions; None where there are none.
+    """
+
+    variable: str = eqx.field(static=True)
+    corner: Scalar = eqx.field(converter=as_scalar)
+    beside: Axis | None = None
+
+    @property
+    def count(self) -> int:
+        return 1 if self.beside is None else 1 + self.beside.count
+
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        sign = jnp.tanh(value / self.corner)[None]
+        return sign if self.beside is None else jnp.concatenate([sign, self.beside.functions(value)])
+
+
 class AngleAxis(Axis):
     """One, and cosine and sine of the whole orders of an angle.
 
@@ -213,13 +238,27 @@ class Learned(Effect):
         return ()
 
     @classmethod
+    def made_of(cls, axes: tuple[Axis, ...], mixing: Array | np.ndarray, c: Iterable[Scalar | float]) -> "Learned":
+        """A function of these axes at this place."""
+        return cls(axes=axes, mixing=mixing, c=tuple(c))
+
+    @classmethod
     def may_depend_on(cls, variable: str) -> bool:
         """Whether it may be a function of a quantity of `UNITS`."""
         return variable != "T_m"
 
+    @classmethod
+    def may_jump_with(cls, variable: str) -> bool:
+        """Whether it may jump where a rate changes its sign, as dry friction does: only with the rate of its place."""
+        return False
+
     @property
     def needs_temperature(self) -> bool:
         return any(axis.variable == "temperature" for axis in self.axes)
+
+    def value(self, motion: Motion) -> Array:
+        """The function, at one instant."""
+        return functions(self.axes, motion) @ self.mixing @ jnp.stack(self.c)
 
 
 class LearnedTorque(Learned):
@@ -228,6 +267,17 @@ class LearnedTorque(Learned):
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         """The torque [N m], along the positive direction of its place."""
         return combined(self.axes, self.mixing, self.c, motion)
+
+    @classmethod
+    def made_of(cls, axes: tuple[Axis, ...], mixing: Array | np.ndarray, c: Iterable[Scalar | float]) -> "Learned":
+        sign = axes[0] if axes else None
+        if not isinstance(sign, SignAxis):
+            return super().made_of(axes, mixing, c)
+        return _RUBBING[cls](axes=axes, mixing=mixing, c=tuple(c), transition=sign.corner)
+
+    @classmethod
+    def may_jump_with(cls, variable: str) -> bool:
+        return variable == _RUBBING[cls].opposes
 
 
 class LearnedMeshTorque(LearnedTorque, MeshTorqueEffect):
@@ -250,6 +300,80 @@ class LearnedLoadTorque(LearnedTorque, LoadSideEffect):
     """Learned torque on the load."""
 
     name: ClassVar[str] = "learned_load_torque"
+
+
+class LearnedFriction(LearnedTorque, DryFriction):
+    """A learned torque that jumps where the rate at its place changes its sign. Its first axis is a `SignAxis`.
+
+    How far it jumps may depend on the other axes.
+
+    Attributes:
+        transition: rate over which the sign turns [rad/s].
+    """
+
+    # The mesh torque along its positive direction opposes the twist; what acts on a shaft drives it.
+    _drives: ClassVar[bool] = True
+
+    transition: Scalar = parameter(
+        unit="rad/s", doc="rate over which the sign turns", source=SOURCE, bounds=(0.0, 1e4), role="shape"
+    )
+
+    @property
+    def corner(self) -> Scalar:
+        return self.transition
+
+    def value(self, motion: Motion) -> Array:
+        sign = eqx.tree_at(lambda s: s.corner, self._sign, self.transition)
+        return functions((sign, *self.axes[1:]), motion) @ self.mixing @ jnp.stack(self.c)
+
+    def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
+        along = combined(self.axes[1:], self.mixing[: self._jumps], self.c, motion)
+        return -along if self._drives else along
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        dry = self.dry(motion, drive)
+        dry = -dry if self._drives else dry
+        beside = self._sign.beside
+        if beside is None:
+            return dry
+        return dry + combined((beside, *self.axes[1:]), self.mixing[self._jumps :], self.c, motion)
+
+    @property
+    def _sign(self) -> SignAxis:
+        sign = self.axes[0]
+        assert isinstance(sign, SignAxis)
+        return sign
+
+    @property
+    def _jumps(self) -> int:
+        """How many of the functions, the first ones, have the sign in them."""
+        return math.prod(axis.count for axis in self.axes[1:])
+
+
+class LearnedMeshFriction(LearnedFriction, LearnedMeshTorque):
+    """Learned torque in the mesh that jumps with the twist's rate."""
+
+    opposes: ClassVar[str] = "v"
+    _drives: ClassVar[bool] = False
+
+
+class LearnedMotorFriction(LearnedFriction, LearnedMotorTorque):
+    """Learned torque on the motor that jumps with its rate."""
+
+    opposes: ClassVar[str] = "omega_m"
+
+
+class LearnedLoadFriction(LearnedFriction, LearnedLoadTorque):
+    """Learned torque on the load that jumps with its rate."""
+
+    opposes: ClassVar[str] = "omega_l"
+
+
+_RUBBING: dict[type[LearnedTorque], type[LearnedFriction]] = {
+    LearnedMeshTorque: LearnedMeshFriction,
+    LearnedMotorTorque: LearnedMotorFriction,
+    LearnedLoadTorque: LearnedLoadFriction,
+}
 
 
 class LearnedMeshError(Learned, MeshGeometryEffect):
@@ -298,35 +422,50 @@ DRIFTS = ("time", "temperature")
 """Those that are no motion: what depends on them drifts."""
 
 _RATES = ("v", "omega_m", "omega_l")
-# Share of the largest rate within which the knots are even.
+# Share of the largest rate within which the knots are even, and over which a sign turns at first.
 _NEAR_STANDSTILL = 0.005
 
 
-def axes_over(ranges: Mapping[str, tuple[float, float]]) -> list[tuple[Axis, ...]]:
+def axes_over(ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | None = None) -> list[tuple[Axis, ...]]:
     """What a function of one or two quantities may be made of, the simplest first.
 
     Of one quantity: a few powers, which go on beyond the data; any smooth function. Of two: one of them times any
-    function of the other (a stiffness or a damping that something changes); any smooth function of both.
+    function of the other (a stiffness or a damping that something changes); any smooth function of both. Each of the
+    former two may jump where a rate changes its sign, and of two quantities the jump may depend on the other one
+    (friction that something changes).
 
     The load's angle comes back after a turn, but what is tied to the load need not, so that it has powers as well. The
     motor's angle has none, nor has what drifts, of which nobody knows how it goes on.
 
     Args:
         ranges: between which values the data have each quantity.
+        jumps_with: the rate, if any, whose sign the function may jump with.
     """
     if len(ranges) == 1:
         ((variable, (low, high)),) = ranges.items()
-        any_function = (axis_over(variable, low, high),)
+        any_function = axis_over(variable, low, high)
         if variable == "theta_m" or variable in DRIFTS:
-            return [any_function]
-        return [(PowerAxis(variable, largest=max(abs(low), abs(high))),), any_function]
+            return [(any_function,)]
+        smooth = (PowerAxis(variable, largest=max(abs(low), abs(high))), any_function)
+        jumping = (_sign_over(variable, low, high, beside) for beside in smooth if variable == jumps_with)
+        return [(axis,) for axis in (*smooth, *jumping)]
     one, other = ranges
     scaled = [
         tuple(LinearAxis(n) if n == by else axis_over(n, *ranges[n]) for n in ranges)
         for by in ranges
         if by in ("x", "T_m", *_RATES)
     ]
-    return [*scaled, (axis_over(one, *ranges[one], beside=other), axis_over(other, *ranges[other], beside=one))]
+    jumping = [
+        (_sign_over(by, *ranges[by]), axis_over(on, *ranges[on]))
+        for by, on in ((one, other), (other, one))
+        if by == jumps_with
+    ]
+    both = (axis_over(one, *ranges[one], beside=other), axis_over(other, *ranges[other], beside=one))
+    return [*scaled, *jumping, both]
+
+
+def _sign_over(variable: str, low: float, high: float, beside: Axis | None = None) -> SignAxis:
+    return SignAxis(variable, corner=_NEAR_STANDSTILL * max(abs(low), abs(high)), beside=beside)
 
 
 def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:
