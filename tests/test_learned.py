@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,10 @@ from fitting.along import acting_at_knots, unit_pushes
 from fitting.errors import InputError
 from fitting.experiment import cut, experiment_from_log, split
 from fitting.model_file import StoredModel, read_model, to_json
+from hdjax import sampled
 from hdjax.effects import Conditions, Effect, Motion, Scales
 from hdjax.effects.actuation import TorqueGain
-from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.friction import CoulombFriction, LoadFriction, MotorFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.learned import (
     ANGLES,
@@ -26,18 +28,22 @@ from hdjax.effects.learned import (
     UNITS,
     AngleAxis,
     Axis,
+    LearnedFriction,
     LearnedLoadTorque,
     LearnedMeshError,
     LearnedMeshTorque,
     LearnedMotorTorque,
+    LearnedTorque,
     LinearAxis,
     PowerAxis,
+    SignAxis,
     SplineAxis,
     axes_over,
     axis_over,
     combined,
     functions,
 )
+from hdjax.simulate import march
 
 
 @eqx.filter_jit
@@ -85,8 +91,8 @@ def test_powers_are_those_of_the_formula():
     np.testing.assert_allclose(evaluated(axis, jnp.asarray(values)), wanted, rtol=1e-14)
 
 
-def forms_over(**ranges: tuple[float, float]) -> list[tuple[type, ...]]:
-    return [tuple(type(axis) for axis in axes) for axes in axes_over(ranges)]
+def forms_over(jumps_with: str | None = None, **ranges: tuple[float, float]) -> list[tuple[type, ...]]:
+    return [tuple(type(axis) for axis in axes) for axes in axes_over(ranges, jumps_with=jumps_with)]
 
 
 @pytest.mark.parametrize("variable", ["theta_m", "time", "temperature"])
@@ -107,6 +113,75 @@ def test_the_simplest_choice_comes_first():
     ]
     assert forms_over(x=(-1.0, 1.0), theta_m=(0.0, 9.0)) == [(LinearAxis, AngleAxis), (SplineAxis, AngleAxis)]
     assert forms_over(theta_l=(0.0, 1.0), time=(0.0, 9.0)) == [(AngleAxis, SplineAxis)]
+
+
+def test_what_may_jump_is_smooth_or_jumps():
+    smooth, jumping = axes_over({"v": (-2.0, 1.0)})[:2], axes_over({"v": (-2.0, 1.0)}, jumps_with="v")[2:]
+    for (axis,), (sign,) in zip(smooth, jumping, strict=True):
+        assert isinstance(sign, SignAxis) and sign.variable == "v"
+        assert 0.0 < float(sign.corner) < 0.1
+        assert eqx.tree_equal(sign.beside, axis)
+    assert forms_over(v=(-1.0, 1.0), theta_m=(0.0, 9.0), jumps_with="v")[1] == (SignAxis, AngleAxis)
+    # The sign is the first one of its variables.
+    assert forms_over(x=(-1.0, 1.0), v=(-1.0, 1.0), jumps_with="v")[2] == (SignAxis, SplineAxis)
+    assert SignAxis not in sum(forms_over(x=(-1.0, 1.0), omega_l=(-1.0, 1.0), jumps_with="v"), ())
+
+
+@pytest.mark.parametrize(("form", "rate"), [(f, v) for f in LEARNED for v in UNITS])
+def test_only_the_rate_of_its_place_can_make_a_torque_jump(form: type, rate: str):
+    own = {"learned_mesh_torque": "v", "learned_motor_torque": "omega_m", "learned_load_torque": "omega_l"}
+    assert form.may_jump_with(rate) == (own.get(form.name) == rate)
+
+
+def jumping(form: type[LearnedTorque], *, level: float, corner: float, slope: float = 0.0, on: Axis | None = None):
+    """A torque that opposes the rate at its place with a level and in proportion to it; `on` has functions of one
+    further quantity that all count alike."""
+    rate = next(variable for variable in UNITS if form.may_jump_with(variable))
+    against = 1.0 if form is LearnedMeshTorque else -1.0
+    axes = SignAxis(rate, corner=corner, beside=LinearAxis(rate)), *([] if on is None else [on])
+    mixing = np.kron(np.eye(2), np.ones((1 if on is None else on.count, 1)))
+    return form.made_of(axes, mixing, [against * level, against * slope])
+
+
+FRICTIONS = {
+    "mesh": (LearnedMeshTorque, lambda: [CoulombFriction(T_c=2.0, v_0=3e-3)], 0.0),
+    "motor": (LearnedMotorTorque, lambda: [MotorFriction(T_c=2.0, transition=3e-3, b=0.1)], 0.1),
+    "load": (LearnedLoadTorque, lambda: [LoadFriction(T_c=2.0, transition=3e-3, b=0.1)], 0.1),
+}
+
+
+@pytest.mark.parametrize(("form", "known", "slope"), FRICTIONS.values(), ids=FRICTIONS.keys())
+def test_a_torque_that_jumps_is_dry_friction(form: type[LearnedTorque], known, slope: float):
+    """At every instant, and where it stops a drive within a step and holds it."""
+    effect = jumping(form, level=2.0, corner=3e-3, slope=slope)
+    assert isinstance(effect, LearnedFriction) and isinstance(effect, form) and effect.name == form.name
+    base = rig.drive_model()
+    wanted = base.with_effects(*known())
+    found = base.with_effects(effect)
+    for state in (jnp.asarray([1.3, 0.025, 4.0, 0.05]), jnp.asarray([1.3, 0.025, 1e-3, -1e-3])):
+        np.testing.assert_allclose(rates(found, state), rates(wanted, state), rtol=1e-12)
+        scale = np.abs(slopes(wanted, state)).max()
+        np.testing.assert_allclose(slopes(found, state), slopes(wanted, state), rtol=1e-10, atol=1e-12 * scale)
+    torque = sampled(1e-3 * np.arange(200), 3.0 * np.sin(0.1 * np.arange(200)), hold="zero-order")
+    runs = [march(m, torque, None, jnp.zeros(4), solver=dfx.Tsit5(), substeps=1)[0] for m in (found, wanted)]
+    np.testing.assert_allclose(runs[0], runs[1], rtol=1e-9, atol=1e-12 * np.abs(runs[1]).max())
+
+
+def test_how_far_it_jumps_may_depend_on_something():
+    effect = jumping(LearnedMeshTorque, level=2.0, corner=3e-3, on=PowerAxis("theta_m", largest=2.0))
+    assert isinstance(effect, LearnedFriction)
+    motion = Motion(x=jnp.asarray(0.3), v=jnp.asarray(-1.0), theta_m=jnp.asarray(1.0))
+    # 1 + 1/2 + 1/4 + 1/4 + 1/8, times the level.
+    np.testing.assert_allclose(effect.level(motion, rig.drive_model().drive), 4.25, rtol=1e-12)
+    np.testing.assert_allclose(effect.torque(motion, rig.drive_model().drive, jnp.zeros(0)), -4.25, rtol=1e-12)
+
+
+def test_its_value_has_the_width_that_a_fit_gave_it():
+    model = rig.drive_model().with_effects(jumping(LearnedMeshTorque, level=2.0, corner=3e-3, slope=0.5))
+    (effect,) = model.replace({"learned_mesh_torque.transition": 0.1}).effects
+    motion = Motion(x=jnp.zeros(()), v=jnp.asarray(0.05))
+    np.testing.assert_allclose(effect.value(motion), 2.0 * np.tanh(0.5) + 0.025, rtol=1e-12)
+    np.testing.assert_allclose(effect.torque(motion, model.drive, jnp.zeros(0)), effect.value(motion), rtol=1e-12)
 
 
 def test_a_quantity_in_proportion_is_that_quantity():
@@ -295,6 +370,39 @@ def test_every_axis_comes_back_from_a_file(axis: Axis, tmp_path: Path):
     effect = read(written, tmp_path).model.effect("learned_mesh_torque")
     assert isinstance(effect, LearnedMeshTorque)
     assert eqx.tree_equal(effect.axes, (axis,))
+
+
+def written_jump() -> str:
+    effect = jumping(LearnedMotorTorque, level=1 / 3, corner=3e-3, on=AngleAxis("theta_m", 2))
+    model = rig.drive_model().with_effects(effect).replace({"learned_motor_torque.transition": 1 / 7})
+    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+
+
+def test_a_jump_comes_back_from_a_file(tmp_path: Path):
+    found = read(written_jump(), tmp_path)
+    assert to_json(found) == written_jump()
+    effect = found.model.effect("learned_motor_torque")
+    assert isinstance(effect, LearnedFriction)
+    assert float(effect.corner) == 1 / 7
+
+
+BROKEN_JUMPS = {
+    "of another place": lambda e: e.update(name="learned_load_torque"),
+    "no first variable": lambda e: e["axes"].reverse(),
+    "twice": lambda e: e["axes"].__setitem__(1, e["axes"][0]),
+    "not wide": lambda e: e["parameters"].update(transition=0.0),
+    "no width": lambda e: e["parameters"].pop("transition"),
+    "a width and no jump": lambda e: e["axes"].__setitem__(0, e["axes"][0]["beside"]),
+    "beside it what it can't be": lambda e: e["axes"][0]["beside"].update(variable="colour"),
+}
+
+
+@pytest.mark.parametrize("change", BROKEN_JUMPS.values(), ids=BROKEN_JUMPS.keys())
+def test_broken_jumps(change, tmp_path: Path):
+    content = json.loads(written_jump())
+    change(content["effects"][0])
+    with pytest.raises(InputError, match=r"give the model\.json of a report"):
+        read(json.dumps(content), tmp_path)
 
 
 BROKEN = {

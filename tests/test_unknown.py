@@ -26,7 +26,7 @@ from hdjax.effects.actuation import TorqueBias, TorqueGain
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.learned import LearnedMeshError, LearnedMotorTorque, LinearAxis, PowerAxis, SplineAxis
+from hdjax.effects.learned import LearnedMeshError, LearnedMotorTorque, LinearAxis, PowerAxis, SignAxis, SplineAxis
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, STEP = 1600, 4e-3
@@ -114,6 +114,23 @@ def test_the_shape_is_named(rubbing: Unknown):
     assert best.families == ("coulomb_friction",)
     assert best.explained > 0.95
     assert [s.explained for s in found.closest] == sorted((s.explained for s in found.closest), reverse=True)
+
+
+@pytest.mark.slow
+def test_a_jump_is_told_from_a_slope():
+    """Along a motion without friction both explain as much; the second look and its refits tell them apart."""
+    level, corner = 10.0, 0.01
+    found = found_of(lambda x, v: level * math.tanh(v / corner))
+    assert is_supported(found) and found.chosen.variables == ("v",)
+    (axis,) = found.chosen.effect.axes
+    assert isinstance(axis, SignAxis) and len(found.chosen.effect.c) <= 4
+    assert np.sqrt(float(found.trial.held_out.covariance[0, 0])) < 1.2 * NOISE
+    curve = curve_of(found)
+    error, inside = misfit(curve, level * np.tanh(curve.at[:, 0] / corner))
+    # The jump is known to a few percent, as it is where the form is known.
+    assert error < 0.15 and inside > 0.8
+    (best, *_) = shapes(curve).closest
+    assert best.families == ("coulomb_friction",) and best.explained > 0.99
 
 
 @pytest.mark.slow
