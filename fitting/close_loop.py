@@ -36,8 +36,8 @@ _MOST_LOST = 0.5
 _EXPLAINED = 0.9
 # Share of a learned torque's mean square that named effects must make up for it to have come out as them.
 _COME_OUT = 0.75
-# A learned torque that adds less than this share to the gain of named effects casts no doubt on them; one in their
-# place must do better by this share of its own gain to outdo them.
+# A learned torque that adds less than this share to the gain of named effects, on training and on held-out data alike,
+# casts no doubt on them; one in their place must do better by this share of its own gain to outdo them.
 _LITTLE = 0.05
 
 
@@ -300,7 +300,10 @@ def _what_is_unknown(
     beside = beside if is_supported(beside) else None
     if named is base:
         return base, beside
-    if beside is not None and beside.gain < _LITTLE * named.gain_over(base):
+    if beside is not None and _is_little(
+        added=(named.training.objective - beside.trial.training.objective, beside.gain),
+        explained=(base.training.objective - named.training.objective, named.gain_over(base)),
+    ):
         return named, beside
     instead = learn(base, data, setting, seed=seed, progress=progress)
     if instead is None or not is_supported(instead):
@@ -317,6 +320,17 @@ def _what_is_unknown(
         and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
     )
     return (named, beside) if stands else (base, instead)
+
+
+def _is_little(added: Sequence[float], explained: Sequence[float]) -> bool:
+    """Whether a torque that is learned beside names adds next to nothing to what they explain.
+
+    Args:
+        added: decrease of the objective by that torque, on training and on held-out data: either may show motions that
+            the other does not.
+        explained: decrease of it by the names.
+    """
+    return all(a < _LITTLE * e for a, e in zip(added, explained, strict=True))
 
 
 def _names_stand(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.close_loop import Loop, _names_stand, close_loop
+from fitting.close_loop import Loop, _is_little, _names_stand, close_loop
 from fitting.experiment import Experiment, experiment_from_log
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
@@ -150,6 +150,18 @@ def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer:
         better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer, out_of_shape=out_of_shape
     )
     assert found == stands
+
+
+@pytest.mark.parametrize(
+    ("training", "held_out", "little"),
+    [
+        (0.01, 0.01, True),
+        (0.3, 0.01, False),  # the held-out stretches don't show the motion where the names fail
+        (0.01, 0.3, False),
+    ],
+)
+def test_what_little_a_learned_torque_adds(training: float, held_out: float, little: bool):
+    assert _is_little(added=(training, held_out), explained=(2.0, 1.0)) == little
 
 
 @pytest.mark.slow
