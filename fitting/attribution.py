@@ -1,6 +1,6 @@
 """Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, long_gains, trained
-from fitting.uncertainty import Estimate, uncertainty
+from fitting.uncertainty import Estimate, Uncertainty, uncertainty
 from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
@@ -161,7 +161,7 @@ def _supported(verdict: Verdict, before: Trial, base: Trial) -> bool:
         and verdict.gain > LEAST_GAIN
         and verdict.p_value <= SIGNIFICANCE
         and _share_of_removed(verdict.trial, before, base) > _IMPERFECTION
-        and _strength_is_determined(verdict)
+        and _has_a_strength(verdict)
     )
 
 
@@ -179,19 +179,31 @@ def _share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:
     return float(np.sqrt(np.max(np.maximum(then - left, 0.0)[better] / (first - then)[better])))
 
 
-def _strength_is_determined(verdict: Verdict) -> bool:
-    """Whether the fit tells at least one of the effect's strengths from zero, of those that its name speaks of;
-    another hold has none to tell.
+def _has_a_strength(verdict: Verdict) -> bool:
+    """Whether one of a competitor's strengths is told from zero; another hold has none to tell."""
+    assert verdict.trial is not None
+    own = {verdict.name} & {e.name for e in verdict.trial.model.effects}
+    return told_from_zero(verdict.trial.training, own) == own
+
+
+def told_from_zero(fit: Fit, names: Collection[str]) -> set[str]:
+    """Those effects of a model of which the fit tells at least one strength from zero, of those that their name speaks
+    of.
 
     With the effect's shape as fitted: where a strength is zero, its shape means nothing, and along a valley of shapes
     that explain the same (a creep's stiffness over its time) the strength may well be open.
+
+    Args:
+        fit: of the model.
+        names: of effects to ask for.
     """
-    assert verdict.trial is not None
-    model = verdict.trial.model
-    if verdict.name not in {e.name for e in model.effects}:
-        return True
-    effect = model.effect(verdict.name)
-    found = uncertainty(verdict.trial.training, torque_noise=False)
+    if not names:
+        return set()
+    found = uncertainty(fit, torque_noise=False)
+    return {name for name in names if _is_told(found, fit.model.effect(name))}
+
+
+def _is_told(found: Uncertainty, effect: Effect) -> bool:
     paths, strengths = list(found.estimates), strength_paths(effect)
     shape = [paths.index(p) for p in effect_paths(effect) if p not in strengths]
     across = found.covariance[:, shape]

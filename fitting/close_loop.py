@@ -9,20 +9,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.attribution import Round, look
-from fitting.base_fit import base_fit, is_held, leaves_white_noise
+from fitting.base_fit import base_fit, is_held
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
+from fitting.doubt import what_is_unknown
 from fitting.errors import DataError
-from fitting.estimate import lost, measurement_noise
+from fitting.estimate import lost
 from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
+from fitting.measurement_noise import measurement_noise
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
 from fitting.screening import programs_ahead
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
-from fitting.unknown import Unknown, is_supported, learn, share_of
+from fitting.unknown import Unknown
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -34,11 +36,6 @@ _EXCESS = 1.5
 _MOST_LOST = 0.5
 # Share of the unexplained variance that found effects must remove to be called the explanation: two thirds of its rms.
 _EXPLAINED = 0.9
-# Share of a learned torque's mean square that named effects must make up for it to have come out as them.
-_COME_OUT = 0.75
-# A learned torque that adds less than this share to the gain of named effects, on training and on held-out data alike,
-# casts no doubt on them; one in their place must do better by this share of its own gain to outdo them.
-_LITTLE = 0.05
 
 
 class Finding(eqx.Module):
@@ -145,8 +142,9 @@ def close_loop(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
     )
     clock.lap("attribution")
-    trusted, unknown = _what_is_unknown(base, named, data, setting, seed=seed, progress=progress)
+    trusted, unknown = what_is_unknown(base, named, data, setting, seed=seed, progress=progress)
     clock.lap("unknown effects")
+    fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
     noise = measurement_noise((named if unknown is None else unknown.trial).training)
     decision = _decide(base, trusted, unknown, noise)
     if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < _EXCESS:
@@ -169,7 +167,11 @@ def close_loop(
         return validation_rmse(trial.training, *data[trial.hold], noise=noise, halo=setting.halo)
 
     by_name = after.validation_rmse if unknown is None else rmse_of(trusted)
-    rmse_without = {} if trusted is base else {name: rmse_of(trial) for name, trial in without.items()}
+    if trusted is not named:
+        kept = [] if trusted is base else [n for n in without if n not in fallen]
+        finer = setting.with_steps_of(trusted.training)
+        without = {n: base if len(kept) == 1 else _without(n, trusted, base, data, finer) for n in kept}
+    rmse_without = {name: rmse_of(trial) for name, trial in without.items()}
     findings = _findings(rounds, after.model, by_name, rmse_without)
     if unknown is not None:
         findings = (*findings, _unknown_finding(unknown, after, by_name))
@@ -184,7 +186,7 @@ def close_loop(
         findings=findings,
         rounds=rounds,
         dropped=dropped,
-        doubted=tuple(e.name for e in named.model.effects if trusted is not named),
+        doubted=tuple(e.name for e in named.model.effects if e.name in fallen),
         unknown=unknown,
         evidence=seen,
         noise=noise,
@@ -282,76 +284,6 @@ def _without(name: str, current: Trial, base: Trial, data: Data, setting: Settin
     if name in {e.name for e in current.model.effects}:
         return attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
     return attempt(current.model, data, base.hold, setting, start=current)
-
-
-def _what_is_unknown(
-    base: Trial, named: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
-) -> tuple[Trial, Unknown | None]:
-    """The model whose names can be trusted, and the torque that is learned beside them.
-
-    A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
-    as one beside it does (where nothing can be learned beside it: by far better than it does), and either does not come
-    out as the named effect or does better by far with fewer parameters. What a learned torque beside it hardly betters
-    is in no doubt.
-    """
-    if leaves_white_noise(named.training):
-        return named, None
-    beside = learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
-    beside = beside if is_supported(beside) else None
-    if named is base:
-        return base, beside
-    if beside is not None and _is_little(
-        added=(named.training.objective - beside.trial.training.objective, beside.gain),
-        explained=(base.training.objective - named.training.objective, named.gain_over(base)),
-    ):
-        return named, beside
-    instead = learn(base, data, setting, seed=seed, progress=progress)
-    if instead is None or not is_supported(instead):
-        return named, beside
-    rival = named if beside is None else beside.trial
-    stands = _names_stand(
-        better_by=rival.held_out.objective - instead.trial.held_out.objective,
-        gain=instead.gain,
-        beside=beside is not None,
-        come_out=named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT,
-        fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
-        out_of_shape=beside is not None
-        and beside.chosen.of == instead.chosen.of
-        and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
-    )
-    return (named, beside) if stands else (base, instead)
-
-
-def _is_little(added: Sequence[float], explained: Sequence[float]) -> bool:
-    """Whether a torque that is learned beside names adds next to nothing to what they explain.
-
-    Args:
-        added: decrease of the objective by that torque, on training and on held-out data: either may show motions that
-            the other does not.
-        explained: decrease of it by the names.
-    """
-    return all(a < _LITTLE * e for a, e in zip(added, explained, strict=True))
-
-
-def _names_stand(
-    *, better_by: float, gain: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool
-) -> bool:
-    """Whether names are in no doubt.
-
-    Args:
-        better_by: decrease of the held-out objective by a learned torque in their place, against what they explain with
-            what is learned beside them.
-        gain: what that torque explains.
-        beside: whether anything is learned beside them.
-        come_out: whether it has come out as what they name.
-        fewer: how many parameters fewer it has.
-        out_of_shape: whether one of them stands for one shape of a function of a quantity, and what is learned beside
-            them is a function of that as well.
-    """
-    by_far = better_by > _LITTLE * gain
-    as_good = by_far or (beside and better_by >= -LEAST_GAIN)
-    simpler = (by_far and fewer > 0) or (out_of_shape and fewer >= 0)
-    return not as_good or (come_out and not simpler)
 
 
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:

@@ -10,17 +10,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.arrow import projected
-from fitting.experiment import Stretch, cut, scales
+from fitting.experiment import Stretch, scales
 from fitting.free import FreeParameters
-from fitting.posing import initial_states, natural_frequency, pose
+from fitting.posing import initial_states, pose
 from fitting.residual import RUNAWAY, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, linearise, solve
 from hdjax import Model
 from hdjax.lanes import spread
 from hdjax.program_cache import jit_small
 
-# Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three.
-_REWEIGHTINGS = 3
+REWEIGHTINGS = 3
+"""Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
+
 # An output that the model can't follow may take longer to lose its say.
 _MOST_REWEIGHTINGS = 12
 # Simulations longer than this many segments start from states that shorter ones have found already.
@@ -29,9 +30,6 @@ _LONGEST_RETRY = 16
 _OUTLIER = 6.0
 # Iterations in each window of samples, of windows that grow.
 _WINDOW_STEPS = 12
-# So many samples tell the noise to 1 %.
-_NOISE_SAMPLES = 5000
-_NOISE_STEPS = 30
 
 
 class Fit(eqx.Module):
@@ -154,7 +152,7 @@ def fit(
         return solve(problem, begin, max_steps, damping, least_progress=least_progress)
 
     for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
-        problem = _weighed(problem, covariance, swing)
+        problem = weighed(problem, covariance, swing)
         solution = solved(unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
             if begin_anew and not (solution.success or hold_parameters):
@@ -174,7 +172,7 @@ def fit(
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=problem.free.unpack(model, values),
-        problem=_weighed(problem, covariance, swing) if reweigh else problem,
+        problem=weighed(problem, covariance, swing) if reweigh else problem,
         unknowns=unknowns,
         error=solution.left_over.error,
         covariance=covariance,
@@ -187,7 +185,7 @@ def fit(
 
 
 @jit_small
-def _weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
+def weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
     return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, swing)))
@@ -202,7 +200,7 @@ def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unkno
     """
     weight = problem.segments.weight
     length = weight.shape[1]
-    apart = _zeros_like(problem.segments.joined)
+    apart = zeros_like(problem.segments.joined)
     for samples in _growing(problem, length):
         masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
         part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
@@ -223,7 +221,7 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
     suspect = old > _OUTLIER * np.median(old[np.asarray(problem.segments.weight).any(axis=1)])
     if not suspect.any():
         return None
-    held = eqx.tree_at(lambda p: p.active, problem, _zeros_like(problem.active))
+    held = eqx.tree_at(lambda p: p.active, problem, zeros_like(problem.active))
     model = problem.free.unpack(problem.model, parameters)
     fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)), least_progress)
     new = np.asarray(evaluate(problem, fresh).squares)
@@ -233,7 +231,7 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
     return Unknowns(parameters, jnp.where(better[:, None], fresh.states, found.unknowns.states))
 
 
-def _zeros_like(array: Array) -> Array:
+def zeros_like(array: Array) -> Array:
     """Zeros in the place of an array, without a program that makes them."""
     return jax.device_put(np.zeros(array.shape, array.dtype), array.sharding if array.committed else None)
 
@@ -271,56 +269,6 @@ def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " 
 def _half_log_determinant(covariance: Array) -> float:
     sign, value = np.linalg.slogdet(np.asarray(covariance))
     return float(0.5 * value) if sign > 0 else np.inf
-
-
-def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
-    """Covariance of the outputs' measurement noise: what stays when each short piece of the log may start anew.
-
-    Within half a period an initial state explains any smooth motion, missing physics included, so that little but
-    noise is left. Corrected for the initial states that were fitted.
-
-    Args:
-        found: a fit; its parameters are held, and its compiled program does the work.
-    """
-    count, length = found.problem.segments.weight.shape
-    half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
-    piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
-    held = eqx.tree_at(lambda p: p.active, found.problem, _zeros_like(found.problem.active))
-    swing = jnp.asarray(np.asarray(scales(found.stretches).x))
-    total, samples, freedom = np.zeros(found.covariance.shape), 0.0, 0.0
-    # A piece is the head of a segment; segments that begin later have other heads.
-    for offset in range(0, length - piece + 1, piece):
-        shifted = [Stretch(s.experiment, s.start + offset, s.stop) for s in found.stretches if len(s) >= offset + piece]
-        if not shifted or samples >= _NOISE_SAMPLES:
-            break
-        segments = cut(shifted, length, halo=held.segments.halo, count=count)
-        weight = np.asarray(segments.weight)
-        head = weight * weight[:, piece - 1 : piece] * (np.arange(length) < piece)[None]
-        part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
-        unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
-        # The program of the fit, where all is in the same places.
-        part, unknowns = spread((part, unknowns), count)
-        covariance = found.covariance
-        for turn in range(_REWEIGHTINGS):
-            part = _weighed(part, covariance, swing)
-            solution = solve(part, unknowns, _NOISE_STEPS, NEARBY_DAMPING if turn else FIRST_DAMPING)
-            unknowns, covariance = solution.unknowns, solution.left_over.covariance
-        total, samples = total + np.asarray(covariance) * head.sum(), samples + float(head.sum())
-        freedom += _states_freedom(part, unknowns)
-    rows = samples * total.shape[0]
-    return jnp.asarray(total / samples * (rows / (rows - freedom)))
-
-
-def _states_freedom(problem: Problem, unknowns: Unknowns) -> float:
-    """How many numbers the initial states have fitted to the outputs; a state that its prior holds counts in part."""
-    by_state = np.asarray(linearise(problem, unknowns).by_state)
-    outputs = by_state[:, : problem.segments.measured[0].size]
-    measured, all_rows = (np.einsum("sri,srj->sij", rows, rows) for rows in (outputs, by_state))
-    scale = np.sqrt(np.einsum("sii->si", all_rows))
-    scale = np.where(scale > 0, scale, 1.0)
-    units = scale[:, :, None] * scale[:, None, :]
-    inverse = np.linalg.pinv(all_rows / units, rcond=1e-12, hermitian=True)
-    return float(np.einsum("sij,sji->", inverse, measured / units))
 
 
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:

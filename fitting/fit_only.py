@@ -13,11 +13,11 @@ from fitting.clock import Clock
 from fitting.close_loop import Finding
 from fitting.compare import Account, account
 from fitting.diagnostics import ResidualDiagnostics, diagnose
-from fitting.estimate import measurement_noise
 from fitting.experiment import Experiment, split
 from fitting.frequency_response import FrequencyResponse, frequency_response
 from fitting.goodness import Goodness, goodness
 from fitting.long_fit import long_fit
+from fitting.measurement_noise import measurement_noise
 from fitting.posterior import Posterior, posterior
 from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.residual_tests import ResidualTests, residual_tests

@@ -36,6 +36,7 @@ from hdjax.effects.learned import (
     AngleAxis,
     Axis,
     Learned,
+    LearnedFriction,
     LearnedMeshTorque,
     LearnedTorque,
     LinearAxis,
@@ -242,7 +243,12 @@ def _functions_of(
 ) -> list[Candidate]:
     """One place and choice of variables with all that a function of them may be made of, fewest coefficients first."""
     jumps_with = next((name for name in variables if form.may_jump_with(name)), None)
-    axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with)
+    # A second look knows how sharp a jump is.
+    corner = next(
+        (float(e.corner) for e in seen.look.model.effects if isinstance(e, form) and isinstance(e, LearnedFriction)),
+        None,
+    )
+    axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with, corner=corner)
     choices = (_candidate(seen, form, each, own) for each in axes)
     return sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c))
 

@@ -156,8 +156,7 @@ def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest
     found = Uncertainty(estimates, covariance / np.outer(spread, spread), covariance, covariance)
     monkeypatch.setattr(attribution, "uncertainty", lambda *args, **options: found)
     before, _ = verdicts
-    trial = eqx.tree_at(lambda t: t.model, before, model)
-    return attribution._strength_is_determined(Verdict(effect.name, effect.family, trial, 1.0, 0.005, True))
+    return attribution.told_from_zero(eqx.tree_at(lambda f: f.model, before.training, model), {effect.name}) != set()
 
 
 def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: pytest.MonkeyPatch):

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.close_loop import Loop, _is_little, _names_stand, close_loop
+from fitting.close_loop import Loop, close_loop
+from fitting.doubt import _is_little, _names_stand
 from fitting.experiment import Experiment, experiment_from_log
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias

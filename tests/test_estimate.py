@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit, lost, measurement_noise, needed_substeps, whitening
+from fitting.estimate import Fit, fit, lost, needed_substeps, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
+from fitting.measurement_noise import measurement_noise
 from fitting.uncertainty import uncertainty
 from hdjax.effects.backlash import Backlash
 from hdjax.effects.friction import CoulombFriction

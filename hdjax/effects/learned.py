@@ -426,7 +426,9 @@ _RATES = ("v", "omega_m", "omega_l")
 _NEAR_STANDSTILL = 0.005
 
 
-def axes_over(ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | None = None) -> list[tuple[Axis, ...]]:
+def axes_over(
+    ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | None = None, corner: float | None = None
+) -> list[tuple[Axis, ...]]:
     """What a function of one or two quantities may be made of, the simplest first.
 
     Of one quantity: a few powers, which go on beyond the data; any smooth function. Of two: one of them times any
@@ -440,6 +442,7 @@ def axes_over(ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | No
     Args:
         ranges: between which values the data have each quantity.
         jumps_with: the rate, if any, whose sign the function may jump with.
+        corner: rate over which that sign turns, where something is known of it [rad/s].
     """
     if len(ranges) == 1:
         ((variable, (low, high)),) = ranges.items()
@@ -447,7 +450,7 @@ def axes_over(ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | No
         if variable == "theta_m" or variable in DRIFTS:
             return [(any_function,)]
         smooth = (PowerAxis(variable, largest=max(abs(low), abs(high))), any_function)
-        jumping = (_sign_over(variable, low, high, beside) for beside in smooth if variable == jumps_with)
+        jumping = (_sign_over(variable, low, high, corner, beside) for beside in smooth if variable == jumps_with)
         return [(axis,) for axis in (*smooth, *jumping)]
     one, other = ranges
     scaled = [
@@ -456,7 +459,7 @@ def axes_over(ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | No
         if by in ("x", "T_m", *_RATES)
     ]
     jumping = [
-        (_sign_over(by, *ranges[by]), axis_over(on, *ranges[on]))
+        (_sign_over(by, *ranges[by], corner), axis_over(on, *ranges[on]))
         for by, on in ((one, other), (other, one))
         if by == jumps_with
     ]
@@ -464,8 +467,8 @@ def axes_over(ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | No
     return [*scaled, *jumping, both]
 
 
-def _sign_over(variable: str, low: float, high: float, beside: Axis | None = None) -> SignAxis:
-    return SignAxis(variable, corner=_NEAR_STANDSTILL * max(abs(low), abs(high)), beside=beside)
+def _sign_over(variable: str, low: float, high: float, corner: float | None, beside: Axis | None = None) -> SignAxis:
+    return SignAxis(variable, corner or _NEAR_STANDSTILL * max(abs(low), abs(high)), beside)
 
 
 def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:

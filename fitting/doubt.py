@@ -1,0 +1,120 @@
+"""Whether names can be trusted: what is learned where they leave something, beside them and in their place."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+
+from fitting.attribution import told_from_zero
+from fitting.base_fit import leaves_white_noise
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
+from fitting.unknown import Unknown, is_supported, learn, share_of
+
+# Share of a learned torque's mean square that named effects must make up for it to have come out as them.
+_COME_OUT = 0.75
+# A learned torque that adds less than this share to the gain of named effects, on training and on held-out data alike,
+# casts no doubt on them; one in their place must do better by this share of its own gain to outdo them.
+_LITTLE = 0.05
+
+
+def what_is_unknown(
+    base: Trial, named: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
+) -> tuple[Trial, Unknown | None]:
+    """The model whose names can be trusted, and the torque that is learned beside them.
+
+    A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
+    as one beside it does (where nothing can be learned beside it: by far better than it does), and either does not come
+    out as the named effect or does better by far with fewer parameters. What a learned torque beside it hardly betters
+    is in no doubt.
+    """
+    if leaves_white_noise(named.training):
+        return named, None
+    beside = learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
+    beside = beside if is_supported(beside) else None
+    if beside is not None:
+        named, beside = _without_superfluous(base, named, beside, data, setting)
+    if named is base:
+        return base, beside
+    if beside is not None and _is_little(
+        added=(named.training.objective - beside.trial.training.objective, beside.gain),
+        explained=(base.training.objective - named.training.objective, named.gain_over(base)),
+    ):
+        return named, beside
+    instead = learn(base, data, setting, seed=seed, progress=progress)
+    if instead is None or not is_supported(instead):
+        return named, beside
+    rival = named if beside is None else beside.trial
+    stands = _names_stand(
+        better_by=rival.held_out.objective - instead.trial.held_out.objective,
+        gain=instead.gain,
+        beside=beside is not None,
+        come_out=named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT,
+        fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
+        out_of_shape=beside is not None
+        and beside.chosen.of == instead.chosen.of
+        and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
+    )
+    return (named, beside) if stands else (base, instead)
+
+
+def _without_superfluous(
+    base: Trial, named: Trial, beside: Unknown, data: Data, setting: Setting
+) -> tuple[Trial, Unknown]:
+    """Names, and what was learned beside them, without the effects that this has made superfluous: none of their
+    strengths is told from zero any more, and held-out data hardly miss them."""
+    names = {e.name for e in named.model.effects}
+    fallen = names - told_from_zero(beside.trial.training, names)
+    if not fallen:
+        return named, beside
+    trial = _refitted_without(fallen, beside.trial, data, setting)
+    if trial.held_out.objective - beside.trial.held_out.objective >= max(LEAST_GAIN, _LITTLE * beside.gain):
+        return named, beside
+    bare = base
+    if fallen != names or named.hold != base.hold:
+        bare = _refitted_without(fallen, named, data, setting)
+    states = [n for n in named.model.state_names if n in bare.model.state_names]
+    kept = [named.model.state_names.index(n) for n in states]
+    gain = bare.held_out.objective - trial.held_out.objective
+    return bare, eqx.tree_at(
+        lambda u: (u.before, u.trial, u.states, u.push, u.gain),
+        beside,
+        (bare, trial, beside.states[:, kept], beside.push[:, kept], gain),
+    )
+
+
+def _refitted_without(fallen: set[str], trial: Trial, data: Data, setting: Setting) -> Trial:
+    model = trial.model
+    for name in fallen:
+        model = model.without_effect(name)
+    return attempt(model, data, trial.hold, setting.with_steps_of(trial.training), start=trial)
+
+
+def _is_little(added: Sequence[float], explained: Sequence[float]) -> bool:
+    """Whether a torque that is learned beside names adds next to nothing to what they explain.
+
+    Args:
+        added: decrease of the objective by that torque, on training and on held-out data: either may show motions that
+            the other does not.
+        explained: decrease of it by the names.
+    """
+    return all(a < _LITTLE * e for a, e in zip(added, explained, strict=True))
+
+
+def _names_stand(
+    *, better_by: float, gain: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool
+) -> bool:
+    """Whether names are in no doubt.
+
+    Args:
+        better_by: decrease of the held-out objective by a learned torque in their place, against what they explain with
+            what is learned beside them.
+        gain: what that torque explains.
+        beside: whether anything is learned beside them.
+        come_out: whether it has come out as what they name.
+        fewer: how many parameters fewer it has.
+        out_of_shape: whether one of them stands for one shape of a function of a quantity, and what is learned beside
+            them is a function of that as well.
+    """
+    by_far = better_by > _LITTLE * gain
+    as_good = by_far or (beside and better_by >= -LEAST_GAIN)
+    simpler = (by_far and fewer > 0) or (out_of_shape and fewer >= 0)
+    return not as_good or (come_out and not simpler)
