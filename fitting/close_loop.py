@@ -145,7 +145,8 @@ def close_loop(
     trusted, unknown = what_is_unknown(base, named, data, setting, seed=seed, progress=progress)
     clock.lap("unknown effects")
     fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
-    noise = measurement_noise((named if unknown is None else unknown.trial).training)
+    best = named if unknown is None else unknown.trial
+    noise = measurement_noise(base.training, *([] if best is base else [best.training]))
     decision = _decide(base, trusted, unknown, noise)
     if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < _EXCESS:
         # What the names leave is hardly more than noise.
@@ -262,7 +263,7 @@ def _add_effects(
         current = attempt(current.model, data, current.hold, setting, start=current)
         rounds.append(this)
         progress(f"found {this.winner.name}")
-    dropped = []
+    dropped = _holds_given_up(rounds, base.hold, current.hold)
     without = {}
     for name in [e.name for e in current.model.effects][:-1]:
         poorer = _without(name, current, base, data, setting)
@@ -277,6 +278,14 @@ def _add_effects(
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else _without(name, current, base, data, setting)
     return current, tuple(rounds), tuple(dropped), without
+
+
+def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[str]:
+    """Findings of another hold of the torque that a later one has taken back."""
+    holds = [
+        this for this in rounds if this.accepted and this.winner.trial and this.winner.trial.hold != this.before.hold
+    ]
+    return [this.winner.name for this in holds if last == first or this is not holds[-1]]
 
 
 def _without(name: str, current: Trial, base: Trial, data: Data, setting: Setting) -> Trial:

@@ -45,7 +45,16 @@ class _Pieces(eqx.Module):
         return self.squares / self.samples * (rows / (rows - self.freedom))
 
 
-def measurement_noise(found: Fit) -> Float[Array, "outputs outputs"]:
+def measurement_noise(*fits: Fit) -> Float[Array, "outputs outputs"]:
+    """Covariance of the outputs' measurement noise, as the fit sees it that leaves the least.
+
+    Args:
+        fits: of models of the same data. Each leaves the noise at least; one that goes astray leaves more.
+    """
+    return min(map(_noise_beside, fits), key=lambda c: float(np.linalg.slogdet(np.asarray(c))[1]))
+
+
+def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     """Covariance of the outputs' measurement noise: what stays when each short piece of the log may start anew.
 
     Within half a period an initial state explains most smooth motion, missing physics included, so that little but

@@ -10,7 +10,6 @@ import rig
 from fitting.estimate import Fit, fit, lost, needed_substeps, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
-from fitting.measurement_noise import measurement_noise
 from fitting.uncertainty import uncertainty
 from hdjax.effects.backlash import Backlash
 from hdjax.effects.friction import CoulombFriction
@@ -159,19 +158,6 @@ def test_steps_follow_a_sharp_friction():
         needed[name] = needed_substeps(result)
         assert needed_substeps(result, tolerance=1e9) == 2
     assert needed["sharp"] > needed["smooth"] >= 2
-
-
-def test_measurement_noise_needs_no_good_model():
-    stretches = whole(rig.reduced_experiment(REDUCED_COUNT, noise=1e-3))
-    fits = {
-        k: reduced_fit(rig.reduced_model(omega_0=k * rig.OMEGA_0), stretches, hold_parameters=True) for k in (1.0, 1.02)
-    }
-    noise = {k: float(np.sqrt(measurement_noise(f)[0, 0])) for k, f in fits.items()}
-    # 1000 samples less two states in nine: 2.6 % of a standard deviation.
-    assert noise[1.0] == pytest.approx(1e-3, rel=0.08)
-    # A frequency 2 % off leaves much more over many periods than over half of one.
-    assert fits[1.02].dynamic_error_std > 1e-2
-    assert noise[1.02] < 0.2 * fits[1.02].dynamic_error_std
 
 
 @pytest.mark.slow

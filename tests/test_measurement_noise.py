@@ -1,0 +1,58 @@
+"""The noise of the outputs, beside models that are right, off, or lack a force."""
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.estimate import Fit, fit
+from fitting.experiment import Stretch
+from fitting.free import base_paths
+from fitting.measurement_noise import _MOTION, measurement_noise
+
+COUNT = 1000
+NOISE = 1e-3
+# 1000 samples less a few numbers in every nine: 3 % of a standard deviation.
+CLOSE = 0.1
+
+
+def held(*, noise: np.ndarray | float = NOISE, omega_0: float = rig.OMEGA_0, **physics) -> Fit:
+    """A fit whose parameters are held, along a log that may have physics which it lacks."""
+    experiment = rig.reduced_experiment(COUNT, noise=noise, **physics)
+    model = rig.reduced_model(omega_0=omega_0)
+    stretches = [Stretch(experiment, 0, len(experiment))]
+    return fit(model, stretches, base_paths(model), horizon=128, substeps=2, count=8, hold_parameters=True)
+
+
+def rms(*fits: Fit) -> float:
+    return float(np.sqrt(measurement_noise(*fits)[0, 0]))
+
+
+def test_no_good_model_is_needed():
+    right, off = held(), held(omega_0=1.02 * rig.OMEGA_0)
+    assert rms(right) == pytest.approx(NOISE, rel=CLOSE)
+    # A frequency 2 % off leaves much more over many periods than over half of one.
+    assert off.dynamic_error_std > 1e-2
+    assert rms(off) < 0.2 * off.dynamic_error_std
+
+
+@pytest.mark.parametrize(("bias", "most"), [(0.0, 1.0), (1.0, _MOTION), (5.0, 1.0)])
+def test_a_force_that_the_model_lacks_is_no_noise(bias: float, most: float):
+    """Within half a period the strongest moves the drive by sixty times the noise; a weak one may pass for some."""
+    assert (1.0 - CLOSE) * NOISE < rms(held(bias=bias)) < (1.0 + 1.5 * CLOSE) * most * NOISE
+
+
+def test_the_model_that_leaves_the_least_tells():
+    right, off = held(), held(omega_0=1.2 * rig.OMEGA_0)
+    assert rms(off, right) == rms(right, off) == min(rms(right), rms(off))
+
+
+@pytest.mark.parametrize("samples", [6, 12, 24])
+def test_noise_of_any_colour_stays(samples: int):
+    """Two more powers of time take less off a random walk than what counts as motion."""
+    walks = np.cumsum(np.random.default_rng(0).normal(size=(20000, samples)), axis=1)
+    time = np.linspace(-1.0, 1.0, samples)
+    left = []
+    for powers in (2, 4):
+        seen = np.linalg.qr(np.vander(time, powers))[0]
+        left.append(np.sum((walks - walks @ seen @ seen.T) ** 2) / (samples - powers))
+    assert 1.2 < np.sqrt(left[0] / left[1]) < _MOTION
