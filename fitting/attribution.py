@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Array
 
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
@@ -109,6 +110,7 @@ def look(
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     refitted: dict[str, Trial] = {}
     worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
+    suspects = [lead for lead in screened.leads if _imitated(before, lead.effect) and lead not in worth]
 
     def refit(leads: Sequence[Lead], setting: Setting, give_up_above: float = np.inf) -> None:
         with _programs_ahead(before, leads[1:], data, setting):
@@ -120,7 +122,7 @@ def look(
                 if trial is not None and np.isfinite(trial.held_out.objective):
                     refitted[lead.effect.name] = trial
 
-    first = first_of_each_family(worth)
+    first = first_of_each_family(worth, suspects)
     with _programs_ahead(before, first[1:], data, setting):
         refit(first[:1], setting)
     leader = refitted.get(first[0].effect.name) if first else None
@@ -128,13 +130,14 @@ def look(
         look_ahead(leader.training)
         # What is to come near it in its first pass needs its steps.
         fine = setting.with_steps_of(leader.training)
-        refit(possible_ties(worth, first), fine, _on_the_way(before, leader.training.objective, 1.0 - _NEAR_TIE))
+        rivals = [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])]
+        refit(rivals, fine, _on_the_way(before, leader.training.objective, 1.0 - _NEAR_TIE))
     else:
         refit(first[1:], setting)
         if refitted:
             best = max(refitted, key=lambda name: refitted[name].gain_over(before))
-            family = next(lead.effect.family for lead in worth if lead.effect.name == best)
-            refit(further_forms(worth, family, first), setting)
+            family = next(lead.effect.family for lead in first if lead.effect.name == best)
+            refit(further_forms([*worth, *suspects], family, first), setting)
     found: list[Verdict] = []
     for lead in screened.leads:
         trial = refitted.get(lead.effect.name)
@@ -249,6 +252,11 @@ def _programs_ahead(before: Trial, leads: Sequence[Lead], data: Data, setting: S
         yield
 
 
+def _imitated(before: Trial, effect: Effect) -> tuple[tuple[dict[str, Array], Effect], ...]:
+    """What the model's own parameters may stand for, see [`hdjax.effects.Effect.imitated`][]."""
+    return effect.imitated(before.model.drive, scales(before.training.stretches, before.model))
+
+
 def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
     """Refit with the effect, from the first-order estimate and from what is typical."""
     model = before.model
@@ -261,7 +269,12 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
     typical = lead.effect.typical(scales(before.training.stretches, model))
-    starts = [first, *(model.with_effects(effect) for effect in typical)]
+    imitated = _imitated(before, lead.effect)
+    starts = [
+        first,
+        *(model.with_effects(effect) for effect in typical),
+        *(model.replace(values).with_effects(effect) for values, effect in imitated),
+    ]
     trial = challenge(
         starts,
         data,

@@ -33,13 +33,22 @@ def worth_a_refit(screened: Screen, *, least: float) -> list[Lead]:
     return [lead for lead in screened.leads if lead.gain >= least and screened.p_value(lead.gain) <= _WORTH_A_REFIT]
 
 
-def first_of_each_family(leads: Sequence[Lead]) -> list[Lead]:
-    """The likeliest form of each family, likeliest first; the simplest of those that explain nearly as much."""
+def first_of_each_family(leads: Sequence[Lead], suspects: Sequence[Lead] = ()) -> list[Lead]:
+    """The likeliest form of each family, likeliest first; the simplest of those that explain nearly as much.
+
+    Args:
+        leads: what is worth a refit, best first.
+        suspects: what else may be behind the model's own parameters; of these families one form is always there.
+    """
     families: dict[str, list[Lead]] = {}
     for lead in leads:
         families.setdefault(lead.effect.family, []).append(lead)
     found = [_simplest([a for a in forms if a.gain >= NEARLY * forms[0].gain]) for forms in families.values()]
-    return found[:_FAMILIES]
+    found = found[:_FAMILIES]
+    for lead in suspects:
+        if lead.effect.family not in {other.effect.family for other in found}:
+            found.append(lead)
+    return found
 
 
 def _simplest(leads: Sequence[Lead]) -> Lead:

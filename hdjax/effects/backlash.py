@@ -1,5 +1,6 @@
 """Backlash: a dead zone in the mesh."""
 
+import math
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ from hdjax.parameters import Scalar, parameter
 
 # Share of the half-width over which damping sets in beyond the edge; and what divides where there is no zone.
 _ONSET, _NOTHING = 0.02, 1e-30
+# A spring that hardens more than this at its largest twist (alpha x^2) is none: vendors' tables give a third of it.
+_HARDEST = 1.0
 
 
 class Backlash(MeshTorqueEffect):
@@ -32,6 +35,22 @@ class Backlash(MeshTorqueEffect):
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return (cls(),)
+
+    @classmethod
+    def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
+        """The dead zone beyond which a straight spring has the torque and the slope of one that hardens from nearly
+        nothing."""
+        if not float(drive.alpha) * scales.x_max**2 > _HARDEST:
+            return ()
+        found = []
+        for x in (math.sqrt(2.0) * scales.x, scales.x_max):
+            hardening = 1.0 + 3.0 * drive.alpha * x**2
+            stiff = (
+                {"K": drive.K * hardening} if isinstance(drive, Drive) else {"omega_0": drive.omega_0 * hardening**0.5}
+            )
+            width = x - restoring(jnp.asarray(x), drive.alpha) / hardening
+            found.append((stiff | {"alpha": jnp.zeros_like(drive.alpha)}, cls(b=width)))
+        return tuple(found)
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         x = motion.x

@@ -146,6 +146,14 @@ class Effect(eqx.Module):
         """
         return ()
 
+    @classmethod
+    def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], "Effect"], ...]:
+        """What a drive whose parameters no real one has may stand for: the effect, with values of those parameters
+        that go with it. Further starting points of a fit, from which the first-order view is far off; none where the
+        drive is plausible.
+        """
+        return ()
+
     @property
     def needs_temperature(self) -> bool:
         """Whether it depends on the drive's temperature."""
