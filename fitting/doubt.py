@@ -1,8 +1,7 @@
 """Whether names can be trusted: what is learned where they leave something, beside them and in their place."""
 
 from collections.abc import Callable, Sequence
-
-import equinox as eqx
+from dataclasses import replace
 
 from fitting.attribution import told_from_zero
 from fitting.base_fit import leaves_white_noise
@@ -74,10 +73,8 @@ def _without_superfluous(
     states = [n for n in named.model.state_names if n in bare.model.state_names]
     kept = [named.model.state_names.index(n) for n in states]
     gain = bare.held_out.objective - trial.held_out.objective
-    return bare, eqx.tree_at(
-        lambda u: (u.before, u.trial, u.states, u.push, u.gain),
-        beside,
-        (bare, trial, beside.states[:, kept], beside.push[:, kept], gain),
+    return bare, replace(
+        beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
     )
 
 

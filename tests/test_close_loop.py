@@ -1,13 +1,16 @@
 """The whole loop on a small scale: it names the effect that was hidden, and nothing where nothing was."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 import rig
-from fitting.close_loop import Loop, close_loop
-from fitting.doubt import _is_little, _names_stand
+from fitting.attribution import Round, Verdict
+from fitting.close_loop import Loop, _holds_given_up, close_loop
 from fitting.experiment import Experiment, experiment_from_log
+from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
@@ -131,40 +134,6 @@ def test_a_weight_that_outweighs_the_motor_is_found():
     assert before.std < rig.K
 
 
-@pytest.mark.parametrize(
-    ("better_by", "beside", "come_out", "fewer", "out_of_shape", "stands"),
-    [
-        (-0.5, True, False, 1, True, True),  # what stands in their place is poorer
-        (0.0, True, False, 0, False, False),  # as good as with what is learned beside them, and something else
-        (0.0, True, True, 1, False, True),  # as good, and what they name
-        (0.0, True, True, 0, True, False),  # what they name has another shape
-        (0.0, True, True, -1, True, True),  # another shape, for more parameters
-        (0.9, True, True, 0, False, True),
-        (0.9, True, True, 1, False, False),  # better by far and simpler
-        (0.0, False, False, 1, False, True),  # as good as they are alone
-        (0.9, False, False, 0, False, False),
-        (0.9, False, True, 1, False, False),
-    ],
-)
-def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool, stands: bool):
-    found = _names_stand(
-        better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer, out_of_shape=out_of_shape
-    )
-    assert found == stands
-
-
-@pytest.mark.parametrize(
-    ("training", "held_out", "little"),
-    [
-        (0.01, 0.01, True),
-        (0.3, 0.01, False),  # the held-out stretches don't show the motion where the names fail
-        (0.01, 0.3, False),
-    ],
-)
-def test_what_little_a_learned_torque_adds(training: float, held_out: float, little: bool):
-    assert _is_little(added=(training, held_out), explained=(2.0, 1.0)) == little
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [2.0, 10.0])
 def test_a_spring_to_the_ground_is_no_weight(stiffness: float):
@@ -177,6 +146,28 @@ def test_a_spring_to_the_ground_is_no_weight(stiffness: float):
     assert (chosen.form.name, chosen.variables) == ("learned_load_torque", ("theta_l",))
     assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=1e-3)
     assert found.after.validation_rmse < 0.01 * found.before.validation_rmse
+
+
+@pytest.mark.parametrize(
+    ("tried", "given_up"),
+    [
+        ([], []),
+        (["linear"], []),
+        (["linear", "zero-order"], ["linear hold", "zero-order hold"]),  # the first one again: nothing was found
+        (["linear", "cubic"], ["linear hold"]),
+    ],
+)
+def test_a_hold_that_was_taken_back_is_no_finding(rubbing, tried: list[Hold], given_up: list[str]):
+    first: Hold = "zero-order"
+    (this, *_) = rubbing[0].rounds
+    rounds, now = [this], first
+    for hold in tried:
+        before, after = replace(this.before, hold=now), replace(this.before, hold=hold)
+        rounds.append(
+            Round(before, this.screen, (Verdict(f"{hold} hold", "input_delay", after, 1.0, 0.005, True),), True)
+        )
+        now = hold
+    assert _holds_given_up(rounds, first, now) == given_up
 
 
 def test_single_precision_is_refused():

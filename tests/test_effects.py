@@ -493,6 +493,38 @@ def test_backlash_pushes_only_outside_its_zone():
         assert torque(sign * 1.1e-3) == pytest.approx(sign * 7160 * (1e-3 + 2e4 * 1e-9))
 
 
+SWING = Scales(x=4e-4, x_max=1e-3, v=0.1, omega_m=5.0, omega_l=0.1, time_step=1e-3)
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [eqx.tree_at(lambda d: d.alpha, DRIVE, jnp.asarray(5e8)), ReducedDrive(mu=3.0, omega_0=90.0, alpha=5e8, gain=20.0)],
+    ids=["drive", "reduced"],
+)
+def test_a_spring_that_hardens_from_nothing_may_be_a_dead_zone(drive):
+    """Beyond which a straight spring has the same torque and slope at some twist of the motion."""
+    starts = Backlash.imitated(drive, SWING)
+    for (values, effect), x in zip(starts, jnp.asarray([np.sqrt(2.0) * SWING.x, SWING.x_max]), strict=True):
+        stiff = eqx.tree_at(lambda d, v=values: [getattr(d, n) for n in v], drive, list(values.values()))
+
+        def torque(x, stiff=stiff, effect=effect):
+            return stiff.mesh_torque(x, jnp.zeros(())) + effect.torque(
+                Motion(x=x, v=jnp.zeros(())), stiff, jnp.zeros(0)
+            )
+
+        def hardening(x):
+            return drive.mesh_torque(x, jnp.zeros(()))
+
+        assert 0.5 * x < float(effect.b) < x and float(stiff.alpha) == 0.0
+        assert float(torque(x)) == pytest.approx(float(hardening(x)), rel=1e-9)
+        assert float(jax.grad(torque)(x)) == pytest.approx(float(jax.grad(hardening)(x)), rel=1e-9)
+
+
+def test_a_plausible_spring_stands_for_nothing_else():
+    hard = eqx.tree_at(lambda d: d.alpha, DRIVE, jnp.asarray(4.5e5))
+    assert [form for form in CATALOGUE if form.imitated(hard, SWING)] == []
+
+
 @pytest.mark.parametrize("fine", (7, 19, 68))
 def test_a_delay_is_a_late_torque(fine):
     """A held torque, `fine` fiftieths of an interval late, against the same torque on a 50 times finer grid.

@@ -1,0 +1,106 @@
+"""When a name stands, and when it falls."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting import doubt
+from fitting.base_fit import base_fit
+from fitting.doubt import _is_little, _names_stand
+from fitting.experiment import segment_count, split
+from fitting.learned_look import Candidate
+from fitting.posing import segment_length
+from fitting.trial import Setting, Trial, attempt, halo_for
+from fitting.unknown import Unknown
+from hdjax.effects import Conditions
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.creep import Creep
+from hdjax.effects.learned import LearnedMeshTorque, axes_over
+
+
+@pytest.mark.parametrize(
+    ("better_by", "beside", "come_out", "fewer", "out_of_shape", "stands"),
+    [
+        (-0.5, True, False, 1, True, True),  # what stands in their place is poorer
+        (0.0, True, False, 0, False, False),  # as good as with what is learned beside them, and something else
+        (0.0, True, True, 1, False, True),  # as good, and what they name
+        (0.0, True, True, 0, True, False),  # what they name has another shape
+        (0.0, True, True, -1, True, True),  # another shape, for more parameters
+        (0.9, True, True, 0, False, True),
+        (0.9, True, True, 1, False, False),  # better by far and simpler
+        (0.0, False, False, 1, False, True),  # as good as they are alone
+        (0.9, False, False, 0, False, False),
+        (0.9, False, True, 1, False, False),
+    ],
+)
+def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool, stands: bool):
+    found = _names_stand(
+        better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer, out_of_shape=out_of_shape
+    )
+    assert found == stands
+
+
+@pytest.mark.parametrize(
+    ("training", "held_out", "little"),
+    [
+        (0.01, 0.01, True),
+        (0.3, 0.01, False),  # the held-out stretches don't show the motion where the names fail
+        (0.01, 0.3, False),
+    ],
+)
+def test_what_little_a_learned_torque_adds(training: float, held_out: float, little: bool):
+    assert _is_little(added=(training, held_out), explained=(2.0, 1.0)) == little
+
+
+@pytest.fixture(scope="module")
+def base() -> Trial:
+    data = {"zero-order": split((rig.reduced_experiment(1200, noise=1e-3),))}
+    training = data["zero-order"][0]
+    found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
+    count = segment_count(training, segment_length(found.horizon))
+    setting = Setting(found.horizon, halo_for(training), found.substeps, count)
+    return attempt(found.model, data, "zero-order", setting)
+
+
+@pytest.mark.parametrize(
+    ("told", "missed_by", "left"),
+    [
+        (set(), 0.0, set()),
+        (set(), 0.09, set()),  # hardly missed, of a gain of two
+        (set(), 0.2, {"creep", "torque_bias"}),
+        ({"torque_bias"}, 0.0, {"torque_bias"}),
+        ({"creep"}, 0.0, {"creep"}),
+        ({"creep", "torque_bias"}, 0.0, {"creep", "torque_bias"}),
+    ],
+)
+def test_names_that_what_is_learned_leaves_nothing_fall(
+    base: Trial, told: set[str], missed_by: float, left: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    def with_effects(*effects, objective: float) -> Trial:
+        model = base.model.with_effects(*effects)
+        return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
+
+    def refitted_without(fallen, trial, data, setting):
+        kept = [e for e in trial.model.effects if e.name not in fallen]
+        learned = any(isinstance(e, LearnedMeshTorque) for e in kept)
+        return with_effects(*kept, objective=-7.0 + missed_by if learned else -5.0)
+
+    monkeypatch.setattr(doubt, "told_from_zero", lambda fit, names: told)
+    monkeypatch.setattr(doubt, "_refitted_without", refitted_without)
+    names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
+    (axes, *_) = axes_over({"v": (-1.0, 1.0)})
+    learned = LearnedMeshTorque.made_of(axes, np.eye(axes[0].count)[:, :1], (1.0,))
+    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, learned, np.zeros(4), np.zeros((2, 1)))
+    named, trial = with_effects(*names, objective=-5.0), with_effects(*names, learned, objective=-7.0)
+    motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
+    beside = Unknown(named, trial, (), chosen, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
+    bare, beside = doubt._without_superfluous(base, named, beside, {}, Setting(32, 4, 1, 8))
+    assert {e.name for e in bare.model.effects} == left
+    assert (bare is base) == (left == set()) and beside.before is bare
+    assert {e.name for e in beside.trial.model.effects} == left | {learned.name}
+    # The states of what fell are gone with it; creep has one.
+    assert beside.states.shape == beside.push.shape == (2, 3 if "creep" in left else 2)
+    assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)

@@ -1,0 +1,35 @@
+"""Which forms are refitted, from the first look alone."""
+
+import numpy as np
+
+from fitting.screening import Lead, Screen
+from fitting.shortlist import first_of_each_family, further_forms, worth_a_refit
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.backlash import Backlash, UndampedBacklash
+from hdjax.effects.creep import Creep
+from hdjax.effects.stiffness import QuadraticStiffness
+
+CREEP = Lead(Creep(k=1.0, tau=1.0, span=1.0), {}, 1.0)
+QUADRATIC = Lead(QuadraticStiffness(), {}, 0.5)
+BIAS = Lead(TorqueBias(), {}, 0.01)
+UNDAMPED, GAP = Lead(UndampedBacklash(b=0.0), {}, 0.002), Lead(Backlash(b=0.0), {}, 0.001)
+SCREEN = Screen((CREEP, QUADRATIC, BIAS, UNDAMPED, GAP), np.zeros(199))
+
+
+def test_what_explains_too_little_is_not_worth_a_refit():
+    assert worth_a_refit(SCREEN, least=1e-4) == [CREEP, QUADRATIC]
+
+
+def test_what_chance_does_as_well_is_not_either():
+    assert worth_a_refit(Screen(SCREEN.leads, np.full(199, 2.0)), least=1e-4) == []
+
+
+def test_a_suspect_is_there_however_little_it_explains():
+    """One form of its family; the others compete where that one is the best."""
+    assert first_of_each_family([CREEP, QUADRATIC]) == [CREEP, QUADRATIC]
+    assert first_of_each_family([CREEP, QUADRATIC], [UNDAMPED, GAP]) == [CREEP, QUADRATIC, UNDAMPED]
+    assert further_forms([CREEP, UNDAMPED, GAP], "backlash", [CREEP, UNDAMPED]) == [GAP]
+
+
+def test_a_suspect_that_is_a_lead_already_is_not_there_twice():
+    assert first_of_each_family([CREEP, GAP], [UNDAMPED]) == [CREEP, GAP]
