@@ -19,6 +19,8 @@ _STEPS = 30
 _POWERS = (2, 3)
 # These take at most 1.4 times off the rms of noise of any colour up to a random walk; where more goes, it was motion.
 _MOTION = 1.5
+# Where pieces are so short that fewer of their numbers are left to tell the noise, powers of time are not taken off.
+_LEAST_LEFT = 0.25
 
 
 class _Pieces(eqx.Module):
@@ -39,10 +41,15 @@ class _Pieces(eqx.Module):
         return _Pieces(self.squares + squares, self.samples + samples, self.freedom + freedom)
 
     @property
+    def left(self) -> float:
+        """Share of the measured numbers that tell the noise, beyond those that were fitted; zero without samples."""
+        rows = self.samples * len(self.squares)
+        return 1.0 - self.freedom / rows if rows else 0.0
+
+    @property
     def covariance(self) -> Float[np.ndarray, "outputs outputs"]:
         """Corrected for what was fitted."""
-        rows = self.samples * len(self.squares)
-        return self.squares / self.samples * (rows / (rows - self.freedom))
+        return self.squares / self.samples / self.left
 
 
 def measurement_noise(*fits: Fit) -> Float[Array, "outputs outputs"]:
@@ -94,7 +101,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
 
 
 def _of_both(anew: _Pieces, smoothed: _Pieces) -> Float[np.ndarray, "outputs outputs"]:
-    if smoothed.samples == 0.0:
+    if smoothed.left < _LEAST_LEFT:
         return anew.covariance
     less = np.sqrt(np.diag(anew.covariance) / np.diag(smoothed.covariance))
     return smoothed.covariance if np.max(less) > _MOTION else anew.covariance
