@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array
 
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
@@ -110,7 +109,9 @@ def look(
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
     refitted: dict[str, Trial] = {}
     worth = worth_a_refit(screened, least=0.25 * LEAST_GAIN)
-    suspects = [lead for lead in screened.leads if _imitated(before, lead.effect) and lead not in worth]
+    swing = scales(before.training.stretches, before.model)
+    behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
+    suspects = [lead for lead in behind if lead not in worth]
 
     def refit(leads: Sequence[Lead], setting: Setting, give_up_above: float = np.inf) -> None:
         with _programs_ahead(before, leads[1:], data, setting):
@@ -252,13 +253,9 @@ def _programs_ahead(before: Trial, leads: Sequence[Lead], data: Data, setting: S
         yield
 
 
-def _imitated(before: Trial, effect: Effect) -> tuple[tuple[dict[str, Array], Effect], ...]:
-    """What the model's own parameters may stand for, see [`hdjax.effects.Effect.imitated`][]."""
-    return effect.imitated(before.model.drive, scales(before.training.stretches, before.model))
-
-
 def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
-    """Refit with the effect, from the first-order estimate and from what is typical."""
+    """Refit with the effect, from the first-order estimate, from what is typical, and from what the model's own
+    parameters may stand for."""
     model = before.model
     known = model.parameters()
     moved = {}
@@ -268,12 +265,11 @@ def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_a
         # First-order changes may overshoot; a positive parameter stays positive.
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
     first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
-    typical = lead.effect.typical(scales(before.training.stretches, model))
-    imitated = _imitated(before, lead.effect)
+    swing = scales(before.training.stretches, model)
     starts = [
         first,
-        *(model.with_effects(effect) for effect in typical),
-        *(model.replace(values).with_effects(effect) for values, effect in imitated),
+        *(model.with_effects(effect) for effect in lead.effect.typical(swing)),
+        *(model.replace(values).with_effects(effect) for values, effect in lead.effect.imitated(model.drive, swing)),
     ]
     trial = challenge(
         starts,

@@ -23,7 +23,15 @@ def what_is_unknown(
     A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
     as one beside it does (where nothing can be learned beside it: by far better than it does), and either does not come
     out as the named effect or does better by far with fewer parameters. What a learned torque beside it hardly betters
-    is in no doubt.
+    is in no doubt. Names of which a learned torque beside them leaves nothing fall in any case.
+
+    Args:
+        base: the model without effects.
+        named: the model with those that were found.
+        data: the stretches.
+        setting: how they are cut.
+        seed: of the surrogates behind the p-values.
+        progress: told what is being done.
     """
     if leaves_white_noise(named.training):
         return named, None
@@ -46,7 +54,9 @@ def what_is_unknown(
         better_by=rival.held_out.objective - instead.trial.held_out.objective,
         gain=instead.gain,
         beside=beside is not None,
-        come_out=named.hold == base.hold and share_of(named.model, instead) >= _COME_OUT,
+        come_out=_show_what_they_are_named_for(named, beside)
+        and named.hold == base.hold
+        and share_of(named.model, instead) >= _COME_OUT,
         fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
         out_of_shape=beside is not None
         and beside.chosen.of == instead.chosen.of
@@ -76,6 +86,13 @@ def _without_superfluous(
     return bare, replace(
         beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
     )
+
+
+def _show_what_they_are_named_for(named: Trial, beside: Unknown | None) -> bool:
+    """Whether every name still has a strength that is told from zero beside what was learned: friction that ripples,
+    whose ripple is gone there, has the right size and the wrong name."""
+    names = {e.name for e in named.model.effects}
+    return beside is None or told_from_zero(beside.trial.training, names) == names
 
 
 def _refitted_without(fallen: set[str], trial: Trial, data: Data, setting: Setting) -> Trial:

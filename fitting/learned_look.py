@@ -244,10 +244,8 @@ def _functions_of(
     """One place and choice of variables with all that a function of them may be made of, fewest coefficients first."""
     jumps_with = next((name for name in variables if form.may_jump_with(name)), None)
     # A second look knows how sharp a jump is.
-    corner = next(
-        (float(e.corner) for e in seen.look.model.effects if isinstance(e, form) and isinstance(e, LearnedFriction)),
-        None,
-    )
+    jumps = (e for e in seen.look.model.effects if isinstance(e, form) and isinstance(e, LearnedFriction))
+    corner = next((float(jump.corner) for jump in jumps), None)
     axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with, corner=corner)
     choices = (_candidate(seen, form, each, own) for each in axes)
     return sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c))
