@@ -54,9 +54,9 @@ def what_is_unknown(
         better_by=rival.held_out.objective - instead.trial.held_out.objective,
         gain=instead.gain,
         beside=beside is not None,
-        come_out=_show_what_they_are_named_for(named, beside)
-        and named.hold == base.hold
-        and share_of(named.model, instead) >= _COME_OUT,
+        come_out=named.hold == base.hold
+        and share_of(named.model, instead) >= _COME_OUT
+        and _show_what_they_are_named_for(named, beside),
         fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
         out_of_shape=beside is not None
         and beside.chosen.of == instead.chosen.of

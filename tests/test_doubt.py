@@ -8,12 +8,11 @@ import pytest
 
 import rig
 from fitting import doubt
-from fitting.base_fit import base_fit
+from fitting.close_loop import _base_trial
 from fitting.doubt import _is_little, _names_stand
-from fitting.experiment import segment_count, split
+from fitting.experiment import split
 from fitting.learned_look import Candidate
-from fitting.posing import segment_length
-from fitting.trial import Setting, Trial, attempt, halo_for
+from fitting.trial import Setting, Trial
 from fitting.unknown import Unknown
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
@@ -58,11 +57,7 @@ def test_what_little_a_learned_torque_adds(training: float, held_out: float, lit
 @pytest.fixture(scope="module")
 def base() -> Trial:
     data = {"zero-order": split((rig.reduced_experiment(1200, noise=1e-3),))}
-    training = data["zero-order"][0]
-    found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-    count = segment_count(training, segment_length(found.horizon))
-    setting = Setting(found.horizon, halo_for(training), found.substeps, count)
-    return attempt(found.model, data, "zero-order", setting)
+    return _base_trial(rig.reduced_model(), data, "zero-order")[0]
 
 
 @pytest.mark.parametrize(
