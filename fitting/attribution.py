@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Float
 
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
+from fitting.measurement_noise import measurement_noise
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
@@ -25,9 +27,6 @@ SIGNIFICANCE = 0.01
 """Largest p-value of an accepted effect: the chance that the best of the catalogue does as well on noise."""
 
 
-# No form and no solver is exact: an effect that removes less than this share (rms) of what those before it have removed
-# may be what they get wrong themselves.
-_IMPERFECTION = 3e-3
 # Standard errors by which a strength must differ from zero: one percent of chance over a hundred forms and shapes.
 _BEST_OF_MANY = 3.9
 # Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
@@ -164,8 +163,28 @@ def _supported(verdict: Verdict, before: Trial, base: Trial) -> bool:
         verdict.trial is not None
         and verdict.gain > LEAST_GAIN
         and verdict.p_value <= SIGNIFICANCE
-        and _share_of_removed(verdict.trial, before, base) > _IMPERFECTION
+        and _share_of_removed(verdict.trial, before, base) > _imperfection(before)
         and _has_a_strength(verdict)
+    )
+
+
+def _imperfection(before: Trial) -> float:
+    """Share (rms) of what a model's effects have removed that they may get wrong themselves."""
+    return max((effect.imperfection for effect in before.model.effects), default=0.0)
+
+
+def leaves_imperfection(before: Trial, base: Trial) -> bool:
+    """Whether nothing is left beyond the measurement noise but what a model's effects may get wrong themselves, so
+    that no further effect could remove more.
+
+    Args:
+        before: the model.
+        base: the model without effects.
+    """
+    # The base model's noise is the cheaper one to ask for, and the other can only be smaller.
+    return all(
+        _share(before, base, np.diag(np.asarray(measurement_noise(*fits)))) <= _imperfection(before)
+        for fits in ((base.training,), (base.training, before.training))
     )
 
 
@@ -176,11 +195,22 @@ def _share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:
     What a form gets wrong is a share of what it does to each output: friction may turn the motor thousands of times
     farther than its encoder's noise, and the twist only a little.
     """
-    left, then, first = (np.diag(np.asarray(t.held_out.covariance)) for t in (trial, before, base))
+    return _share(before, base, _mean_squares(trial))
+
+
+def _share(before: Trial, base: Trial, left: Float[np.ndarray, " outputs"]) -> float:
+    """What it would take off the held-out error if so little (mean squares) were left, as in
+    [`_share_of_removed`][]."""
+    then, first = _mean_squares(before), _mean_squares(base)
     better = first > then
     if before is base or not np.any(better):
         return np.inf
     return float(np.sqrt(np.max(np.maximum(then - left, 0.0)[better] / (first - then)[better])))
+
+
+def _mean_squares(trial: Trial) -> Float[np.ndarray, " outputs"]:
+    """Of each output's held-out error."""
+    return np.diag(np.asarray(trial.held_out.covariance))
 
 
 def _has_a_strength(verdict: Verdict) -> bool:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import Round, look
+from fitting.attribution import Round, leaves_imperfection, look
 from fitting.base_fit import base_fit, is_held
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, validation_rmse
@@ -242,7 +242,7 @@ def _add_effects(
     """
     current, rounds = base, []
     found = 0
-    while found < max_effects:
+    while found < max_effects and not (found and leaves_imperfection(current, base)):
         this = look(
             current,
             data,

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from fitting.attribution import told_from_zero
+from fitting.attribution import leaves_imperfection, told_from_zero
 from fitting.base_fit import leaves_white_noise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
 from fitting.unknown import Unknown, is_supported, learn, share_of
@@ -13,6 +13,8 @@ _COME_OUT = 0.75
 # A learned torque that adds less than this share to the gain of named effects, on training and on held-out data alike,
 # casts no doubt on them; one in their place must do better by this share of its own gain to outdo them.
 _LITTLE = 0.05
+# So many names that together leave nothing but noise may be the terms of one function.
+_MANY = 3
 
 
 def what_is_unknown(
@@ -23,7 +25,9 @@ def what_is_unknown(
     A name is doubtful where a learned torque in its place, which is free to be anything, predicts unseen data as well
     as one beside it does (where nothing can be learned beside it: by far better than it does), and either does not come
     out as the named effect or does better by far with fewer parameters. What a learned torque beside it hardly betters
-    is in no doubt. Names of which a learned torque beside them leaves nothing fall in any case.
+    is in no doubt. Names of which a learned torque beside them leaves nothing fall in any case. Where names leave
+    nothing but noise and what their laws may get wrong, there is nothing to learn beside them, and only many of them are
+    in doubt: where one learned torque with fewer parameters does as well.
 
     Args:
         base: the model without effects.
@@ -33,9 +37,10 @@ def what_is_unknown(
         seed: of the surrogates behind the p-values.
         progress: told what is being done.
     """
-    if leaves_white_noise(named.training):
+    enough = leaves_white_noise(named.training) or leaves_imperfection(named, base)
+    if enough and len(named.model.effects) < _MANY:
         return named, None
-    beside = learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
+    beside = None if enough else learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
     beside = beside if is_supported(beside) else None
     if beside is not None:
         named, beside = _without_superfluous(base, named, beside, data, setting)
@@ -54,6 +59,7 @@ def what_is_unknown(
         better_by=rival.held_out.objective - instead.trial.held_out.objective,
         gain=instead.gain,
         beside=beside is not None,
+        enough=enough,
         come_out=named.hold == base.hold
         and share_of(named.model, instead) >= _COME_OUT
         and _show_what_they_are_named_for(named, beside),
@@ -114,7 +120,7 @@ def _is_little(added: Sequence[float], explained: Sequence[float]) -> bool:
 
 
 def _names_stand(
-    *, better_by: float, gain: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool
+    *, better_by: float, gain: float, beside: bool, enough: bool, come_out: bool, fewer: int, out_of_shape: bool
 ) -> bool:
     """Whether names are in no doubt.
 
@@ -123,12 +129,13 @@ def _names_stand(
             what is learned beside them.
         gain: what that torque explains.
         beside: whether anything is learned beside them.
+        enough: whether they leave nothing but noise, and what they may get wrong themselves.
         come_out: whether it has come out as what they name.
         fewer: how many parameters fewer it has.
         out_of_shape: whether one of them stands for one shape of a function of a quantity, and what is learned beside
             them is a function of that as well.
     """
     by_far = better_by > _LITTLE * gain
-    as_good = by_far or (beside and better_by >= -LEAST_GAIN)
+    as_good = by_far or ((beside or (enough and fewer > 0)) and better_by >= -LEAST_GAIN)
     simpler = (by_far and fewer > 0) or (out_of_shape and fewer >= 0)
     return not as_good or (come_out and not simpler)

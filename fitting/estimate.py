@@ -277,7 +277,7 @@ def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     return np.logical_not(np.all(np.abs(white) < RUNAWAY, axis=(1, 2)))
 
 
-def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 8) -> int:
+def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 16) -> int:
     """Solver steps in a sample interval that keep the step error below a fraction of the residual.
 
     Args:

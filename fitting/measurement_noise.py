@@ -13,8 +13,10 @@ from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, linearise, solve
 from hdjax.lanes import spread
 
 # So many samples tell the noise to 1 %.
-_SAMPLES = 5000
+_SAMPLES = 4000
 _STEPS = 30
+# A few steps that together take less than this share off the squares are not worth another.
+_LEAST_PROGRESS = 1e-3
 # Powers of time that forces beyond the model's add to a piece, whose initial state gives it the constant and the slope.
 _POWERS = (2, 3)
 # These take at most 1.4 times off the rms of noise of any colour up to a random walk; where more goes, it was motion.
@@ -92,7 +94,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         covariance = found.covariance
         for turn in range(REWEIGHTINGS):
             part = weighed(part, covariance, swing)
-            solution = solve(part, unknowns, _STEPS, NEARBY_DAMPING if turn else FIRST_DAMPING)
+            damping = NEARBY_DAMPING if turn else FIRST_DAMPING
+            solution = solve(part, unknowns, _STEPS, damping, least_progress=_LEAST_PROGRESS)
             unknowns, covariance = solution.unknowns, solution.left_over.covariance
         seen = linearise(part, unknowns)
         anew = anew.and_more(np.asarray(covariance) * head.sum(), float(head.sum()), _states_freedom(part, seen))

@@ -158,7 +158,7 @@ def challenge(
     # Where a corner is sharper than the steps resolve, a fit rounds it until they do.
     finer = setting.fine_enough(best)
     if finer is not setting:
-        best = trained(best.model, data, hold, finer, best, give_up_above=limit)
+        best = trained(best.model, data, hold, finer, best, give_up_above=limit, retry_states=True)
     return _judged(best, data, hold, finer) if best.objective <= limit else None
 
 

@@ -31,6 +31,8 @@ class DryFriction(Effect):
     """
 
     opposes: ClassVar[str]
+    # How the sign turns near rest is nowhere laid down: a hyperbolic tangent is one way of many.
+    imperfection: ClassVar[float] = 1e-2
 
     @property
     @abc.abstractmethod

@@ -120,6 +120,7 @@ class Effect(eqx.Module):
         drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
             single one shows it.
         one_shape_of: the quantity that it is a function of, where another function of that would be something else.
+        imperfection: share (rms) of what it removes of an error that its law may get wrong itself: no form is exact.
     """
 
     family: ClassVar[str]
@@ -129,6 +130,7 @@ class Effect(eqx.Module):
     named_for: ClassVar[tuple[str, ...]] = ()
     drawn_against: ClassVar[str | None] = None
     one_shape_of: ClassVar[str | None] = None
+    imperfection: ClassVar[float] = 3e-3
 
     @classmethod
     @abc.abstractmethod
