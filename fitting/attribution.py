@@ -122,22 +122,24 @@ def look(
                 if trial is not None and np.isfinite(trial.held_out.objective):
                     refitted[lead.effect.name] = trial
 
+    def refit_beside(best: Trial, leads: Sequence[Lead]) -> None:
+        # What is to come near it in its first pass needs its steps.
+        fine = setting.with_steps_of(best.training)
+        refit(leads, fine, _on_the_way(before, best.training.objective, 1.0 - _NEAR_TIE))
+
     first = first_of_each_family(worth, suspects)
     with _programs_ahead(before, first[1:], data, setting):
         refit(first[:1], setting)
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
         look_ahead(leader.training)
-        # What is to come near it in its first pass needs its steps.
-        fine = setting.with_steps_of(leader.training)
-        rivals = [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])]
-        refit(rivals, fine, _on_the_way(before, leader.training.objective, 1.0 - _NEAR_TIE))
+        refit_beside(leader, [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])])
     else:
         refit(first[1:], setting)
         if refitted:
             best = max(refitted, key=lambda name: refitted[name].gain_over(before))
             family = next(lead.effect.family for lead in first if lead.effect.name == best)
-            refit(further_forms([*worth, *suspects], family, first), setting)
+            refit_beside(refitted[best], further_forms([*worth, *suspects], family, first))
     found: list[Verdict] = []
     for lead in screened.leads:
         trial = refitted.get(lead.effect.name)

@@ -26,8 +26,8 @@ def what_is_unknown(
     as one beside it does (where nothing can be learned beside it: by far better than it does), and either does not come
     out as the named effect or does better by far with fewer parameters. What a learned torque beside it hardly betters
     is in no doubt. Names of which a learned torque beside them leaves nothing fall in any case. Where names leave
-    nothing but noise and what their laws may get wrong, there is nothing to learn beside them, and only many of them are
-    in doubt: where one learned torque with fewer parameters does as well.
+    nothing but noise and what their laws may get wrong, there is nothing to learn beside them; only many of them are in
+    doubt then, where one learned torque with fewer parameters does as well.
 
     Args:
         base: the model without effects.
