@@ -142,6 +142,35 @@ def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
     assert attribution._share_of_removed(after, base, base) == np.inf
 
 
+@pytest.mark.parametrize(
+    ("effect", "left", "noise", "is_all"),
+    [
+        (TorqueBias(), 2.0, 1.0, True),  # 1.7 units beyond the noise, of 1000 that were removed
+        (TorqueBias(), 5.0, 1.0, False),
+        (MotorFriction(T_c=0.1, transition=0.1), 5.0, 1.0, True),  # nobody knows how a sign turns near rest
+        (MotorFriction(T_c=0.1, transition=0.1), 20.0, 1.0, False),
+        (TorqueBias(), 5.0, 4.9, True),
+        (None, 0.0, 1.0, False),
+    ],
+)
+def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
+    verdicts, effect: Effect | None, left: float, noise: float, is_all: bool, monkeypatch: pytest.MonkeyPatch
+):
+    trial, _ = verdicts
+
+    def with_error(rms: float, *effects: Effect) -> Trial:
+        parts = (rig.drive_model().with_effects(*effects), jnp.asarray([[rms**2]]))
+        return eqx.tree_at(lambda t: (t.model, t.held_out.covariance), trial, parts)
+
+    # The base model's own estimate may be too large where what is missing is strong.
+    monkeypatch.setattr(
+        attribution, "measurement_noise", lambda *fits: jnp.asarray([[(noise if len(fits) > 1 else 5.0) ** 2]])
+    )
+    base = with_error(1000.0)
+    before = base if effect is None else with_error(left, effect)
+    assert attribution.leaves_imperfection(before, base) == is_all
+
+
 def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether a strength counts as determined beside a parameter of the drive, by a fit with this covariance."""
     drive, own = (rig.drive_model(), "B_sp") if effect.needs_motor else (rig.reduced_model(), "mu")

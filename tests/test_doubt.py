@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,25 +22,66 @@ from hdjax.effects.learned import LearnedMeshTorque, axes_over
 
 
 @pytest.mark.parametrize(
-    ("better_by", "beside", "come_out", "fewer", "out_of_shape", "stands"),
+    ("better_by", "beside", "enough", "come_out", "fewer", "out_of_shape", "stands"),
     [
-        (-0.5, True, False, 1, True, True),  # what stands in their place is poorer
-        (0.0, True, False, 0, False, False),  # as good as with what is learned beside them, and something else
-        (0.0, True, True, 1, False, True),  # as good, and what they name
-        (0.0, True, True, 0, True, False),  # what they name has another shape
-        (0.0, True, True, -1, True, True),  # another shape, for more parameters
-        (0.9, True, True, 0, False, True),
-        (0.9, True, True, 1, False, False),  # better by far and simpler
-        (0.0, False, False, 1, False, True),  # as good as they are alone
-        (0.9, False, False, 0, False, False),
-        (0.9, False, True, 1, False, False),
+        (-0.5, True, False, False, 1, True, True),  # what stands in their place is poorer
+        (0.0, True, False, False, 0, False, False),  # as good as with what is learned beside them, and something else
+        (0.0, True, False, True, 1, False, True),  # as good, and what they name
+        (0.0, True, False, True, 0, True, False),  # what they name has another shape
+        (0.0, True, False, True, -1, True, True),  # another shape, for more parameters
+        (0.9, True, False, True, 0, False, True),
+        (0.9, True, False, True, 1, False, False),  # better by far and simpler
+        (0.0, False, False, False, 1, False, True),  # as good as they are alone
+        (0.9, False, False, False, 0, False, False),
+        (0.9, False, False, True, 1, False, False),
+        (0.0, False, True, False, 1, False, False),  # they leave but noise, and one function with fewer parameters does
+        (0.0, False, True, False, 0, False, True),
+        (0.0, False, True, True, 1, False, True),  # it has come out as what they name
+        (-0.5, False, True, False, 3, False, True),
     ],
 )
-def test_when_names_stand(better_by: float, beside: bool, come_out: bool, fewer: int, out_of_shape: bool, stands: bool):
+def test_when_names_stand(
+    better_by: float, beside: bool, enough: bool, come_out: bool, fewer: int, out_of_shape: bool, stands: bool
+):
     found = _names_stand(
-        better_by=better_by, gain=10.0, beside=beside, come_out=come_out, fewer=fewer, out_of_shape=out_of_shape
+        better_by=better_by,
+        gain=10.0,
+        beside=beside,
+        enough=enough,
+        come_out=come_out,
+        fewer=fewer,
+        out_of_shape=out_of_shape,
     )
     assert found == stands
+
+
+@pytest.mark.parametrize(
+    ("names", "white", "imperfect", "asks_for"),
+    [
+        (2, True, False, []),
+        (2, False, True, []),
+        (2, False, False, ["beside", "instead"]),
+        (3, True, False, ["instead"]),  # many names that leave but noise
+        (3, False, True, ["instead"]),
+        (3, False, False, ["beside", "instead"]),
+    ],
+)
+def test_what_is_learned_to_doubt_names(
+    base: Trial, names: int, white: bool, imperfect: bool, asks_for: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    effects = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias(), Creep(k=2.0, tau=3.0, span=1.0))[:names]
+    named = eqx.tree_at(lambda t: t.model.effects, base, effects)
+    asked = []
+
+    def learn(before, *args, **options):
+        asked.append("instead" if before is base else "beside")
+
+    monkeypatch.setattr(doubt, "leaves_white_noise", lambda fit: white)
+    monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base: imperfect)
+    monkeypatch.setattr(doubt, "learn", learn)
+    setting = Setting(32, 4, 1, 8)
+    assert doubt.what_is_unknown(base, named, {}, setting, seed=0, progress=lambda message: None) == (named, None)
+    assert asked == asks_for
 
 
 @pytest.mark.parametrize(
