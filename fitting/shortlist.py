@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from fitting.free import effect_paths
 from fitting.screening import Lead, Screen
+from hdjax.effects import CATALOGUE
 
 NEARLY = 0.95
 """A form with fewer parameters goes first where it explains at least this share of what its family's best one does."""
@@ -12,6 +13,8 @@ _WORTH_A_REFIT = 0.2
 # Nor is one that explains less than this share of what the best one does: where stiffness is far off, as with backlash,
 # the first look misses the gain of the right form by a factor of ten.
 _SHARE_OF_BEST = 0.05
+# First-order gains that differ by less than this share are the same.
+_THE_SAME = 1e-6
 # Families whose likeliest form is refitted inside the equations in each round.
 _FAMILIES = 5
 # Further forms of the best one's family that compete with it there.
@@ -52,8 +55,16 @@ def first_of_each_family(leads: Sequence[Lead], suspects: Sequence[Lead] = ()) -
 
 
 def _simplest(leads: Sequence[Lead]) -> Lead:
-    """The one with the fewest parameters and states of its own."""
-    return min(leads, key=lambda lead: (len(effect_paths(lead.effect)) + len(lead.effect.states), -lead.gain))
+    """The one with the fewest parameters and states of its own; of those that to first order are one and the same
+    (backlash with and without damping in the gap) the one that the catalogue lists first."""
+    best = max(leads, key=lambda lead: lead.gain)
+
+    def order(lead: Lead) -> tuple[int, int, int]:
+        behind = round((best.gain - lead.gain) / (_THE_SAME * best.gain))
+        own = len(effect_paths(lead.effect)) + len(lead.effect.states)
+        return own, behind, CATALOGUE.index(type(lead.effect))
+
+    return min(leads, key=order)
 
 
 def possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:

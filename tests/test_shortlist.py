@@ -33,3 +33,11 @@ def test_a_suspect_is_there_however_little_it_explains():
 
 def test_a_suspect_that_is_a_lead_already_is_not_there_twice():
     assert first_of_each_family([CREEP, GAP], [UNDAMPED]) == [CREEP, GAP]
+
+
+def test_of_what_is_the_same_to_first_order_the_catalogues_first_form_goes_first():
+    """A gap without damping shows nothing of it to first order, and rounding decides which form leads."""
+    same = [Lead(UndampedBacklash(b=0.0), {}, 0.002 * (1.0 + 1e-13)), Lead(Backlash(b=0.0), {}, 0.002)]
+    assert first_of_each_family(same) == same[1:]
+    more = [Lead(UndampedBacklash(b=0.0), {}, 0.002), Lead(Backlash(b=0.0), {}, 0.002 * (1.0 - 1e-3))]
+    assert first_of_each_family(more) == more[:1]
