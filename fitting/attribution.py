@@ -34,6 +34,8 @@ _BEST_OF_MANY = 3.9
 _HOLD_STEPS = 3
 # What is tied with the best gains as much but for this share; so it must in its first pass to be worth another.
 _NEAR_TIE = 0.1
+# A family of which one form gains this share of what the best of all does may have one that does better.
+_MAY_DO_BETTER = 0.75
 # Gains that differ by less than this share are the same.
 _SAME_GAIN = 0.02
 # A rival that explains less than this share of what the best one so far does, in its first pass, is given up.
@@ -137,9 +139,10 @@ def look(
     else:
         refit(first[1:], setting)
         if refitted:
-            best = max(refitted, key=lambda name: refitted[name].gain_over(before))
-            family = next(lead.effect.family for lead in first if lead.effect.name == best)
-            refit_beside(refitted[best], further_forms([*worth, *suspects], family, first))
+            best = max(refitted.values(), key=lambda trial: trial.gain_over(before))
+            near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
+            families = [a.effect.family for a in first if _reaches(refitted.get(a.effect.name), near)]
+            refit_beside(best, further_forms([*worth, *suspects], families, first))
     found: list[Verdict] = []
     for lead in screened.leads:
         trial = refitted.get(lead.effect.name)
@@ -273,6 +276,10 @@ def _supported_first(verdicts: list[Verdict], before: Trial, base: Trial) -> tup
 def _on_the_way(before: Trial, best: float, share: float) -> float:
     """The training objective of what gains a share of what the best one does; infinite where there is none yet."""
     return before.training.objective - share * (before.training.objective - best) if np.isfinite(best) else np.inf
+
+
+def _reaches(trial: Trial | None, objective: float) -> bool:
+    return trial is not None and trial.training.objective <= objective
 
 
 @contextmanager

@@ -36,7 +36,7 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=_longest(start), substeps=substeps)
-    explains = long.objective + _to_close(long) <= start.objective + _freedom_of_states(start) + _LOSS
+    explains = with_gaps_closed(long) <= start.objective + _freedom_of_states(start) + _LOSS
     if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
@@ -55,11 +55,11 @@ def follows(found: Fit) -> bool:
     return bool(np.all(np.diag(np.asarray(found.covariance)) < 0.25 * measured.var(axis=0)))
 
 
-def _to_close(found: Fit) -> float:
-    """What it would add to the objective, about, to close the gaps that are left between joined segments: a fit that
-    came no closer does not follow the log for so long."""
+def with_gaps_closed(found: Fit) -> float:
+    """The objective, about, if what gaps are left between joined segments were closed: a fit that came no closer does
+    not follow the log for so long."""
     gap = np.asarray(linearise(found.problem, found.unknowns).gap) * np.asarray(found.problem.gap_weight)
-    return 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
+    return found.objective + 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
 
 
 def _longest(found: Fit) -> int:

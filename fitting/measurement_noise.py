@@ -12,8 +12,9 @@ from fitting.residual import RUNAWAY, Blocks, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, linearise, solve
 from hdjax.lanes import spread
 
-# So many samples tell the noise to 1 %.
-_SAMPLES = 4000
+# So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.
+_SAMPLES = 2500
+_SETTLED = 0.02
 _STEPS = 30
 # A few steps that together take less than this share off the squares are not worth another.
 _LEAST_PROGRESS = 1e-3
@@ -91,12 +92,16 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         # The program of the fit, where all is in the same places.
         part, unknowns = spread((part, unknowns), count)
-        covariance = found.covariance
+        covariance, before = found.covariance, np.full(len(found.covariance), np.inf)
         for turn in range(REWEIGHTINGS):
             part = weighed(part, covariance, swing)
             damping = NEARBY_DAMPING if turn else FIRST_DAMPING
             solution = solve(part, unknowns, _STEPS, damping, least_progress=_LEAST_PROGRESS)
             unknowns, covariance = solution.unknowns, solution.left_over.covariance
+            now = np.sqrt(np.diag(np.asarray(covariance)))
+            if np.all(np.abs(now - before) <= _SETTLED * now):
+                break
+            before = now
         seen = linearise(part, unknowns)
         anew = anew.and_more(np.asarray(covariance) * head.sum(), float(head.sum()), _states_freedom(part, seen))
         smoothed = smoothed.and_more(*_smoothed(part, seen, piece))

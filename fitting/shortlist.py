@@ -17,7 +17,7 @@ _SHARE_OF_BEST = 0.05
 _THE_SAME = 1e-6
 # Families whose likeliest form is refitted inside the equations in each round.
 _FAMILIES = 5
-# Further forms of the best one's family that compete with it there.
+# Further forms of the best one's family, and of those that are as good, that compete there.
 _FORMS = 3
 # Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
 # at least this share of what it does,
@@ -76,6 +76,7 @@ def possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:
     return others + forms[:_FORMS]
 
 
-def further_forms(leads: Sequence[Lead], family: str, tried: Sequence[Lead]) -> list[Lead]:
-    """The next forms of a family."""
-    return [lead for lead in leads if lead.effect.family == family and lead not in tried][:_FORMS]
+def further_forms(leads: Sequence[Lead], families: Sequence[str], tried: Sequence[Lead]) -> list[Lead]:
+    """The next forms of some families."""
+    left = [lead for lead in leads if lead not in tried]
+    return [lead for family in families for lead in [a for a in left if a.effect.family == family][:_FORMS]]

@@ -13,7 +13,7 @@ from fitting.estimate import Fit, fit, needed_substeps
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.free_run import FreeRun, free_run, rms_error
-from fitting.long_fit import follows, over_whole_stretches
+from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed
 from fitting.posing import pose_ahead, states_from
 from hdjax import Hold, Model
 from hdjax.effects import Effect
@@ -257,7 +257,7 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
     long_before, long_after = (over_whole_stretches(t.held_out) for t in (before, trial))
     if not (follows(long_before) or follows(long_after)):
         return 1.0
-    return float(np.clip((long_before.objective - long_after.objective) / short, 0.0, 1.0))
+    return float(np.clip((with_gaps_closed(long_before) - with_gaps_closed(long_after)) / short, 0.0, 1.0))
 
 
 def long_gains(before: Trial, trials: Sequence[Trial], data: Data, setting: Setting) -> list[float] | None:

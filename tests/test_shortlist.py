@@ -28,7 +28,7 @@ def test_a_suspect_is_there_however_little_it_explains():
     """One form of its family; the others compete where that one is the best."""
     assert first_of_each_family([CREEP, QUADRATIC]) == [CREEP, QUADRATIC]
     assert first_of_each_family([CREEP, QUADRATIC], [UNDAMPED, GAP]) == [CREEP, QUADRATIC, UNDAMPED]
-    assert further_forms([CREEP, UNDAMPED, GAP], "backlash", [CREEP, UNDAMPED]) == [GAP]
+    assert further_forms([CREEP, UNDAMPED, GAP], ["backlash"], [CREEP, UNDAMPED]) == [GAP]
 
 
 def test_a_suspect_that_is_a_lead_already_is_not_there_twice():
