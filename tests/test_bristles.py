@@ -141,7 +141,7 @@ def test_slow_bristles_are_not_bounded(v):
 @pytest.mark.parametrize("omega_m", (-30.0, -2.0, 0.5, 5.0, 80.0))
 def test_lugre_at_constant_speed_is_the_stribeck_curve(omega_m):
     """Friction of EFFECTS.md, `(T_c + (T_s - T_c) exp(-(w/w_s)^2)) sgn w + b w`, once the bristles have bent."""
-    effect = LuGreMotorFriction(T_c=0.2, b=0.01, excess=0.5, omega_s=4.0, bend=1e-3, settling=1e-4)
+    effect = LuGreMotorFriction(T_c=0.2, b=0.01, excess=0.5, omega_s=4.0, bend=1e-3, tau=0.02, settling=1e-4)
     rate = np.full((400, 3), omega_m)
     step = 0.3 * np.hypot(1e-3 / omega_m, 1e-4)  # of the time within which it bends
     (bent,) = np.asarray(followed(effect, jnp.zeros(401), jnp.asarray(rate), jnp.asarray(step)))[-1]
@@ -150,9 +150,18 @@ def test_lugre_at_constant_speed_is_the_stribeck_curve(omega_m):
     level = 0.2 + 0.1 * np.exp(-((omega_m / 4.0) ** 2))
     assert torque == pytest.approx(-level * np.sign(omega_m) - 0.01 * omega_m, rel=1e-6)
     derived = {name: float(v) for name, (v, _) in effect.derived(DRIVE).items()}
-    assert derived == pytest.approx({"sigma_0": 200.0, "T_s": 0.3})
+    assert derived == pytest.approx({"sigma_0": 200.0, "sigma_1": 4.0, "T_s": 0.3})
     # A motor that has long turned starts there, to the Stribeck level.
     assert float(effect.initial_state(motion)[0]) == pytest.approx(1e-3 * np.sign(omega_m))
+
+
+def test_while_bristles_stick_they_are_a_spring_and_a_damper():
+    """`sigma_0 z + sigma_1 omega`, for motions far smaller than what they bend by."""
+    effect = LuGreMotorFriction(T_c=0.2, excess=0.5, omega_s=4.0, bend=0.1, tau=0.02, settling=NO_LIMIT)
+    for z, omega_m in ((1e-6, 1e-4), (-2e-6, 3e-5), (0.0, -1e-4)):
+        motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=jnp.asarray(omega_m))
+        torque = float(effect.torque(motion, DRIVE, jnp.asarray([z])))
+        assert torque == pytest.approx(-2.0 * z - 0.04 * omega_m, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -160,12 +169,18 @@ def test_lugre_at_constant_speed_is_the_stribeck_curve(omega_m):
     (
         DahlMotorFriction(T_c=0.2, bend=5e-4, settling=NO_LIMIT),
         LuGreMotorFriction(T_c=0.2, excess=1.0, omega_s=1e-2, bend=5e-4, settling=NO_LIMIT),
+        LuGreMotorFriction(T_c=0.2, excess=1.0, omega_s=1e-2, bend=5e-4, tau=1e-3, settling=NO_LIMIT),
     ),
-    ids=lambda e: e.name,
+    ids=("dahl", "lugre", "lugre_damped"),
 )
 def test_bristles_on_the_motor_take_work_and_give_back_no_more_than_they_store(effect):
     angle, states = along_sine(effect, 1e-3, 30.0, cycles=2)
-    friction = 0.2 * states[:, 0] / 5e-4  # N m, against the motor
+    rate = 1e-3 * 30.0 * np.cos(2 * np.pi * np.linspace(0.0, 2.0, angle.size))
+
+    def torque(omega_m, state):
+        return effect.torque(Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=omega_m), DRIVE, state)
+
+    friction = -np.asarray(jax.vmap(torque)(jnp.asarray(rate), jnp.asarray(states)))  # N m, against the motor
     work = np.concatenate([[0.0], np.cumsum(0.5 * (friction[1:] + friction[:-1]) * np.diff(angle))])
     stored = 0.5 * 0.2 * states[:, 0] ** 2 / 5e-4
     lost = work - stored

@@ -55,11 +55,11 @@ class DahlMotorFriction(MotorSideEffect):
 
 
 class LuGreMotorFriction(MotorSideEffect):
-    """LuGre friction `sigma_0 z + b omega_m` against the motor, with `z' = omega_m - sigma_0 |omega_m| z / g`.
+    """LuGre friction `sigma_0 z + sigma_1 z' + b omega_m` against the motor (Canudas de Wit et al. 1995), where
+    `z' = omega_m - sigma_0 |omega_m| z / g`.
 
-    `g = T_c (1 + excess exp(-(omega_m / omega_s)^2))` and `sigma_0 = T_c / bend`, so that the bristles saturate at
-    `bend` times the Stribeck level whatever T_c is. The bristles' own damping sigma_1 is left out: it matters only
-    while they stick.
+    `g = T_c (1 + excess exp(-(omega_m / omega_s)^2))`, `sigma_0 = T_c / bend` and `sigma_1 = sigma_0 tau`, so that the
+    bristles saturate at `bend` times the Stribeck level whatever T_c is, and nothing is left of them without it.
     """
 
     family: ClassVar[str] = "motor_friction"
@@ -87,14 +87,19 @@ class LuGreMotorFriction(MotorSideEffect):
         role="shape",
     )
     bend: Scalar = parameter(unit="rad", doc="motor angle within which it slides", bounds=(0.0, 10.0), role="shape")
+    tau: Scalar = parameter(
+        0.0, unit="s", doc="damping of the bristles over their stiffness", bounds=(0.0, 1e3), role="shape"
+    )
     settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(omega_s=0.2 * scales.omega_m, bend=bend, settling=scales.time_step) for bend in _bends(scales))
+        shape = {"omega_s": 0.2 * scales.omega_m, "tau": 0.3 / scales.natural_frequency, "settling": scales.time_step}
+        return tuple(cls(bend=bend, **shape) for bend in _bends(scales))
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
+        (slipping,) = self.state_rates(motion, state)
+        return -self.T_c * (state[0] + self.tau * slipping) / self.bend - self.b * motor_rate(motion)
 
     def _level(self, motion: Motion) -> Array:
         return 1.0 + self.excess * exponential(-((motor_rate(motion) / self.omega_s) ** 2))
@@ -112,6 +117,7 @@ class LuGreMotorFriction(MotorSideEffect):
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return {
             "sigma_0": (self.T_c / self.bend, "N m/rad"),
+            "sigma_1": (self.tau * self.T_c / self.bend, "N m s/rad"),
             "T_s": (self.T_c * (1.0 + self.excess), "N m"),
         }
 
