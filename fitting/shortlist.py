@@ -17,7 +17,7 @@ _SHARE_OF_BEST = 0.05
 _THE_SAME = 1e-6
 # Families whose likeliest form is refitted inside the equations in each round.
 _FAMILIES = 5
-# Further forms of the best one's family, and of those that are as good, that compete there.
+# Further forms of the best one's family, and of each that comes near it, that compete there.
 _FORMS = 3
 # Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
 # at least this share of what it does,
