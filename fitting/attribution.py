@@ -12,7 +12,7 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
-from fitting.measurement_noise import measurement_noise
+from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
@@ -157,8 +157,10 @@ def look(
         gain = -np.inf if trial is None else trial.gain_over(before)
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
-    ordered = _simplest_first(_with_separability(found), before, data, setting)
-    verdicts, accepted = _supported_first(ordered, before, base)
+    found = _with_separability(found)
+    if any(_supported(verdict, before, base) for verdict in found):
+        found = _simplest_first(found, before, data, setting)
+    verdicts, accepted = _supported_first(found, before, base)
     return Round(before, screened, tuple(verdicts), accepted)
 
 
@@ -178,19 +180,24 @@ def _imperfection(before: Trial) -> float:
     return max((effect.imperfection for effect in before.model.effects), default=0.0)
 
 
-def leaves_imperfection(before: Trial, base: Trial) -> bool:
+def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> tuple[bool, MeasurementNoise]:
     """Whether nothing is left beyond the measurement noise but what a model's effects may get wrong themselves, so
     that no further effect could remove more.
 
     Args:
         before: the model.
         base: the model without effects.
+        noise: as far as fits have been asked for it.
+
+    Returns:
+        Whether it is so, and the noise, for which the model has been asked as well where it mattered: it may see less
+        of it than the base model.
     """
-    # The base model's noise is the cheaper one to ask for, and the other can only be smaller.
-    return all(
-        _share(before, base, np.diag(np.asarray(measurement_noise(*fits)))) <= _imperfection(before)
-        for fits in ((base.training,), (base.training, before.training))
-    )
+    small = _imperfection(before)
+    if _share(before, base, np.diag(np.asarray(noise.covariance))) > small:
+        return False, noise
+    noise = noise.and_beside(before.training)
+    return _share(before, base, np.diag(np.asarray(noise.covariance))) <= small, noise
 
 
 def _share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:

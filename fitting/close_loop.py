@@ -19,7 +19,7 @@ from fitting.estimate import lost
 from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
 from fitting.long_fit import long_fit
-from fitting.measurement_noise import measurement_noise
+from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
 from fitting.screening import programs_ahead
@@ -138,15 +138,15 @@ def close_loop(
     with programs_ahead(model, next(iter(data.values()))[0], catalogue):
         base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
-    named, rounds, dropped, without = _add_effects(
+    named, rounds, dropped, without, seen_noise = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
     )
     clock.lap("attribution")
-    trusted, unknown = what_is_unknown(base, named, data, setting, seed=seed, progress=progress)
+    trusted, unknown = what_is_unknown(base, named, data, setting, noise=seen_noise, seed=seed, progress=progress)
     clock.lap("unknown effects")
     fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
     best = named if unknown is None else unknown.trial
-    noise = measurement_noise(base.training, *([] if best is base else [best.training]))
+    noise = seen_noise.and_beside(best.training).covariance
     decision = _decide(base, trusted, unknown, noise)
     if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < _EXCESS:
         # What the names leave is hardly more than noise.
@@ -235,14 +235,20 @@ def _add_effects(
     catalogue: Sequence[type[Effect]],
     seed: int,
     progress: Callable[[str], None],
-) -> tuple[Trial, tuple[Round, ...], tuple[str, ...], dict[str, Trial]]:
+) -> tuple[Trial, tuple[Round, ...], tuple[str, ...], dict[str, Trial], MeasurementNoise]:
     """Add the best effect, refit, look again; then drop what a later effect has made superfluous.
 
-    Returns the model, the rounds, the names of what was dropped, and the model without each of what was kept.
+    Returns the model, the rounds, the names of what was dropped, the model without each of what was kept, and the
+    noise.
     """
     current, rounds = base, []
+    noise = measurement_noise(base.training)
     found = 0
-    while found < max_effects and not (found and leaves_imperfection(current, base)):
+    while found < max_effects:
+        if found:
+            enough, noise = leaves_imperfection(current, base, noise)
+            if enough:
+                break
         this = look(
             current,
             data,
@@ -277,7 +283,7 @@ def _add_effects(
         without[kept[-1].winner.name] = kept[-1].before
     for name in (this.winner.name for this in kept if this.winner.name not in without):
         without[name] = base if len(kept) == 1 else _without(name, current, base, data, setting)
-    return current, tuple(rounds), tuple(dropped), without
+    return current, tuple(rounds), tuple(dropped), without, noise
 
 
 def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[str]:

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 from fitting.attribution import leaves_imperfection, told_from_zero
 from fitting.base_fit import leaves_white_noise
+from fitting.estimate import half_log_determinant
+from fitting.measurement_noise import MeasurementNoise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
 from fitting.unknown import Unknown, is_supported, learn, share_of
 
@@ -13,12 +15,21 @@ _COME_OUT = 0.75
 # A learned torque that adds less than this share to the gain of named effects, on training and on held-out data alike,
 # casts no doubt on them; one in their place must do better by this share of its own gain to outdo them.
 _LITTLE = 0.05
+# Noise is known to a few per cent, and fitted initial states take as much off it: what this adds to an objective.
+_NOISE_MARGIN = 0.05
 # So many names that together leave nothing but noise may be the terms of one function.
 _MANY = 3
 
 
 def what_is_unknown(
-    base: Trial, named: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
+    base: Trial,
+    named: Trial,
+    data: Data,
+    setting: Setting,
+    *,
+    noise: MeasurementNoise,
+    seed: int,
+    progress: Callable[[str], None],
 ) -> tuple[Trial, Unknown | None]:
     """The model whose names can be trusted, and the torque that is learned beside them.
 
@@ -34,10 +45,11 @@ def what_is_unknown(
         named: the model with those that were found.
         data: the stretches.
         setting: how they are cut.
+        noise: of the measured outputs, as far as fits have been asked for it.
         seed: of the surrogates behind the p-values.
         progress: told what is being done.
     """
-    enough = leaves_white_noise(named.training) or leaves_imperfection(named, base)
+    enough = leaves_white_noise(named.training) or leaves_imperfection(named, base, noise)[0]
     if enough and len(named.model.effects) < _MANY:
         return named, None
     beside = None if enough else learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
@@ -51,6 +63,8 @@ def what_is_unknown(
         explained=(base.training.objective - named.training.objective, named.gain_over(base)),
     ):
         return named, beside
+    if beside is None and not enough and _explain_all_but_little(base, named, noise):
+        return named, None
     instead = learn(base, data, setting, seed=seed, progress=progress)
     if instead is None or not is_supported(instead):
         return named, beside
@@ -117,6 +131,12 @@ def _is_little(added: Sequence[float], explained: Sequence[float]) -> bool:
         explained: decrease of it by the names.
     """
     return all(a < _LITTLE * e for a, e in zip(added, explained, strict=True))
+
+
+def _explain_all_but_little(base: Trial, named: Trial, noise: MeasurementNoise) -> bool:
+    """Whether not even a torque that left nothing but noise would be better than names by far."""
+    least = half_log_determinant(noise.covariance) - _NOISE_MARGIN
+    return named.held_out.objective - least < _LITTLE * (base.held_out.objective - least)
 
 
 def _names_stand(

@@ -162,7 +162,7 @@ def fit(
             if mended is not None:
                 solution = solved(mended, NEARBY_DAMPING)
         unknowns, covariance = solution.unknowns, solution.left_over.covariance
-        before, objective = objective, _half_log_determinant(covariance)
+        before, objective = objective, half_log_determinant(covariance)
         steps += solution.steps
         settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
         if settled or objective > give_up_above or steps >= 2 * max_steps:
@@ -266,7 +266,8 @@ def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " 
     return np.sqrt(problem.segments.weight.shape[1]) * jnp.concatenate([angles, rates, *hidden])
 
 
-def _half_log_determinant(covariance: Array) -> float:
+def half_log_determinant(covariance: Array) -> float:
+    """The objective that errors of this covariance make; infinite where it is none."""
     sign, value = np.linalg.slogdet(np.asarray(covariance))
     return float(0.5 * value) if sign > 0 else np.inf
 

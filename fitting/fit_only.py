@@ -100,7 +100,7 @@ def fit_only(
     hold = min(holds, key=lambda h: fits[h].objective)
     base, (_, validation) = fits[hold], split(experiments[hold])
     clock.lap("base fit")
-    noise = measurement_noise(base)
+    noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
     found = long_fit(base, must_explain=True)

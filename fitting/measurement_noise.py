@@ -55,13 +55,31 @@ class _Pieces(eqx.Module):
         return self.squares / self.samples / self.left
 
 
-def measurement_noise(*fits: Fit) -> Float[Array, "outputs outputs"]:
-    """Covariance of the outputs' measurement noise, as the fit sees it that leaves the least.
+class MeasurementNoise(eqx.Module):
+    """The noise of the measured outputs, as the fit sees it that leaves the least.
 
-    Args:
-        fits: of models of the same data. Each leaves the noise at least; one that goes astray leaves more.
+    Each fit of the same data leaves the noise at least; one that goes astray leaves more.
+
+    Attributes:
+        covariance: of the outputs.
+        asked: the fits that were asked; asking takes as long as a fit.
     """
-    return min(map(_noise_beside, fits), key=lambda c: float(np.linalg.slogdet(np.asarray(c))[1]))
+
+    covariance: Float[Array, "outputs outputs"]
+    asked: tuple[Fit, ...]
+
+    def and_beside(self, found: Fit) -> "MeasurementNoise":
+        """The same, where one more fit is asked."""
+        if any(found is fit for fit in self.asked):
+            return self
+        other = _noise_beside(found)
+        least = min(self.covariance, other, key=lambda c: float(np.linalg.slogdet(np.asarray(c))[1]))
+        return MeasurementNoise(least, (*self.asked, found))
+
+
+def measurement_noise(found: Fit) -> MeasurementNoise:
+    """The noise as one fit sees it."""
+    return MeasurementNoise(_noise_beside(found), (found,))
 
 
 def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:

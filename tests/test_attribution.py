@@ -14,6 +14,7 @@ from fitting.attribution import Verdict, look
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
 from fitting.free import effect_paths
+from fitting.measurement_noise import MeasurementNoise
 from fitting.posing import segment_length
 from fitting.trial import Setting, Trial, attempt, halo_for
 from fitting.uncertainty import Estimate, Uncertainty
@@ -143,18 +144,24 @@ def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
 
 
 @pytest.mark.parametrize(
-    ("effect", "left", "noise", "is_all"),
+    ("effect", "left", "noise", "is_all", "asked"),
     [
-        (TorqueBias(), 2.0, 1.0, True),  # 1.7 units beyond the noise, of 1000 that were removed
-        (TorqueBias(), 5.0, 1.0, False),
-        (MotorFriction(T_c=0.1, transition=0.1), 5.0, 1.0, True),  # nobody knows how a sign turns near rest
-        (MotorFriction(T_c=0.1, transition=0.1), 20.0, 1.0, False),
-        (TorqueBias(), 5.0, 4.9, True),
-        (None, 0.0, 1.0, False),
+        (TorqueBias(), 2.0, 1.0, True, True),  # 1.7 units beyond the noise, of 1000 that were removed
+        (TorqueBias(), 5.0, 1.0, False, True),
+        (MotorFriction(T_c=0.1, transition=0.1), 5.0, 1.0, True, True),  # nobody knows how a sign turns near rest
+        (MotorFriction(T_c=0.1, transition=0.1), 20.0, 1.0, False, False),  # even the base model tells
+        (TorqueBias(), 5.0, 4.9, True, True),
+        (None, 0.0, 1.0, False, False),
     ],
 )
 def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
-    verdicts, effect: Effect | None, left: float, noise: float, is_all: bool, monkeypatch: pytest.MonkeyPatch
+    verdicts,
+    effect: Effect | None,
+    left: float,
+    noise: float,
+    is_all: bool,
+    asked: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ):
     trial, _ = verdicts
 
@@ -162,13 +169,15 @@ def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
         parts = (rig.drive_model().with_effects(*effects), jnp.asarray([[rms**2]]))
         return eqx.tree_at(lambda t: (t.model, t.held_out.covariance), trial, parts)
 
-    # The base model's own estimate may be too large where what is missing is strong.
-    monkeypatch.setattr(
-        attribution, "measurement_noise", lambda *fits: jnp.asarray([[(noise if len(fits) > 1 else 5.0) ** 2]])
-    )
-    base = with_error(1000.0)
+    def seen_as(rms: float) -> MeasurementNoise:
+        return MeasurementNoise(jnp.asarray([[rms**2]]), ())
+
+    monkeypatch.setattr(MeasurementNoise, "and_beside", lambda self, fit: seen_as(noise))
+    base, by_base = with_error(1000.0), seen_as(5.0)
     before = base if effect is None else with_error(left, effect)
-    assert attribution.leaves_imperfection(before, base) == is_all
+    found, seen = attribution.leaves_imperfection(before, base, by_base)
+    assert found == is_all
+    assert (seen is not by_base) == asked
 
 
 def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:

@@ -10,15 +10,18 @@ import pytest
 import rig
 from fitting import doubt
 from fitting.close_loop import _base_trial
-from fitting.doubt import _is_little, _names_stand
+from fitting.doubt import _explain_all_but_little, _is_little, _names_stand
 from fitting.experiment import split
 from fitting.learned_look import Candidate
+from fitting.measurement_noise import MeasurementNoise
 from fitting.trial import Setting, Trial
 from fitting.unknown import Unknown
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
 from hdjax.effects.learned import LearnedMeshTorque, axes_over
+
+NOISE = 1e-3
 
 
 @pytest.mark.parametrize(
@@ -77,11 +80,30 @@ def test_what_is_learned_to_doubt_names(
         asked.append("instead" if before is base else "beside")
 
     monkeypatch.setattr(doubt, "leaves_white_noise", lambda fit: white)
-    monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base: imperfect)
+    monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base, noise: (imperfect, noise))
     monkeypatch.setattr(doubt, "learn", learn)
     setting = Setting(32, 4, 1, 8)
-    assert doubt.what_is_unknown(base, named, {}, setting, seed=0, progress=lambda message: None) == (named, None)
+    # Both leave a hundred times as much.
+    noise = MeasurementNoise((0.01 * NOISE) ** 2 * jnp.eye(1), (base.training, named.training))
+    options = {"noise": noise, "seed": 0, "progress": lambda message: None}
+    assert doubt.what_is_unknown(base, named, {}, setting, **options) == (named, None)
     assert asked == asks_for
+
+
+@pytest.mark.parametrize(
+    ("left", "all_but_little"),
+    [
+        (1.02, True),
+        (1.15, True),  # of a hundredfold error: a twentieth of its logarithm
+        (1.3, False),
+    ],
+)
+def test_names_that_noise_itself_would_hardly_better_are_in_no_doubt(base: Trial, left: float, all_but_little: bool):
+    def with_error(ratio: float) -> Trial:
+        return replace(base, held_out=replace(base.held_out, objective=float(np.log(ratio * NOISE))))
+
+    noise = MeasurementNoise(NOISE**2 * jnp.eye(1), ())
+    assert _explain_all_but_little(with_error(100.0), with_error(left), noise) == all_but_little
 
 
 @pytest.mark.parametrize(
@@ -98,7 +120,7 @@ def test_what_little_a_learned_torque_adds(training: float, held_out: float, lit
 
 @pytest.fixture(scope="module")
 def base() -> Trial:
-    data = {"zero-order": split((rig.reduced_experiment(1200, noise=1e-3),))}
+    data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
     return _base_trial(rig.reduced_model(), data, "zero-order")[0]
 
 

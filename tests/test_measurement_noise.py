@@ -23,8 +23,11 @@ def held(*, noise: float = NOISE, omega_0: float = rig.OMEGA_0, **physics) -> Fi
     return fit(model, stretches, base_paths(model), horizon=128, substeps=2, count=8, hold_parameters=True)
 
 
-def rms(*fits: Fit) -> float:
-    return float(np.sqrt(measurement_noise(*fits)[0, 0]))
+def rms(first: Fit, *others: Fit) -> float:
+    noise = measurement_noise(first)
+    for other in others:
+        noise = noise.and_beside(other)
+    return float(np.sqrt(noise.covariance[0, 0]))
 
 
 def test_no_good_model_is_needed():
@@ -44,6 +47,8 @@ def test_a_force_that_the_model_lacks_is_no_noise(bias: float, most: float):
 def test_the_model_that_leaves_the_least_tells():
     right, off = held(), held(omega_0=1.2 * rig.OMEGA_0)
     assert rms(off, right) == rms(right, off) == min(rms(right), rms(off))
+    noise = measurement_noise(right).and_beside(off)
+    assert noise.and_beside(right) is noise is noise.and_beside(off)
 
 
 @pytest.mark.parametrize("samples", [6, 12, 24])
