@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from hdjax.effects import (
     MotorSideEffect,
     Scales,
 )
-from hdjax.effects.learned import LEARNED_TORQUES, LearnedTorque
+from hdjax.effects.learned import LEARNED_TORQUES, LearnedReading, LearnedTorque
 from hdjax.parameters import Scalar, parameter
 from hdjax.program_cache import jit_small
 from hdjax.signals import polynomial
@@ -175,6 +176,13 @@ def _unit_pushes(
     find = jax.vmap(jax.jacfwd(rates, argnums=(0, 1)), in_axes=(None, None, 0, 0))
     by_strength, by_input = find(jnp.zeros(len(names)), jnp.zeros(()), states, conditions)
     return {name: by_strength[..., i] for i, name in enumerate(names)} | {INPUT: by_input}
+
+
+def unit_reading(model: Model, form: type[LearnedReading]) -> Float[Array, " outputs"]:
+    """What a unit of error of what an encoder reads does to the outputs."""
+    bare, at_rest = replace(model, effects=()), jnp.zeros(len(model.motion_states))
+    probed = bare.with_effects(form(axes=(), mixing=jnp.ones((1, 1)), c=(jnp.ones(()),)))
+    return probed.outputs(at_rest) - bare.outputs(at_rest)
 
 
 def place_of(effect: Effect) -> type[LearnedTorque] | None:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from fitting.along import place_of
 from fitting.estimate import Fit
 from fitting.explained import solved
-from fitting.linear_look import Look, look_along, products
+from fitting.linear_look import Acting, Look, look_along, products
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,
@@ -20,7 +20,8 @@ from hdjax.effects import (
     MotorSideEffect,
     SensorEffect,
 )
-from hdjax.effects.learned import ANGLES, Learned, LearnedTorque
+from hdjax.effects.learned import Learned, LearnedTorque
+from hdjax.effects.learned_axes import ANGLES
 
 # Values of the variable at which the data are asked, in each direction.
 _PLACES = 14
@@ -140,7 +141,7 @@ def _told(
         places.append(nodes)
         middle.append(_nearby(value[there], does[there], nodes))
         hats.append(_hats(value, nodes) * there[..., None])
-    found = products(look, (look.pushes[form.name],), (np.concatenate(hats, axis=-1),))
+    found = products(look, Acting((look.pushes[form.name],)), (np.concatenate(hats, axis=-1),))
     own = slice(len(look.problem.free.paths), None)
     # The error is whitened: an equal sum over the outputs is the likelihood.
     gram = np.einsum("siipq->pq", found.gram[..., own, own])

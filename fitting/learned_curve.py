@@ -13,18 +13,21 @@ from fitting.uncertainty import Uncertainty
 from fitting.unknown import Unknown
 from hdjax import Model
 from hdjax.effects import Motion
-from hdjax.effects.learned import LEARNED, AngleAxis, Learned, LearnedTorque
-
-PLACES = dict(zip((form.name for form in LEARNED), ("mesh", "motor", "load", "mesh angle"), strict=True))
-"""Where each learned function acts."""
+from hdjax.effects.learned import LEARNED, Learned, LearnedTorque
+from hdjax.effects.learned_axes import AngleAxis
 
 WORDS = {
     "mesh": "torque in the mesh",
     "motor": "torque on the motor",
     "load": "torque on the load",
     "mesh angle": "error of the mesh's angle",
+    "motor encoder": "error of the motor's encoder",
+    "load encoder": "error of the load's encoder",
 }
 """What each place's learned function is, in words."""
+
+PLACES = dict(zip((form.name for form in LEARNED), WORDS, strict=True))
+"""Where each learned function acts."""
 
 _POINTS = {1: 200, 2: 41}
 
@@ -33,7 +36,7 @@ class LearnedCurve(eqx.Module):
     """A learned function.
 
     Attributes:
-        place: "mesh", "motor" or "load" of a torque; "mesh angle" of an error there.
+        place: "mesh", "motor" or "load" of a torque; "mesh angle", "motor encoder" or "load encoder" of an error there.
         quantity: "torque" or "error".
         variables: what it depends on.
         at: variables at instants of the training data, by column; angles within one turn where the data have more.

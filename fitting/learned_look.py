@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.linalg import block_diag, eigh, null_space
 
-from fitting.along import ERROR, SLOPE
+from fitting.along import ERROR, SLOPE, unit_reading
 from fitting.estimate import Fit
 from fitting.free import effect_paths
 from fitting.linear_look import (
+    Acting,
     Look,
     Products,
-    Pushes,
     Sizes,
     best_steps,
     left_after,
@@ -30,20 +30,15 @@ from fitting.linear_look import (
 )
 from hdjax import Model, ReducedModel
 from hdjax.effects.learned import (
-    ANGLES,
     LEARNED,
-    UNITS,
-    AngleAxis,
-    Axis,
     Learned,
     LearnedFriction,
+    LearnedMeshError,
     LearnedMeshTorque,
+    LearnedReading,
     LearnedTorque,
-    LinearAxis,
-    PowerAxis,
-    SignAxis,
-    axes_over,
 )
+from hdjax.effects.learned_axes import ANGLES, UNITS, AngleAxis, Axis, LinearAxis, PowerAxis, SignAxis, axes_over
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -109,13 +104,15 @@ class LearnedLook(eqx.Module):
         kept = np.flatnonzero(self.weight.reshape(-1) > 0)
         return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
 
-    def pushes(self, form: type[Learned]) -> Pushes:
-        """What a form's function adds, and its slope as well for an error of the mesh."""
+    def acting(self, form: type[Learned]) -> Acting:
+        """What a unit of a form's function does, and one of its slope as well for an error of the mesh."""
+        if issubclass(form, LearnedReading):
+            return Acting(reading=unit_reading(self.look.model, form))
         names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
-        return tuple(self.look.pushes[name] for name in names)
+        return Acting(tuple(self.look.pushes[name] for name in names))
 
     def torque_push(self, form: type[Learned]) -> Float[Array, "segments knots states"]:
-        """What a unit of torque does at the place of a form: in the mesh for an error there."""
+        """What a unit of torque does at the place of a form; in the mesh where that is none."""
         return self.look.pushes[form.name if issubclass(form, LearnedTorque) else LearnedMeshTorque.name]
 
 
@@ -174,7 +171,7 @@ def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
 
 
 def _own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
-    """The free parameters as torques at the place of a form; none of them is an error of the mesh."""
+    """The free parameters as torques at the place of a form; none of them is an error of an angle."""
     if issubclass(form, LearnedTorque):
         return np.asarray(parameter_torques(seen.look, seen.torque_push(form)))
     return np.zeros((*seen.weight.shape, len(seen.look.problem.free.paths)))
@@ -183,7 +180,7 @@ def _own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, 
 def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.ndarray]) -> Sizes:
     """The functions of the axes, and their slopes for an error of the mesh."""
     raw = _all_products([_evaluated(a, values[a.variable]) for a in axes])
-    if issubclass(form, LearnedTorque):
+    if not issubclass(form, LearnedMeshError):
         return (raw,)
     (axis,) = axes
     return raw, np.asarray(_all_slopes(axis, jnp.asarray(values[axis.variable])))
@@ -274,7 +271,7 @@ def _candidate(
     # One width, one program.
     width = ((0, 0), (0, 0), (0, max(sizes) - mixing.shape[1]))
     padded = tuple(np.pad(part @ mixing, width) for part in raw)
-    found = products(seen.look, seen.pushes(form), padded).in_parts(_FOLDS)
+    found = products(seen.look, seen.acting(form), padded).in_parts(_FOLDS)
     found = _instead_of_own(found, seen.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
     base = _left_out(found, parameters)

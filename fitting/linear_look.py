@@ -22,9 +22,6 @@ from hdjax.where import where
 _REWEIGHTINGS = 2
 
 
-Pushes = tuple[Float[Array, "segments knots states"], ...]
-"""What a unit of each thing does to the state's rates."""
-
 Sizes = tuple[Float[Array | np.ndarray, "segments knots forces"], ...]
 """How much of each thing there is."""
 
@@ -54,6 +51,18 @@ class Look(eqx.Module):
     def model(self) -> Model:
         """The fitted model."""
         return self.problem.model
+
+
+class Acting(eqx.Module):
+    """What a unit of each of a force's parts does.
+
+    Attributes:
+        pushes: to the state's rates.
+        reading: to the outputs, in place of that, where it is no force but an error of what an encoder reads.
+    """
+
+    pushes: tuple[Float[Array, "segments knots states"], ...] = ()
+    reading: Float[Array, " outputs"] | None = None
 
 
 class Products(eqx.Module):
@@ -138,40 +147,43 @@ def _parameter_torques(problem: Problem, states: Array, conditions: Conditions, 
     return where(there, torque, 0.0)
 
 
-def products(look: Look, pushes: Pushes, sizes: Sizes) -> Products:
+def products(look: Look, acting: Acting, sizes: Sizes) -> Products:
     """What forces would do to the outputs.
 
     Args:
         look: the fit.
-        pushes: what each force is made of, some of the look's pushes: a torque at one place, mostly.
+        acting: what each force is made of, some of the look's pushes: a torque at one place, mostly; or what a unit of
+            a reading is.
         sizes: how much of each, at each knot; in a straight line between.
     """
-    found = _products(look, pushes, tuple(jnp.asarray(a) for a in sizes))
+    found = _products(look, acting, tuple(jnp.asarray(a) for a in sizes))
     return Products(*(np.asarray(a) for a in found))
 
 
 @eqx.filter_jit
-def _products(look: Look, pushes: Pushes, sizes: Sizes) -> tuple[Array, Array, Array, Array]:
-    columns = _columns(look, pushes, sizes)
+def _products(look: Look, acting: Acting, sizes: Sizes) -> tuple[Array, Array, Array, Array]:
+    columns = _columns(look, acting, sizes)
     error = look.error
     gram = jnp.einsum("snip,snjq->sijpq", columns, columns)
     gradient = jnp.einsum("snip,snj->sijp", columns, error)
     return gram, gradient, jnp.einsum("sni,snj->sij", error, error), jnp.sum(look.problem.segments.weight, axis=1)
 
 
-def _columns(look: Look, pushes: Pushes, sizes: Sizes) -> Float[Array, "segments samples outputs columns"]:
+def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[Array, "segments samples outputs columns"]:
     """The whitened outputs' derivative by the free parameters and by each force."""
-    first, *others = (p[..., None] * s[:, :, None, :] for p, s in zip(pushes, sizes, strict=True))
-    forces = sum(others, start=first)
-    segments = look.problem.segments
-    return explained(
-        look.blocks, look.followed, segments, look.problem.whitening, forces[:, :-1], forces[:, 1:], jnp.zeros(())
-    )
+    size, reading = sizes[0], jnp.zeros(())
+    forces = jnp.zeros((*size.shape[:2], look.followed.states.shape[-1], size.shape[-1]))
+    if acting.reading is not None:
+        reading = acting.reading[None, None, :, None] * size[:, :-1, None, :]
+    for push, size in zip(acting.pushes, sizes, strict=acting.reading is None):
+        forces = forces + push[..., None] * size[:, :, None, :]
+    segments, whitening = look.problem.segments, look.problem.whitening
+    return explained(look.blocks, look.followed, segments, whitening, forces[:, :-1], forces[:, 1:], reading)
 
 
 def surrogate_gains(
     looks: tuple[Look, Look],
-    pushes: tuple[Pushes, Pushes],
+    acting: tuple[Acting, Acting],
     sizes: tuple[Sizes, Sizes],
     surrogates: tuple[np.ndarray, np.ndarray],
 ) -> Float[np.ndarray, " draws"]:
@@ -179,13 +191,13 @@ def surrogate_gains(
 
     Args:
         looks: at the data that are fitted, and at unseen data.
-        pushes: what the forces are made of, likewise.
+        acting: what the forces are made of, likewise.
         sizes: likewise.
         surrogates: residuals of the same colour with random phases, by draw, segment and row.
     """
     (gram, gradient), (unseen_gram, unseen_gradient) = (
-        [np.asarray(a) for a in _against(look, p, tuple(jnp.asarray(one) for one in size), jnp.asarray(drawn))]
-        for look, p, size, drawn in zip(looks, pushes, sizes, surrogates, strict=True)
+        [np.asarray(a) for a in _against(look, unit, tuple(jnp.asarray(one) for one in size), jnp.asarray(drawn))]
+        for look, unit, size, drawn in zip(looks, acting, sizes, surrogates, strict=True)
     )
     known = len(looks[0].problem.free.paths)
     loss = []
@@ -198,8 +210,8 @@ def surrogate_gains(
 
 
 @eqx.filter_jit
-def _against(look: Look, pushes: Pushes, sizes: Sizes, surrogates: Array) -> tuple[Array, Array]:
-    columns = _columns(look, pushes, sizes)
+def _against(look: Look, acting: Acting, sizes: Sizes, surrogates: Array) -> tuple[Array, Array]:
+    columns = _columns(look, acting, sizes)
     rows = columns.reshape(columns.shape[0], -1, columns.shape[-1])
     return jnp.einsum("srp,srq->pq", rows, rows), jnp.einsum("srp,dsr->pd", rows, surrogates)
 

@@ -14,18 +14,8 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME, Effect
-from hdjax.effects.learned import (
-    LEARNED,
-    UNITS,
-    AngleAxis,
-    Axis,
-    Learned,
-    LearnedFriction,
-    LinearAxis,
-    PowerAxis,
-    SignAxis,
-    SplineAxis,
-)
+from hdjax.effects.learned import LEARNED, Learned, LearnedFriction
+from hdjax.effects.learned_axes import UNITS, AngleAxis, Axis, LinearAxis, PowerAxis, SignAxis, SplineAxis
 from hdjax.parameters import as_scalar, own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from fitting.learned_curve import LearnedCurve
 from fitting.unknown import without
-from hdjax.effects.learned import ANGLES, DRIFTS
+from hdjax.effects.learned_axes import ANGLES, DRIFTS
 
 Kind = Literal["constant", "linear", "even", "odd", "magnitude", "knee", "sign", "stribeck", "order"]
 
@@ -31,6 +31,8 @@ _FAMILIES: dict[tuple[str, str, Kind], str] = {
     ("mesh", "v", "odd"): "nonlinear_damping",
     ("mesh", "theta_m", "order"): "kinematic_error",
     ("mesh angle", "theta_m", "order"): "kinematic_error",
+    ("motor encoder", "theta_m", "order"): "encoder_eccentricity",
+    ("load encoder", "theta_l", "order"): "encoder_eccentricity",
     ("motor", "theta_m", "order"): "cogging",
     ("motor", "omega_m", "sign"): "motor_friction",
     ("motor", "omega_m", "linear"): "motor_friction",

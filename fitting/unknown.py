@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.along import unit_reading
 from fitting.attribution import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
 from fitting.learned_look import (
@@ -28,6 +29,7 @@ from fitting.surrogates import surrogates
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, sampled
 from hdjax.effects import Conditions, Motion
+from hdjax.effects.learned import LearnedReading
 
 # A poorer error by this share (in the objective) is no reason for a second variable.
 _WORTH_A_VARIABLE = 0.03
@@ -48,7 +50,7 @@ class Unknown(eqx.Module):
         chosen: the one that was taken.
         states: of the model without it, at the instants that stand for the density of the data.
         conditions: time and temperature there.
-        push: what a unit of torque adds to their rates: at its place, or in the mesh for an error there.
+        push: what a unit of torque adds to their rates: at its place, or in the mesh for an error of an angle.
         gain: decrease of the held-out objective.
         p_value: chance of such a gain where nothing is missing.
     """
@@ -142,13 +144,25 @@ def share_of(named: Model, found: Unknown) -> float:
     """
     known = found.before.model.effects
     apart = [
-        without(_torques(eqx.tree_at(lambda m: m.effects, named, (*known, e)), found), found.chosen.known)
+        without(_done(eqx.tree_at(lambda m: m.effects, named, (*known, e)), found), found.chosen.known)
         for e in named.effects
         if e.name not in {k.name for k in known}
     ]
-    learned = without(_torques(found.trial.model, found), found.chosen.known)
+    learned = without(_done(found.trial.model, found), found.chosen.known)
     alike = float(sum(part @ learned for part in apart) ** 2)
     return alike / max(float(sum(part @ part for part in apart)) * float(learned @ learned), 1e-300)
+
+
+def _done(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
+    """What the effects of a model, beyond those a function was learned with, do where the function acts: as a torque
+    there, or to what an encoder reads."""
+    if not issubclass(found.chosen.form, LearnedReading):
+        return _torques(model, found)
+    unit = np.asarray(unit_reading(model, found.chosen.form))
+    bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
+    states = jnp.asarray(found.states)
+    added = np.asarray(jax.vmap(model.outputs)(states) - jax.vmap(bare.outputs)(states))
+    return added @ unit / (unit @ unit)
 
 
 def _torques(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
@@ -201,7 +215,7 @@ def _p_value(seen: LearnedLook, before: Trial, chosen: Candidate, gain: float, s
     unseen = learned_look(before.held_out)
     null = surrogate_gains(
         (seen.look, unseen.look),
-        (seen.pushes(chosen.form), unseen.pushes(chosen.form)),
+        (seen.acting(chosen.form), unseen.acting(chosen.form)),
         (sizes_along(chosen, seen), sizes_along(chosen, unseen)),
         (surrogates(before.training, seed), surrogates(before.held_out, seed + 1)),
     )

@@ -19,7 +19,8 @@ from fitting.unknown import Unknown
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep
-from hdjax.effects.learned import LearnedMeshTorque, axes_over
+from hdjax.effects.learned import LearnedMeshTorque
+from hdjax.effects.learned_axes import axes_over
 
 NOISE = 1e-3
 

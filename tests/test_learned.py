@@ -12,7 +12,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 import rig
-from fitting.along import acting_at_knots, unit_pushes
+from fitting.along import acting_at_knots, unit_pushes, unit_reading
 from fitting.errors import InputError
 from fitting.experiment import cut, experiment_from_log, split
 from fitting.model_file import StoredModel, read_model, to_json
@@ -22,18 +22,23 @@ from hdjax.effects.actuation import TorqueGain
 from hdjax.effects.friction import CoulombFriction, LoadFriction, MotorFriction
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.learned import (
-    ANGLES,
     LEARNED,
     LEARNED_TORQUES,
-    UNITS,
-    AngleAxis,
-    Axis,
     LearnedFriction,
+    LearnedLoadReading,
     LearnedLoadTorque,
     LearnedMeshError,
     LearnedMeshTorque,
+    LearnedMotorReading,
     LearnedMotorTorque,
+    LearnedReading,
     LearnedTorque,
+)
+from hdjax.effects.learned_axes import (
+    ANGLES,
+    UNITS,
+    AngleAxis,
+    Axis,
     LinearAxis,
     PowerAxis,
     SignAxis,
@@ -43,6 +48,7 @@ from hdjax.effects.learned import (
     combined,
     functions,
 )
+from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.simulate import march
 
 
@@ -323,6 +329,33 @@ def test_a_learned_error_of_the_mesh_is_a_kinematic_error():
     np.testing.assert_allclose(rates(found, state), rates(wanted, state), rtol=1e-12)
     scale = np.abs(slopes(wanted, state)).max()
     np.testing.assert_allclose(slopes(found, state), slopes(wanted, state), rtol=1e-10, atol=1e-12 * scale)
+
+
+def test_a_learned_reading_is_an_eccentric_encoder():
+    """What is read is what the catalogue's form reads, whatever the angle; no force goes with it."""
+    base, state = rig.drive_model(), jnp.asarray([1.3, 0.025, 40.0, 0.05])
+    for form, known, angle in (
+        (LearnedMotorReading, MotorEncoderEccentricity(cosine=2e-4, sine=-1e-4, n=2.0), "theta_m"),
+        (LearnedLoadReading, LoadEncoderEccentricity(cosine=2e-4, sine=-1e-4, n=2.0), "theta_l"),
+    ):
+        axis = AngleAxis(angle, 3)
+        c = np.zeros(axis.count)
+        nothing = base.with_effects(learned(form, axis, c=c))
+        np.testing.assert_array_equal(nothing.outputs(state), base.outputs(state))
+        c[3], c[4] = 2e-4, -1e-4
+        found, wanted = base.with_effects(learned(form, axis, c=c)), base.with_effects(known)
+        np.testing.assert_allclose(found.outputs(state), wanted.outputs(state), rtol=1e-14)
+        assert np.any(np.asarray(found.outputs(state) != base.outputs(state)))
+        np.testing.assert_array_equal(rates(found, state), rates(base, state))
+        by_state = [np.asarray(jax.jacfwd(m.outputs)(state)) for m in (found, wanted)]
+        np.testing.assert_allclose(*by_state, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("form", "unit"), [(LearnedMotorReading, [1 / rig.N] * 2), (LearnedLoadReading, [0.0, -1.0])])
+def test_a_unit_of_a_reading_is_a_radian_whatever_is_learned_already(form: type[LearnedReading], unit: list[float]):
+    learned_already = learned(form, AngleAxis("theta_m" if form is LearnedMotorReading else "theta_l", 1), c=[1.0] * 3)
+    for model in (rig.drive_model(), rig.drive_model().with_effects(learned_already)):
+        np.testing.assert_allclose(unit_reading(model, form), unit, rtol=1e-14)
 
 
 def test_an_error_of_the_mesh_of_anything_but_the_angle_is_refused(tmp_path: Path):

@@ -26,7 +26,9 @@ from hdjax.effects.actuation import TorqueBias, TorqueGain
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.kinematic import KinematicError
-from hdjax.effects.learned import LearnedMeshError, LearnedMotorTorque, LinearAxis, PowerAxis, SignAxis, SplineAxis
+from hdjax.effects.learned import LearnedLoadReading, LearnedMeshError, LearnedMotorReading, LearnedMotorTorque
+from hdjax.effects.learned_axes import LinearAxis, PowerAxis, SignAxis, SplineAxis
+from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, STEP = 1600, 4e-3
@@ -211,6 +213,49 @@ def test_an_error_of_the_mesh_is_told_from_a_torque():
     wrong = rig.drive_model().with_effects(CoulombFriction(T_c=2.0, v_0=0.01))
     assert share_of(right, found) > 0.95
     assert share_of(wrong, found) < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("form", "name", "angle", "motor_amplitude", "load_amplitude"),
+    [
+        (LearnedMotorReading, "motor encoder", "theta_m", 6e-3, 0.0),
+        (LearnedLoadReading, "load encoder", "theta_l", 0.0, 2e-4),
+    ],
+)
+def test_an_error_of_an_encoder_is_told_from_what_moves_the_drive(
+    form: type, name: str, angle: str, motor_amplitude: float, load_amplitude: float
+):
+    """The third order, which no form of the catalogue has, and which is not amplified at resonance."""
+    states, torque = rig.drive_motion(rig.drive_torque(COUNT)), rig.drive_torque(COUNT)
+    read = states.copy()
+    read[:, 0] += motor_amplitude * np.cos(3 * states[:, 0])
+    read[:, 1] += load_amplitude * np.cos(3 * states[:, 1])
+    log = rig.drive_log(read, torque, noise=1.0, seed=0)
+    data = {"zero-order": split([experiment_from_log(log, hold="zero-order", N=rig.N)])}
+    trial = attempt(rig.drive_model(), data, "zero-order", SETTING)
+    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    assert found is not None and is_supported(found)
+    assert found.chosen.of == (form, (angle,))
+    noise = np.log(rig.MOTOR_NOISE / rig.N) + np.log(rig.LOAD_NOISE)
+    before, after = (t.held_out.objective for t in (trial, found.trial))
+    # A few powers of the load's angle come near the cosine over so small an arc, and no nearer.
+    assert before > noise + 2.0 and after < noise + (0.1 if form is LearnedMotorReading else 1.0)
+    curve = curve_of(found)
+    assert (curve.place, curve.quantity) == (name, "error")
+    error, _ = misfit(curve, (motor_amplitude + load_amplitude) * np.cos(3 * curve.at[:, 0]))
+    assert error < 0.1
+    alike = [shape for shape in shapes(curve).closest if f"cos(3 {angle})" in shape.expression]
+    # Over an arc of 0.4 rad of the load an order is a power as well.
+    assert alike and alike[0].families == ("encoder_eccentricity",) and alike[0].explained > 0.95
+    # The effect that it is, and two that it is not.
+    right = {
+        "motor encoder": MotorEncoderEccentricity(cosine=motor_amplitude, n=3.0),
+        "load encoder": LoadEncoderEccentricity(cosine=load_amplitude, n=3.0),
+    }[name]
+    assert share_of(rig.drive_model().with_effects(right), found) > 0.95
+    for wrong in (KinematicError(cos_2=1e-4), CoulombFriction(T_c=2.0, v_0=0.01)):
+        assert share_of(rig.drive_model().with_effects(wrong), found) < 0.3
 
 
 @pytest.mark.slow

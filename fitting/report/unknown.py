@@ -10,7 +10,7 @@ from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from fitting.shapes import Shape, shapes
 from hdjax import ReducedModel
-from hdjax.effects.learned import UNITS
+from hdjax.effects.learned_axes import UNITS
 
 _WORDS = {
     "x": "twist",

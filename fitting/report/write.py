@@ -20,7 +20,7 @@ from fitting.report.proposal import COMMAND_FILE, command_table
 from fitting.report.text import report_text
 from fitting.report.unknown import curve_of, unit_in_log
 from fitting.rig import Rig
-from hdjax.effects.learned import UNITS
+from hdjax.effects.learned_axes import UNITS
 
 
 def write_report(
