@@ -82,9 +82,10 @@ class Blocks(eqx.Module):
 
 @jit_kept
 def simulate_segments(
-    problem: Problem, unknowns: Unknowns
+    problem: Problem, unknowns: Unknowns, intervals: Int[Array, ""] | None = None
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
-    """The outputs that the model gives on each segment, and the state it ends in."""
+    """The outputs that the model gives on each segment, and the state it ends in; `intervals` as in
+    [`hdjax.simulate.march`][]."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
     segments = problem.segments
     temperature = segments.temperature if any(e.needs_temperature for e in model.effects) else None
@@ -104,6 +105,7 @@ def simulate_segments(
             state,
             solver=problem.solver,
             substeps=problem.substeps,
+            intervals=intervals,
             unroll=problem.unroll,
             temperature=temperature,
         )
@@ -117,8 +119,8 @@ def residual(
 ) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
     """Whitened output error of each segment by row, then its hidden initial states in units of their prior; and the
     gap before each joined segment."""
-    outputs, end = simulate_segments(problem, unknowns)
     weight = problem.segments.weight[:, :, None]
+    outputs, end = simulate_segments(problem, unknowns, _needed(problem.segments))
     # A simulation may run away where there are no data; infinity times zero is no zero.
     error = where(weight > 0, (problem.segments.measured - outputs) * weight, 0.0)
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
@@ -129,6 +131,15 @@ def residual(
     gap = unknowns.states - jnp.roll(end, 1, axis=0)
     gap = where(jnp.abs(gap) < _LOST, gap, _LOST)
     return rows, where(joined, gap, 0.0)
+
+
+def _needed(segments: Segments) -> Int[Array, ""]:
+    """How many sample intervals have to be simulated: up to the last sample that counts in any segment, all where
+    segments are joined at their ends."""
+    length = segments.weight.shape[1]
+    counts = jnp.any(segments.weight > 0, axis=0)
+    last = jnp.max(where(counts, jnp.arange(length), 0))
+    return where(jnp.any(segments.joined), length, last)
 
 
 def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments hidden"]:

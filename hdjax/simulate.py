@@ -17,6 +17,7 @@ from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.results import Ending, SimulationError
 from hdjax.rubbing import over_step
 from hdjax.signals import PiecewisePolynomial, polynomial
+from hdjax.where import where
 
 
 class Trajectory(eqx.Module):
@@ -203,6 +204,7 @@ def march(
     *,
     solver: dfx.AbstractERK,
     substeps: int | Int[Array, ""],
+    intervals: Int[Array, ""] | None = None,
     unroll: bool = True,
     temperature: PiecewisePolynomial | None = None,
 ) -> tuple[Float[Array, "n states"], State]:
@@ -220,6 +222,8 @@ def march(
         initial_state: state at the first knot.
         solver: an explicit Runge-Kutta solver of diffrax; its tableau is used.
         substeps: steps in each sample interval. An array is data, so that one compiled program serves any number.
+        intervals: in how many of the intervals, from the first on, the drive moves; in the others it stays where it is,
+            at next to no cost. Data, as `substeps`; all of them where None.
         unroll: whether a step's stages are written out. A loop over them compiles several times faster for a large
             model, and runs slower for a small one.
         temperature: of the drive [K] on the same knots; None where no effect depends on it.
@@ -236,7 +240,7 @@ def march(
     table = np.stack([np.pad(row, (0, len(nodes) - len(row))) for row in [np.zeros(0), *lower]])
 
     def interval(state, inputs):
-        coefficients, load_coefficients, warmth, knot, width = inputs
+        index, coefficients, load_coefficients, warmth, knot, width = inputs
         h = width / jnp.asarray(substeps, dtype=width.dtype)
 
         def around(s, rubbing=None):
@@ -271,11 +275,13 @@ def march(
             return _advanced(y, h, weights, slopes)
 
         # A loop rather than unrolled steps: the program, and its compile time, stay the same size.
-        end = jax.lax.fori_loop(0, substeps, lambda j, y: step(y, jnp.asarray(j, dtype=h.dtype) * h), state)
+        steps = substeps if intervals is None else where(index < intervals, substeps, 0)
+        end = jax.lax.fori_loop(0, steps, lambda j, y: step(y, jnp.asarray(j, dtype=h.dtype) * h), state)
         return end, state
 
     load_coefficients, warmth = (None if s is None else s.coefficients for s in (load_torque, temperature))
-    inputs = (torque.coefficients, load_coefficients, warmth, torque.knots[:-1], jnp.diff(torque.knots))
+    width = jnp.diff(torque.knots)
+    inputs = (jnp.arange(width.size), torque.coefficients, load_coefficients, warmth, torque.knots[:-1], width)
     # The state travels as separate numbers: under vmap each is one contiguous row of lanes.
     end, states = jax.lax.scan(interval, tuple(initial_state), inputs)
     return jnp.stack(states, axis=-1), jnp.stack(end)

@@ -50,6 +50,27 @@ def test_zero_at_the_truth_of_a_reduced_drive():
     assert np.max(np.abs(error)) < 1e-6 * np.max(np.abs(experiment.measured))
 
 
+def test_what_no_sample_asks_for_is_not_simulated():
+    """With the later samples masked the drive stops there, and all that counts is as before; joined segments go on to
+    their ends."""
+    model = rig.reduced_model()
+    whole = problem_of(rig.reduced_experiment(COUNT), model, base_paths(model), substeps=2)
+    start = Unknowns(whole.free.pack(model), first_states(rig.reduced_motion(rig.reduced_forcing(COUNT))))
+    mask = (jnp.arange(LENGTH) < 11).astype(float)[None, :]
+    masked = eqx.tree_at(lambda p: p.segments.weight, whole, whole.segments.weight * mask)
+    joined = eqx.tree_at(lambda p: p.segments.joined, masked, jnp.asarray([False, True, True]))
+    rows = np.asarray(masked.segments.weight) > 0
+    full, part, gaps = (blocks(p, start) for p in (whole, masked, joined))
+    for name in ("residual", "by_parameter", "by_state"):
+        wanted = np.where(rows.reshape(*rows.shape, *[1] * (getattr(full, name).ndim - 2)), getattr(full, name), 0.0)
+        np.testing.assert_allclose(getattr(part, name), wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
+    _, end = simulate_segments(whole, start)
+    np.testing.assert_allclose(gaps.gap[1:], start.states[1:] - end[:-1], rtol=1e-12)
+    _, stopped = simulate_segments(whole, start, jnp.asarray(10))
+    # It stands still once nothing is asked for, which is not where it would have been.
+    assert np.abs(np.asarray(stopped - end)).max() > 1e-3 * np.abs(np.asarray(end)).max()
+
+
 PHYSICS = {"mesh_friction": (0.8, 0.05), "torque_bias": 0.03, "kinematic": (1.5e-4, -1e-4), "gravity": 2.0}
 EFFECTS = (
     CoulombFriction(T_c=0.8, v_0=0.05),
