@@ -1,5 +1,6 @@
 """Settings for every test (stricter than a user's), and the data beside the repository."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,10 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from hdjax.program_cache import forget
+
+# Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
+# by tests. What a user's command compiles is made well, as `jit_small` says.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false")
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
