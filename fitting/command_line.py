@@ -4,6 +4,7 @@ speeds`."""
 # ruff: noqa: E402
 
 import contextlib
+import gc
 import os
 
 # XLA reads this once, when jax loads. With a warm cache it would warn at length that the processor lacks
@@ -441,6 +442,8 @@ def _set_up_jax() -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 the data can't support the request, 2 bad usage or bad input."""
+    # Making programs leaves millions of small objects that stay: Python would go through them again and again.
+    gc.set_threshold(200_000)
     _set_up_jax()
     try:
         app(arguments, exit_on_error=False, print_error=False)

@@ -1,5 +1,6 @@
 """Settings for every test (stricter than a user's), and the data beside the repository."""
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,9 @@ from hdjax.program_cache import forget
 # Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
 # by tests. What a user's command compiles is made well, as `jit_small` says.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false")
+
+# As the command line does, for the same reason.
+gc.set_threshold(200_000)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
