@@ -13,7 +13,7 @@ from fitting.uncertainty import Uncertainty
 from fitting.unknown import Unknown
 from hdjax import Model
 from hdjax.effects import Motion
-from hdjax.effects.learned import LEARNED, Learned, LearnedTorque
+from hdjax.effects.learned import LEARNED, Learned, LearnedPeriodic, LearnedTorque
 from hdjax.effects.learned_axes import AngleAxis
 
 WORDS = {
@@ -39,7 +39,9 @@ class LearnedCurve(eqx.Module):
         place: "mesh", "motor" or "load" of a torque; "mesh angle", "motor encoder" or "load encoder" of an error there.
         quantity: "torque" or "error".
         variables: what it depends on.
-        at: variables at instants of the training data, by column; angles within one turn where the data have more.
+        period: after which a function of time comes back [s]; None where it does not.
+        at: variables at instants of the training data, by column; angles within one turn where the data have more, and
+            time within one period.
         value: at those instants [N m or rad].
         std: its standard error.
         known: what the drive's own parameters stand for at those instants: the function is without it.
@@ -51,6 +53,7 @@ class LearnedCurve(eqx.Module):
     place: str = eqx.field(static=True)
     quantity: Literal["torque", "error"] = eqx.field(static=True)
     variables: tuple[str, ...] = eqx.field(static=True)
+    period: float | None = eqx.field(static=True)
     at: Float[np.ndarray, "instants variables"]
     value: Float[np.ndarray, " instants"]
     std: Float[np.ndarray, " instants"]
@@ -72,6 +75,9 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     effect = model.effect(name)
     assert isinstance(effect, Learned)
     values = np.stack([np.asarray(getattr(found.motion, v)) for v in found.chosen.variables], axis=1)
+    period = 2 * np.pi / float(effect.omega) if isinstance(effect, LearnedPeriodic) else None
+    if period is not None:
+        values = np.mod(values, period)
     for column, axis in zip(values.T, effect.axes, strict=True):
         if isinstance(axis, AngleAxis) and np.ptp(column) > 2 * np.pi:
             column[:] = np.mod(column, 2 * np.pi)
@@ -84,6 +90,7 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
         PLACES[name],
         "torque" if isinstance(effect, LearnedTorque) else "error",
         found.chosen.variables,
+        period,
         values,
         value,
         std,

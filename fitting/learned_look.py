@@ -28,6 +28,7 @@ from fitting.linear_look import (
     parameter_torques,
     products,
 )
+from fitting.spectral_lines import spectral_lines
 from hdjax import Model, ReducedModel
 from hdjax.effects.learned import (
     LEARNED,
@@ -35,10 +36,21 @@ from hdjax.effects.learned import (
     LearnedFriction,
     LearnedMeshError,
     LearnedMeshTorque,
+    LearnedPeriodic,
     LearnedReading,
     LearnedTorque,
 )
-from hdjax.effects.learned_axes import ANGLES, UNITS, AngleAxis, Axis, LinearAxis, PowerAxis, SignAxis, axes_over
+from hdjax.effects.learned_axes import (
+    ANGLES,
+    UNITS,
+    AngleAxis,
+    Axis,
+    LinearAxis,
+    PeriodicAxis,
+    PowerAxis,
+    SignAxis,
+    axes_over,
+)
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -92,11 +104,13 @@ class LearnedLook(eqx.Module):
         look: at the fit.
         values: variables at each knot.
         weight: of each knot.
+        lines: frequencies that stand out of what the fit leaves over [rad/s].
     """
 
     look: Look
     values: dict[str, Float[np.ndarray, "segments knots"]]
     weight: Float[np.ndarray, "segments knots"]
+    lines: tuple[float, ...] = eqx.field(static=True)
 
     @property
     def instants(self) -> Int[np.ndarray, " instants"]:
@@ -124,7 +138,7 @@ def learned_look(fit: Fit) -> LearnedLook:
     finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
     # The last knot of a segment is the first one of the next.
     weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
-    return LearnedLook(look, values, weight)
+    return LearnedLook(look, values, weight, spectral_lines(fit))
 
 
 def candidates(seen: LearnedLook) -> list[Candidate]:
@@ -240,10 +254,11 @@ def _functions_of(
 ) -> list[Candidate]:
     """One place and choice of variables with all that a function of them may be made of, fewest coefficients first."""
     jumps_with = next((name for name in variables if form.may_jump_with(name)), None)
-    # A second look knows how sharp a jump is.
-    jumps = (e for e in seen.look.model.effects if isinstance(e, form) and isinstance(e, LearnedFriction))
-    corner = next((float(jump.corner) for jump in jumps), None)
-    axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with, corner=corner)
+    # A second look knows how sharp a jump is, and at which frequency a torque comes back.
+    before = next((e for e in seen.look.model.effects if isinstance(e, form)), None)
+    corner = float(before.corner) if isinstance(before, LearnedFriction) else None
+    lines = (float(before.omega),) if isinstance(before, LearnedPeriodic) else seen.lines
+    axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with, corner=corner, lines=lines)
     choices = (_candidate(seen, form, each, own) for each in axes)
     return sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c))
 
@@ -335,7 +350,7 @@ def _roughness_along(axis: Axis) -> np.ndarray:
     if isinstance(axis, SignAxis):
         beside = [] if axis.beside is None else [_roughness_along(axis.beside)]
         return np.asarray(block_diag(_ROUGHNESS_OF_A_SIGN, *beside))
-    if isinstance(axis, AngleAxis):
+    if isinstance(axis, AngleAxis | PeriodicAxis):
         order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
         return np.diag((2 * np.pi * order) ** 4)
     if isinstance(axis, PowerAxis):

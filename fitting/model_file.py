@@ -14,13 +14,24 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import BY_NAME, Effect
-from hdjax.effects.learned import LEARNED, Learned, LearnedFriction
-from hdjax.effects.learned_axes import UNITS, AngleAxis, Axis, LinearAxis, PowerAxis, SignAxis, SplineAxis
+from hdjax.effects.learned import LEARNED, Learned, LearnedFriction, LearnedPeriodic
+from hdjax.effects.learned_axes import (
+    UNITS,
+    AngleAxis,
+    Axis,
+    LinearAxis,
+    PeriodicAxis,
+    PowerAxis,
+    SignAxis,
+    SplineAxis,
+)
 from hdjax.parameters import as_scalar, own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
 
 _MOST_FUNCTIONS = 1000
+# What learned functions have beside their coefficients.
+_SHAPES: dict[type[Learned], str] = {LearnedFriction: "transition", LearnedPeriodic: "omega"}
 
 
 class StoredModel(eqx.Module):
@@ -100,7 +111,7 @@ def _axis(content: dict[str, Any]) -> Axis:
     if "corner" in content:
         beside = content.get("beside")
         return SignAxis(content["variable"], content["corner"], None if beside is None else _axis(beside))
-    own = {"orders": AngleAxis, "largest": PowerAxis, "low": SplineAxis}
+    own = {"omega": PeriodicAxis, "orders": AngleAxis, "largest": PowerAxis, "low": SplineAxis}
     form = next((form for name, form in own.items() if name in content), LinearAxis)
     return form(**content)
 
@@ -121,17 +132,22 @@ def _effect(content: Any) -> Effect:
             raise ValueError(f"{axis.variable} from {axis.low} to {axis.high}")
         if isinstance(axis, PowerAxis) and not axis.largest > 0:
             raise ValueError(f"{axis.variable} up to {axis.largest}")
+        if isinstance(axis, PeriodicAxis) and not (len(axes) == 1 and axis.variable == "time" and axis.omega > 0):
+            raise ValueError(f"{axis.variable} at {axis.omega} rad/s")
     mixing = jnp.asarray(content["mixing"], dtype=float)
     own = dict(content["parameters"])
-    transition = own.pop("transition", None)
+    shape = {name: own.pop(name) for name in _SHAPES.values() if name in own}
     coefficients = tuple(own[f"c_{i}"] for i in range(len(own)))
     wanted = (math.prod(a.count for a in axes), len(coefficients))
     if mixing.shape != wanted or not bool(jnp.all(jnp.isfinite(mixing))):
         raise ValueError(f"a mixing of shape {mixing.shape} where {wanted} was expected")
     effect = form.made_of(axes, mixing, coefficients)
-    if isinstance(effect, LearnedFriction) and not (transition is not None and transition > 0):
-        raise ValueError(f"a jump over {transition} rad/s")
-    return eqx.tree_at(lambda e: e.transition, effect, as_scalar(transition)) if transition is not None else effect
+    expected = {name for kind, name in _SHAPES.items() if isinstance(effect, kind)}
+    if shape.keys() != expected or not all(value > 0 for value in shape.values()):
+        raise ValueError(f"{shape} where {expected or 'nothing'} was expected")
+    for name, value in shape.items():
+        effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(value))
+    return effect
 
 
 def _parts(axis: Axis) -> tuple[Axis, ...]:

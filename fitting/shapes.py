@@ -42,6 +42,7 @@ _FAMILIES: dict[tuple[str, str, Kind], str] = {
     ("load", "omega_l", "linear"): "load_friction",
     ("load", "omega_l", "stribeck"): "load_friction",
     ("load", "theta_l", "order"): "gravity_load",
+    ("load", "time", "order"): "load_disturbance",
     ("motor", "", "constant"): "torque_sensor",
 }
 # A knee at less than this share of the largest twist is a dead zone rather than a change of slope.
@@ -110,6 +111,9 @@ def _distinct(ranked: list[_Form]) -> list[_Form]:
 def _forms(curve: LearnedCurve) -> Iterator[_Form]:
     count = len(curve.value)
     yield _Form(("1",), np.ones((count, 1)), _FAMILIES.get((curve.place, "", "constant")))
+    if curve.period is not None:
+        yield from _waves(curve.place, curve.at[:, 0], 2 * np.pi / curve.period)
+        return
     parts = [list(_of_one(curve.place, n, curve.at[:, i])) for i, n in enumerate(curve.variables)]
     for forms in parts:
         yield from forms
@@ -118,6 +122,14 @@ def _forms(curve: LearnedCurve) -> Iterator[_Form]:
             labels = tuple(f"{a} {b}" for a in one.labels for b in other.labels)
             columns = (one.columns[:, :, None] * other.columns[:, None, :]).reshape(count, -1)
             yield _Form(labels, columns, _family_of_product(curve, one, other))
+
+
+def _waves(place: str, time: np.ndarray, omega: float) -> Iterator[_Form]:
+    """The multiples of a frequency."""
+    for n in (1, 2, 3):
+        labels = (f"cos({n * omega:.6g} time)", f"sin({n * omega:.6g} time)")
+        columns = np.stack([np.cos(n * omega * time), np.sin(n * omega * time)], axis=1)
+        yield _Form(labels, columns, _FAMILIES.get((place, "time", "order")))
 
 
 def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:

@@ -49,6 +49,7 @@ def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] |
         "name": finding.name,
         "place": curve.place,
         "variables": list(curve.variables),
+        "period": curve.period,
         "quantity": curve.quantity,
         "units": {curve.quantity: unit} | {n: unit_in_log(UNITS[n], outcome, units) for n in curve.variables},
         "says": _sentence(curve, found.closest, outcome.doubted),
@@ -85,6 +86,9 @@ def _shape_dict(shape: Shape) -> dict[str, Any]:
 def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[str, ...]) -> str:
     """What was learned, and what it resembles."""
     said = [f"A learned {place_and_variables(curve.place, list(curve.variables))}, stands for what is missing."]
+    if curve.period is not None:
+        frequency = formatting.number(1.0 / curve.period)
+        said.append(f"It comes back {frequency} times a second, whatever the drive does.")
     if closest:
         best = closest[0]
         like = " and ".join(plain_family(f) for f in best.families)

@@ -27,7 +27,7 @@ from hdjax.effects.effect import (
     Scales,
     SensorEffect,
 )
-from hdjax.effects.learned_axes import Axis, SignAxis, combined, functions
+from hdjax.effects.learned_axes import Axis, PeriodicAxis, SignAxis, combined, functions
 from hdjax.parameters import Scalar, parameter
 
 FAMILY = "unknown"
@@ -91,10 +91,12 @@ class LearnedTorque(Learned):
 
     @classmethod
     def made_of(cls, axes: tuple[Axis, ...], mixing: Array | np.ndarray, c: Iterable[Scalar | float]) -> "Learned":
-        sign = axes[0] if axes else None
-        if not isinstance(sign, SignAxis):
-            return super().made_of(axes, mixing, c)
-        return _RUBBING[cls](axes=axes, mixing=mixing, c=tuple(c), transition=sign.corner)
+        first = axes[0] if axes else None
+        if isinstance(first, SignAxis):
+            return _RUBBING[cls](axes=axes, mixing=mixing, c=tuple(c), transition=first.corner)
+        if isinstance(first, PeriodicAxis):
+            return _PERIODIC[cls](axes=axes, mixing=mixing, c=tuple(c), omega=first.omega)
+        return super().made_of(axes, mixing, c)
 
     @classmethod
     def may_jump_with(cls, variable: str) -> bool:
@@ -190,10 +192,51 @@ class LearnedLoadFriction(LearnedFriction, LearnedLoadTorque):
     opposes: ClassVar[str] = "omega_l"
 
 
+class LearnedPeriodic(LearnedTorque):
+    """A learned torque that comes back after a time of its own, whatever the drive does. Its axis is a `PeriodicAxis`.
+
+    The time counts from each log's start, as in [`hdjax.effects.load.LoadDisturbance`][].
+
+    Attributes:
+        omega: angular frequency [rad/s].
+    """
+
+    omega: Scalar = parameter(unit="rad/s", doc="angular frequency", source=SOURCE, bounds=(0.0, 1e6), role="shape")
+
+    def value(self, motion: Motion) -> Array:
+        return super().value(self._in_step(motion))
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return super().torque(self._in_step(motion), drive, state)
+
+    def _in_step(self, motion: Motion) -> Motion:
+        """The motion, with the time that it would be at the frequency of the axis."""
+        (axis,) = self.axes
+        assert isinstance(axis, PeriodicAxis) and motion.time is not None
+        return replace(motion, time=motion.time * (self.omega / axis.omega))
+
+
+class LearnedMeshPeriodic(LearnedPeriodic, LearnedMeshTorque):
+    """Learned torque in the mesh that comes back in time."""
+
+
+class LearnedMotorPeriodic(LearnedPeriodic, LearnedMotorTorque):
+    """Learned torque on the motor that comes back in time."""
+
+
+class LearnedLoadPeriodic(LearnedPeriodic, LearnedLoadTorque):
+    """Learned torque on the load that comes back in time."""
+
+
 _RUBBING: dict[type[LearnedTorque], type[LearnedFriction]] = {
     LearnedMeshTorque: LearnedMeshFriction,
     LearnedMotorTorque: LearnedMotorFriction,
     LearnedLoadTorque: LearnedLoadFriction,
+}
+_PERIODIC: dict[type[LearnedTorque], type[LearnedPeriodic]] = {
+    LearnedMeshTorque: LearnedMeshPeriodic,
+    LearnedMotorTorque: LearnedMotorPeriodic,
+    LearnedLoadTorque: LearnedLoadPeriodic,
 }
 
 

@@ -31,6 +31,8 @@ ANGLES = {"theta_m": 6, "theta_l": 3}
 DRIFTS = ("time", "temperature")
 """Those that are no motion: what depends on them drifts."""
 
+# Of what comes back in time, the highest multiple of its frequency.
+_HARMONICS = 3
 _RATES = ("v", "omega_m", "omega_l")
 # Share of the largest rate within which the knots are even, and over which a sign turns at first.
 _NEAR_STANDSTILL = 0.005
@@ -169,8 +171,33 @@ class AngleAxis(Axis):
         return jnp.stack([jnp.ones_like(value), *(part for pair in turned for part in pair)])
 
 
+class PeriodicAxis(Axis):
+    """One, and cosine and sine of the whole multiples of an angular frequency.
+
+    Attributes:
+        variable: the time.
+        omega: the frequency, for a look; a fit may move it (see [`LearnedPeriodic`][]) [rad/s].
+        orders: the highest multiple.
+    """
+
+    variable: str = eqx.field(static=True)
+    omega: Scalar = eqx.field(converter=as_scalar)
+    orders: int = eqx.field(static=True, default=_HARMONICS)
+
+    @property
+    def count(self) -> int:
+        return 1 + 2 * self.orders
+
+    def functions(self, value: Array) -> Float[Array, " functions"]:
+        return AngleAxis(self.variable, self.orders).functions(self.omega * value)
+
+
 def axes_over(
-    ranges: Mapping[str, tuple[float, float]], *, jumps_with: str | None = None, corner: float | None = None
+    ranges: Mapping[str, tuple[float, float]],
+    *,
+    jumps_with: str | None = None,
+    corner: float | None = None,
+    lines: Sequence[float] = (),
 ) -> list[tuple[Axis, ...]]:
     """What a function of one or two quantities may be made of, the simplest first.
 
@@ -180,18 +207,21 @@ def axes_over(
     (friction that something changes).
 
     The load's angle comes back after a turn, but what is tied to the load need not, so that it has powers as well. The
-    motor's angle has none, nor has what drifts, of which nobody knows how it goes on.
+    motor's angle has none, nor has what drifts, of which nobody knows how it goes on; but a function of time may come
+    back at a frequency that stands out.
 
     Args:
         ranges: between which values the data have each quantity.
         jumps_with: the rate, if any, whose sign the function may jump with.
         corner: rate over which that sign turns, where something is known of it [rad/s].
+        lines: frequencies at which a function of time may come back [rad/s].
     """
     if len(ranges) == 1:
         ((variable, (low, high)),) = ranges.items()
         any_function = axis_over(variable, low, high)
         if variable == "theta_m" or variable in DRIFTS:
-            return [(any_function,)]
+            periodic = (PeriodicAxis(variable, omega) for omega in lines if variable == "time")
+            return [(any_function,), *((axis,) for axis in periodic)]
         smooth = (PowerAxis(variable, largest=max(abs(low), abs(high))), any_function)
         jumping = (_sign_over(variable, low, high, corner, beside) for beside in smooth if variable == jumps_with)
         return [(axis,) for axis in (*smooth, *jumping)]
