@@ -31,6 +31,7 @@ from hdjax.effects.learned import (
     LearnedMeshTorque,
     LearnedMotorReading,
     LearnedMotorTorque,
+    LearnedPeriodic,
     LearnedReading,
     LearnedTorque,
 )
@@ -40,6 +41,7 @@ from hdjax.effects.learned_axes import (
     AngleAxis,
     Axis,
     LinearAxis,
+    PeriodicAxis,
     PowerAxis,
     SignAxis,
     SplineAxis,
@@ -48,6 +50,7 @@ from hdjax.effects.learned_axes import (
     combined,
     functions,
 )
+from hdjax.effects.load import LoadDisturbance
 from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.simulate import march
 
@@ -214,6 +217,45 @@ def test_angles_are_periodic():
     wanted = [1.0] + [f(n * 0.7) for n in range(1, axis.orders + 1) for f in (np.cos, np.sin)]
     np.testing.assert_allclose(found, wanted, atol=1e-14)
     np.testing.assert_allclose(found, axis.functions(jnp.asarray(0.7 - 4 * np.pi)), atol=1e-12)
+
+
+def test_time_may_come_back_at_a_frequency_that_stands_out():
+    (drift,), *lines = axes_over({"time": (0.0, 9.0)}, lines=(20.0, 30.0))
+    assert isinstance(drift, SplineAxis)
+    for (axis,), omega in zip(lines, (20.0, 30.0), strict=True):
+        assert isinstance(axis, PeriodicAxis) and float(axis.omega) == omega
+    for other in ({"theta_m": (0.0, 9.0)}, {"x": (0.0, 1.0), "time": (0.0, 9.0)}):
+        assert PeriodicAxis not in sum(([type(a) for a in axes] for axes in axes_over(other, lines=(20.0,))), [])
+    found = PeriodicAxis("time", 20.0, 2).functions(jnp.asarray(0.3))
+    np.testing.assert_allclose(found, [1.0, np.cos(6), np.sin(6), np.cos(12), np.sin(12)], rtol=1e-14)
+
+
+def coming_back(form: type[LearnedTorque], at: float, c: list[float]) -> LearnedPeriodic:
+    """A torque whose coefficients are a constant, a cosine and a sine of time."""
+    effect = form.made_of((PeriodicAxis("time", at, 1),), np.eye(3), c)
+    assert isinstance(effect, LearnedPeriodic)
+    return effect
+
+
+def test_a_torque_that_comes_back_is_a_line():
+    """Whatever frequency its axis had, and in its derivative by the frequency that a fit may move."""
+    effect = coming_back(LearnedLoadTorque, 20.0, [0.2, 1.0, -2.0])
+    base, state = rig.drive_model(), jnp.asarray([1.3, 0.025, 4.0, 0.05])
+    line = LoadDisturbance(constant=0.2, cosine=1.0, sine=-2.0, omega=21.0)
+    found, wanted = base.with_effects(effect), base.with_effects(line)
+    motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), time=jnp.asarray(0.7))
+
+    @eqx.filter_jit
+    def rates_at(model, path, omega):
+        moved = model.replace({path: omega})
+        return moved.rates(state, jnp.zeros(()), jnp.zeros(()), Conditions(jnp.asarray(0.7), None))
+
+    names = (found, "learned_load_torque.omega"), (wanted, "load_disturbance.omega")
+    for differentiate in (lambda f: f, lambda f: jax.jacfwd(f, argnums=2)):
+        one, other = (differentiate(rates_at)(model, path, jnp.asarray(21.0)) for model, path in names)
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    (moved,) = found.replace({"learned_load_torque.omega": 21.0}).effects
+    np.testing.assert_allclose(moved.value(motion), line.torque(motion, base.drive, jnp.zeros(0)), rtol=1e-12)
 
 
 def test_two_variables_are_products():
@@ -395,7 +437,8 @@ def test_round_trip(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "axis", [AngleAxis("theta_l", 3), LinearAxis("v"), PowerAxis("v", 1 / 3), SplineAxis("v", -1 / 3, 2.0, 0.1)]
+    "axis",
+    [AngleAxis("theta_l", 3), LinearAxis("v"), PowerAxis("v", 1 / 3), SplineAxis("v", -1 / 3, 2.0, 0.1)],
 )
 def test_every_axis_comes_back_from_a_file(axis: Axis, tmp_path: Path):
     model = rig.drive_model().with_effects(learned(LearnedMeshTorque, axis))
@@ -417,6 +460,38 @@ def test_a_jump_comes_back_from_a_file(tmp_path: Path):
     effect = found.model.effect("learned_motor_torque")
     assert isinstance(effect, LearnedFriction)
     assert float(effect.corner) == 1 / 7
+
+
+def written_line() -> str:
+    effect = coming_back(LearnedMotorTorque, 20.0, [1 / 3, 0.1, 0.0])
+    model = rig.drive_model().with_effects(effect).replace({"learned_motor_torque.omega": 61 / 3})
+    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+
+
+def test_a_line_comes_back_from_a_file(tmp_path: Path):
+    found = read(written_line(), tmp_path)
+    assert to_json(found) == written_line()
+    effect = found.model.effect("learned_motor_torque")
+    assert isinstance(effect, LearnedPeriodic)
+    assert float(effect.omega) == 61 / 3
+
+
+BROKEN_LINES = {
+    "no place for a torque": lambda e: e.update(name="learned_motor_reading"),
+    "of an angle": lambda e: e["axes"][0].update(variable="theta_m"),
+    "standing still": lambda e: e["axes"][0].update(omega=0.0),
+    "backwards": lambda e: e["parameters"].update(omega=-1.0),
+    "no frequency": lambda e: e["parameters"].pop("omega"),
+    "a frequency and no line": lambda e: e["axes"][0].pop("omega"),
+}
+
+
+@pytest.mark.parametrize("change", BROKEN_LINES.values(), ids=BROKEN_LINES.keys())
+def test_broken_lines(change, tmp_path: Path):
+    content = json.loads(written_line())
+    change(content["effects"][0])
+    with pytest.raises(InputError, match=r"give the model\.json of a report"):
+        read(json.dumps(content), tmp_path)
 
 
 BROKEN_JUMPS = {

@@ -190,6 +190,23 @@ def test_what_drifts_is_told_from_what_moves(variable: str, values: np.ndarray):
     assert variable in best.expression and best.explained > 0.9
 
 
+def test_what_comes_back_in_time_is_learned_with_its_frequency():
+    omega, size = 0.71 * rig.OMEGA_0, 3 * NOISE * rig.OMEGA_0**2
+    found = found_of(lambda x, v: 0.0, drift=size * np.sin(omega * TIME))
+    assert is_supported(found) and found.chosen.variables == ("time",)
+    before, after = (np.sqrt(float(t.held_out.covariance[0, 0])) for t in (found.before, found.trial))
+    assert before > 2 * NOISE and after < 1.1 * NOISE
+    estimates = uncertainty(found.trial.training).estimates["learned_mesh_torque.omega"]
+    assert abs(estimates.value - omega) < 4 * estimates.std < 1e-2 * omega
+    curve = curve_of(found)
+    assert curve.period == pytest.approx(2 * np.pi / omega, rel=1e-2)
+    # A torque that is held between samples comes half a sample late.
+    error, inside = misfit(curve, size * np.sin(omega * (curve.at[:, 0] - 0.5 * STEP)))
+    assert error < 0.03 and inside > 0.8
+    best = shapes(curve).closest[0]
+    assert best.expression.count("time)") == 2 and best.explained > 0.95
+
+
 @pytest.mark.slow
 def test_an_error_of_the_mesh_is_told_from_a_torque():
     amplitude = 3e-4
