@@ -66,6 +66,9 @@ def test_smooth_effects_against_scipy():
         sag=0.1,
         sag_speed=5.0,
         drift=0.5,
+        hum=0.01,
+        hum_rate=300.0,
+        hum_phase=0.6,
         push=0.1,
         push_amplitude=np.array([0.5, 0.0]),
         push_rate=np.array([200.0, 0.0]),
@@ -95,6 +98,7 @@ def test_smooth_effects_against_scipy():
         reaction = 0.1 * np.sin(2 * a + 0.5) * (3500 * x**2 + 0.25 * 2e7 * x**4)
         third = 3000 * (b - c) + 0.2 * (r - q)
         motor = s - (1 / 50 + e_a) * tau + reaction - 1e-3 * w + 0.02 * np.cos(4 * a) + 0.5 * t
+        motor += 0.01 * np.sin(300 * t + 0.6)
         held = 3 * b + 1.5 * np.sin(b + 0.3) + 0.7 * np.sin(3 * b + 0.9)
         load = (1 - e_b) * tau + 0.1 + 0.5 * np.sin(200 * t) - 0.05 * r - held - third
         load += 0.5 * 5e-2 * 0.2 * np.sin(b + 0.4) * r**2

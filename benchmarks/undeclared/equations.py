@@ -145,6 +145,8 @@ def _pulls(t, y, u, brake, warm, p, out):
     x = phi / p.ratio + e * swing - lam
     torque, reaction = _mesh(x, w * over_motor - r * over_load, phi, w, y, warm, p, out)
     motor = acting + p.drift * t - over_motor * torque + reaction - w * (p.drag_m + p.windage * abs(w))
+    if p.hum != 0.0:
+        motor += p.hum * math.sin(p.hum_rate * t + p.hum_phase)
     for i in range(3):
         if p.cog[i] != 0.0:
             motor += p.cog[i] * math.cos(p.cog_order[i] * phi + p.cog_phase[i])

@@ -347,6 +347,12 @@ def _drift(s, random, base):
     return {"drift": _sign(random) * s * base.motor_torque}
 
 
+def _hum(s, random, base):
+    """Strength: amplitude over the motor torque."""
+    rate = base.omega_0 * np.exp(random.uniform(np.log(0.05), np.log(1.5)))
+    return {"hum": s * base.motor_torque, "hum_rate": rate, "hum_phase": _phase(random)}
+
+
 def _saturation(s, random, base):
     """Strength: motor torque over the torque at which the amplifier saturates."""
     return {"saturates": s / base.motor_torque}
@@ -432,6 +438,7 @@ FORMS = (
     Form("unknown", "dead zone of the amplifier", 3e-3, 0.1, _dead_zone),
     Form("unknown", "load inertia that swings", 0.03, 0.3, _swing),
     Form("unknown", "damping that leans", 0.1, 0.8, _leaning_damping),
+    Form("unknown", "hum of the amplifier", 0.01, 0.15, _hum),
 )
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))

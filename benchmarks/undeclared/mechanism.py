@@ -38,7 +38,7 @@ class Mechanism(NamedTuple):
     lag: float = 0.0
     ramp: float = 0.0
     # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; drag,
-    # windage; a torque that drifts [N m/s]; cogging lines.
+    # windage; a torque that drifts [N m/s], one that hums; cogging lines.
     hold_m: float = 0.0
     slide_m: float = 0.0
     sink_m: float = 1.0
@@ -51,6 +51,9 @@ class Mechanism(NamedTuple):
     drag_m: float = 0.0
     windage: float = 0.0
     drift: float = 0.0
+    hum: float = 0.0
+    hum_rate: float = 0.0
+    hum_phase: float = 0.0
     cog: np.ndarray = _NONE_3
     cog_order: np.ndarray = _NONE_3
     cog_phase: np.ndarray = _NONE_3

@@ -57,7 +57,8 @@ def summary(report: Mapping[str, Any]) -> str:
 
 
 def _learned(report: Mapping[str, Any]) -> str:
-    return place_and_variables(report["unknown"]["place"], report["unknown"]["variables"])
+    unknown = report["unknown"]
+    return place_and_variables(unknown["place"], unknown["variables"], unknown["period"])
 
 
 def _count(number: int) -> str:

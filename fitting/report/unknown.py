@@ -74,9 +74,11 @@ def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
     return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"])
 
 
-def place_and_variables(curve_place: str, variables: list[str]) -> str:
+def place_and_variables(place: str, variables: list[str], period: float | None) -> str:
     """Where a learned function acts and what it depends on, in words."""
-    return f"{WORDS[curve_place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
+    if period is not None:
+        return f"{WORDS[place]}, which comes back {formatting.number(1.0 / period)} times a second"
+    return f"{WORDS[place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
 
 
 def _shape_dict(shape: Shape) -> dict[str, Any]:
@@ -85,10 +87,10 @@ def _shape_dict(shape: Shape) -> dict[str, Any]:
 
 def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[str, ...]) -> str:
     """What was learned, and what it resembles."""
-    said = [f"A learned {place_and_variables(curve.place, list(curve.variables))}, stands for what is missing."]
+    where = place_and_variables(curve.place, list(curve.variables), curve.period)
+    said = [f"A learned {where}, stands for what is missing."]
     if curve.period is not None:
-        frequency = formatting.number(1.0 / curve.period)
-        said.append(f"It comes back {frequency} times a second, whatever the drive does.")
+        said.append("It does so whatever the drive does, and with the same phase at the start of every log.")
     if closest:
         best = closest[0]
         like = " and ".join(plain_family(f) for f in best.families)
