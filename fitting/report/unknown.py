@@ -90,7 +90,7 @@ def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[st
     where = place_and_variables(curve.place, list(curve.variables), curve.period)
     said = [f"A learned {where}, stands for what is missing."]
     if curve.period is not None:
-        said.append("It does so whatever the drive does, and with the same phase at the start of every log.")
+        said.append("It comes back whatever the drive does, and with the same phase at the start of every log.")
     if closest:
         best = closest[0]
         like = " and ".join(plain_family(f) for f in best.families)
