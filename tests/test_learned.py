@@ -1,6 +1,7 @@
 """The learned torque as an effect: what its functions are, at each place, and nothing at zero."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import diffrax as dfx
@@ -437,8 +438,7 @@ def test_round_trip(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "axis",
-    [AngleAxis("theta_l", 3), LinearAxis("v"), PowerAxis("v", 1 / 3), SplineAxis("v", -1 / 3, 2.0, 0.1)],
+    "axis", [AngleAxis("theta_l", 3), LinearAxis("v"), PowerAxis("v", 1 / 3), SplineAxis("v", -1 / 3, 2.0, 0.1)]
 )
 def test_every_axis_comes_back_from_a_file(axis: Axis, tmp_path: Path):
     model = rig.drive_model().with_effects(learned(LearnedMeshTorque, axis))
@@ -476,6 +476,14 @@ def test_a_line_comes_back_from_a_file(tmp_path: Path):
     assert float(effect.omega) == 61 / 3
 
 
+def is_refused(text: str, change: Callable[[dict], object], which: int, folder: Path) -> None:
+    """A model file of which one effect was changed."""
+    content = json.loads(text)
+    change(content["effects"][which])
+    with pytest.raises(InputError, match=r"give the model\.json of a report"):
+        read(json.dumps(content), folder)
+
+
 BROKEN_LINES = {
     "no place for a torque": lambda e: e.update(name="learned_motor_reading"),
     "of an angle": lambda e: e["axes"][0].update(variable="theta_m"),
@@ -488,10 +496,7 @@ BROKEN_LINES = {
 
 @pytest.mark.parametrize("change", BROKEN_LINES.values(), ids=BROKEN_LINES.keys())
 def test_broken_lines(change, tmp_path: Path):
-    content = json.loads(written_line())
-    change(content["effects"][0])
-    with pytest.raises(InputError, match=r"give the model\.json of a report"):
-        read(json.dumps(content), tmp_path)
+    is_refused(written_line(), change, 0, tmp_path)
 
 
 BROKEN_JUMPS = {
@@ -507,10 +512,7 @@ BROKEN_JUMPS = {
 
 @pytest.mark.parametrize("change", BROKEN_JUMPS.values(), ids=BROKEN_JUMPS.keys())
 def test_broken_jumps(change, tmp_path: Path):
-    content = json.loads(written_jump())
-    change(content["effects"][0])
-    with pytest.raises(InputError, match=r"give the model\.json of a report"):
-        read(json.dumps(content), tmp_path)
+    is_refused(written_jump(), change, 0, tmp_path)
 
 
 BROKEN = {
@@ -526,7 +528,4 @@ BROKEN = {
 
 @pytest.mark.parametrize("change", BROKEN.values(), ids=BROKEN.keys())
 def test_broken_files(change, tmp_path: Path):
-    content = json.loads(written())
-    change(content["effects"][1])
-    with pytest.raises(InputError, match=r"give the model\.json of a report"):
-        read(json.dumps(content), tmp_path)
+    is_refused(written(), change, 1, tmp_path)
