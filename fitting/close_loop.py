@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from fitting.attribution import Round, leaves_imperfection, look
 from fitting.base_fit import base_fit, is_held
 from fitting.clock import Clock
-from fitting.compare import Account, account, excess, validation_rmse
+from fitting.clocks import put_back, with_clocks_set
+from fitting.compare import EXCESS, Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.doubt import what_is_unknown
 from fitting.errors import DataError
@@ -23,6 +24,7 @@ from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
 from fitting.screening import programs_ahead
+from fitting.surprise import SURPRISED, surprise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
 from fitting.unknown import Unknown
 from hdjax import Hold, Model
@@ -30,8 +32,6 @@ from hdjax.effects import CATALOGUE, Effect
 
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
-# A residual this much larger than the measurement noise is not noise.
-_EXCESS = 1.5
 # Share of segments in which the base model may run away.
 _MOST_LOST = 0.5
 # Share of the unexplained variance that found effects must remove to be called the explanation: two thirds of its rms.
@@ -77,6 +77,9 @@ class Loop(eqx.Module):
         setting: how the logs were cut.
         after_substeps: solver steps in a sample interval of the final model.
         stretches: training and held-out stretches.
+        surprise: how much farther off than they promised free runs of held-out stretches are where effects were found
+            that do not explain them; None elsewhere.
+        put_back: by how much the clock of each log was put back [s], so that a line is in phase.
         seconds: where the time went.
     """
 
@@ -96,6 +99,8 @@ class Loop(eqx.Module):
     setting: Setting
     after_substeps: int = eqx.field(static=True)
     stretches: tuple[tuple[Stretch, ...], tuple[Stretch, ...]]
+    surprise: float | None
+    put_back: tuple[float, ...] = eqx.field(static=True)
     seconds: dict[str, float]
 
 
@@ -138,6 +143,9 @@ def close_loop(
     with programs_ahead(model, next(iter(data.values()))[0], catalogue):
         base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
+    base, clocked = with_clocks_set(base, data, setting, progress=progress)
+    late, data = put_back(data[hold][0], clocked[hold][0]), clocked
+    clock.lap("clocks")
     named, rounds, dropped, without, seen_noise = _add_effects(
         base, data, setting, max_effects=max_effects, catalogue=catalogue, seed=seed, progress=progress
     )
@@ -148,7 +156,7 @@ def close_loop(
     best = named if unknown is None else unknown.trial
     noise = seen_noise.and_beside(best.training).covariance
     decision = _decide(base, trusted, unknown, noise)
-    if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < _EXCESS:
+    if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < EXCESS:
         # What the names leave is hardly more than noise.
         unknown = None
     current = trusted if unknown is None else unknown.trial
@@ -161,6 +169,12 @@ def close_loop(
     before = after
     if current is not base:
         before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
+
+    surprised = None
+    if decision == "effect_found":
+        surprised = surprise(final, before, after, validation, noise=noise, halo=setting.halo)
+        if surprised is not None and surprised > SURPRISED:
+            decision = "unexplained"
 
     def rmse_of(trial: Trial) -> float:
         if trial is base:
@@ -197,6 +211,8 @@ def close_loop(
         setting=setting,
         after_substeps=final.substeps,
         stretches=(training, validation),
+        surprise=surprised,
+        put_back=late,
         seconds=clock.laps,
     )
 
@@ -304,11 +320,11 @@ def _without(name: str, current: Trial, base: Trial, data: Data, setting: Settin
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:
     left = excess(trusted.held_out, noise)
     if trusted is base:
-        return "model_sufficient" if unknown is None and np.max(left) < _EXCESS else "unexplained"
+        return "model_sufficient" if unknown is None and np.max(left) < EXCESS else "unexplained"
     at_first = excess(base.held_out, noise)
     explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
     misfit = np.argmax(at_first)
-    if left[misfit] < _EXCESS or explained[misfit] >= _EXPLAINED:
+    if left[misfit] < EXCESS or explained[misfit] >= _EXPLAINED:
         return "effect_found"
     return "unexplained"
 

@@ -14,6 +14,9 @@ from fitting.profile import with_profiles
 from fitting.uncertainty import Uncertainty, uncertainty
 from hdjax import Model
 
+EXCESS = 1.5
+"""A residual this many times as large as the measurement noise is not noise."""
+
 
 class Account(eqx.Module):
     """What one fitted model is worth.

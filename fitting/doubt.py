@@ -3,8 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from fitting.attribution import leaves_imperfection, told_from_zero
 from fitting.base_fit import leaves_white_noise
+from fitting.compare import EXCESS, excess
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
@@ -49,7 +52,7 @@ def what_is_unknown(
         seed: of the surrogates behind the p-values.
         progress: told what is being done.
     """
-    enough = leaves_white_noise(named.training) or leaves_imperfection(named, base, noise)[0]
+    enough = _leaves_noise(named, noise) or leaves_imperfection(named, base, noise)[0]
     if enough and len(named.model.effects) < _MANY:
         return named, None
     beside = None if enough else learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
@@ -83,6 +86,13 @@ def what_is_unknown(
         and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
     )
     return (named, beside) if stands else (base, instead)
+
+
+def _leaves_noise(trial: Trial, noise: MeasurementNoise) -> bool:
+    """Whether nothing but noise is left: of the dynamic error nothing that its colour betrays, and of no output more
+    than the measurement noise. (What moves a motor as a whole hardly twists the gear.)"""
+    left = excess(trial.training, noise.covariance)
+    return leaves_white_noise(trial.training) and bool(np.all(left < EXCESS))
 
 
 def _without_superfluous(

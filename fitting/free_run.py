@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, cut
@@ -43,10 +43,14 @@ class FreeRun(eqx.Module):
     weight: Float[np.ndarray, " n"] | None = None
 
     @property
+    def counts(self) -> Bool[np.ndarray, " n"]:
+        """Which samples count."""
+        return np.ones(self.time.size, dtype=bool) if self.weight is None else self.weight > 0
+
+    @property
     def squared_error(self) -> Float[np.ndarray, " counted"]:
         """Squares of measured minus predicted [rad^2], of the samples that count."""
-        square = (self.measured - self.predicted) ** 2
-        return square if self.weight is None else square[self.weight > 0]
+        return ((self.measured - self.predicted) ** 2)[self.counts]
 
     @property
     def rmse(self) -> float:

@@ -1,5 +1,6 @@
 """What forces along a fitted motion would explain of what a fit leaves over, to first order."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -87,17 +88,23 @@ class Products(eqx.Module):
     def in_parts(self, many: int) -> "Products":
         """Added up in parts of what follows one another, so many at most."""
         size = self.samples.size
-        return self._added(np.arange(size) * many // size == np.arange(many)[:, None])
+        return self.added(np.arange(size) * many // size == np.arange(many)[:, None])
 
     def others(self) -> "Products":
         """For each part all the others, added up."""
-        return self._added(~np.eye(self.samples.size, dtype=bool))
+        return self.added(~np.eye(self.samples.size, dtype=bool))
 
     def first(self, columns: int) -> "Products":
         """Those of the first columns alone."""
         return Products(self.gram[..., :columns, :columns], self.gradient[..., :columns], self.square, self.samples)
 
-    def _added(self, which: Bool[np.ndarray, "sums parts"]) -> "Products":
+    def columns(self, which: Sequence[int]) -> "Products":
+        """Those of some columns alone."""
+        kept = np.asarray(which)
+        return Products(self.gram[..., kept[:, None], kept], self.gradient[..., kept], self.square, self.samples)
+
+    def added(self, which: Bool[np.ndarray, "sums parts"]) -> "Products":
+        """Added up over the parts that each row of `which` names."""
         return Products(*(np.tensordot(which.astype(float), a, axes=1) for a in vars(self).values()))
 
 

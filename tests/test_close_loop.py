@@ -1,6 +1,7 @@
 """The whole loop on a small scale: it names the effect that was hidden, and nothing where nothing was."""
 
 from dataclasses import replace
+from importlib import import_module
 
 import jax
 import numpy as np
@@ -178,3 +179,11 @@ def test_single_precision_is_refused():
             reduced_loop(experiment)
     finally:
         jax.config.update("jax_enable_x64", True)
+
+
+def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatch: pytest.MonkeyPatch):
+    """What is found over short segments is named all the same; more is missing."""
+    monkeypatch.setattr(import_module("fitting.close_loop"), "surprise", lambda *args, **options: 1.4)
+    loop = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION))
+    assert [f.name for f in loop.findings] == ["coulomb_friction"]
+    assert (loop.decision, loop.surprise) == ("unexplained", 1.4)

@@ -60,18 +60,25 @@ def test_when_names_stand(
 
 
 @pytest.mark.parametrize(
-    ("names", "white", "imperfect", "asks_for"),
+    ("names", "white", "times_noise", "imperfect", "asks_for"),
     [
-        (2, True, False, []),
-        (2, False, True, []),
-        (2, False, False, ["beside", "instead"]),
-        (3, True, False, ["instead"]),  # many names that leave but noise
-        (3, False, True, ["instead"]),
-        (3, False, False, ["beside", "instead"]),
+        (2, True, 1.0, False, []),
+        (2, True, 100.0, False, ["beside", "instead"]),  # white, but no noise: of the motor's angle, say
+        (2, False, 100.0, True, []),
+        (2, False, 100.0, False, ["beside", "instead"]),
+        (3, True, 1.0, False, ["instead"]),  # many names that leave but noise
+        (3, False, 100.0, True, ["instead"]),
+        (3, False, 100.0, False, ["beside", "instead"]),
     ],
 )
 def test_what_is_learned_to_doubt_names(
-    base: Trial, names: int, white: bool, imperfect: bool, asks_for: list[str], monkeypatch: pytest.MonkeyPatch
+    base: Trial,
+    names: int,
+    white: bool,
+    times_noise: float,
+    imperfect: bool,
+    asks_for: list[str],
+    monkeypatch: pytest.MonkeyPatch,
 ):
     effects = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias(), Creep(k=2.0, tau=3.0, span=1.0))[:names]
     named = eqx.tree_at(lambda t: t.model.effects, base, effects)
@@ -84,8 +91,8 @@ def test_what_is_learned_to_doubt_names(
     monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base, noise: (imperfect, noise))
     monkeypatch.setattr(doubt, "learn", learn)
     setting = Setting(32, 4, 1, 8)
-    # Both leave a hundred times as much.
-    noise = MeasurementNoise((0.01 * NOISE) ** 2 * jnp.eye(1), (base.training, named.training))
+    # Both leave so much.
+    noise = MeasurementNoise((NOISE / times_noise) ** 2 * jnp.eye(1), (base.training, named.training))
     options = {"noise": noise, "seed": 0, "progress": lambda message: None}
     assert doubt.what_is_unknown(base, named, {}, setting, **options) == (named, None)
     assert asked == asks_for

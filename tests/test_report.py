@@ -139,7 +139,14 @@ def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
             "consequence": "they are left out",
         }
     ]
-    assert found["logs"] == [{"name": HOSTILE, "samples": 3000, "held_out": 600, "seconds": 2999 * rig.STEP}]
+    (log,) = found["logs"]
+    assert log == {
+        "name": HOSTILE,
+        "samples": 3000,
+        "held_out": 600,
+        "seconds": 2999 * rig.STEP,
+        "clock_put_back": 0.0,
+    }
     assert found["hold"] == HOLD and found["dropped"] == [] and found["unexplained"] is None
 
 
@@ -197,6 +204,24 @@ def test_what_is_unexplained_is_told(loop: Loop):
     assert left["depends_on"] in ("motor speed", "dynamic error", "rate of the dynamic error", "motor angle")
     assert left["explained_share"] == max(left["explained_shares"].values())
     assert f"depends most on the {left['depends_on']}" in found["summary"]
+
+
+def test_free_runs_that_names_do_not_explain_are_told(loop: Loop):
+    found = report_dict(Loop(**{**vars(loop), "decision": "unexplained", "surprise": 1.4}))
+    assert found["unexplained"]["free_runs_times_expected"] == 1.4
+    assert "A part was found" in found["summary"]
+    assert "1.40 times what noise and uncertainty allow" in found["summary"]
+
+
+@pytest.mark.parametrize(("family", "told"), [("load_disturbance", True), ("motor_friction", False)])
+def test_a_line_that_begins_each_log_anyhow_is_told(loop: Loop, family: str, told: bool):
+    """Where something of the final model comes back in time: whose clock was put back, and what no log can tell."""
+    (finding,) = loop.findings
+    late = Loop(**{**vars(loop), "findings": (dataclasses.replace(finding, family=family),), "put_back": (-0.0147,)})
+    found = report_dict(late)
+    assert [log["clock_put_back"] for log in found["logs"]] == [-0.0147]
+    notes = [note for note in found["cannot_tell"] if "clock" in note]
+    assert [HOSTILE in note and "\u221214.7 ms" in note for note in notes] == [True] * told
 
 
 def test_share_that_a_dependence_explains():

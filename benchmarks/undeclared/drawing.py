@@ -35,6 +35,8 @@ _OF_ANGLE = {
     "position_dependent_friction",
     "position_dependent_stiffness",
 }
+# How much later than the first one a log begins [s], on the clock of what goes on between them.
+_LATER = (20.0, 600.0)
 # Sampling rate [Hz] and samples of the three logs.
 _SIZES = ((1000.0, (10000, 10000, 8000)), (2000.0, (16000, 12000, 12000)), (4000.0, (20000, 16000, 16000)))
 
@@ -67,6 +69,7 @@ class Run:
     """One experiment as it went.
 
     Attributes:
+        mechanism: the drive as it was.
         excitation: what was commanded.
         states: true ones, (samples, states).
         readings: of noiseless encoders, (samples, 2).
@@ -74,6 +77,7 @@ class Run:
         warm: kelvin above the reference.
     """
 
+    mechanism: Mechanism
     excitation: Excitation
     states: np.ndarray
     readings: np.ndarray
@@ -133,7 +137,9 @@ def _pair(random: np.random.Generator, families: Sequence[str]) -> tuple[Form, .
     """Two forms that change different parameters of the mechanism: a second motor friction would replace the first."""
     while True:
         chosen = [forms_of(families[i]) for i in random.choice(len(families), size=2, replace=False)]
-        pair = tuple(forms[random.integers(len(forms))] for forms in chosen)
+        # Not with what goes on between logs: the cases of earlier studies would be others.
+        once = [[form for form in forms if not form.goes_on] for forms in chosen]
+        pair = tuple(forms[random.integers(len(forms))] for forms in once)
         first, second = (set(form.changes(form.high, random, Mechanism())) for form in pair)
         if not first & second:
             return pair
@@ -184,7 +190,10 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
         changes |= alone
         strengths.append(strength)
         detectable.append(seen)
-    runs = tuple(bench.run(base._replace(**changes), i, warm) for i in range(len(LOGS)))
+    begun = np.zeros(len(LOGS))
+    if any(form.goes_on for form in case.forms):
+        begun[1:] = random.uniform(*_LATER, size=begun.size - 1)
+    runs = tuple(bench.run(base._replace(**changes, begun=late), i, warm) for i, late in enumerate(begun))
     if not all(_plausible(run, base) for run in runs):
         return None
     return Drawn(case, base, changes, tuple(strengths), tuple(detectable), encoders, runs, dt)
@@ -238,7 +247,7 @@ class _Bench:
             brake=commanded.brake,
             warm=warm[index],
         )
-        return Run(commanded, states, np.column_stack(read_encoders(mechanism, states)), torque, warm[index])
+        return Run(mechanism, commanded, states, np.column_stack(read_encoders(mechanism, states)), torque, warm[index])
 
     def detectability(self, changes: dict, warm: Sequence[np.ndarray]) -> float:
         """Of changes alone, in the two logs that the loop is given."""

@@ -146,7 +146,7 @@ def _pulls(t, y, u, brake, warm, p, out):
     torque, reaction = _mesh(x, w * over_motor - r * over_load, phi, w, y, warm, p, out)
     motor = acting + p.drift * t - over_motor * torque + reaction - w * (p.drag_m + p.windage * abs(w))
     if p.hum != 0.0:
-        motor += p.hum * math.sin(p.hum_rate * t + p.hum_phase)
+        motor += p.hum * math.sin(p.hum_rate * (p.begun + t) + p.hum_phase)
     for i in range(3):
         if p.cog[i] != 0.0:
             motor += p.cog[i] * math.cos(p.cog_order[i] * phi + p.cog_phase[i])
@@ -162,7 +162,7 @@ def _pulls(t, y, u, brake, warm, p, out):
         load -= 0.5 * _load_inertia(lam, p)[1] * r * r
     for i in range(2):
         if p.push_amplitude[i] != 0.0:
-            load += p.push_amplitude[i] * math.sin(p.push_rate[i] * t + p.push_phase[i])
+            load += p.push_amplitude[i] * math.sin(p.push_rate[i] * (p.begun + t) + p.push_phase[i])
     if p.bristle_l > 0.0:
         rubbed, out[12] = _bristles(r, y[12], p.bristle_l, p.bristle_drag_l, p.hold_l, p.slide_l, p.sink_l)
         load -= rubbed

@@ -28,6 +28,7 @@ class Form:
         undefined: base parameters that have no one true value beside this form.
         heats: whether it needs a temperature that changes.
         straight: whether it stands in the place of the base's cubic, so that the base has none.
+        goes_on: whether it goes on between logs, each of which then begins at another instant of it.
     """
 
     family: str
@@ -38,6 +39,7 @@ class Form:
     undefined: tuple[str, ...] = ()
     heats: bool = False
     straight: bool = False
+    goes_on: bool = False
 
 
 def _phase(random: np.random.Generator) -> float:
@@ -415,6 +417,7 @@ FORMS = (
     Form("load_disturbance", "a line", 0.01, 0.15, _pushes(1, False)),
     Form("load_disturbance", "two lines", 0.01, 0.15, _pushes(2, False)),
     Form("load_disturbance", "a line and a constant", 0.01, 0.15, _pushes(1, True)),
+    Form("load_disturbance", "a line that goes on", 0.01, 0.15, _pushes(1, False), goes_on=True),
     Form("extra_resonance", "flexible load", 0.05, 0.5, _third(0.6, 1.8)),
     Form("extra_resonance", "soft fixture", 0.05, 0.5, _third(0.2, 0.6)),
     Form("temperature", "stiffness", 2e-4, 2e-3, _warm_spring, ("K", "alpha"), heats=True),
@@ -439,6 +442,7 @@ FORMS = (
     Form("unknown", "load inertia that swings", 0.03, 0.3, _swing),
     Form("unknown", "damping that leans", 0.1, 0.8, _leaning_damping),
     Form("unknown", "hum of the amplifier", 0.01, 0.15, _hum),
+    Form("unknown", "hum that goes on", 0.01, 0.15, _hum, goes_on=True),
 )
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))

@@ -37,6 +37,8 @@ class Mechanism(NamedTuple):
     dead_time: float = 0.0
     lag: float = 0.0
     ramp: float = 0.0
+    # When the log begins [s], on the clock of what comes back in time.
+    begun: float = 0.0
     # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; drag,
     # windage; a torque that drifts [N m/s], one that hums; cogging lines.
     hold_m: float = 0.0

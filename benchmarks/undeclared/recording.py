@@ -81,7 +81,7 @@ def _own_error(drawn: Drawn) -> float:
     """Of the free run along the held-out log."""
     run = drawn.runs[-1]
     return own_error(
-        drawn.base._replace(**drawn.changes),
+        run.mechanism,
         run.states[0, :4],
         run.torque,
         drawn.encoders,

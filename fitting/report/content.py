@@ -81,7 +81,7 @@ def report_dict(
         "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
         "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),
         "seconds": dict(outcome.seconds),
-        "logs": [_log_dict(*runs) for runs in zip(outcome.before.training, outcome.before.validation, strict=True)],
+        "logs": _logs(outcome),
         "health": [{"log": log} | dataclasses.asdict(f) for log, f in health],
         "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
     }
@@ -94,12 +94,19 @@ def report_dict(
     return report
 
 
-def _log_dict(training: FreeRun, validation: FreeRun) -> dict[str, Any]:
+def _logs(outcome: Outcome) -> list[dict[str, Any]]:
+    runs = list(zip(outcome.before.training, outcome.before.validation, strict=True))
+    late = outcome.put_back if isinstance(outcome, Loop) else (0.0,) * len(runs)
+    return [_log_dict(*each, by) for each, by in zip(runs, late, strict=True)]
+
+
+def _log_dict(training: FreeRun, validation: FreeRun, put_back: float) -> dict[str, Any]:
     return {
         "name": training.name,
         "samples": int(training.time.size + validation.time.size),
         "held_out": int(validation.time.size),
         "seconds": float(validation.time[-1] - training.time[0]),
+        "clock_put_back": put_back,
     }
 
 

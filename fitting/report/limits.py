@@ -85,10 +85,25 @@ def limits(report: Mapping[str, Any]) -> list[str]:
                 f"A tie: {other['name']} ({plain_family(other['family'])}) explains the held-out data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
+    notes += _own_phases(report)
     drifting = beyond_prediction(report, final["rmse"]["validation"])
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _own_phases(report: Mapping[str, Any]) -> list[str]:
+    """What a line that begins each log in another phase leaves open."""
+    late = [(log["name"], log["clock_put_back"]) for log in report["logs"] if log["clock_put_back"]]
+    families = {e["family"] for e in report["after"]["effects"]}
+    returns = "load_disturbance" in families or (report["unknown"] or {}).get("period")
+    if not late or not returns:
+        return []
+    told = formatting.words([f"by {formatting.quantity(by, 's', digits=3)} in {name}" for name, by in late])
+    return [
+        f"What comes back in time begins each log in another phase, for which the clock was put back {told}. In a log "
+        "that was not fitted its phase is not known: a prediction takes that of the logs whose clocks were left."
+    ]
 
 
 def _absent(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:

@@ -49,6 +49,13 @@ def summary(report: Mapping[str, Any]) -> str:
             f"{opening} A learned {_learned(report)}, removes {_removed(before, after)} of the held-out error, which "
             f"falls from {_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
         )
+    beyond = left["free_runs_times_expected"]
+    if beyond is not None:
+        return (
+            f"{opening} Short segments, each of which may start anew, show little of it: free runs of whole held-out "
+            f"stretches err by {_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and "
+            "uncertainty allow."
+        )
     return (
         f"{opening} What is left over is {formatting.number(left['times_noise'])} times the measurement noise, and "
         f"depends most on the {left['depends_on']} (which accounts for "

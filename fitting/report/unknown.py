@@ -52,7 +52,7 @@ def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] |
         "period": curve.period,
         "quantity": curve.quantity,
         "units": {curve.quantity: unit} | {n: unit_in_log(UNITS[n], outcome, units) for n in curve.variables},
-        "says": _sentence(curve, found.closest, outcome.doubted),
+        "says": _sentence(curve, found.closest, outcome.doubted, in_step=not any(outcome.put_back)),
         "coefficients": len(outcome.unknown.chosen.effect.c),
         "validation_gain": finding.validation_gain,
         "p_value": finding.p_value,
@@ -85,12 +85,13 @@ def _shape_dict(shape: Shape) -> dict[str, Any]:
     return {"expression": shape.expression, "r_squared": shape.explained, "families": list(shape.families)}
 
 
-def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[str, ...]) -> str:
-    """What was learned, and what it resembles."""
+def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[str, ...], *, in_step: bool) -> str:
+    """What was learned, and what it resembles; `in_step` with the logs as they begin."""
     where = place_and_variables(curve.place, list(curve.variables), curve.period)
     said = [f"A learned {where}, stands for what is missing."]
     if curve.period is not None:
-        said.append("It comes back whatever the drive does, and with the same phase at the start of every log.")
+        phase = "with the same phase at the start of every log" if in_step else "begins each log in another phase"
+        said.append(f"It comes back whatever the drive does, and {phase}.")
     if closest:
         best = closest[0]
         like = " and ".join(plain_family(f) for f in best.families)

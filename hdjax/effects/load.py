@@ -61,8 +61,8 @@ class ConstantLoad(LoadSideEffect):
 class LoadDisturbance(LoadSideEffect):
     """A torque `constant + cosine cos(omega t) + sine sin(omega t)` on the load, tied to no shaft.
 
-    The time counts from each log's start, and cosine and sine are common to all logs of a drive: a disturbance that
-    does not start anew with each log is found in one log at a time only.
+    The time counts from each log's start, and cosine and sine are common to all logs of a drive: of a disturbance that
+    goes on between logs, the clocks of all but one have to be put back until it is in phase.
     """
 
     family: ClassVar[str] = "load_disturbance"

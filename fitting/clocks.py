@@ -1,0 +1,194 @@
+"""The clocks of several logs, set by a line in what a fit leaves over: a disturbance of its own frequency does not wait
+for a log to start, so that it begins each one in another phase."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from fitting.estimate import Fit
+from fitting.experiment import Stretch
+from fitting.explained import solved
+from fitting.free import effect_paths
+from fitting.linear_look import Acting, Look, best_steps, left_after, look_along, products
+from fitting.spectral_lines import spectral_lines
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
+from hdjax.effects.learned import LEARNED_TORQUES, Learned, LearnedPeriodic, LearnedTorque
+from hdjax.effects.learned_axes import PeriodicAxis
+
+# A line is in a log where it is told from zero by this many standard errors.
+_TOLD = 5.0
+# Clocks are right where a line of one phase does so much of what it would do with a phase of each log's own.
+_COHERENT = 0.9
+# Clocks are set by a line that explains this share of all that is left, noise included. Less of one is found in one log
+# at least, and the lines that an excitation of many lines leaves behind explain little each.
+_LEAST_SHARE = 0.25
+# Refits after which the clocks have settled, and by how many standard errors of a phase they may still be off.
+_REFITS = 4
+_SETTLED = 0.1
+
+
+class Phasors(eqx.Module):
+    """A line in several logs, as a torque.
+
+    Attributes:
+        place: where the torque acts.
+        omega: its frequency [rad/s].
+        torque: `C + i S` of the torque `C cos(omega t) + S sin(omega t)` in each log [N m].
+        information: of each log about either part [1/(N m)^2].
+        values: how many measured values tell of it.
+    """
+
+    place: type[LearnedTorque] = eqx.field(static=True)
+    omega: float
+    torque: Complex[np.ndarray, " logs"]
+    information: Float[np.ndarray, " logs"]
+    values: float
+
+    @property
+    def share(self) -> float:
+        """Of the squares of what is left, what the line explains with a phase of each log's own."""
+        explained = float(np.sum(self.told**2))
+        return explained / (explained + self.values)
+
+    @property
+    def told(self) -> Float[np.ndarray, " logs"]:
+        """Standard errors by which the line is told from zero in each log."""
+        return np.sqrt(self.information) * np.abs(self.torque)
+
+    @property
+    def mean(self) -> complex:
+        """Of the torque over the logs."""
+        return complex(np.sum(self.information * self.torque) / np.sum(self.information))
+
+    @property
+    def effect(self) -> Learned:
+        """The torque of that mean, inside the equations."""
+        axes = (PeriodicAxis("time", self.omega, orders=1),)
+        return self.place.made_of(axes, np.eye(axes[0].count)[:, 1:], (self.mean.real, self.mean.imag))
+
+    @property
+    def first(self) -> int:
+        """The first log that has the line."""
+        return int(np.argmax(self.told > _TOLD))
+
+    @property
+    def late(self) -> Float[np.ndarray, " logs"]:
+        """By how much later than in the first log that has the line it comes in each of them [s], within half a period
+        either way; zero in one that does not have it."""
+        turned = np.angle(self.torque * self.in_phase.torque.conj())
+        return np.where(np.arange(turned.size) == self.first, 0.0, turned) / self.omega
+
+    @property
+    def in_phase(self) -> "Phasors":
+        """The same with the first phase in all logs that have the line."""
+        turned = np.abs(self.torque) * np.exp(1j * np.angle(self.torque[self.first]))
+        return replace(self, torque=np.where(self.told > _TOLD, turned, self.torque))
+
+
+def with_clocks_set(
+    base: Trial, data: Data, setting: Setting, *, progress: Callable[[str], None]
+) -> tuple[Trial, Data]:
+    """The logs with their clocks set so that a line that stands out of what the base model leaves over is in phase; as
+    they are where there is no such line, or where it is in phase already.
+
+    The time of the first log that has the line stays as it is. Nothing else in a base model looks at a clock.
+
+    Args:
+        base: the base model.
+        data: the stretches.
+        setting: how they are cut.
+        progress: told what is being done.
+    """
+    if len(data[base.hold][0]) < 2:
+        return base, data
+    seen = max(_lines(base.training), key=lambda line: line.share, default=None)
+    if seen is None or seen.share < _LEAST_SHARE or np.sum(seen.told > _TOLD) < 2:
+        return base, data
+    if abs(seen.mean) >= _COHERENT * abs(seen.in_phase.mean):
+        return base, data
+    progress("setting the logs' clocks by a line")
+    clocked = _set_by(seen, base, data, setting)
+    if clocked is None:
+        return base, data
+    return attempt(base.model, clocked, base.hold, setting, start=base, hold_parameters=True), clocked
+
+
+def put_back(before: Sequence[Stretch], after: Sequence[Stretch]) -> tuple[float, ...]:
+    """By how much the clock of each stretch was put back [s]."""
+    return tuple(a.experiment.origin - b.experiment.origin for b, a in zip(before, after, strict=True))
+
+
+def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | None:
+    """The data with their clocks set by a line, refined by refits with it; None where these do not explain more."""
+    near = base
+    for _ in range(_REFITS):
+        data = _put_back(data, seen.late)
+        near = attempt(base.model.with_effects(seen.in_phase.effect), data, base.hold, setting, start=near)
+        if near.training.objective > base.training.objective - LEAST_GAIN:
+            return None
+        seen = _fitted(near.training)
+        if np.all(np.abs(seen.late) * seen.omega * seen.told < _SETTLED):
+            break
+    return data
+
+
+def _put_back(data: Data, late: Float[np.ndarray, " logs"]) -> Data:
+    def one(stretch: Stretch, by: float) -> Stretch:
+        experiment = stretch.experiment
+        return replace(stretch, experiment=replace(experiment, origin=experiment.origin + float(by)))
+
+    def each(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
+        return tuple(one(s, by) for s, by in zip(stretches, late, strict=True))
+
+    return {hold: (each(training), each(validation)) for hold, (training, validation) in data.items()}
+
+
+def _lines(found: Fit) -> list[Phasors]:
+    """The lines that stand out of what a fit leaves over, each at the place where it explains most."""
+    frequencies = spectral_lines(found)
+    if not frequencies:
+        return []
+    look = look_along(found)
+    places = [place for place in LEARNED_TORQUES if place.name in look.pushes]
+    return [max((_at(p, omega, look, found) for p in places), key=lambda line: line.share) for omega in frequencies]
+
+
+def _fitted(found: Fit) -> Phasors:
+    """The line that a fit has as its last effect, with what it leaves over of it in each log."""
+    line = found.model.effects[-1]
+    assert isinstance(line, LearnedPeriodic)
+    (place,) = (place for place in LEARNED_TORQUES if isinstance(line, place))
+    left = _at(place, float(line.omega), look_along(found), found, own=effect_paths(line))
+    return replace(left, torque=left.torque + complex(*line.c))
+
+
+def _at(place: type[LearnedTorque], omega: float, look: Look, found: Fit, own: Sequence[str] = ()) -> Phasors:
+    """What a torque at one place makes of a line in each log of a fit, to first order, beside all that is free but the
+    parameters `own`."""
+    angle = omega * np.asarray(look.conditions.time)
+    size = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    by_log = products(look, Acting((look.pushes[place.name],)), (size,)).added(_segments_of_logs(found))
+    kept = by_log.columns([*(i for i, path in enumerate(found.free.paths) if path not in own), -2, -1])
+    steps = best_steps(kept)
+    weight = np.linalg.pinv(left_after(kept, steps) / np.maximum(kept.samples, 1.0)[:, None, None], hermitian=True)
+    gram = np.einsum("sij,sijpq->spq", weight, kept.gram)
+    information = np.array([_information(g) for g in gram])
+    values = float(np.sum(kept.samples)) * kept.square.shape[1]
+    return Phasors(place, omega, steps[:, -2] + 1j * steps[:, -1], information, values)
+
+
+def _segments_of_logs(found: Fit) -> Bool[np.ndarray, "logs segments"]:
+    count, length = found.problem.segments.weight.shape
+    logs = np.arange(len(found.stretches))
+    log = np.repeat(logs, [-(-len(s) // length) for s in found.stretches])
+    return np.pad(log, (0, count - log.size), constant_values=-1) == logs[:, None]
+
+
+def _information(gram: Float[np.ndarray, "columns columns"]) -> float:
+    """About either of the last two columns, whatever the others are."""
+    across = gram[:-2, -2:]
+    own = gram[-2:, -2:] - across.T @ solved(gram[:-2, :-2], across)
+    return float(max(np.trace(own) / 2, 0.0))

@@ -1,0 +1,58 @@
+"""Whether what explains short segments explains whole stretches too: each segment may start anew, and what drifts apart
+from one to the next shows in free runs alone."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.compare import Account
+from fitting.estimate import Fit
+from fitting.experiment import Stretch
+from fitting.prediction_band import PredictionBand, prediction_bands
+
+SURPRISED = 1.25
+"""Free runs that are farther off than this, in units of what their bands allow, are not what the model promised."""
+
+# Share of the variance beyond the noise that a model must remove of the free runs' error to explain it, whatever its
+# bands: no form is exact, and bands know nothing of that.
+_EXPLAINED = 0.9
+
+
+def surprise(
+    final: Fit,
+    before: Account,
+    after: Account,
+    validation: Sequence[Stretch],
+    *,
+    noise: Float[Array, "outputs outputs"],
+    halo: int,
+) -> float | None:
+    """Rms by which free runs of held-out stretches are off, over the rms that their bands allow: noise, and what noise
+    leaves open of parameters and initial state.
+
+    Near one where the model is right, a chaotic one as well: its bands grow as its errors do. None where the model
+    explains the free runs' error, or where its bands leave the numbers, since nothing was promised then.
+
+    Args:
+        final: the model with its effects.
+        before: the base model's account.
+        after: the final model's.
+        validation: the held-out stretches.
+        noise: covariance of the measurement noise.
+        halo: intervals of torque before a stretch.
+    """
+    variance = float(noise[-1, -1])
+    at_first = before.validation_rmse**2 - variance
+    if after.validation_rmse**2 - variance <= (1.0 - _EXPLAINED) * at_first:
+        return None
+    bands = prediction_bands(final, after.uncertainty, validation, noise=noise, halo=halo, runs=after.validation)
+    return over_bands(bands)
+
+
+def over_bands(bands: Sequence[PredictionBand]) -> float | None:
+    """Rms error of several runs over the rms that their bands allow; None where these left the numbers."""
+    allowed = np.concatenate([band.std_measured[band.run.counts] ** 2 for band in bands])
+    seen = np.concatenate([band.run.squared_error for band in bands])
+    ratio = np.sqrt(np.sum(seen) / np.sum(allowed))
+    return float(ratio) if np.isfinite(allowed).all() else None

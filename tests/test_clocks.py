@@ -1,0 +1,111 @@
+"""Logs that a disturbance of its own frequency runs through: their clocks are set so that it is in phase."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.base_fit import base_fit
+from fitting.clocks import Phasors, put_back, with_clocks_set
+from fitting.experiment import Experiment, experiment_from_log, segment_count, split
+from fitting.posing import segment_length
+from fitting.trial import Data, Setting, Trial, attempt, halo_for
+from hdjax import Hold
+from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
+
+HOLDS: tuple[Hold, ...] = ("zero-order", "linear")
+COUNT, NOISE = 3000, 1e-3
+OMEGA, LINE = 41.3, 400.0
+"""Of the disturbance: its frequency, not one of the forcing's own, and its acceleration."""
+
+
+def experiment(seed: int, hold: Hold, phase: float | None) -> Experiment:
+    """A log of the reduced oscillator with an unlogged line; None for one without."""
+    forcing = rig.reduced_forcing(COUNT, seed=seed)
+    acting = forcing
+    if phase is not None:
+        # Constant over a sample, as the rig holds it: half a sample late, which is the same in all logs.
+        acting = forcing + LINE / rig.GAIN * np.sin(OMEGA * np.arange(COUNT) * rig.REDUCED_STEP + phase)
+    log = rig.reduced_log(rig.reduced_motion(acting)[:, 0], forcing, noise=NOISE, seed=seed)
+    # Stamps that begin anywhere: no clock but the log's own start counts.
+    return experiment_from_log(replace(log, name=f"log {seed}", time=log.time + 7.0 * seed), hold=hold)
+
+
+Begun = tuple[Trial, Data, Setting]
+
+
+@pytest.fixture(scope="module")
+def begun() -> Callable[..., Begun]:
+    """The base model fitted to logs whose line begins in given phases."""
+
+    def fitted(*phases: float | None) -> Begun:
+        data: Data = {h: split([experiment(i, h, phase) for i, phase in enumerate(phases)]) for h in HOLDS}
+        training = data[HOLDS[0]][0]
+        found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
+        count = segment_count(training, segment_length(found.horizon))
+        setting = Setting(found.horizon, halo_for(training), found.substeps, count)
+        return attempt(found.model, data, HOLDS[0], setting), data, setting
+
+    return fitted
+
+
+def silent(message: str) -> None:
+    pass
+
+
+def test_logs_that_begin_in_other_phases(begun):
+    """The second log's clock is put back by what its line comes later than the first one's; parameters stay, and one
+    torque then explains both logs to the noise."""
+    first, second = 0.4, 2.3
+    base, data, setting = begun(first, second)
+    told = []
+    after, clocked = with_clocks_set(base, data, setting, progress=told.append)
+    for hold in HOLDS:
+        for old, new in zip(data[hold], clocked[hold], strict=True):
+            assert put_back(old, new) == (0.0, pytest.approx((first - second) / OMEGA, abs=1e-4))
+    assert len(told) == 1
+    assert after.training.objective == pytest.approx(base.training.objective, abs=1e-3)
+    for path, (value, _) in base.model.parameters().items():
+        assert float(after.model.get(path)) == pytest.approx(float(value), rel=1e-9)
+
+    def with_line(d: Data) -> Trial:
+        line = Phasors(LearnedMeshTorque, OMEGA, np.full(2, 1j * LINE), np.ones(2), 1.0).effect
+        return attempt(base.model.with_effects(line), d, HOLDS[0], setting, start=base)
+
+    assert with_line(clocked).training.dynamic_error_std == pytest.approx(NOISE, rel=0.05)
+    assert with_line(data).training.dynamic_error_std > 2 * NOISE
+
+
+@pytest.mark.parametrize("phases", [(0.4, 0.4), (None, None), (None, 0.4), (0.4,)])
+def test_clocks_that_are_right_stay(begun, phases: tuple[float | None, ...]):
+    """In phase already, without a line, with one in a single log, and a log by itself."""
+    base, data, setting = begun(*phases)
+    after, clocked = with_clocks_set(base, data, setting, progress=silent)
+    assert after is base and clocked is data
+
+
+def line(*torque: complex) -> Phasors:
+    return Phasors(LearnedLoadTorque, 10.0, np.array(torque), np.full(len(torque), 100.0), 1000.0)
+
+
+def test_how_late_a_line_comes():
+    """Against the first log that has it, within half a period; a log that lacks it keeps its clock."""
+    seen = line(0.001, 1.0, np.exp(0.5j), np.exp(-3.0j), 0.3j)
+    np.testing.assert_allclose(seen.late, [0.0, 0.0, 0.05, -0.3, 0.0], atol=1e-15)
+    np.testing.assert_allclose(seen.in_phase.torque, [0.001, 1.0, 1.0, 1.0, 0.3j], atol=1e-15)
+    assert abs(seen.in_phase.mean) > abs(seen.mean)
+
+
+def test_the_share_that_a_line_explains():
+    """Ten standard errors in each of ten logs of a hundred values each: as much as the noise."""
+    assert line(*np.exp(1j * np.arange(10.0))).share == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("place", LEARNED_TORQUES)
+def test_a_line_as_a_torque(place):
+    """`C cos + S sin`, at its place."""
+    effect = replace(line(3.0 + 4.0j), place=place).effect
+    assert isinstance(effect, place)
+    assert [float(c) for c in effect.c] == [3.0, 4.0]

@@ -1,0 +1,95 @@
+"""Free runs of whole held-out stretches against what their bands promised."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting.compare import Account, account
+from fitting.estimate import Fit, fit
+from fitting.experiment import split
+from fitting.free_run import FreeRun
+from fitting.prediction_band import PredictionBand
+from fitting.surprise import over_bands, surprise
+
+NOISE = 1e-6
+
+
+def run(times_noise: float, weight: np.ndarray | None = None, count: int = 50) -> FreeRun:
+    """One that is off by so much at every sample."""
+    return FreeRun("log", np.arange(count) * 1e-3, np.zeros(count), np.full(count, times_noise * NOISE), None, weight)
+
+
+def band(of: FreeRun, std_parameters: float = 0.0, std_state: float = 0.0) -> PredictionBand:
+    """In units of the noise."""
+    ones = np.ones(of.time.size) * NOISE
+    return PredictionBand(of, std_parameters * ones, std_state * ones, NOISE)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Fit, Account]:
+    """A model and its account, whose free runs are put in by hand."""
+    training, validation = split((rig.reduced_experiment(600, noise=2e-3),))
+    found = fit(rig.reduced_model(), training, ("mu", "omega_0", "alpha", "gain"), horizon=128, substeps=2, count=8)
+    return found, account(found, training, validation, noise=found.covariance, halo=0)
+
+
+@pytest.mark.parametrize(
+    ("bands", "expected"),
+    [
+        ([band(run(1.0))], 1.0),
+        ([band(run(3.0), std_parameters=2.0, std_state=2.0)], 1.0),
+        ([band(run(3.0))], 3.0),
+        # Squares count, over all stretches.
+        ([band(run(1.0)), band(run(7.0), std_parameters=7.0)], np.sqrt(50.0 / 51.0)),
+        # A chaotic motion promises nothing.
+        ([band(run(100.0), std_state=1e4)], 0.01),
+    ],
+)
+def test_what_a_free_run_promised(bands: list[PredictionBand], expected: float):
+    assert over_bands(bands) == pytest.approx(expected, rel=1e-3)
+
+
+def test_samples_that_are_not_believed_do_not_count():
+    weight = np.repeat([1.0, 0.0], 25)
+    odd = run(1.0, weight)
+    odd = replace(odd, measured=np.where(weight > 0, odd.measured, 1.0))
+    assert over_bands([band(odd)]) == pytest.approx(1.0)
+
+
+def test_a_band_that_left_the_numbers_promised_nothing():
+    assert over_bands([band(run(9.0), std_state=np.inf), band(run(9.0))]) is None
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "asked"),
+    [
+        (10.0, 1.1, False),
+        (10.0, 3.2, False),  # nine tenths of the variance beyond the noise
+        (10.0, 4.0, True),
+        (1.5, 1.4, True),
+        (np.inf, 50.0, False),
+        (np.inf, np.inf, False),
+        (10.0, np.inf, True),
+    ],
+)
+def test_bands_are_asked_where_names_do_not_explain(
+    fitted: tuple[Fit, Account], before: float, after: float, asked: bool, monkeypatch: pytest.MonkeyPatch
+):
+    module = import_module("fitting.surprise")
+    monkeypatch.setattr(module, "prediction_bands", lambda *args, runs, **options: [band(runs[0])])
+    found, known = fitted
+    then, now = (replace(known, validation=(run(times),)) for times in (before, after))
+    seen = surprise(found, then, now, found.stretches, noise=NOISE**2 * jnp.eye(1), halo=0)
+    assert seen == (pytest.approx(after) if asked else None)
+
+
+def test_a_right_model_does_not_surprise(fitted: tuple[Fit, Account]):
+    """Its own free run, beside a base model that does no better: what is asked is the band."""
+    found, known = fitted
+    _, validation = split((rig.reduced_experiment(600, noise=2e-3),))
+    seen = surprise(found, known, known, validation, noise=found.covariance, halo=0)
+    assert seen == pytest.approx(1.0, abs=0.2)
