@@ -125,7 +125,7 @@ def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | 
     """The data with their clocks set by a line, refined by refits with it; None where these do not explain more."""
     near = base
     for _ in range(_REFITS):
-        data = _put_back(data, seen.late)
+        data = _with_clocks_put_back(data, seen.late)
         near = attempt(base.model.with_effects(seen.in_phase.effect), data, base.hold, setting, start=near)
         if near.training.objective > base.training.objective - LEAST_GAIN:
             return None
@@ -135,7 +135,7 @@ def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | 
     return data
 
 
-def _put_back(data: Data, late: Float[np.ndarray, " logs"]) -> Data:
+def _with_clocks_put_back(data: Data, late: Float[np.ndarray, " logs"]) -> Data:
     def one(stretch: Stretch, by: float) -> Stretch:
         experiment = stretch.experiment
         return replace(stretch, experiment=replace(experiment, origin=experiment.origin + float(by)))

@@ -12,7 +12,7 @@ from fitting.attribution import Round, leaves_imperfection, look
 from fitting.base_fit import base_fit, is_held
 from fitting.clock import Clock
 from fitting.clocks import put_back, with_clocks_set
-from fitting.compare import EXCESS, Account, account, excess, validation_rmse
+from fitting.compare import EXCESS, EXPLAINED, Account, account, excess, validation_rmse
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.doubt import what_is_unknown
 from fitting.errors import DataError
@@ -34,8 +34,6 @@ Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
 # Share of segments in which the base model may run away.
 _MOST_LOST = 0.5
-# Share of the unexplained variance that found effects must remove to be called the explanation: two thirds of its rms.
-_EXPLAINED = 0.9
 
 
 class Finding(eqx.Module):
@@ -324,7 +322,7 @@ def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[A
     at_first = excess(base.held_out, noise)
     explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
     misfit = np.argmax(at_first)
-    if left[misfit] < EXCESS or explained[misfit] >= _EXPLAINED:
+    if left[misfit] < EXCESS or explained[misfit] >= EXPLAINED:
         return "effect_found"
     return "unexplained"
 

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.compare import Account
+from fitting.compare import EXPLAINED, Account
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
 from fitting.prediction_band import PredictionBand, prediction_bands
 
 SURPRISED = 1.25
 """Free runs that are farther off than this, in units of what their bands allow, are not what the model promised."""
-
-# Share of the variance beyond the noise that a model must remove of the free runs' error to explain it, whatever its
-# bands: no form is exact, and bands know nothing of that.
-_EXPLAINED = 0.9
 
 
 def surprise(
@@ -32,7 +28,8 @@ def surprise(
     leaves open of parameters and initial state.
 
     Near one where the model is right, a chaotic one as well: its bands grow as its errors do. None where the model
-    explains the free runs' error, or where its bands leave the numbers, since nothing was promised then.
+    explains the free runs' error (no form is exact, and bands know nothing of that), or where its bands leave the
+    numbers, since nothing was promised then.
 
     Args:
         final: the model with its effects.
@@ -44,7 +41,7 @@ def surprise(
     """
     variance = float(noise[-1, -1])
     at_first = before.validation_rmse**2 - variance
-    if after.validation_rmse**2 - variance <= (1.0 - _EXPLAINED) * at_first:
+    if after.validation_rmse**2 - variance <= (1.0 - EXPLAINED) * at_first:
         return None
     bands = prediction_bands(final, after.uncertainty, validation, noise=noise, halo=halo, runs=after.validation)
     return over_bands(bands)
