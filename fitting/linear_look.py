@@ -14,6 +14,7 @@ from fitting.estimate import Fit
 from fitting.explained import explained, solved, without_untold
 from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem
+from fitting.sight import where_it_goes
 from fitting.solve import linearise
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
@@ -111,7 +112,12 @@ class Products(eqx.Module):
 def look_along(fit: Fit) -> Look:
     """Linearise a fit along its motion."""
     problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
-    followed = follow(problem, fit.unknowns)
+    kept, followed = where_it_goes(fit, follow(problem, fit.unknowns))
+    error = jnp.asarray(fit.error)
+    if not kept.all():
+        weight = where(kept[:, None], problem.segments.weight, 0.0)
+        problem = eqx.tree_at(lambda p: p.segments.weight, problem, weight)
+        error = where(kept[:, None, None], error, 0.0)
     conditions = conditions_at_knots(problem.segments)
     if isinstance(fit.model, TwoInertiaModel):
         conditions = replace(conditions, T_m=acting_at_knots(fit.model, problem.segments))
@@ -122,7 +128,7 @@ def look_along(fit: Fit) -> Look:
         motions(fit.model, followed.states, conditions),
         conditions,
         unit_pushes(fit.model, followed.states, conditions),
-        jnp.asarray(fit.error) @ fit.problem.whitening.T,
+        error @ fit.problem.whitening.T,
     )
 
 

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.along import Along, along
 from fitting.estimate import Fit, lost
@@ -72,13 +72,20 @@ def sight(fit: Fit, seed: int) -> Sight:
     segments: Segments = _on_host(problem.segments)
     whitening = _on_host(problem.whitening)
     residual = _on_host(fit.error) @ whitening.T
-    # Where the model runs away there is no motion to look along.
-    kept = jnp.asarray(~lost(fit) & np.isfinite(np.asarray(followed.transition)).all(axis=(1, 2, 3)))
-    followed = jax.tree.map(lambda a: where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
+    kept, followed = where_it_goes(fit, followed)
     segments = replace(segments, weight=where(kept[:, None], segments.weight, 0.0))
     residual = where(kept[:, None, None], residual, 0.0)
     seen = along(fit.model, followed, segments, fit.stretches)
     return Sight(seen, found, whitening, residual, jnp.asarray(surrogates(fit, seed)))
+
+
+def where_it_goes(fit: Fit, followed: Followed) -> tuple[Bool[np.ndarray, " segments"], Followed]:
+    """The segments in which a model does not run away, and its motion with zeros in the others: there is none to look
+    along."""
+    kept = ~lost(fit) & np.isfinite(np.asarray(followed.transition)).all(axis=(1, 2, 3))
+    if kept.all():
+        return kept, followed
+    return kept, jax.tree.map(lambda a: where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
 
 
 def follow_on(training: Fit, held_out: Fit) -> bool:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ import rig
 from fitting.base_fit import base_fit
 from fitting.clocks import Phasors, put_back, with_clocks_set
 from fitting.experiment import Experiment, experiment_from_log, segment_count, split
+from fitting.linear_look import Acting, look_along, products
 from fitting.posing import segment_length
 from fitting.trial import Data, Setting, Trial, attempt, halo_for
 from hdjax import Hold
@@ -109,3 +111,24 @@ def test_a_line_as_a_torque(place):
     effect = replace(line(3.0 + 4.0j), place=place).effect
     assert isinstance(effect, place)
     assert [float(c) for c in effect.c] == [3.0, 4.0]
+
+
+def test_a_segment_that_runs_away_tells_nothing(begun):
+    """A look along the motion leaves it out, whole, and the line is seen in the others."""
+    base, _, _ = begun(0.4, 2.3)
+    fit = base.training
+    states = np.array(fit.unknowns.states)
+    states[2] = np.nan
+    broken = replace(
+        fit,
+        unknowns=replace(fit.unknowns, states=jnp.asarray(states)),
+        error=jnp.asarray(np.where(np.arange(len(states))[:, None, None] == 2, np.inf, np.asarray(fit.error))),
+    )
+    look = look_along(broken)
+    weight = np.asarray(look.problem.segments.weight)
+    assert not weight[2].any() and weight[[1, 3]].all()
+    time = np.asarray(look.conditions.time)
+    size = np.stack([np.cos(OMEGA * time), np.sin(OMEGA * time)], axis=-1)
+    found = products(look, Acting((look.pushes[LearnedMeshTorque.name],)), (size,))
+    for part in vars(found).values():
+        assert np.isfinite(part).all() and not part[2].any() and part[1].any()
