@@ -127,7 +127,7 @@ def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | 
     for _ in range(_REFITS):
         data = _with_clocks_put_back(data, seen.late)
         near = attempt(base.model.with_effects(seen.in_phase.effect), data, base.hold, setting, start=near)
-        if near.training.objective > base.training.objective - LEAST_GAIN:
+        if not near.training.objective < base.training.objective - LEAST_GAIN:
             return None
         seen = _fitted(near.training)
         if np.all(np.abs(seen.late) * seen.omega * seen.told < _SETTLED):
