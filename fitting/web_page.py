@@ -6,6 +6,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fitting import formatting
+from fitting.files import finite
 
 
 def environment(filters: Mapping[str, Callable[..., Any]]) -> Environment:
@@ -27,6 +28,8 @@ def environment(filters: Mapping[str, Callable[..., Any]]) -> Environment:
         "quantity": formatting.quantity,
         "number": formatting.number,
         "unit": formatting.pretty_unit,
+        # What is no number leaves a gap in a figure.
+        "finite": finite,
     }
     found.filters |= filters
     return found

@@ -39,6 +39,7 @@ from fitting.report import (
 from fitting.report.limits import limits, parameter_note
 from fitting.starting_values import starting_models
 from fitting.uncertainty import Estimate, Uncertainty
+from fitting.web_page import environment
 from hdjax import Hold
 from hdjax.effects import FAMILIES
 from hdjax.effects.actuation import TorqueBias
@@ -655,3 +656,8 @@ def test_units_of_a_reduced_log(unit: str, place: Literal["drive", "mesh", "actu
 @pytest.mark.parametrize(("share", "shown"), [(0.98, "98 %"), (0.9996, "99.96 %"), (-0.013, "−1.3 %"), (1.0, "100 %")])
 def test_shares_do_not_round_up_to_everything(share: float, shown: str):
     assert formatting.percent(share) == shown
+
+
+def test_what_is_no_number_leaves_a_gap_in_a_figure():
+    template = environment({}).from_string("{{ figure | finite | tojson }}")
+    assert template.render(figure={"y": [1.0, math.nan, -math.inf]}) == '{"y":[1.0,null,null]}'
