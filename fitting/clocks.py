@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
+from fitting.along import place_of
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
 from fitting.explained import solved
@@ -159,8 +160,8 @@ def _lines(found: Fit) -> list[Phasors]:
 def _fitted(found: Fit) -> Phasors:
     """The line that a fit has as its last effect, with what it leaves over of it in each log."""
     line = found.model.effects[-1]
-    assert isinstance(line, LearnedPeriodic)
-    (place,) = (place for place in LEARNED_TORQUES if isinstance(line, place))
+    place = place_of(line)
+    assert isinstance(line, LearnedPeriodic) and place is not None
     left = _at(place, float(line.omega), look_along(found), found, own=effect_paths(line))
     return replace(left, torque=left.torque + complex(*line.c))
 
