@@ -185,10 +185,11 @@ def unit_reading(model: Model, form: type[LearnedReading]) -> Float[Array, " out
     return probed.outputs(at_rest) - bare.outputs(at_rest)
 
 
-def place_of(effect: Effect) -> type[LearnedTorque] | None:
-    """The learned torque that acts where an effect does; None where that is no torque."""
+def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
+    """The learned torque that acts where an effect, or a form, does; None where that is no torque."""
+    own = effect if isinstance(effect, type) else type(effect)
     kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
-    return next((form for form, kind in zip(LEARNED_TORQUES, kinds, strict=True) if isinstance(effect, kind)), None)
+    return next((form for form, kind in zip(LEARNED_TORQUES, kinds, strict=True) if issubclass(own, kind)), None)
 
 
 def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:

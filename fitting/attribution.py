@@ -120,7 +120,7 @@ def look(
                 progress(f"refitting with {lead.effect.name}")
                 best = min((t.training.objective for t in refitted.values()), default=np.inf)
                 hopeless = _on_the_way(before, best, _HOPELESS)
-                trial = _try_lead(before, lead, data, setting, min(give_up_above, hopeless))
+                trial = try_lead(before, lead, data, setting, min(give_up_above, hopeless))
                 if trial is not None and np.isfinite(trial.held_out.objective):
                     refitted[lead.effect.name] = trial
 
@@ -299,7 +299,7 @@ def _programs_ahead(before: Trial, leads: Sequence[Lead], data: Data, setting: S
         yield
 
 
-def _try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
+def try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
     """Refit with the effect, from the first-order estimate, from what is typical, and from what the model's own
     parameters may stand for."""
     model = before.model

@@ -55,8 +55,16 @@ def what_is_unknown(
     enough = _leaves_noise(named, noise) or leaves_imperfection(named, base, noise)[0]
     if enough and len(named.model.effects) < _MANY:
         return named, None
-    beside = None if enough else learn(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
-    beside = beside if is_supported(beside) else None
+    little = _explain_all_but_little(base, named, noise)
+    instead = None
+    if named is not base and not enough and not little:
+        instead = _learned(base, data, setting, seed=seed, progress=progress)
+        if instead is not None and _leaves_noise(instead.trial, noise) and not _has_come_out(instead, named, base):
+            # Nothing beside the names could be better.
+            return base, instead
+    beside = None
+    if not enough:
+        beside = _learned(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
     if beside is not None:
         named, beside = _without_superfluous(base, named, beside, data, setting)
     if named is base:
@@ -66,10 +74,11 @@ def what_is_unknown(
         explained=(base.training.objective - named.training.objective, named.gain_over(base)),
     ):
         return named, beside
-    if beside is None and not enough and _explain_all_but_little(base, named, noise):
+    if beside is None and not enough and little:
         return named, None
-    instead = learn(base, data, setting, seed=seed, progress=progress)
-    if instead is None or not is_supported(instead):
+    if enough or little:
+        instead = _learned(base, data, setting, seed=seed, progress=progress)
+    if instead is None:
         return named, beside
     rival = named if beside is None else beside.trial
     stands = _names_stand(
@@ -77,15 +86,26 @@ def what_is_unknown(
         gain=instead.gain,
         beside=beside is not None,
         enough=enough,
-        come_out=named.hold == base.hold
-        and share_of(named.model, instead) >= _COME_OUT
-        and _show_what_they_are_named_for(named, beside),
+        come_out=_has_come_out(instead, named, base) and _show_what_they_are_named_for(named, beside),
         fewer=len(rival.training.free.paths) - len(instead.trial.training.free.paths),
         out_of_shape=beside is not None
         and beside.chosen.of == instead.chosen.of
         and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
     )
     return (named, beside) if stands else (base, instead)
+
+
+def _learned(
+    before: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
+) -> Unknown | None:
+    """What can be learned beside a model, where the data support it."""
+    found = learn(before, data, setting, seed=seed, progress=progress)
+    return found if is_supported(found) else None
+
+
+def _has_come_out(instead: Unknown, named: Trial, base: Trial) -> bool:
+    """Whether what was learned in the place of names has come out as them."""
+    return named.hold == base.hold and share_of(named.model, instead, named.training) >= _COME_OUT
 
 
 def _leaves_noise(trial: Trial, noise: MeasurementNoise) -> bool:

@@ -13,12 +13,11 @@ from fitting.linear_look import Acting, Look, look_along, products
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,
-    LoadSideEffect,
     MeshGeometryEffect,
     MeshTorqueEffect,
     Motion,
-    MotorSideEffect,
     SensorEffect,
+    ShaftEffect,
 )
 from hdjax.effects.learned import Learned, LearnedTorque
 from hdjax.effects.learned_axes import ANGLES
@@ -109,7 +108,7 @@ def _done(model: Model, name: str, motion: Motion, states: Array) -> Array:
     own = [names.index(f"{name}.{s}") for s in effect.states]
 
     def at(motion: Motion, state: Array) -> Array:
-        if isinstance(effect, MeshTorqueEffect | MotorSideEffect | LoadSideEffect):
+        if isinstance(effect, MeshTorqueEffect | ShaftEffect):
             # A model has the drive that its effects need.
             return effect.torque(motion, model.drive, state[jnp.asarray(own, dtype=int)])  # pyright: ignore[reportArgumentType]
         assert isinstance(model.drive, Drive) and motion.theta_m is not None and motion.theta_l is not None

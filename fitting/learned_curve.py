@@ -108,11 +108,7 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 def _evaluated(model: Model, name: str, uncertainty: Uncertainty, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Value and standard error of a model's learned function at rows of its variables."""
-    known = list(uncertainty.estimates)
-    own = [i for i, path in enumerate(known) if path.startswith(f"{name}.")]
-    paths = [known[i] for i in own]
-    std = np.array([uncertainty.estimates[path].std for path in paths])
-    covariance = np.asarray(uncertainty.correlation)[np.ix_(own, own)] * np.outer(std, std)
+    paths, covariance = uncertainty.of_effect(name)
 
     def at(parameters, row):
         effect = model.replace(dict(zip(paths, parameters, strict=True))).effect(name)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.linalg import block_diag, eigh, null_space
 
-from fitting.along import ERROR, SLOPE, unit_reading
+from fitting.along import ERROR, SLOPE, place_of, unit_reading
 from fitting.estimate import Fit
 from fitting.free import effect_paths
 from fitting.linear_look import (
@@ -125,9 +125,9 @@ class LearnedLook(eqx.Module):
         names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
         return Acting(tuple(self.look.pushes[name] for name in names))
 
-    def torque_push(self, form: type[Learned]) -> Float[Array, "segments knots states"]:
-        """What a unit of torque does at the place of a form; in the mesh where that is none."""
-        return self.look.pushes[form.name if issubclass(form, LearnedTorque) else LearnedMeshTorque.name]
+    def torque_push(self, place: type[LearnedTorque] | None) -> Float[Array, "segments knots states"]:
+        """What a unit of torque does at a place; in the mesh where it is none."""
+        return self.look.pushes[(place or LearnedMeshTorque).name]
 
 
 def learned_look(fit: Fit) -> LearnedLook:
@@ -146,7 +146,7 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
     alone explains anything."""
     reduced = isinstance(seen.look.model, ReducedModel)
     forms = [form for form in LEARNED if not (form.needs_motor and reduced)]
-    own = {form: _own_functions(seen, form) for form in forms}
+    own = {form: own_functions(seen, form) for form in forms}
     may = {form: [name for name in seen.values if form.may_depend_on(name)] for form in forms}
 
     def look_at(form: type[Learned], choices: Iterable[tuple[str, ...]]) -> list[Candidate]:
@@ -169,7 +169,7 @@ def looked_again(first: Candidate, seen: LearnedLook) -> list[Candidate]:
     explains most, and before it the simplest one that explains nearly as much.
 
     To first order a steep slope is as good as a jump along a motion that was found with a slope."""
-    found = _functions_of(seen, first.form, first.variables, _own_functions(seen, first.form))
+    found = _functions_of(seen, first.form, first.variables, own_functions(seen, first.form))
     if not found:
         return []
     best = max(found, key=lambda c: c.gain)
@@ -184,10 +184,10 @@ def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
     return tuple(part @ mixing for part in _functions(chosen.form, chosen.effect.axes, values))
 
 
-def _own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
+def own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
     """The free parameters as torques at the place of a form; none of them is an error of an angle."""
     if issubclass(form, LearnedTorque):
-        return np.asarray(parameter_torques(seen.look, seen.torque_push(form)))
+        return np.asarray(parameter_torques(seen.look, seen.torque_push(place_of(form))))
     return np.zeros((*seen.weight.shape, len(seen.look.problem.free.paths)))
 
 

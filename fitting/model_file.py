@@ -25,6 +25,7 @@ from hdjax.effects.learned_axes import (
     SignAxis,
     SplineAxis,
 )
+from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY
 from hdjax.parameters import as_scalar, own_parameters, own_value
 
 SCHEMA = "hdjax-model/1"
@@ -32,6 +33,7 @@ SCHEMA = "hdjax-model/1"
 _MOST_FUNCTIONS = 1000
 # What learned functions have beside their coefficients.
 _SHAPES: dict[type[Learned], str] = {LearnedFriction: "transition", LearnedPeriodic: "omega"}
+_WITH_PARAMETERS: dict[str, type[Effect]] = {**BY_NAME, **{form.name: form for form in LEARNED_WITH_MEMORY}}
 
 
 class StoredModel(eqx.Module):
@@ -119,7 +121,7 @@ def _axis(content: dict[str, Any]) -> Axis:
 def _effect(content: Any) -> Effect:
     learned = {form.name: form for form in LEARNED}
     if content["name"] not in learned:
-        return BY_NAME[content["name"]](**content["parameters"])
+        return _WITH_PARAMETERS[content["name"]](**content["parameters"])
     form = learned[content["name"]]
     axes = tuple(_axis(a) for a in content["axes"])
     for i, axis in enumerate(axes):

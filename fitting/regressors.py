@@ -22,12 +22,11 @@ from hdjax.effects import (
     ActuatorEffect,
     Conditions,
     Effect,
-    LoadSideEffect,
     MeshGeometryEffect,
     MeshTorqueEffect,
     Motion,
-    MotorSideEffect,
     SensorEffect,
+    ShaftEffect,
 )
 from hdjax.effects.learned import LearnedMotorTorque
 from hdjax.parameters import own_value
@@ -128,7 +127,7 @@ def _stacked(proposals: Sequence[Effect]) -> Effect:
 
 
 def _takes_inertia(effect: Effect) -> bool:
-    return isinstance(effect, LoadSideEffect) and effect.takes_inertia()
+    return isinstance(effect, ShaftEffect) and effect.takes_inertia()
 
 
 def _padded(values: np.ndarray) -> Array:
@@ -181,7 +180,7 @@ def _columns(
             assert motion.theta_m is not None
             return {ERROR: effect.error(motion.theta_m), SLOPE: effect.slope(motion.theta_m)}
         place = place_of(effect)
-        assert place is not None and isinstance(effect, MeshTorqueEffect | MotorSideEffect | LoadSideEffect)
+        assert place is not None and isinstance(effect, MeshTorqueEffect | ShaftEffect)
         at = jax.vmap(lambda motion, state: effect.torque(motion, bare.drive, state))  # pyright: ignore[reportArgumentType]
         torques = {place.name: jnp.broadcast_to(at(motion, own), motion.x.shape)}
         if isinstance(effect, MeshTorqueEffect) and effect.reacts() and isinstance(bare.drive, Drive):

@@ -88,6 +88,11 @@ def where_it_goes(fit: Fit, followed: Followed) -> tuple[Bool[np.ndarray, " segm
     return kept, jax.tree.map(lambda a: where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
 
 
+def motion_states(fit: Fit) -> Float[np.ndarray, "segments knots states"]:
+    """The states that a fitted model goes through; zero where it runs away."""
+    return np.nan_to_num(np.asarray(follow(_looked_at(fit), fit.unknowns).states), posinf=0.0, neginf=0.0)
+
+
 def follow_on(training: Fit, held_out: Fit) -> bool:
     """Whether each held-out stretch begins where a training stretch ends."""
     ends = [(s.name, s.stop) for s in training.stretches]

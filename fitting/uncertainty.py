@@ -59,6 +59,14 @@ class Uncertainty(eqx.Module):
     covariance: Float[np.ndarray, "parameters parameters"]
     unit_covariance: Float[np.ndarray, "parameters parameters"]
 
+    def of_effect(self, name: str) -> tuple[list[str], Float[np.ndarray, "own own"]]:
+        """The dotted paths of an effect's parameters, and their covariance in SI units."""
+        known = list(self.estimates)
+        own = [i for i, path in enumerate(known) if path.startswith(f"{name}.")]
+        paths = [known[i] for i in own]
+        std = np.array([self.estimates[path].std for path in paths])
+        return paths, self.correlation[np.ix_(own, own)] * np.outer(std, std)
+
 
 def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise: bool = True) -> Uncertainty:
     """Standard errors and intervals of a fit.

@@ -1,7 +1,8 @@
 """What is missing where the catalogue does not say: learned inside the equations, as a function of what matters.
 
 Which place and which variables is decided on training data alone ([`fitting.learned_look`][]); the held-out stretches
-then judge one learned function, like any other effect.
+then judge one learned function, like any other effect. What no function of the present motion explains may have a
+memory ([`fitting.remembering`][]).
 """
 
 from collections.abc import Callable, Sequence
@@ -10,11 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from fitting.along import unit_reading
+from fitting.along import place_of, unit_reading
 from fitting.attribution import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
+from fitting.estimate import Fit
 from fitting.learned_look import (
     NEARLY,
     Candidate,
@@ -25,6 +27,8 @@ from fitting.learned_look import (
     sizes_along,
 )
 from fitting.linear_look import surrogate_gains
+from fitting.remembering import Remembered, Remembering, remembering
+from fitting.sight import motion_states
 from fitting.surrogates import surrogates
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, sampled
@@ -41,14 +45,15 @@ _LARGEST_CHANGE = 1.0
 
 
 class Unknown(eqx.Module):
-    """A learned function that the data support.
+    """What was learned and the data support: a function of the motion, or a torque with a memory of it.
 
     Attributes:
         before: the model without it.
         trial: the model with it.
         candidates: all places and variables, best first by the first look.
         chosen: the one that was taken.
-        states: of the model without it, at the instants that stand for the density of the data.
+        instants: of the training motion that stand for the density of the data, counted along its segments.
+        states: of the model without it, there.
         conditions: time and temperature there.
         push: what a unit of torque adds to their rates: at its place, or in the mesh for an error of an angle.
         gain: decrease of the held-out objective.
@@ -57,8 +62,9 @@ class Unknown(eqx.Module):
 
     before: Trial
     trial: Trial
-    candidates: tuple[Candidate, ...]
-    chosen: Candidate
+    candidates: tuple[Candidate | Remembered, ...]
+    chosen: Candidate | Remembered
+    instants: Int[np.ndarray, " instants"]
     states: Float[np.ndarray, "instants states"]
     conditions: Conditions
     push: Float[np.ndarray, "instants states"]
@@ -88,29 +94,69 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     seen = learned_look(before.training)
     least = _LEAST_SHARE_BESIDE if before.model.effects else _LEAST_SHARE
     found = sorted((c for c in candidates(seen) if c.gain > least), key=lambda c: -c.gain)
-    best: tuple[Candidate, Trial] | None = None
-    for several in (False, True):
-        if best is not None and leaves_white_noise(best[1].training):
-            break
-        for candidate in _rivals([c for c in found if (len(c.variables) > 1) == several]):
-            if several and best is not None and candidate.gain < best[0].gain + _WORTH_A_VARIABLE:
-                break
-            progress(f"learning a function of {' and '.join(candidate.variables)}")
-            trial = _refitted(before, candidate, data, setting)
-            if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
-                best = candidate, trial
-    if best is None:
+    alone, pairs = ([c for c in found if (len(c.variables) > 1) == several] for several in (False, True))
+
+    best = _likeliest(alone, None, before, data, setting, progress)
+    memory: Remembering | None = None
+    remembered: tuple[Remembered, Trial] | None = None
+    if not _is_enough(best):
+        memory = remembering(before, seen, least=least, seed=seed, progress=progress)
+        # A law with memory has fewer parameters than a function of two variables.
+        if memory.candidates and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0):
+            remembered = memory.put_inside(before, data, setting, rival=best, progress=progress)
+    if not _is_enough(remembered):
+        if not _is_enough(best):
+            worth = [c for c in pairs if best is None or c.gain >= best[0].gain + _WORTH_A_VARIABLE]
+            best = _likeliest(worth, best, before, data, setting, progress)
+        best = None if best is None else _refined(best, data, setting, progress)
+        if memory is not None and remembered is None and not _is_enough(best):
+            remembered = memory.put_inside(before, data, setting, rival=best, progress=progress)
+
+    if remembered is not None and (best is None or _betters(remembered[1], best[1], before)):
+        assert memory is not None
+        gain = remembered[1].gain_over(before)
+        chosen, trial, p_value = *remembered, memory.screen.p_value(gain)
+    elif best is not None:
+        gain = before.held_out.objective - best[1].held_out.objective
+        chosen, trial, p_value = *best, _p_value(seen, before, best[0], gain, seed)
+    else:
         return None
-    chosen, trial = _refined(best, data, setting, progress)
-    gain = before.held_out.objective - trial.held_out.objective
-    p_value = _p_value(seen, before, chosen, gain, seed)
     instants = seen.instants
     states, acting = (
         np.asarray(a).reshape(-1, a.shape[2])[instants]
-        for a in (seen.look.followed.states, seen.torque_push(chosen.form))
+        for a in (seen.look.followed.states, seen.torque_push(place_of(chosen.form)))
     )
     conditions = jax.tree.map(lambda a: a.reshape(-1)[instants], seen.look.conditions)
-    return Unknown(before, trial, tuple(found), chosen, states, conditions, acting, gain, p_value)
+    others = (*found, *(memory.candidates if memory is not None else ()))
+    ranked = tuple(sorted(others, key=lambda c: -c.gain))
+    return Unknown(before, trial, ranked, chosen, instants, states, conditions, acting, gain, p_value)
+
+
+def _likeliest(
+    found: Sequence[Candidate],
+    best: tuple[Candidate, Trial] | None,
+    before: Trial,
+    data: Data,
+    setting: Setting,
+    progress: Callable[[str], None],
+) -> tuple[Candidate, Trial] | None:
+    """The best of the likeliest candidates and of what was the best so far, inside the equations."""
+    for candidate in _rivals(found):
+        progress(f"learning a function of {' and '.join(candidate.variables)}")
+        trial = _refitted(before, candidate, data, setting)
+        if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
+            best = candidate, trial
+    return best
+
+
+def _is_enough(found: tuple[Candidate | Remembered, Trial] | None) -> bool:
+    return found is not None and leaves_white_noise(found[1].training)
+
+
+def _betters(trial: Trial, other: Trial, before: Trial) -> bool:
+    """Whether a model explains more than another one: of the training data, with what its parameters cost, and of
+    those it has not seen, where what it remembers has to last."""
+    return _penalised(trial) < _penalised(other) and trial.gain_over(before) > other.gain_over(before)
 
 
 def _refined(
@@ -132,7 +178,7 @@ def is_supported(found: Unknown | None) -> bool:
     return found is not None and found.gain > LEAST_GAIN and found.p_value <= SIGNIFICANCE
 
 
-def share_of(named: Model, found: Unknown) -> float:
+def share_of(named: Model, found: Unknown, fit: Fit | None = None) -> float:
     """Share of a learned torque's mean square that the effects of a model, beyond those it was learned with, make up.
 
     Near one the learned torque, which was free to be anything, has come out as those effects. Effects that cancel each
@@ -141,23 +187,24 @@ def share_of(named: Model, found: Unknown) -> float:
     Args:
         named: the model with the effects.
         found: what was learned.
+        fit: of that model, whose effects' own states count; where not given they are as after a long rest.
     """
     known = found.before.model.effects
     apart = [
-        without(_done(eqx.tree_at(lambda m: m.effects, named, (*known, e)), found), found.chosen.known)
+        without(_done(eqx.tree_at(lambda m: m.effects, named, (*known, e)), found, fit), found.chosen.known)
         for e in named.effects
         if e.name not in {k.name for k in known}
     ]
-    learned = without(_done(found.trial.model, found), found.chosen.known)
+    learned = without(_done(found.trial.model, found, found.trial.training), found.chosen.known)
     alike = float(sum(part @ learned for part in apart) ** 2)
     return alike / max(float(sum(part @ part for part in apart)) * float(learned @ learned), 1e-300)
 
 
-def _done(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
+def _done(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " instants"]:
     """What the effects of a model, beyond those a function was learned with, do where the function acts: as a torque
     there, or to what an encoder reads."""
     if not issubclass(found.chosen.form, LearnedReading):
-        return _torques(model, found)
+        return _torques(model, found, fit)
     unit = np.asarray(unit_reading(model, found.chosen.form))
     bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
     states = jnp.asarray(found.states)
@@ -165,23 +212,35 @@ def _done(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
     return added @ unit / (unit @ unit)
 
 
-def _torques(model: Model, found: Unknown) -> Float[np.ndarray, " instants"]:
+def _torques(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " instants"]:
     """What the effects of a model, beyond those a function was learned with, are as a torque at the function's place,
     at the instants."""
     bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
-    hidden = jnp.asarray(model.rest())[found.states.shape[1] :]
     zero = jnp.zeros(())
     silence = sampled(np.arange(2.0), np.zeros(2), hold="zero-order")
+
+    count = found.states.shape[1]
 
     def added(state: Array, conditions: Conditions) -> Array:
         # An error of the torque is an effect as well.
         steady = silence.affine(jnp.ones(()), zero if conditions.T_m is None else conditions.T_m)
         acting, before = (m.actuate(steady)(zero) for m in (model, bare))
-        own = model.rates(jnp.concatenate([state, hidden]), acting, zero, conditions)
-        return own[: state.shape[0]] - bare.rates(state, before, zero, conditions)
+        own = model.rates(state, acting, zero, conditions)
+        return own[:count] - bare.rates(state[:count], before, zero, conditions)
 
-    rates = np.asarray(jax.vmap(added)(jnp.asarray(found.states), found.conditions))
+    rates = np.asarray(jax.vmap(added)(_own_motion(model, found, fit), found.conditions))
     return np.sum(found.push * rates, axis=1) / np.sum(found.push**2, axis=1)
+
+
+def _own_motion(model: Model, found: Unknown, fit: Fit | None) -> Float[Array, "instants states"]:
+    """The states at the instants, with those of effects that the model before has not as a fit has them."""
+    states, rest = jnp.asarray(found.states), jnp.asarray(model.rest())
+    further = model.state_names[states.shape[1] :]
+    if fit is None or not further:
+        return jnp.concatenate([states, jnp.broadcast_to(rest[states.shape[1] :], (len(states), len(further)))], axis=1)
+    followed = motion_states(fit).reshape(-1, len(fit.model.state_names))[found.instants]
+    own = [fit.model.state_names.index(name) for name in further]
+    return jnp.concatenate([states, jnp.asarray(followed[:, own])], axis=1)
 
 
 def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> np.ndarray:

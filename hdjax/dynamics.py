@@ -21,6 +21,7 @@ from hdjax.effects import (
     Motion,
     MotorSideEffect,
     SensorEffect,
+    ShaftEffect,
 )
 from hdjax.parameters import ParameterInfo, as_scalar, own_parameters, own_value
 from hdjax.signals import PiecewisePolynomial
@@ -197,19 +198,27 @@ class TwoInertiaModel(Model):
         on_load = tau + load_torque
         for effect in self._of(LoadSideEffect):
             on_load = on_load + effect.torque(motion, drive, own[effect.name])
-        rates = [state[2], state[3], on_motor / drive.J_m, on_load / self._load_inertia]
+        rates = [state[2], state[3], on_motor / self._motor_inertia, on_load / self._load_inertia]
         return self._with_own_rates(motion, rates, own)
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         by_rate = {"omega_m": (1.0, 0.0), "omega_l": (0.0, 1.0), "v": (1.0 / self.drive.N, -1.0)}
         one, other = by_rate[moved], by_rate[opposed]
-        return one[0] * other[0] / self.drive.J_m + one[1] * other[1] / self._load_inertia
+        return one[0] * other[0] / self._motor_inertia + one[1] * other[1] / self._load_inertia
+
+    @property
+    def _motor_inertia(self) -> Array:
+        """What the motor's own rate has of the drive's J_m."""
+        return self.drive.J_m - self._inertia_taken(MotorSideEffect)
 
     @property
     def _load_inertia(self) -> Array:
         """What the load's own rate has of the drive's J_l."""
-        taken = (effect.inertia_taken(self.drive) for effect in self._of(LoadSideEffect))
-        return self.drive.J_l - sum(taken, jnp.zeros_like(self.drive.J_l))
+        return self.drive.J_l - self._inertia_taken(LoadSideEffect)
+
+    def _inertia_taken(self, kind: type[ShaftEffect]) -> Array:
+        taken = (effect.inertia_taken(self.drive) for effect in self._of(kind))
+        return sum(taken, jnp.zeros_like(self.drive.J_l))
 
     def outputs(self, state: State) -> Float[Array, "2"]:
         theta_m, theta_l = state[0], state[1]

@@ -4,6 +4,7 @@ from fitting.plots.evidence import evidence_plot as evidence_plot
 from fitting.plots.gallery import fit_plots as fit_plots
 from fitting.plots.gallery import plots as plots
 from fitting.plots.learned import learned_plot as learned_plot
+from fitting.plots.learned import response_plot as response_plot
 from fitting.plots.long_trace import decimated as decimated
 from fitting.plots.next_experiment import next_experiment_plot as next_experiment_plot
 from fitting.plots.plot import Plot as Plot

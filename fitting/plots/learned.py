@@ -1,10 +1,11 @@
-"""What was learned, a torque or an error of an angle, against what it depends on."""
+"""What was learned, a torque or an error of an angle, against what it depends on, or over frequency."""
 
 import numpy as np
 
 from fitting.formatting import axis_label, pretty_unit
 from fitting.learned_curve import WORDS, LearnedCurve
-from fitting.plots.look import AFTER, FAINT, axis, figure, line_trace, numbers
+from fitting.learned_response import LearnedResponse
+from fitting.plots.look import AFTER, FAINT, axis, axis_scale, figure, line_trace, numbers
 from fitting.plots.plot import Figure, Plot
 
 _BINS = 60
@@ -24,6 +25,36 @@ def learned_plot(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Pl
     return _surface(curve, unit, units)
 
 
+def response_plot(found: LearnedResponse, *, unit: str) -> Plot:
+    """The stiffness over frequency of a learned torque that lags, with its band.
+
+    Args:
+        found: the response.
+        unit: of its stiffness.
+    """
+    widest = np.exp(np.minimum(_NORMAL_95 * found.std, np.log(1e3)))
+    low, high = found.stiffness / widest, found.stiffness * widest
+    traces = [
+        _band(found.frequency, low, high),
+        line_trace(found.frequency, found.stiffness, name="learned", color=AFTER, width=2.0),
+    ]
+    ends = float(found.frequency[0]), float(found.frequency[-1])
+    sizes = float(np.min(found.stiffness)), float(np.max(found.stiffness))
+    layout = {
+        "xaxis": axis("frequency [Hz]", **axis_scale(True, *ends)),
+        "yaxis": axis(axis_label("size of torque over angle", pretty_unit(unit)), **axis_scale(True, *sizes)),
+    }
+    return Plot(
+        "learned-torque",
+        "found",
+        f"The learned {WORDS[found.place]}",
+        "What is missing, as learned inside the equations of motion: a torque that lags behind an angle, over the "
+        "angle, at each frequency. The band is that of the standard errors; what the logs do not excite is the law's "
+        "word alone.",
+        figure(traces, 360, **layout),
+    )
+
+
 def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     name = curve.variables[0]
     at, value, reach = curve.grid[0], curve.on_grid, _NORMAL_95 * curve.std_on_grid
@@ -38,16 +69,7 @@ def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
         "opacity": 0.5,
         "hoverinfo": "skip",
     }
-    band = {
-        "type": "scatter",
-        "name": "95 % band",
-        "x": numbers(np.concatenate([at, at[::-1]])),
-        "y": numbers(np.concatenate([value + reach, (value - reach)[::-1]])),
-        "fill": "toself",
-        "fillcolor": "rgba(0, 114, 178, 0.2)",
-        "line": {"width": 0},
-        "hoverinfo": "skip",
-    }
+    band = _band(at, value - reach, value + reach)
     layout = {
         "xaxis": axis(axis_label(name, pretty_unit(units[name])), exponentformat="power"),
         "yaxis": axis(axis_label(curve.quantity, pretty_unit(unit)), exponentformat="power", overlaying="y2"),
@@ -57,6 +79,19 @@ def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     }
     traces = [density, band, line_trace(at, value, name="learned", color=AFTER, width=2.0)]
     return _plot(curve, figure(traces, 360, **layout))
+
+
+def _band(at: np.ndarray, low: np.ndarray, high: np.ndarray) -> Figure:
+    return {
+        "type": "scatter",
+        "name": "95 % band",
+        "x": numbers(np.concatenate([at, at[::-1]])),
+        "y": numbers(np.concatenate([high, low[::-1]])),
+        "fill": "toself",
+        "fillcolor": "rgba(0, 114, 178, 0.2)",
+        "line": {"width": 0},
+        "hoverinfo": "skip",
+    }
 
 
 def _surface(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:

@@ -65,7 +65,7 @@ def summary(report: Mapping[str, Any]) -> str:
 
 def _learned(report: Mapping[str, Any]) -> str:
     unknown = report["unknown"]
-    return place_and_variables(unknown["place"], unknown["variables"], unknown["period"])
+    return place_and_variables(unknown["place"], unknown["variables"], unknown["period"], unknown["memory"])
 
 
 def _count(number: int) -> str:

@@ -1,16 +1,23 @@
-"""The learned function, where the catalogue does not explain what is missing."""
+"""What was learned, where the catalogue does not explain what is missing."""
 
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from fitting import formatting
+from fitting.along import place_of
 from fitting.close_loop import Loop
-from fitting.learned_curve import WORDS, LearnedCurve, learned_curve
+from fitting.free import effect_paths
+from fitting.learned_curve import PLACES, WORDS, LearnedCurve, learned_curve
+from fitting.learned_response import LearnedResponse, learned_response
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from fitting.shapes import Shape, shapes
 from hdjax import ReducedModel
+from hdjax.effects.learned import Learned
 from hdjax.effects.learned_axes import UNITS
+from hdjax.effects.learned_memory import Lagging, LearnedMemory, Yielding
 
 _WORDS = {
     "x": "twist",
@@ -24,47 +31,118 @@ _WORDS = {
     "temperature": "temperature",
 }
 _QUANTITIES = {"torque": "N m", "error": "rad"}
+_MEMORIES = {"lags": "lags behind", "yields": "yields to"}
 _TOLD = 6
+# What lags and is damped by so much does not swing.
+_CREEPS = 0.5
 
 
-def curve_of(loop: Loop) -> LearnedCurve | None:
-    """The learned function of a loop with its final values; None where there is none."""
+def curve_of(loop: Loop) -> LearnedCurve | LearnedResponse | None:
+    """The learned function of a loop with its final values, or the response of a torque that lags; None where there is
+    neither. (What a torque does that yields is drawn like an effect.)"""
     if loop.unknown is None:
+        return None
+    effect = loop.after.model.effect(loop.unknown.chosen.form.name)
+    if isinstance(effect, Lagging):
+        return learned_response(effect.name, loop.after.model, loop.after.uncertainty)
+    if isinstance(effect, LearnedMemory):
         return None
     return learned_curve(loop.unknown, loop.after.model, loop.after.uncertainty)
 
 
 def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] | None:
-    """The learned function: what it depends on, what it is worth, and what it looks like; None where there is none."""
+    """What was learned: what it depends on, what it is worth, and what it looks like; None where there is nothing."""
     if not isinstance(outcome, Loop) or outcome.unknown is None:
         return None
-    curve = curve_of(outcome)
-    assert curve is not None
     finding = next(f for f in outcome.findings if f.name == outcome.unknown.chosen.form.name)
-    found = shapes(curve)
-    unit = unit_in_log(_QUANTITIES[curve.quantity], outcome, units)
     others = [c for c in outcome.unknown.candidates if len(c.variables) == 1][:_TOLD]
+    effect = outcome.after.model.effect(finding.name)
+    told = _of_memory(effect, outcome) if isinstance(effect, LearnedMemory) else _of_function(outcome)
+    wanted = {told["quantity"]: _QUANTITIES[told["quantity"]]} | {n: UNITS[n] for n in told["variables"]}
     return {
         "family": finding.family,
         "name": finding.name,
-        "place": curve.place,
-        "variables": list(curve.variables),
-        "period": curve.period,
-        "quantity": curve.quantity,
-        "units": {curve.quantity: unit} | {n: unit_in_log(UNITS[n], outcome, units) for n in curve.variables},
-        "says": _sentence(curve, found.closest, outcome.doubted, in_step=not any(outcome.put_back)),
-        "coefficients": len(outcome.unknown.chosen.effect.c),
+        **told,
+        "units": {name: unit_in_log(unit, outcome, units) for name, unit in wanted.items()},
         "validation_gain": finding.validation_gain,
         "p_value": finding.p_value,
         "rmse": {
             "before": outcome.after.validation_rmse / max(1.0 - finding.validation_gain, 1e-12),
             "after": outcome.after.validation_rmse,
         },
-        "shapes": [_shape_dict(s) for s in found.closest],
-        "symbolic": None if found.symbolic is None else _shape_dict(found.symbolic),
         "doubted": list(outcome.doubted),
         "looked_at": [{"place": c.form.name, "variable": c.variables[0], "gain": c.gain} for c in others],
     }
+
+
+def _of_function(loop: Loop) -> dict[str, Any]:
+    """What is told of a function of the present motion."""
+    curve = curve_of(loop)
+    assert isinstance(curve, LearnedCurve) and loop.unknown is not None
+    effect = loop.after.model.effect(loop.unknown.chosen.form.name)
+    assert isinstance(effect, Learned)
+    found = shapes(curve)
+    return {
+        "place": curve.place,
+        "variables": list(curve.variables),
+        "period": curve.period,
+        "memory": None,
+        "quantity": curve.quantity,
+        "says": _sentence(curve, found.closest, loop.doubted, in_step=not any(loop.put_back)),
+        "coefficients": len(effect.c),
+        "shapes": [_shape_dict(s) for s in found.closest],
+        "symbolic": None if found.symbolic is None else _shape_dict(found.symbolic),
+    }
+
+
+def _of_memory(effect: LearnedMemory, loop: Loop) -> dict[str, Any]:
+    """What is told of a torque with a memory."""
+    form = place_of(effect)
+    assert form is not None
+    place, memory = PLACES[form.name], "lags" if isinstance(effect, Lagging) else "yields"
+    where = place_and_variables(place, [effect.angle], None, memory)
+    said = [f"A learned {where}, stands for what is missing. It depends on the past: it has a memory of its own."]
+    family = _remembers(effect, place)
+    if isinstance(effect, Lagging):
+        hertz = formatting.quantity(float(effect.omega) / (2 * np.pi), "Hz", digits=3)
+        said.append(f"What lags has a natural frequency of {hertz} and a damping ratio of {effect.zeta:.2g}.")
+    said.append(f"Of the catalogue, {plain_family(family)} looks like it.")
+    said += _doubted(loop.doubted)
+    return {
+        "place": place,
+        "variables": [effect.angle],
+        "period": None,
+        "memory": memory,
+        "quantity": "torque",
+        "says": " ".join(said),
+        "coefficients": len(effect_paths(effect)),
+        "shapes": [],
+        "symbolic": {"expression": _formula(effect), "r_squared": 1.0, "families": [family]},
+    }
+
+
+def _remembers(effect: LearnedMemory, place: str) -> str:
+    """The family of the catalogue that looks like a torque with memory."""
+    if isinstance(effect, Lagging):
+        return "creep" if place == "mesh" and effect.zeta >= _CREEPS else "extra_resonance"
+    return {"mesh": "hysteresis", "motor": "motor_friction", "load": "load_friction"}[place]
+
+
+def _formula(effect: LearnedMemory) -> str:
+    """A torque with memory in a formula, against the angle that it is of."""
+    u = effect.angle
+    if isinstance(effect, Lagging):
+        spring, damper = float(effect.omega) ** 2, 2 * float(effect.zeta) * float(effect.omega)
+        return (
+            f"{effect.k:.4g} ({u} - y) {effect.b:+.4g} ({u}' - y') where y'' = {spring:.4g} ({u} - y) "
+            f"{damper:+.4g} ({u}' - y')"
+        )
+    assert isinstance(effect, Yielding)
+    bow = float(effect.bow)
+    return (
+        f"{effect.k:.4g} z where z' = {u}' (1 {bow - 1.0:+.3g} s {-bow:+.3g} s^2) on the way out, "
+        f"{u}' (1 {effect.back:+.3g} s {effect.back_bow:+.3g} s^2) on the way back, s = |z| / {effect.reach:.4g}"
+    )
 
 
 def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
@@ -74,8 +152,10 @@ def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
     return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"])
 
 
-def place_and_variables(place: str, variables: list[str], period: float | None) -> str:
-    """Where a learned function acts and what it depends on, in words."""
+def place_and_variables(place: str, variables: list[str], period: float | None, memory: str | None) -> str:
+    """Where something learned acts and what it depends on, in words."""
+    if memory is not None:
+        return f"{WORDS[place]}, which {_MEMORIES[memory]} the {_WORDS[variables[0]]}"
     if period is not None:
         return f"{WORDS[place]}, which comes back {formatting.number(1.0 / period)} times a second"
     return f"{WORDS[place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
@@ -87,7 +167,7 @@ def _shape_dict(shape: Shape) -> dict[str, Any]:
 
 def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[str, ...], *, in_step: bool) -> str:
     """What was learned, and what it resembles; `in_step` with the logs as they begin."""
-    where = place_and_variables(curve.place, list(curve.variables), curve.period)
+    where = place_and_variables(curve.place, list(curve.variables), curve.period, None)
     said = [f"A learned {where}, stands for what is missing."]
     if curve.period is not None:
         phase = "with the same phase at the start of every log" if in_step else "begins each log in another phase"
@@ -100,9 +180,14 @@ def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[st
             f"Of the simple forms `{best.expression}`{named} is closest: it accounts for "
             f"{formatting.percent(best.explained)} of its mean square over the data."
         )
-    if doubted:
-        said.append(
-            f"{formatting.words(list(doubted))} explained a part, but what was learned explains more and does not "
-            "look like it: the name would be wrong."
-        )
-    return " ".join(said)
+    return " ".join([*said, *_doubted(doubted)])
+
+
+def _doubted(names: tuple[str, ...]) -> list[str]:
+    """What is said of names that what was learned contradicts."""
+    if not names:
+        return []
+    return [
+        f"{formatting.words(list(names))} explained a part, but what was learned explains more and does not look like "
+        "it: the name would be wrong."
+    ]

@@ -10,8 +10,9 @@ from fitting import findings
 from fitting.close_loop import Loop
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly
+from fitting.learned_curve import LearnedCurve
 from fitting.next_experiment import NextExperiment
-from fitting.plots import Plot, evidence_plot, fit_plots, learned_plot, next_experiment_plot, plots
+from fitting.plots import Plot, evidence_plot, fit_plots, learned_plot, next_experiment_plot, plots, response_plot
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
@@ -115,8 +116,10 @@ def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperim
         quantities = {"torque": "N m", "error": "rad"} | UNITS
         in_log = {name: unit_in_log(unit, outcome, units) for name, unit in quantities.items()}
         found += [evidence_plot(seen, units=in_log) for seen in outcome.evidence]
-        curve, told = curve_of(outcome), report["unknown"]
-        if curve is not None:
-            found.append(learned_plot(curve, unit=told["units"][curve.quantity], units=told["units"]))
+        learned, told = curve_of(outcome), report["unknown"]
+        if isinstance(learned, LearnedCurve):
+            found.append(learned_plot(learned, unit=told["units"][learned.quantity], units=told["units"]))
+        elif learned is not None:
+            found.append(response_plot(learned, unit=unit_in_log("N m/rad", outcome, units)))
         return found + last
     return fit_plots(outcome, units=units) + last

@@ -40,3 +40,6 @@ from hdjax.effects.effect import (
 from hdjax.effects.effect import (
     SensorEffect as SensorEffect,
 )
+from hdjax.effects.effect import (
+    ShaftEffect as ShaftEffect,
+)

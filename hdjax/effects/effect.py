@@ -178,35 +178,35 @@ class Effect(eqx.Module):
         raise ValueError(f"`{self.name}` has no internal states")
 
 
-class MotorSideEffect(Effect):
-    """Adds a torque to the motor's equation."""
+class ShaftEffect(Effect):
+    """Adds a torque to the equation of a shaft, and may have some of its inertia."""
 
     needs_motor: ClassVar[bool] = True
-    drawn_against: ClassVar[str | None] = "omega_m"
 
     @abc.abstractmethod
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        """Torque on the motor, along +theta_m [N m]."""
-
-
-class LoadSideEffect(Effect):
-    """Adds a torque to the load's equation."""
-
-    needs_motor: ClassVar[bool] = True
-    drawn_against: ClassVar[str | None] = "omega_l"
-
-    @abc.abstractmethod
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        """Torque on the load, along +theta_l [N m]."""
+        """Torque on the shaft, along its positive direction [N m]."""
 
     def inertia_taken(self, drive: Drive) -> Array:
-        """Inertia that is not on the load, although the drive's J_l counts it [kg m^2]."""
+        """Inertia that is not on the shaft, although the drive's J_m or J_l counts it [kg m^2]."""
         return jnp.zeros_like(drive.J_l)
 
     @classmethod
     def takes_inertia(cls) -> bool:
         """Whether there is such inertia."""
-        return cls.inertia_taken is not LoadSideEffect.inertia_taken
+        return cls.inertia_taken is not ShaftEffect.inertia_taken
+
+
+class MotorSideEffect(ShaftEffect):
+    """Adds a torque to the motor's equation."""
+
+    drawn_against: ClassVar[str | None] = "omega_m"
+
+
+class LoadSideEffect(ShaftEffect):
+    """Adds a torque to the load's equation."""
+
+    drawn_against: ClassVar[str | None] = "omega_l"
 
 
 class MeshTorqueEffect(Effect):

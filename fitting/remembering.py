@@ -1,0 +1,118 @@
+"""A torque with a memory of its own, where no function of the present motion explains what is missing."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from fitting.along import place_of
+from fitting.attribution import try_lead
+from fitting.learned_look import LearnedLook, own_functions
+from fitting.screening import Lead, Screen, screen
+from fitting.shortlist import worth_a_refit
+from fitting.trial import Data, Setting, Trial
+from hdjax.effects.learned import LearnedMeshTorque
+from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY, LearnedMemory
+
+# Laws that are put inside the equations, the likeliest first.
+_TRIED = 2
+
+
+class Remembered(eqx.Module):
+    """A law with memory at a place, as the first look sees it.
+
+    Attributes:
+        form: the law.
+        gain: decrease of the objective on held-out data, to first order.
+        known: what the free parameters stand for at its place, at the instants that are kept.
+    """
+
+    form: type[LearnedMemory] = eqx.field(static=True)
+    gain: float
+    known: Float[np.ndarray, "instants known"]
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """What it remembers."""
+        return (self.form.angle,)
+
+    @property
+    def of(self) -> tuple[type[LearnedMemory], tuple[str, ...]]:
+        """Law and variable."""
+        return self.form, self.variables
+
+
+class Remembering(eqx.Module):
+    """What torques with memory would explain.
+
+    Attributes:
+        candidates: places and laws, best first by the first look.
+        screen: that look.
+    """
+
+    candidates: tuple[Remembered, ...]
+    screen: Screen
+
+    def put_inside(
+        self,
+        before: Trial,
+        data: Data,
+        setting: Setting,
+        *,
+        rival: tuple[object, Trial] | None,
+        progress: Callable[[str], None],
+    ) -> tuple[Remembered, Trial] | None:
+        """The candidate that explains most inside the equations, of the likeliest ones, and the model with it.
+
+        Args:
+            before: the model that was looked at.
+            data: the stretches.
+            setting: how they are cut.
+            rival: what else was learned, and a model that it has to better.
+            progress: told what is being done.
+        """
+        best: tuple[Remembered, Trial] | None = None
+        limit = (before if rival is None else rival[1]).training.objective
+        leads = {type(lead.effect): lead for lead in self.screen.leads}
+        for candidate in self.candidates[:_TRIED]:
+            progress(f"learning a {candidate.form.name.replace('_', ' ')}")
+            trial = try_lead(before, leads[candidate.form], data, setting, limit)
+            if trial is not None and (best is None or trial.gain_over(before) > best[1].gain_over(before)):
+                best, limit = (candidate, trial), trial.training.objective
+        return best
+
+
+def remembering(
+    before: Trial, seen: LearnedLook, *, least: float, seed: int, progress: Callable[[str], None]
+) -> Remembering:
+    """Look for torques with memory.
+
+    Where an effect of the model remembers already, no further memory is looked for: two of the same thing could not be
+    told apart.
+
+    Args:
+        before: the model.
+        seen: a look at it.
+        least: gain to first order that is worth a refit.
+        seed: of the surrogates behind the p-values.
+        progress: told what is being done.
+    """
+    taken = {place_of(e) for e in before.model.effects if e.states}
+    forms = [form for form in LEARNED_WITH_MEMORY if place_of(form) not in taken]
+    progress("looking for a memory")
+    screened = screen(before.training, before.held_out, catalogue=forms, seed=seed)
+    worth = worth_a_refit(screened, least=least)
+    return Remembering(tuple(_remembered(lead, seen) for lead in worth), screened)
+
+
+def _remembered(lead: Lead, seen: LearnedLook) -> Remembered:
+    form = type(lead.effect)
+    assert issubclass(form, LearnedMemory)
+    place = place_of(form)
+    known = np.zeros((seen.instants.size, 0))
+    if place is LearnedMeshTorque:
+        own = own_functions(seen, place)
+        known = own.reshape(-1, own.shape[2])[seen.instants]
+        known = known[:, np.any(known != 0.0, axis=0)]
+    return Remembered(form, lead.gain, known)

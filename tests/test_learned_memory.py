@@ -1,0 +1,270 @@
+"""The learned torques with memory: which known laws they are, and that they are found where no function will do."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rig
+from fitting.along import place_of
+from fitting.close_loop import Loop, _base_trial, close_loop
+from fitting.experiment import experiment_from_log, split
+from fitting.learned_look import learned_look
+from fitting.learned_response import learned_response
+from fitting.model_file import StoredModel, read_model, to_json
+from fitting.plots import response_plot
+from fitting.remembering import remembering
+from fitting.report import write_report
+from fitting.screening import Screen
+from fitting.uncertainty import Estimate, Uncertainty
+from fitting.unknown import share_of
+from hdjax import Model
+from hdjax.effects import Effect, Motion, Scales
+from hdjax.effects.hysteresis import BoucWen, Dahl, SharpBoucWen
+from hdjax.effects.learned import FAMILY, LearnedMeshTorque
+from hdjax.effects.learned_memory import (
+    LEARNED_WITH_MEMORY,
+    Lagging,
+    LaggingLoadTorque,
+    LaggingMeshTorque,
+    LaggingMotorTorque,
+    LearnedMemory,
+    Yielding,
+    YieldingMeshTorque,
+    YieldingMotorTorque,
+)
+from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
+from hdjax.effects.stiffness import QuadraticStiffness
+
+BASE = rig.drive_model()
+J_L = float(BASE.drive.J_l)
+STATE = jnp.asarray([0.4, 0.0075, 3.0, -0.4])
+SCALES = Scales(x=1e-3, x_max=3e-3, v=0.3, omega_m=12.0, omega_l=0.2, time_step=5e-4, duration=2.0, omega_0=380.0)
+SPANS = {"lag_span": 1.0, "rate_span": 1.0}
+COUNT, NOISE = 1600, 1e-3
+
+every_form = pytest.mark.parametrize("form", LEARNED_WITH_MEMORY, ids=lambda form: form.name)
+
+
+def rates(effect: Effect, own: list[float]) -> np.ndarray:
+    state = jnp.concatenate([STATE, jnp.asarray(own)])
+    return np.asarray(BASE.with_effects(effect).rates(state, jnp.asarray(0.3), jnp.zeros(())))
+
+
+@every_form
+def test_without_strength_it_is_gone_and_its_states_stay_finite(form: type[LearnedMemory]):
+    assert form.family == FAMILY
+    for effect in form.proposals(SCALES):
+        own = np.asarray(effect.initial_state(BASE.motion(STATE)))
+        found = rates(effect, own.tolist())
+        np.testing.assert_array_equal(found[:4], np.asarray(BASE.rates(STATE, jnp.asarray(0.3), jnp.zeros(()))))
+        assert np.isfinite(found).all() and np.all(np.asarray(effect.state_scale()) > 0)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_load_that_lags_is_a_third_inertia(beside: bool):
+    share, omega, zeta = 0.3, 250.0, 0.04
+    form = ResonanceBesideLoad if beside else ExtraResonance
+    known = form(mass_ratio=share, omega_3=omega, zeta=zeta, twist_span=1.0, rate_span=1.0)
+    k, b = share * J_L * omega**2, 2 * zeta * omega * share * J_L
+    same = LaggingLoadTorque(k=k, b=b, omega=omega, zeta=zeta, share=0.0 if beside else share, **SPANS)
+    own = [2e-3, -0.7]
+    np.testing.assert_allclose(rates(same, own), rates(known, own), rtol=1e-12)
+    np.testing.assert_array_equal(same.initial_state(BASE.motion(STATE)), known.initial_state(BASE.motion(STATE)))
+
+
+def test_a_share_of_the_motor_may_lag_with_it():
+    """With all that lags tied to the motor for good, the motor is what it was."""
+    J_m, share, omega = float(BASE.drive.J_m), 0.4, 300.0
+    k, b = share * J_m * omega**2, 0.2 * omega * share * J_m
+    taken = LaggingMotorTorque(k=k, b=b, omega=omega, zeta=0.1, share=share, **SPANS)
+    motion = BASE.motion(STATE)
+    found = rates(taken, [0.0, float(STATE[2])])
+    bare = np.asarray(BASE.rates(STATE, jnp.asarray(0.3), jnp.zeros(())))
+    assert found[2] == pytest.approx(bare[2] / (1.0 - share), rel=1e-12)
+    assert np.asarray(taken.state_rates(motion, jnp.asarray([0.0, STATE[2]])))[1] == 0.0
+    # Slowly enough nothing lags: the share moves along, and the whole inertia is felt.
+    slow = taken.stiffness(jnp.asarray(1e-3 * omega), BASE.drive)
+    assert abs(complex(slow)) < 1e-5 * share * J_m * (1e-3 * omega) ** 2
+
+
+@pytest.mark.parametrize("omega", [20.0, 200.0, 900.0])
+def test_the_stiffness_of_what_lags_is_that_of_its_equations(omega: float):
+    effect = LaggingMeshTorque(k=500.0, b=0.7, omega=210.0, zeta=0.3, **SPANS)
+    zero = jnp.zeros(())
+
+    def of(x, v, state):
+        motion = Motion(x=x, v=v)
+        return effect.state_rates(motion, state), effect.torque(motion, BASE.drive, state)
+
+    A, B = (np.asarray(jax.jacobian(lambda s, v: of(zero, v, s)[0], i)(jnp.zeros(2), zero)) for i in (0, 1))
+    C, D = (np.asarray(jax.jacobian(lambda s, v: of(zero, v, s)[1], i)(jnp.zeros(2), zero)) for i in (0, 1))
+    s = 1j * omega
+    wanted = (C @ np.linalg.solve(s * np.eye(2) - A, B) + D) * s
+    assert complex(effect.stiffness(jnp.asarray(omega), BASE.drive)) == pytest.approx(wanted, rel=1e-9)
+
+
+YIELD, RATIO = 3e-4, 0.4
+KNOWN = {
+    "Dahl": (Dahl(k=900.0, yield_twist=YIELD, settling=1e-12), {"reach": YIELD, "bow": 0.0, "back": 1.0}),
+    "Bouc-Wen": (
+        BoucWen(k=900.0, memory_twist=YIELD, ratio=RATIO),
+        {"reach": YIELD / (1 + RATIO), "bow": 0.0, "back": (1 - RATIO) / (1 + RATIO)},
+    ),
+    "Bouc-Wen with n = 2": (
+        SharpBoucWen(k=900.0, memory_twist=YIELD, ratio=RATIO),
+        {"reach": YIELD / (1 + RATIO) ** 0.5, "bow": 1.0, "back": 0.0, "back_bow": (1 - RATIO) / (1 + RATIO)},
+    ),
+}
+
+
+@pytest.mark.parametrize("known", KNOWN)
+@given(share=st.floats(-1.0, 1.0), backwards=st.booleans())
+@settings(max_examples=20, deadline=None)
+def test_what_yields_is_a_known_hysteresis(known: str, share: float, backwards: bool):
+    effect, shape = KNOWN[known]
+    same = YieldingMeshTorque(k=900.0, **{"back": 0.0, "back_bow": 0.0} | shape)
+    motion = Motion(x=jnp.zeros(()), v=jnp.asarray(-0.2 if backwards else 0.2))
+    state = jnp.asarray([share * shape["reach"]])
+    found, wanted = (np.asarray(e.state_rates(motion, state)) for e in (same, effect))
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9)
+    assert float(same.torque(motion, BASE.drive, state)) == float(effect.torque(motion, BASE.drive, state))
+
+
+@given(bow=st.floats(0.0, 1.0), back=st.floats(0.0, 2.0), swing=st.floats(0.1, 30.0))
+@settings(max_examples=15, deadline=None)
+def test_what_yields_saturates_and_takes_energy(bow: float, back: float, swing: float):
+    reach, steps = 1e-3, 4000
+    effect = YieldingMotorTorque(k=5.0, reach=reach, bow=bow, back=back)
+    phase = np.linspace(0.0, 4 * np.pi, steps)
+    moves = jnp.asarray(swing * reach * np.cos(phase))
+    h = phase[1] - phase[0]
+
+    def step(z, omega):
+        motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=omega, theta_m=jnp.zeros(()))
+        middle = z + 0.5 * h * effect.state_rates(motion, z)
+        return z + h * effect.state_rates(motion, middle), effect.torque(motion, BASE.drive, middle) * omega
+
+    z, power = jax.lax.scan(step, jnp.zeros(1), moves)
+    assert abs(float(z[0])) < 1.01 * reach
+    # Of the second round, whose start and end are the same.
+    assert float(jnp.sum(power[steps // 2 :])) < 0.0
+
+
+@every_form
+def test_it_is_read_as_it_was_written(form: type[LearnedMemory], tmp_path: Path):
+    effect = form.proposals(SCALES)[0]
+    stored = StoredModel(
+        BASE.with_effects(effect).replace({f"{form.name}.k": 1 / 7}), "linear", 2, 4, 1e-12 * jnp.eye(2)
+    )
+    path = tmp_path / "model.json"
+    path.write_text(to_json(stored))
+    (read,) = read_model(path).model.effects
+    assert type(read) is form and float(read.k) == 1 / 7
+
+
+def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    def screen(training, held_out, *, catalogue, seed):
+        asked.extend(catalogue)
+        return Screen((), np.zeros(1))
+
+    monkeypatch.setattr("fitting.remembering.screen", screen)
+    data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
+    before = _base_trial(rig.reduced_model(), data, "zero-order")[0]
+    seen = learned_look(before.training)
+    before = replace(before, model=before.model.with_effects(KNOWN["Dahl"][0]))
+    remembering(before, seen, least=0.1, seed=0, progress=lambda message: None)
+    assert set(asked) == {form for form in LEARNED_WITH_MEMORY if place_of(form) is not LearnedMeshTorque}
+
+
+def yielding_log() -> Loop:
+    """A loop over logs of a spring that yields (Bouc-Wen, written down again), of which the catalogue knows nothing."""
+    forcing = rig.reduced_forcing(COUNT, rms=14.0)
+    k, beta, gamma = 0.35 * rig.OMEGA_0**2, 2.0, 0.8
+
+    def rates(y, u):
+        x, v, z = y
+        spring = rig.OMEGA_0**2 * (x + rig.REDUCED_ALPHA * x**3)
+        return v, rig.GAIN * u - rig.MU * v - spring - k * z, v - beta * abs(v) * z - gamma * v * abs(z)
+
+    motion = rig.rk4(rates, (0.0, 0.0, 0.0), forcing, rig.REDUCED_STEP, 10)
+    log = replace(rig.reduced_log(motion[:, 0], forcing, noise=NOISE), name="yielding")
+    experiment = experiment_from_log(log, hold="zero-order")
+    placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
+    return close_loop(
+        placeholder,
+        {"zero-order": (experiment,)},
+        catalogue=(QuadraticStiffness,),
+        hold="zero-order",
+        max_effects=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def yielded() -> Loop:
+    return yielding_log()
+
+
+def test_hysteresis_without_a_name_is_learned_with_its_memory(yielded: Loop):
+    assert yielded.decision == "unexplained" and yielded.unknown is not None
+    assert [f.name for f in yielded.findings] == [YieldingMeshTorque.name]
+    assert yielded.after.validation_rmse < 1.2 * NOISE < 0.2 * yielded.before.validation_rmse
+    assert yielded.findings[0].p_value <= 0.01
+    assert float(yielded.after.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=5e-3)
+
+
+def test_what_was_learned_comes_out_as_the_hysteresis_that_it_is(yielded: Loop):
+    """Where a name stands, memory and all, what is learned in its place confirms it."""
+    found = yielded.unknown
+    assert found is not None
+    training = found.trial.training
+    effect = training.model.effects[0]
+    assert isinstance(effect, Yielding)
+    # The same torque under its other name, along the same states.
+    named = BoucWen(k=effect.k, memory_twist=effect.reach, ratio=0.0)
+    model = found.before.model.with_effects(named)
+    names = {"yielding_mesh_torque.z": "bouc_wen.z"}
+    assert model.state_names[2:] == tuple(names.values())
+    assert share_of(training.model, found, training) > 0.99
+    assert share_of(model, found) < 0.1  # at rest it does nothing
+
+
+def test_the_report_tells_what_yields(yielded: Loop, tmp_path: Path):
+    stored = StoredModel(yielded.after.model, yielded.hold, yielded.after_substeps, yielded.setting.halo, yielded.noise)
+    units = {"dynamic_error": "V", "forcing": "V"}
+    paths = write_report(tmp_path, yielded, model_json=to_json(stored), units=units)
+    report = json.loads(paths["report.json"].read_text())
+    told = report["unknown"]
+    assert (told["place"], told["variables"], told["memory"]) == ("mesh", ["x"], "yields")
+    assert told["coefficients"] == 5 and told["symbolic"]["families"] == ["hysteresis"]
+    assert "yields to the twist" in report["summary"]
+    page = paths["report.html"].read_text()
+    assert "What the learned torque looks like" in page and 'id="evidence-yielding-mesh-torque"' in page
+    assert read_model(paths["model.json"]).model.effects[0].name == YieldingMeshTorque.name
+
+
+def test_the_response_of_what_lags_is_drawn_with_its_band():
+    effect = LaggingLoadTorque(k=900.0, b=0.5, omega=250.0, zeta=0.1, **SPANS)
+    model = BASE.with_effects(effect)
+    paths = ["K", *(f"{effect.name}.{n}" for n in ("k", "b", "omega", "zeta", "share"))]
+    stds = [1.0, 9.0, 0.0, 0.0, 0.0, 0.0]
+    estimates = {
+        p: Estimate(p, float(model.get(p)), s, s, (0.0, 1.0), "1", True) for p, s in zip(paths, stds, strict=True)
+    }
+    found = learned_response(effect.name, model, Uncertainty(estimates, np.eye(6), np.eye(6), np.eye(6)))
+    assert (found.place, found.angle) == ("load", "theta_l")
+    wanted = np.abs(np.asarray(effect.stiffness(jnp.asarray(2 * np.pi * found.frequency), BASE.drive)))
+    np.testing.assert_allclose(found.stiffness, wanted, rtol=1e-9)
+    # Where the spring alone counts, a hundredth of k is a hundredth of the whole.
+    assert found.std[0] == pytest.approx(0.01, rel=1e-2)
+    assert isinstance(effect, Lagging)
+    drawn = response_plot(found, unit="N m/rad")
+    assert drawn.title == "The learned torque on the load" and len(drawn.figure["data"]) == 2
