@@ -23,6 +23,8 @@ from hdjax.effects.learned import LearnedMeshTorque
 from hdjax.effects.learned_axes import axes_over
 
 NOISE = 1e-3
+AXES = axes_over({"v": (-1.0, 1.0)})[0]
+LEARNED = LearnedMeshTorque.made_of(AXES, np.eye(AXES[0].count)[:, :1], (1.0,))
 
 
 @pytest.mark.parametrize(
@@ -63,12 +65,12 @@ def test_when_names_stand(
     ("names", "white", "times_noise", "imperfect", "asks_for"),
     [
         (2, True, 1.0, False, []),
-        (2, True, 100.0, False, ["beside", "instead"]),  # white, but no noise: of the motor's angle, say
+        (2, True, 100.0, False, ["instead", "beside"]),  # white, but no noise: of the motor's angle, say
         (2, False, 100.0, True, []),
-        (2, False, 100.0, False, ["beside", "instead"]),
+        (2, False, 100.0, False, ["instead", "beside"]),
         (3, True, 1.0, False, ["instead"]),  # many names that leave but noise
         (3, False, 100.0, True, ["instead"]),
-        (3, False, 100.0, False, ["beside", "instead"]),
+        (3, False, 100.0, False, ["instead", "beside"]),
     ],
 )
 def test_what_is_learned_to_doubt_names(
@@ -96,6 +98,33 @@ def test_what_is_learned_to_doubt_names(
     options = {"noise": noise, "seed": 0, "progress": lambda message: None}
     assert doubt.what_is_unknown(base, named, {}, setting, **options) == (named, None)
     assert asked == asks_for
+
+
+@pytest.mark.parametrize(("alike", "asks_for"), [(0.5, ["instead"]), (0.9, ["instead", "beside"])])
+def test_where_what_stands_in_their_place_leaves_noise_nothing_is_learned_beside_names(
+    base: Trial, alike: float, asks_for: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    """Unless it has come out as what they name."""
+    named = eqx.tree_at(lambda t: t.model.effects, base, (TorqueBias(),))
+    asked = []
+
+    def learn(before, *args, **options):
+        asked.append("instead" if before is base else "beside")
+        chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros(4), np.zeros((2, 1)))
+        found = Unknown(
+            base, base, (), chosen, np.arange(2), np.zeros((2, 2)), Conditions(), np.ones((2, 2)), 2.0, 0.005
+        )
+        return found if before is base else None
+
+    monkeypatch.setattr(doubt, "_leaves_noise", lambda trial, noise: trial is base)
+    monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base, noise: (False, noise))
+    monkeypatch.setattr(doubt, "share_of", lambda model, found, fit: alike)
+    monkeypatch.setattr(doubt, "learn", learn)
+    noise = MeasurementNoise((NOISE / 100.0) ** 2 * jnp.eye(1), ())
+    options = {"noise": noise, "seed": 0, "progress": lambda message: None}
+    trusted, unknown = doubt.what_is_unknown(base, named, {}, Setting(32, 4, 1, 8), **options)
+    assert asked == asks_for
+    assert (trusted is base) == (unknown is not None) == (alike < 0.75)
 
 
 @pytest.mark.parametrize(
@@ -158,16 +187,15 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
     monkeypatch.setattr(doubt, "told_from_zero", lambda fit, names: told)
     monkeypatch.setattr(doubt, "_refitted_without", refitted_without)
     names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
-    (axes, *_) = axes_over({"v": (-1.0, 1.0)})
-    learned = LearnedMeshTorque.made_of(axes, np.eye(axes[0].count)[:, :1], (1.0,))
-    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, learned, np.zeros(4), np.zeros((2, 1)))
-    named, trial = with_effects(*names, objective=-5.0), with_effects(*names, learned, objective=-7.0)
+    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros(4), np.zeros((2, 1)))
+    named, trial = with_effects(*names, objective=-5.0), with_effects(*names, LEARNED, objective=-7.0)
     motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
-    beside = Unknown(named, trial, (), chosen, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
+    instants = np.arange(2)
+    beside = Unknown(named, trial, (), chosen, instants, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
     bare, beside = doubt._without_superfluous(base, named, beside, {}, Setting(32, 4, 1, 8))
     assert {e.name for e in bare.model.effects} == left
     assert (bare is base) == (left == set()) and beside.before is bare
-    assert {e.name for e in beside.trial.model.effects} == left | {learned.name}
+    assert {e.name for e in beside.trial.model.effects} == left | {LEARNED.name}
     # The states of what fell are gone with it; creep has one.
     assert beside.states.shape == beside.push.shape == (2, 3 if "creep" in left else 2)
     assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)

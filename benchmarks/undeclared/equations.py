@@ -170,6 +170,13 @@ def _pulls(t, y, u, brake, warm, p, out):
         across = p.third_stiffness * (lam - y[4]) + p.third_damping * (r - y[5])
         out[4], out[5] = y[5], across / p.third_inertia
         load -= across
+    if p.wheel_inertia > 0.0:
+        across = p.wheel_stiffness * (phi - y[16]) + p.wheel_damping * (w - y[17])
+        out[16], out[17] = y[17], across / p.wheel_inertia
+        motor -= across
+    if p.tie > 0.0:
+        out[18] = (lam - y[18]) / p.tie_time
+        load -= p.tie * (lam - y[18])
     return motor, load
 
 

@@ -370,6 +370,21 @@ def _swing(s, random, base):
     return {"swing": s, "swing_phase": _phase(random)}
 
 
+def _wheel(s, random, base):
+    """Strength: the wheel's inertia over the motor's."""
+    inertia, omega = s * base.motor_inertia, base.omega_0 * _between(random, 0.3, 1.5)
+    return {
+        "wheel_inertia": inertia,
+        "wheel_stiffness": omega**2 * inertia,
+        "wheel_damping": 2 * random.uniform(0.02, 0.1) * omega * inertia,
+    }
+
+
+def _tie(s, random, base):
+    """Strength: stiffness of the tie over K."""
+    return {"tie": s * base.k1, "tie_time": _between(random, 0.02, 0.3)}
+
+
 def _leaning_damping(s, random, base):
     """Strength: how much more the mesh damps one way, over B_sp."""
     return {"c_lean": _sign(random) * s * base.c1}
@@ -443,6 +458,8 @@ FORMS = (
     Form("unknown", "damping that leans", 0.1, 0.8, _leaning_damping),
     Form("unknown", "hum of the amplifier", 0.01, 0.15, _hum),
     Form("unknown", "hum that goes on", 0.01, 0.15, _hum, goes_on=True),
+    Form("unknown", "wheel on a soft coupling", 0.05, 0.5, _wheel),
+    Form("unknown", "tie that gives way in time", 3e-4, 0.03, _tie),
 )
 
 FAMILIES = tuple(dict.fromkeys(form.family for form in FORMS))

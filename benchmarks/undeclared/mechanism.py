@@ -9,7 +9,8 @@ KNOTS = 720
 
 STATES = (
     "motor_angle motor_rate load_angle load_rate third_angle third_rate bouc_wen "
-    "slip_1 slip_2 slip_3 slip_4 motor_bristle load_bristle creep_1 creep_2 lagged_torque"
+    "slip_1 slip_2 slip_3 slip_4 motor_bristle load_bristle creep_1 creep_2 lagged_torque "
+    "wheel_angle wheel_rate tie"
 ).split()
 
 _NONE_2, _NONE_3, _NONE_4 = np.zeros(2), np.zeros(3), np.zeros(4)
@@ -40,7 +41,7 @@ class Mechanism(NamedTuple):
     # When the log begins [s], on the clock of what comes back in time.
     begun: float = 0.0
     # Motor: dry friction that holds and slides (with a Stribeck rate, a lean to one side, a ripple), or bristles; drag,
-    # windage; a torque that drifts [N m/s], one that hums; cogging lines.
+    # windage; a torque that drifts [N m/s], one that hums; cogging lines; a wheel on a soft coupling.
     hold_m: float = 0.0
     slide_m: float = 0.0
     sink_m: float = 1.0
@@ -59,6 +60,9 @@ class Mechanism(NamedTuple):
     cog: np.ndarray = _NONE_3
     cog_order: np.ndarray = _NONE_3
     cog_phase: np.ndarray = _NONE_3
+    wheel_inertia: float = 0.0
+    wheel_stiffness: float = 0.0
+    wheel_damping: float = 0.0
     # Teeth: error at KNOTS angles of the motor, and its slope there; modulated once per output revolution.
     teeth: np.ndarray = np.zeros(KNOTS)
     teeth_slope: np.ndarray = np.zeros(KNOTS)
@@ -108,7 +112,7 @@ class Mechanism(NamedTuple):
     warm_k: float = 0.0
     warm_c: float = 0.0
     # Load: friction likewise, weight, tether to the ground, three lobes in a turn, an inertia that swings, unlogged
-    # pushes, a third inertia.
+    # pushes, a third inertia, a tie to the ground that gives way in time.
     hold_l: float = 0.0
     slide_l: float = 0.0
     sink_l: float = 1.0
@@ -129,6 +133,8 @@ class Mechanism(NamedTuple):
     third_inertia: float = 0.0
     third_stiffness: float = 0.0
     third_damping: float = 0.0
+    tie: float = 0.0
+    tie_time: float = 1.0
     # Encoders: what each reads beyond the angle.
     motor_disc: float = 0.0
     motor_disc_order: float = 1.0
