@@ -26,7 +26,7 @@ from fitting.posing import segment_length
 from fitting.screening import programs_ahead
 from fitting.surprise import SURPRISED, surprise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
-from fitting.unknown import Unknown
+from fitting.unknown import Unknown, learn_supported
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -76,7 +76,7 @@ class Loop(eqx.Module):
         after_substeps: solver steps in a sample interval of the final model.
         stretches: training and held-out stretches.
         surprise: how much farther off than they promised free runs of held-out stretches are where effects were found
-            that do not explain them; None elsewhere.
+            that do not explain them, and nothing was learned that does better; None elsewhere.
         put_back: by how much the clock of each log was put back [s], so that a line is in phase.
         seconds: where the time went.
     """
@@ -150,7 +150,6 @@ def close_loop(
     clock.lap("attribution")
     trusted, unknown = what_is_unknown(base, named, data, setting, noise=seen_noise, seed=seed, progress=progress)
     clock.lap("unknown effects")
-    fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
     best = named if unknown is None else unknown.trial
     noise = seen_noise.and_beside(best.training).covariance
     decision = _decide(base, trusted, unknown, noise)
@@ -173,12 +172,22 @@ def close_loop(
         surprised = surprise(final, before, after, validation, noise=noise, halo=setting.halo)
         if surprised is not None and surprised > SURPRISED:
             decision = "unexplained"
+            # What follows over long times may be learned in the place of names that do not.
+            instead = learn_supported(base, data, setting, seed=seed, progress=progress)
+            if instead is not None:
+                other = long_fit(instead.trial.training)
+                then = account(other, *data[base.hold], noise=noise, halo=setting.halo)
+                if then.validation_rmse < after.validation_rmse:
+                    trusted, unknown, current = base, instead, instead.trial
+                    training, validation = data[current.hold]
+                    final, after, surprised = other, then, None
 
     def rmse_of(trial: Trial) -> float:
         if trial is base:
             return before.validation_rmse
         return validation_rmse(trial.training, *data[trial.hold], noise=noise, halo=setting.halo)
 
+    fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
     by_name = after.validation_rmse if unknown is None else rmse_of(trusted)
     if trusted is not named:
         kept = [] if trusted is base else [n for n in without if n not in fallen]

@@ -11,7 +11,7 @@ from fitting.compare import EXCESS, excess
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
-from fitting.unknown import Unknown, is_supported, learn, share_of
+from fitting.unknown import Unknown, learn_supported, share_of
 
 # Share of a learned torque's mean square that named effects must make up for it to have come out as them.
 _COME_OUT = 0.75
@@ -58,13 +58,13 @@ def what_is_unknown(
     little = _explain_all_but_little(base, named, noise)
     instead = None
     if named is not base and not enough and not little:
-        instead = _learned(base, data, setting, seed=seed, progress=progress)
+        instead = learn_supported(base, data, setting, seed=seed, progress=progress)
         if instead is not None and _leaves_noise(instead.trial, noise) and not _has_come_out(instead, named, base):
             # Nothing beside the names could be better.
             return base, instead
     beside = None
     if not enough:
-        beside = _learned(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
+        beside = learn_supported(named, data, setting.with_steps_of(named.training), seed=seed, progress=progress)
     if beside is not None:
         named, beside = _without_superfluous(base, named, beside, data, setting)
     if named is base:
@@ -77,7 +77,7 @@ def what_is_unknown(
     if beside is None and not enough and little:
         return named, None
     if enough or little:
-        instead = _learned(base, data, setting, seed=seed, progress=progress)
+        instead = learn_supported(base, data, setting, seed=seed, progress=progress)
     if instead is None:
         return named, beside
     rival = named if beside is None else beside.trial
@@ -93,14 +93,6 @@ def what_is_unknown(
         and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
     )
     return (named, beside) if stands else (base, instead)
-
-
-def _learned(
-    before: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
-) -> Unknown | None:
-    """What can be learned beside a model, where the data support it."""
-    found = learn(before, data, setting, seed=seed, progress=progress)
-    return found if is_supported(found) else None
 
 
 def _has_come_out(instead: Unknown, named: Trial, base: Trial) -> bool:

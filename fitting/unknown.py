@@ -132,6 +132,14 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     return Unknown(before, trial, ranked, chosen, instants, states, conditions, acting, gain, p_value)
 
 
+def learn_supported(
+    before: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
+) -> Unknown | None:
+    """[`learn`][], None also where the data do not support what was learned."""
+    found = learn(before, data, setting, seed=seed, progress=progress)
+    return found if is_supported(found) else None
+
+
 def _likeliest(
     found: Sequence[Candidate],
     best: tuple[Candidate, Trial] | None,

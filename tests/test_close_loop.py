@@ -1,5 +1,6 @@
 """The whole loop on a small scale: it names the effect that was hidden, and nothing where nothing was."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 
@@ -14,6 +15,7 @@ from fitting.experiment import Experiment, experiment_from_log
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.load import GravityLoad
 from hdjax.effects.stiffness import QuadraticStiffness
@@ -27,11 +29,11 @@ X_NOISE = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
 REDUCED_NOISE = 1e-3
 
 
-def reduced_loop(experiment: Experiment, **options) -> Loop:
+def reduced_loop(experiment: Experiment, *, catalogue: Sequence[type[Effect]] = REDUCED_CATALOGUE, **options) -> Loop:
     """With placeholders that are wrong by a factor of about a hundred, and one effect at most: further rounds compile
     as much again."""
     placeholder = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=REDUCED_CATALOGUE, max_effects=1, **options)
+    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=catalogue, max_effects=1, **options)
 
 
 def drive_loop(experiment: Experiment, **options) -> Loop:
@@ -182,8 +184,26 @@ def test_single_precision_is_refused():
 
 
 def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatch: pytest.MonkeyPatch):
-    """What is found over short segments is named all the same; more is missing."""
-    monkeypatch.setattr(import_module("fitting.close_loop"), "surprise", lambda *args, **options: 1.4)
+    """What is found over short segments is named all the same where nothing else can be learned; more is missing."""
+    module = import_module("fitting.close_loop")
+    monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
+    monkeypatch.setattr(module, "learn_supported", lambda *args, **options: None)
     loop = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION))
     assert [f.name for f in loop.findings] == ["coulomb_friction"]
     assert (loop.decision, loop.surprise) == ("unexplained", 1.4)
+
+
+@pytest.mark.slow
+def test_what_explains_whole_stretches_is_learned_in_place_of_names_that_do_not(monkeypatch: pytest.MonkeyPatch):
+    """Damping by the rate's square, made to pass for an explanation, stands for dry friction; a learned jump explains
+    more."""
+    module = import_module("fitting.close_loop")
+    monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
+    monkeypatch.setattr(module, "_decide", lambda *args: "effect_found")
+    monkeypatch.setattr(module, "what_is_unknown", lambda base, named, *args, **options: (named, None))
+    experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)
+    loop = reduced_loop(experiment, catalogue=(QuadraticDamping,))
+    assert [f.name for f in loop.findings] == ["learned_mesh_torque"]
+    assert loop.doubted == ("quadratic_damping",)
+    assert (loop.decision, loop.surprise) == ("unexplained", None)
+    assert loop.after.validation_rmse < 1.2 * REDUCED_NOISE

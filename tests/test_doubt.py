@@ -91,7 +91,7 @@ def test_what_is_learned_to_doubt_names(
 
     monkeypatch.setattr(doubt, "leaves_white_noise", lambda fit: white)
     monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base, noise: (imperfect, noise))
-    monkeypatch.setattr(doubt, "learn", learn)
+    monkeypatch.setattr(doubt, "learn_supported", learn)
     setting = Setting(32, 4, 1, 8)
     # Both leave so much.
     noise = MeasurementNoise((NOISE / times_noise) ** 2 * jnp.eye(1), (base.training, named.training))
@@ -119,7 +119,7 @@ def test_where_what_stands_in_their_place_leaves_noise_nothing_is_learned_beside
     monkeypatch.setattr(doubt, "_leaves_noise", lambda trial, noise: trial is base)
     monkeypatch.setattr(doubt, "leaves_imperfection", lambda before, base, noise: (False, noise))
     monkeypatch.setattr(doubt, "share_of", lambda model, found, fit: alike)
-    monkeypatch.setattr(doubt, "learn", learn)
+    monkeypatch.setattr(doubt, "learn_supported", learn)
     noise = MeasurementNoise((NOISE / 100.0) ** 2 * jnp.eye(1), ())
     options = {"noise": noise, "seed": 0, "progress": lambda message: None}
     trusted, unknown = doubt.what_is_unknown(base, named, {}, Setting(32, 4, 1, 8), **options)

@@ -40,7 +40,6 @@ from hdjax.effects.learned_memory import (
     YieldingMotorTorque,
 )
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
-from hdjax.effects.stiffness import QuadraticStiffness
 
 BASE = rig.drive_model()
 J_L = float(BASE.drive.J_l)
@@ -186,7 +185,7 @@ def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: p
 
 
 def yielding_log() -> Loop:
-    """A loop over logs of a spring that yields (Bouc-Wen, written down again), of which the catalogue knows nothing."""
+    """A loop over logs of a spring that yields (Bouc-Wen, written down again), with no names looked for."""
     forcing = rig.reduced_forcing(COUNT, rms=14.0)
     k, beta, gamma = 0.35 * rig.OMEGA_0**2, 2.0, 0.8
 
@@ -199,13 +198,7 @@ def yielding_log() -> Loop:
     log = replace(rig.reduced_log(motion[:, 0], forcing, noise=NOISE), name="yielding")
     experiment = experiment_from_log(log, hold="zero-order")
     placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    return close_loop(
-        placeholder,
-        {"zero-order": (experiment,)},
-        catalogue=(QuadraticStiffness,),
-        hold="zero-order",
-        max_effects=1,
-    )
+    return close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", max_effects=0)
 
 
 @pytest.fixture(scope="module")

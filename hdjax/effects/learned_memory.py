@@ -114,7 +114,6 @@ class LaggingMeshTorque(Lagging, MeshTorqueEffect):
     """Torque in the mesh that lags behind the twist."""
 
     name: ClassVar[str] = "lagging_mesh_torque"
-    drawn_against: ClassVar[str | None] = None
 
 
 class LaggingMotorTorque(Lagging, MotorSideEffect):
@@ -149,8 +148,8 @@ class Yielding(LearnedMemory):
     """Torque `k z` against an angle u, with `z' = u' f(z)` where u moves on and `z' = u' f(-z)` where it moves back.
 
     With s the deflection z over `reach`, `f = 1 - (1 - bow) s - bow s^2` on the way out, so that z saturates at
-    `reach`, and `f = 1 + back |s| + back_bow s^2` on the way back. Dahl's friction is `bow = 0,
-    back = 1`; Bouc-Wen leaves `back` open where n = 1, and where n = 2, with `bow = 1`, `back_bow`.
+    `reach`, and `f = 1 + back |s| + back_bow s^2` on the way back. With `bow = 0, back = 1` it is Dahl's friction, with
+    `bow = 0` Bouc-Wen's n = 1, and with `bow = 1, back = 0` its n = 2.
     """
 
     states: ClassVar[tuple[str, ...]] = ("z",)
