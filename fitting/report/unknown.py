@@ -17,7 +17,7 @@ from fitting.shapes import Shape, shapes
 from hdjax import ReducedModel
 from hdjax.effects.learned import Learned
 from hdjax.effects.learned_axes import UNITS
-from hdjax.effects.learned_memory import Lagging, LearnedMemory, Yielding
+from hdjax.effects.learned_memory import Lagging, LaggingShaftTorque, LearnedMemory, Yielding
 
 _WORDS = {
     "x": "twist",
@@ -133,9 +133,13 @@ def _formula(effect: LearnedMemory) -> str:
     u = effect.angle
     if isinstance(effect, Lagging):
         spring, damper = float(effect.omega) ** 2, 2 * float(effect.zeta) * float(effect.omega)
+        beside, inertia = "", ""
+        if isinstance(effect, LaggingShaftTorque):
+            beside = f" {effect.drag:+.4g} {u}'"
+            inertia = f", and {effect.share:.3g} of the shaft's inertia is not on it"
         return (
-            f"{effect.k:.4g} ({u} - y) {effect.b:+.4g} ({u}' - y') where y'' = {spring:.4g} ({u} - y) "
-            f"{damper:+.4g} ({u}' - y')"
+            f"{effect.k:.4g} ({u} - y) {effect.b:+.4g} ({u}' - y'){beside} where y'' = {spring:.4g} ({u} - y) "
+            f"{damper:+.4g} ({u}' - y'){inertia}"
         )
     assert isinstance(effect, Yielding)
     bow = float(effect.bow)

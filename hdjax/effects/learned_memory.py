@@ -102,12 +102,9 @@ class Lagging(LearnedMemory):
 
     def stiffness(self, omega: Array, drive: Drive | ReducedDrive) -> Array:
         """Torque against the angle, over the angle, at an angular frequency [N m/rad]; a complex number."""
-        taken = 0.0
-        if isinstance(self, ShaftEffect) and isinstance(drive, Drive):
-            taken = self.inertia_taken(drive)
         own = jax.lax.complex(self.omega**2 - omega**2, 2 * self.zeta * self.omega * omega)
         force = jax.lax.complex(-self.k * omega**2, -self.b * omega**3)
-        return force / own + jax.lax.complex(taken * omega**2, jnp.zeros_like(omega))
+        return force / own
 
 
 class LaggingMeshTorque(Lagging, MeshTorqueEffect):
@@ -116,29 +113,44 @@ class LaggingMeshTorque(Lagging, MeshTorqueEffect):
     name: ClassVar[str] = "lagging_mesh_torque"
 
 
-class LaggingMotorTorque(Lagging, MotorSideEffect):
-    """Torque on the motor that lags behind its angle; a share of the motor's inertia may lag with it."""
+class LaggingShaftTorque(Lagging, ShaftEffect):
+    """What lags behind a shaft, which may have a share of the shaft's inertia and a friction of its own: with
+    `- drag u'`, any linear torque with two states that does not hold the shaft at an angle.
+    """
+
+    against: ClassVar[float] = -1.0
+
+    drag: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction beside it", source=SOURCE, role="strength")
+    share: Scalar = parameter(
+        0.0, unit="1", doc="share of the shaft's inertia that lags", source=SOURCE, role="strength"
+    )
+
+    def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
+        return super().torque(motion, drive, state) - self.drag * self._moves(motion)
+
+    def stiffness(self, omega: Array, drive: Drive | ReducedDrive) -> Array:
+        assert isinstance(drive, Drive)
+        own = jax.lax.complex(self.inertia_taken(drive) * omega**2, self.drag * omega)
+        return super().stiffness(omega, drive) + own
+
+
+class LaggingMotorTorque(LaggingShaftTorque, MotorSideEffect):
+    """Torque on the motor that lags behind its angle."""
 
     name: ClassVar[str] = "lagging_motor_torque"
     angle: ClassVar[str] = "theta_m"
     rate: ClassVar[str] = "omega_m"
-    against: ClassVar[float] = -1.0
-
-    share: Scalar = parameter(0.0, unit="1", doc="share of J_m that lags", source=SOURCE, role="strength")
 
     def inertia_taken(self, drive: Drive) -> Array:
         return self.share * drive.J_m
 
 
-class LaggingLoadTorque(Lagging, LoadSideEffect):
-    """Torque on the load that lags behind its angle; a share of the load's inertia may lag with it."""
+class LaggingLoadTorque(LaggingShaftTorque, LoadSideEffect):
+    """Torque on the load that lags behind its angle."""
 
     name: ClassVar[str] = "lagging_load_torque"
     angle: ClassVar[str] = "theta_l"
     rate: ClassVar[str] = "omega_l"
-    against: ClassVar[float] = -1.0
-
-    share: Scalar = parameter(0.0, unit="1", doc="share of J_l that lags", source=SOURCE, role="strength")
 
     def inertia_taken(self, drive: Drive) -> Array:
         return self.share * drive.J_l
