@@ -37,6 +37,7 @@ from fitting.report import (
     write_report,
 )
 from fitting.report.limits import limits, parameter_note
+from fitting.report.summary import _change
 from fitting.starting_values import starting_models
 from fitting.uncertainty import Estimate, Uncertainty
 from fitting.web_page import environment
@@ -661,3 +662,21 @@ def test_shares_do_not_round_up_to_everything(share: float, shown: str):
 def test_what_is_no_number_leaves_a_gap_in_a_figure():
     template = environment({}).from_string("{{ figure | finite | tojson }}")
     assert template.render(figure={"y": [1.0, math.nan, -math.inf]}) == '{"y":[1.0,null,null]}'
+
+
+@pytest.mark.parametrize(
+    ("after", "said"),
+    [
+        (2e-6, "It removes 80 % of the held-out error, which falls from 10"),
+        (3e-5, "It explains short segments alone; over whole held-out stretches the error rises from 10"),
+        (None, "to a simulation that diverged."),
+    ],
+)
+def test_the_summary_claims_no_gain_where_the_error_rises(after: float | None, said: str):
+    report = {
+        "before": {"rmse": {"validation": 1e-5}},
+        "after": {"rmse": {"validation": after}},
+        "units": {"dynamic_error": "rad"},
+        "noise": {"dynamic_error": 1e-6},
+    }
+    assert said in _change("It", report)

@@ -35,20 +35,15 @@ def summary(report: Mapping[str, Any]) -> str:
         rest = ""
         if report["unknown"]:
             rest = f" More than noise is left, which has no name: a learned {_learned(report)}, stands for it."
-        remove = "Together they remove" if rest or len(families) > 1 else "It removes"
-        return (
-            f"{opening}: {found}.{rest} {remove} {_removed(before, after)} of the held-out error, which falls from "
-            f"{_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
-        )
+        several = bool(rest) or len(families) > 1
+        change = _change("Together they" if several else "It", report, several=several)
+        return f"{opening}: {found}.{rest} {change}"
     left = report["unexplained"]
     opening = "Something is missing that the catalogue does not explain."
     if families:
         opening = f"A part was found ({found}), but something else is missing that the catalogue does not explain."
     if report["unknown"]:
-        return (
-            f"{opening} A learned {_learned(report)}, removes {_removed(before, after)} of the held-out error, which "
-            f"falls from {_rmse(before, unit)} to {_against_noise(after, noise, unit, like=before)}."
-        )
+        return f"{opening} {_change(f'A learned {_learned(report)},', report)}"
     beyond = left["free_runs_times_expected"]
     if beyond is not None:
         return (
@@ -66,6 +61,17 @@ def summary(report: Mapping[str, Any]) -> str:
 def _learned(report: Mapping[str, Any]) -> str:
     unknown = report["unknown"]
     return place_and_variables(unknown["place"], unknown["variables"], unknown["period"], unknown["memory"])
+
+
+def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -> str:
+    """What became of the held-out error by what was found."""
+    before, after = (report[stage]["rmse"]["validation"] for stage in ("before", "after"))
+    unit, s = report["units"]["dynamic_error"], "" if several else "s"
+    then, now = _rmse(before, unit), _against_noise(after, report["noise"]["dynamic_error"], unit, like=before)
+    if before is not None and (after is None or after > before):
+        where = "short segments alone; over whole held-out stretches the error rises"
+        return f"{subject} explain{s} {where} from {then} to {now}."
+    return f"{subject} remove{s} {_removed(before, after)} of the held-out error, which falls from {then} to {now}."
 
 
 def _count(number: int) -> str:
