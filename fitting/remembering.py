@@ -23,14 +23,24 @@ class Remembered(eqx.Module):
     """A law with memory at a place, as the first look sees it.
 
     Attributes:
-        form: the law.
-        gain: decrease of the objective on held-out data, to first order.
+        lead: that look.
         known: what the free parameters stand for at its place, at the instants that are kept.
     """
 
-    form: type[LearnedMemory] = eqx.field(static=True)
-    gain: float
+    lead: Lead
     known: Float[np.ndarray, "instants known"]
+
+    @property
+    def form(self) -> type[LearnedMemory]:
+        """The law."""
+        form = type(self.lead.effect)
+        assert issubclass(form, LearnedMemory)
+        return form
+
+    @property
+    def gain(self) -> float:
+        """Decrease of the objective on held-out data, to first order."""
+        return self.lead.gain
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -74,10 +84,9 @@ class Remembering(eqx.Module):
         """
         best: tuple[Remembered, Trial] | None = None
         limit = (before if rival is None else rival[1]).training.objective
-        leads = {type(lead.effect): lead for lead in self.screen.leads}
         for candidate in self.candidates[:_TRIED]:
             progress(f"learning a {candidate.form.name.replace('_', ' ')}")
-            trial = try_lead(before, leads[candidate.form], data, setting, limit)
+            trial = try_lead(before, candidate.lead, data, setting, limit)
             if trial is not None and (best is None or trial.gain_over(before) > best[1].gain_over(before)):
                 best, limit = (candidate, trial), trial.training.objective
         return best
@@ -103,16 +112,13 @@ def remembering(
     progress("looking for a memory")
     screened = screen(before.training, before.held_out, catalogue=forms, seed=seed)
     worth = worth_a_refit(screened, least=least)
-    return Remembering(tuple(_remembered(lead, seen) for lead in worth), screened)
+    return Remembering(tuple(Remembered(lead, _known(lead, seen)) for lead in worth), screened)
 
 
-def _remembered(lead: Lead, seen: LearnedLook) -> Remembered:
-    form = type(lead.effect)
-    assert issubclass(form, LearnedMemory)
-    place = place_of(form)
-    known = np.zeros((seen.instants.size, 0))
-    if place is LearnedMeshTorque:
-        own = own_functions(seen, place)
-        known = own.reshape(-1, own.shape[2])[seen.instants]
-        known = known[:, np.any(known != 0.0, axis=0)]
-    return Remembered(form, lead.gain, known)
+def _known(lead: Lead, seen: LearnedLook) -> Float[np.ndarray, "instants known"]:
+    """What the free parameters stand for in the mesh; none of them acts on a shaft alone."""
+    if place_of(lead.effect) is not LearnedMeshTorque:
+        return np.zeros((seen.instants.size, 0))
+    own = own_functions(seen, LearnedMeshTorque)
+    known = own.reshape(-1, own.shape[2])[seen.instants]
+    return known[:, np.any(known != 0.0, axis=0)]
