@@ -32,7 +32,6 @@ class Motion_:
         self.time = STEP * np.arange(rows)
         phase = cycles * np.arange(rows) / rows
         wave = np.sin(2 * np.pi * phase) if kind == "sine" else 2 / np.pi * np.arcsin(np.sin(2 * np.pi * phase))
-        self.torque = largest * wave
         if moves == "held":
             self.speed = np.zeros(rows)
         elif moves == "one way":
@@ -40,7 +39,13 @@ class Motion_:
             self.speed = 0.2 * np.clip((rows - 1.5 * np.arange(rows)) / (0.05 * rows), 0.0, 1.0)
         else:
             self.speed = 0.2 * np.sign(np.sin(2 * np.pi * 2 * np.arange(rows) / rows + 0.3))
-        self.motor = 3.0 + RATIO * np.concatenate([[0.0], np.cumsum(self.speed[:-1]) * STEP])
+        path = np.zeros(rows)
+        path[1:] = STEP * np.cumsum(self.speed[:-1])
+        self.motor = 3.0 + RATIO * path
+        # A weight's torque hangs on the angle, and stays where the joint rests.
+        if kind == "weight":
+            wave = np.sin(2 * np.pi * cycles * path / path[-1])
+        self.torque = largest * wave
 
 
 def slow_joint(
@@ -66,7 +71,7 @@ def slow_joint(
         cycles: Of the torque.
         rows: 4 ms apart.
         largest: Amplitude of the torque [N m].
-        kind: Course of the torque, "sine" or "triangle".
+        kind: Course of the torque, "sine", "triangle", or a "weight" that the joint carries round.
         twist_noise: [rad].
         torque_noise: [N m].
         colour: Correlation of neighbouring noises of the twist.
@@ -132,6 +137,20 @@ def relaxation(share: float, constant: float) -> Effect:
             path.append(z)
             z += STEP / constant * (torque - z)
         return share / K * np.array(path)
+
+    return effect
+
+
+def relaxing_rests(amplitude: float, constant: float) -> Effect:
+    """Each stop leaves the twist off its end by an amplitude, which it loses step by step while the joint rests."""
+
+    def effect(motion: Motion_) -> np.ndarray:
+        off, path, rested = 0.0, [], motion.speed[0] == 0
+        for rests in (motion.speed == 0).tolist():
+            off = (amplitude if not rested else off) * (1.0 - STEP / constant) if rests else 0.0
+            rested = rests
+            path.append(off)
+        return np.array(path)
 
     return effect
 

@@ -10,6 +10,9 @@ import numpy as np
 
 from fitting.quasi_static.points import Points
 
+START = "start"
+"""What names of initial states begin with, be they shape parameters or strengths."""
+
 Columns = Callable[[Points, np.ndarray], np.ndarray]
 
 
@@ -46,7 +49,7 @@ class Form:
     @property
     def size(self) -> int:
         """Number of strengths and shape parameters; where a log begins is none of them."""
-        own = [n for n in (*self.strengths, *self.shape_names) if not n.startswith("start")]
+        own = [n for n in (*self.strengths, *self.shape_names) if not n.startswith(START)]
         return len(own)
 
 

@@ -10,12 +10,13 @@ _CONSTANT = "Hold a constant torque at a constant temperature: creep relaxes, a 
 _BOTH_WAYS = "Run the same path both ways: friction changes its sign, {} does not."
 
 
-def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
+def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> Iterator[tuple[str, str]]:
     """Families whose columns are the same as a found one's on these logs, each with the experiment that separates.
 
     Args:
         family: Of the effect that was found.
         points: Of the logs.
+        at_rest: Whether it was found while the joint rests.
     """
     moved = points.direction is not None
     if family == "kinematic_error":
@@ -44,6 +45,12 @@ def lookalikes(family: str, points: Points) -> Iterator[tuple[str, str]]:
             yield "torque_sensor", _BOTH_WAYS.format("an error of the torque sensor")
     elif family == "creep":
         yield "temperature", _CONSTANT
+        if at_rest:
+            yield (
+                "load_friction",
+                "Measure the torque at the output during the rest: gears creep under a constant torque, friction that "
+                "gives way slowly makes it change.",
+            )
     elif family == "input_delay":
         yield (
             "nonlinear_damping",

@@ -9,8 +9,9 @@ from fitting.quasi_static.candidates import catalogue, choices
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
 from fitting.quasi_static.points import Points
+from fitting.quasi_static.rests import RestLook, look_at_rests
 from fitting.quasi_static.stretches import stretches
-from fitting.quasi_static.twist_model import fit_twist
+from fitting.quasi_static.twist_model import TwistModel, fit_twist
 from fitting.trial import LEAST_GAIN
 
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
@@ -37,12 +38,14 @@ class Finding:
         forms: Its forms in the final model, in the order in which they were found.
         validation_gain: Share of the held-out error that it removes, against the final model without it.
         p_value: Chance that the best of the catalogue would gain as much on noise.
+        at_rest: Where it was found among the points at rest, which then tell its figures; else None.
     """
 
     family: str
     forms: tuple[Form, ...]
     validation_gain: float
     p_value: float
+    at_rest: RestLook | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +59,7 @@ class QuasiStaticLoop:
         after: The final model; the same where nothing was found.
         findings: Largest gain first.
         rounds: Every look at the catalogue.
+        at_rest: The look at rests, or None where no joint rested.
         dropped: Forms that a later one made superfluous.
         left: What the final model leaves over, where it depends on something.
         forms_tried: Number of forms in the catalogue.
@@ -67,9 +71,16 @@ class QuasiStaticLoop:
     after: Trial
     findings: tuple[Finding, ...]
     rounds: tuple[Round, ...]
+    at_rest: RestLook | None
     dropped: tuple[str, ...]
     left: Leftover | None
     forms_tried: int
+
+    def told_by(self, finding: Finding) -> tuple[Points, TwistModel, tuple[Form, ...]]:
+        """The points and the equation that tell a finding's figures, and its forms there."""
+        if finding.at_rest is None:
+            return self.held.points, self.after.model, finding.forms
+        return finding.at_rest.held.points, finding.at_rest.after.model, finding.at_rest.after.model.forms
 
 
 def _silent(message: str) -> None:
@@ -102,14 +113,23 @@ def close_loop(
         current = this.rivals[0].trial
         progress(f"found {this.rivals[0].lead.name}")
     current, dropped = _without_superfluous(held, current, base)
+    at_rest = None
+    families = {form.family for form in current.model.forms}
+    if "creep" not in families and len(families) < max_effects:
+        progress("looking at the rests")
+        at_rest = look_at_rests(held, current, seed)
+        if at_rest is not None and at_rest.form is not None:
+            current = held.attempt((*current.model.forms, at_rest.form), (*current.model.shapes, at_rest.shape))
+            progress(f"found {at_rest.form.name}")
     left = leftover(held, current, base, seed)
     return QuasiStaticLoop(
         decision=_decide(base, current, left, points.twist_noise),
         held=held,
         before=base,
         after=current,
-        findings=_findings(held, current, rounds),
+        findings=_findings(held, current, rounds, at_rest),
         rounds=tuple(rounds),
+        at_rest=at_rest,
         dropped=dropped,
         left=left,
         forms_tried=len(forms),
@@ -142,13 +162,16 @@ def _without_superfluous(held: Held, trial: Trial, base: Trial) -> tuple[Trial, 
     return trial, tuple(dropped)
 
 
-def _findings(held: Held, after: Trial, rounds: list[Round]) -> tuple[Finding, ...]:
+def _findings(held: Held, after: Trial, rounds: list[Round], at_rest: RestLook | None) -> tuple[Finding, ...]:
     found = []
     for family in dict.fromkeys(form.family for form in after.model.forms):
         own = tuple(form for form in after.model.forms if form.family == family)
-        without = held.without(after, own)
-        chance = min(r.rivals[0].p_value for r in rounds if r.accepted and set(r.rivals[0].lead.forms) & set(own))
-        found.append(Finding(family, own, 1.0 - after.rmse / without.rmse, chance))
+        gain = 1.0 - after.rmse / held.without(after, own).rmse
+        if at_rest is not None and at_rest.form in own:
+            found.append(Finding(family, own, gain, at_rest.p_value, at_rest))
+        else:
+            chance = min(r.rivals[0].p_value for r in rounds if r.accepted and set(r.rivals[0].lead.forms) & set(own))
+            found.append(Finding(family, own, gain, chance))
     return tuple(sorted(found, key=lambda one: -one.validation_gain))
 
 

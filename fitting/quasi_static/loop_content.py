@@ -14,6 +14,7 @@ from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.noise_colour import DRAWS
 from fitting.quasi_static.preparation import QuasiStaticData
+from fitting.quasi_static.rests import RestLook
 from fitting.quasi_static.strengths import stiffness_of, strengths_of
 from fitting.quasi_static.stretches import FOLDS, stretches
 
@@ -59,19 +60,23 @@ def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
 
 
 def _account(loop: QuasiStaticLoop, trial: Trial) -> dict[str, Any]:
-    training = float(np.sqrt(np.mean(trial.model.misfit**2)))
     return {
         "effects": [],
         "parameters": estimates(stiffness_of(loop.held.points, trial.model)),
         "derived": {},
-        "rmse": {"training": training, "validation": trial.rmse},
+        "rmse": _rmse(trial),
     }
 
 
+def _rmse(trial: Trial) -> dict[str, float]:
+    return {"training": float(np.sqrt(np.mean(trial.model.misfit**2))), "validation": trial.rmse}
+
+
 def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
+    points, model, forms = loop.told_by(finding)
     parameters: dict[str, Any] = {}
-    for form in finding.forms:
-        for name, known in estimates(strengths_of(loop.held.points, loop.after.model, form)).items():
+    for form in forms:
+        for name, known in estimates(strengths_of(points, model, form)).items():
             path = f"{finding.family}.{name}"
             number = sum(other == path or other.startswith(f"{path} (") for other in parameters)
             parameters[f"{path} ({number + 1})" if number else path] = known | _in_arcmin(name, known)
@@ -82,6 +87,17 @@ def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
         "parameters": parameters,
         "validation_gain": finding.validation_gain,
         "p_value": finding.p_value,
+        "at_rest": None if finding.at_rest is None else _at_rest(finding.at_rest),
+    }
+
+
+def _at_rest(found: RestLook) -> dict[str, Any]:
+    before, after = found.round.before, found.after
+    return {
+        "rests": len(found.held.points.names),
+        "before": {"rmse": _rmse(before)},
+        "after": {"rmse": _rmse(after)},
+        "gain": found.gain,
     }
 
 
@@ -100,6 +116,8 @@ def _steps(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
     for this in loop.rounds:
         if this.accepted:
             found.append({"added": this.rivals[0].lead.name, "held_out_rmse": this.rivals[0].trial.rmse})
+    if loop.at_rest is not None and loop.at_rest.form is not None:
+        found.append({"added": loop.at_rest.form.name, "held_out_rmse": loop.after.rmse})
     return found
 
 
@@ -109,7 +127,7 @@ def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
     kept = {form for one in loop.findings for form in one.forms}
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for one in loop.findings:
-        for family, experiment in lookalikes(one.family, points):
+        for family, experiment in lookalikes(one.family, points, at_rest=one.at_rest is not None):
             if family == "coulomb_friction" and _slides_late(loop, one):
                 continue
             found[family, one.family] = {
@@ -186,6 +204,13 @@ def _summary(report: Mapping[str, Any]) -> str:
             f"{formatting.quantity(after, 'rad', like=before)} rms."
         )
     )
+    resting = next((one["at_rest"] for one in report["after"]["effects"] if one["at_rest"]), None)
+    if resting is not None:
+        start, end = (resting[key]["rmse"]["validation"] for key in ("before", "after"))
+        change += (
+            f" While the joint rests it falls from {formatting.quantity(start, 'rad')} to "
+            f"{formatting.quantity(end, 'rad', like=start)}."
+        )
     if report["decision"] == "effect_found":
         count = "A missing effect was" if len(families) == 1 else f"{len(families)} missing effects were"
         return f"{count} found: {formatting.words(families)}.{change}"
@@ -230,6 +255,14 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
         notes.append(
             "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is "
             "a part of the zero, and friction that depends on load or position is a part of the stiffness."
+        )
+    own_stiffness = next((one.at_rest.own_stiffness for one in loop.findings if one.at_rest is not None), None)
+    if own_stiffness is not None:
+        notes.append(
+            "At rest the twist may as well follow the torque as logged, with a stiffness of "
+            f"{formatting.quantity(own_stiffness, 'N m/rad')}, which the logs as a whole rule out. Where the stiffness "
+            "of the whole logs is none of the gear alone, since it holds friction or an encoder's error, that would be "
+            "no creep."
         )
     count = int(stretches(model.misfit, points.log, each=2)[-1]) + 1
     return [*notes, *few_stretches(count), ABOUT_SCALE]

@@ -42,6 +42,8 @@ def _errors(loop: QuasiStaticLoop) -> Picture:
     points = loop.held.points
     trials: list[tuple[str, Trial]] = [("straight line", loop.before)]
     trials += [(f"with {r.rivals[0].lead.name}", r.rivals[0].trial) for r in loop.rounds if r.accepted]
+    if loop.at_rest is not None and loop.at_rest.form is not None:
+        trials.append((f"with {loop.at_rest.form.name}", loop.after))
     factor, unit = scaled_unit(loop.before.rmse, "rad")
     time = points.time + np.array([sum(np.ptp(points.time[o]) for o in points.logs[:i]) for i in points.log])
     traces = [
@@ -59,11 +61,11 @@ def _errors(loop: QuasiStaticLoop) -> Picture:
 def _evidence(loop: QuasiStaticLoop, finding: Finding) -> Picture:
     if finding.family in _ORDERS:
         return _spectrum(loop, finding)
-    points, model = loop.held.points, loop.after.model
-    own = contribution(points, model, finding.forms)
+    points, model, forms = loop.told_by(finding)
+    own = contribution(points, model, forms)
     factor, unit = scaled_unit(float(np.max(np.abs(own + model.misfit))), "rad")
     if finding.family in _IN_TIME:
-        at, label = points.time, "time from the start of the log [s]"
+        at, label = points.time, f"time from the start of the {'log' if finding.at_rest is None else 'rest'} [s]"
     else:
         at, label = points.torque, "joint torque [N m]"
     if finding.family in _IN_TIME:

@@ -23,6 +23,8 @@ def loop_text(report: Mapping[str, Any]) -> str:
     lines += _figures(final["parameters"])
     for one in report["after"]["effects"]:
         gain = formatting.percent(one["validation_gain"])
+        if one["at_rest"] is not None:
+            gain += f" (at rest {formatting.percent(one['at_rest']['gain'])})"
         lines.append(f"[Effect: {one['family']}] {one['name']}, gain {gain}, p = {plain(one['p_value'], 2)}")
         lines += _figures(one["parameters"])
     for other in report["alternatives"]:

@@ -33,6 +33,7 @@ class Points:
 
     Attributes:
         torque: Joint torque without its noise [N m], (n,).
+        logged_torque: With it [N m], (n,).
         twist: [rad], less its mean in its log, (n,).
         time: From the start of its log [s], (n,).
         log: Number of the log that a point is from, (n,), rising.
@@ -52,6 +53,7 @@ class Points:
     """
 
     torque: np.ndarray
+    logged_torque: np.ndarray
     twist: np.ndarray
     time: np.ndarray
     log: np.ndarray
@@ -120,6 +122,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
     torque_noise, torque_error, twist_noise = (float(np.mean([p["noise"][i] for p in parts])) for i in range(3))
     return Points(
         torque=every("torque"),
+        logged_torque=every("logged_torque"),
         twist=every("twist"),
         time=every("time"),
         log=np.repeat(np.arange(len(logs)), sizes),
@@ -146,6 +149,7 @@ def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[st
     smooth, error = without_noise(torque)
     found = {
         "torque": means(smooth, size),
+        "logged_torque": means(torque, size),
         "twist": means(log.dynamic_error - np.mean(log.dynamic_error), size),
         "time": means(log.time - log.time[0], size),
         "noise": np.array([noise(torque), error, noise(means(log.dynamic_error, size))]),

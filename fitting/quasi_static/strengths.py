@@ -71,7 +71,12 @@ def _figures(points: Points, model: TwistModel, form: Form) -> Iterator[_Figure]
         yield "half_width", lambda p: float(p[first]), "rad", "half of the dead zone", True
     elif form.family == "creep":
         yield "time_constant", lambda p: math.exp(p[shape]), "s", "of the relaxation", True
-        yield "share", lambda p: p[first] / p[0], "1", "delayed twist over immediate twist", True
+        if form.of_torque:
+            yield "share", lambda p: p[first] / p[0], "1", "delayed twist over immediate twist", True
+        else:
+            for i in range(strengths.stop - first):
+                text = f"of the relaxation at the stop before rest {i + 1}"
+                yield f"amplitude_{i + 1}", lambda p, i=i: float(p[first + i]), "rad", text, False
     elif form.family == "motor_friction":
         yield "friction", lambda p: -p[first] / p[0], "N m", "friction while the joint moves, at its output", False
         if "share of load" in form.strengths:

@@ -26,7 +26,7 @@ def torque_forms(points: Points) -> Iterator[Form]:
     yield from _hysteresis(points)
     yield from _stiffness_shapes(points)
     yield from _creep(points)
-    yield from _delay(points)
+    yield delay()
     yield from _temperature(points)
 
 
@@ -133,8 +133,9 @@ def _lag(values: np.ndarray, steps: np.ndarray, constant: float) -> np.ndarray:
     return np.array(path)
 
 
-def _delay(points: Points) -> Iterator[Form]:
-    yield Form("input_delay", "delay", _rate, ("delay",), "twist = tau(t - d)/K, to first order in d")
+def delay() -> Form:
+    """The twist is behind the torque as logged."""
+    return Form("input_delay", "delay", _rate, ("delay",), "twist = tau(t - d)/K, to first order in d")
 
 
 def _rate(points: Points, shape: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.quasi_static.form import Form, base_columns
+from fitting.quasi_static.form import START, Form, base_columns
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS
 
@@ -65,15 +65,20 @@ def fit_twist(points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray,
 def hold_out(points: Points, model: TwistModel, fold: np.ndarray) -> np.ndarray:
     """Misfit [rad] of each point by the equation that was fitted, shapes and all, without the point's fold, (n,).
 
-    Where a log begins, the branch of a loop or the state of a relaxation, is taken from the fit of all points: it is an
-    initial state, of which only the log's first stretch knows.
+    Where a log or a rest begins, the branch of a loop or the state of a relaxation, is taken from the fit of all
+    points: it is an initial state, of which only the log's first stretch or the rest knows.
     """
+    base = len(model.coefficients) - sum(len(form.strengths) for form in model.forms)
+    names = [*[""] * base, *(name for form in model.forms for name in form.strengths)]
+    start = np.array([name.startswith(START) for name in names])
     misfit = np.empty_like(points.twist)
     for i in range(FOLDS):
         seen = fold != i
         shapes = _polished(points, model.forms, model.shapes, seen, starts=False)
         matrix = design(points, model.forms, shapes)
-        misfit[~seen] = (points.twist - matrix @ _solved(matrix[seen], points.twist[seen]))[~seen]
+        left = points.twist - matrix[:, start] @ model.coefficients[start]
+        free = matrix[:, ~start]
+        misfit[~seen] = (left - free @ _solved(free[seen], left[seen]))[~seen]
     return misfit
 
 
@@ -94,7 +99,7 @@ def _polished(
     """Shape parameters that suit the seen points best, with or without those that say where a log begins."""
     start = np.concatenate([np.zeros(0), *shapes])
     names = [name for form in forms for name in form.shape_names]
-    free = np.array([starts or not name.startswith("start") for name in names], dtype=bool)
+    free = np.array([starts or not name.startswith(START) for name in names], dtype=bool)
     if not free.any():
         return shapes
     ends = np.cumsum([len(shape) for shape in shapes])[:-1]
