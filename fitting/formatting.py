@@ -144,6 +144,13 @@ def percent(share: float | None) -> str:
     return f"{number(value, 2) if abs(value) < 99.5 else number(value, 3)} %"
 
 
+def smaller(share: float | None) -> str:
+    """How an error that is less by a share stands beside the other."""
+    if share is not None and share < 0:
+        return f"{percent(-share)} larger"
+    return f"{percent(share)} smaller"
+
+
 def p_value(chance: float | None) -> str:
     """A p-value; below a billionth only that."""
     if chance is not None and chance < _LEAST_CHANCE:

@@ -31,3 +31,11 @@ def test_a_number_reads_back_to_within_its_digits(value: float):
     exponent = int(power.translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")) or 0)
     assert float(mantissa) * 10.0**exponent == pytest.approx(value, rel=5.01e-3)
     assert not power or 1.0 <= float(mantissa) < 10.0
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.5, "50 % smaller"), (-1.55, "155 % larger"), (0.0, "0 % smaller"), (None, "— smaller")],
+)
+def test_an_error_that_rises_is_not_called_smaller(share, text):
+    assert formatting.smaller(share) == text

@@ -44,6 +44,7 @@ def report_page(report: Mapping[str, Any], shown: Sequence[Picture]) -> str:
         "interval": _interval,
         "shape": PLAIN_SHAPE.__getitem__,
         "percent": formatting.percent,
+        "smaller": formatting.smaller,
         "family": lambda name: name.replace("_", " "),
     }
     template = "quasi_static.html.jinja" if report["decision"] == "fit_only" else "quasi_static_loop.html.jinja"

@@ -27,6 +27,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
     """
     filters = {
         "percent": formatting.percent,
+        "smaller": formatting.smaller,
         "superscripts": formatting.superscripts,
         "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
         "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
