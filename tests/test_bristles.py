@@ -12,7 +12,7 @@ from hdjax import Drive
 from hdjax.effects import Effect, Motion
 from hdjax.effects.bristle import bristle_rate, slip_rate
 from hdjax.effects.hysteresis import Dahl, MaxwellSlip
-from hdjax.effects.presliding import DahlMotorFriction, LuGreMotorFriction
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0)
 NO_LIMIT = 1e-12  # s: bristles as fast as their law
@@ -22,11 +22,11 @@ NO_LIMIT = 1e-12  # s: bristles as fast as their law
 def followed(effect: Effect, x: jax.Array, rate: jax.Array, step: jax.Array) -> jax.Array:
     """States along a motion whose rate is given at the start, middle and end of each step, by classical Runge-Kutta.
 
-    The twist and the motor's motion are the same here.
+    The motions of twist, motor and load are the same here.
     """
 
     def at(rate, state):
-        return effect.state_rates(Motion(x=rate, v=rate, omega_m=rate), state)
+        return effect.state_rates(Motion(x=rate, v=rate, omega_m=rate, omega_l=rate), state)
 
     def move(state, rates):
         start, middle, end = rates
@@ -138,21 +138,23 @@ def test_slow_bristles_are_not_bounded(v):
     assert float(found) == pytest.approx(v - abs(v) * 0.3, rel=1e-8)
 
 
-@pytest.mark.parametrize("omega_m", (-30.0, -2.0, 0.5, 5.0, 80.0))
-def test_lugre_at_constant_speed_is_the_stribeck_curve(omega_m):
+@pytest.mark.parametrize("form", (LuGreMotorFriction, LuGreLoadFriction))
+@pytest.mark.parametrize("omega", (-30.0, -2.0, 0.5, 5.0, 80.0))
+def test_lugre_at_constant_speed_is_the_stribeck_curve(form, omega):
     """Friction of EFFECTS.md, `(T_c + (T_s - T_c) exp(-(w/w_s)^2)) sgn w + b w`, once the bristles have bent."""
-    effect = LuGreMotorFriction(T_c=0.2, b=0.01, excess=0.5, omega_s=4.0, bend=1e-3, tau=0.02, settling=1e-4)
-    rate = np.full((400, 3), omega_m)
-    step = 0.3 * np.hypot(1e-3 / omega_m, 1e-4)  # of the time within which it bends
+    effect = form(T_c=0.2, b=0.01, excess=0.5, omega_s=4.0, bend=1e-3, tau=0.02, settling=1e-4)
+    rate = np.full((400, 3), omega)
+    step = 0.3 * np.hypot(1e-3 / omega, 1e-4)  # of the time within which it bends
     (bent,) = np.asarray(followed(effect, jnp.zeros(401), jnp.asarray(rate), jnp.asarray(step)))[-1]
-    motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=jnp.asarray(omega_m))
+    turning = jnp.asarray(omega)
+    motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=turning, omega_l=turning)
     torque = float(effect.torque(motion, DRIVE, jnp.asarray([bent])))
-    level = 0.2 + 0.1 * np.exp(-((omega_m / 4.0) ** 2))
-    assert torque == pytest.approx(-level * np.sign(omega_m) - 0.01 * omega_m, rel=1e-6)
+    level = 0.2 + 0.1 * np.exp(-((omega / 4.0) ** 2))
+    assert torque == pytest.approx(-level * np.sign(omega) - 0.01 * omega, rel=1e-6)
     derived = {name: float(v) for name, (v, _) in effect.derived(DRIVE).items()}
     assert derived == pytest.approx({"sigma_0": 200.0, "sigma_1": 4.0, "T_s": 0.3})
-    # A motor that has long turned starts there, to the Stribeck level.
-    assert float(effect.initial_state(motion)[0]) == pytest.approx(1e-3 * np.sign(omega_m))
+    # A shaft that has long turned starts there, to the Stribeck level.
+    assert float(effect.initial_state(motion)[0]) == pytest.approx(1e-3 * np.sign(omega))
 
 
 def test_while_bristles_stick_they_are_a_spring_and_a_damper():

@@ -12,7 +12,7 @@ from hdjax import Drive, Harmonic, ReducedDrive, ReducedModel, TwoInertiaModel, 
 from hdjax.effects import CATALOGUE, Conditions, Motion, Scales, applicable
 from hdjax.effects.cogging import Cogging, SingleOrderCogging
 from hdjax.effects.damping import CubicDamping
-from hdjax.effects.friction import LoadDependentFriction, LoadFriction
+from hdjax.effects.friction import LoadDependentFriction, LoadFriction, StribeckLoadFriction
 from hdjax.effects.kinematic import KinematicSidebands
 from hdjax.effects.load import LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
@@ -111,6 +111,7 @@ def test_what_depends_on_time_and_temperature():
 def test_what_depends_on_rates_and_shapes():
     effects = (
         LoadFriction(T_c=0.5, b=0.2, transition=0.05),
+        StribeckLoadFriction(T_c=0.3, T_excess=0.4, b=0.1, transition=0.05, omega_s=0.1),
         LoadDependentFriction(T_c=0.2, share=0.05, v_0=0.1),
         CubicDamping(c3=3.0),
         SmoothKneeStiffness(stiffening=0.4, knee=5e-4, width=1e-4),
@@ -123,7 +124,8 @@ def test_what_depends_on_rates_and_shapes():
         tau += (0.2 + 0.05 * np.abs(K * (x + ALPHA * x**3))) * np.tanh(v / 0.1)
         rise = lambda u: (u + np.sqrt(u**2 + 1e-8)) / 2  # noqa: E731
         tau += 0.4 * K * (rise(x - 5e-4) - rise(-x - 5e-4))
-        return -tau / N, tau - 0.5 * np.tanh(omega_l / 0.05) - 0.2 * omega_l
+        level = 0.5 + 0.3 + 0.4 * np.exp(-((omega_l / 0.1) ** 2))
+        return -tau / N, tau - level * np.tanh(omega_l / 0.05) - 0.3 * omega_l
 
     against_scipy(effects, rates)
 

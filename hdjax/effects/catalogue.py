@@ -13,6 +13,7 @@ from hdjax.effects.friction import (
     LoadDependentFriction,
     LoadFriction,
     MotorFriction,
+    StribeckLoadFriction,
     StribeckMotorFriction,
 )
 from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
@@ -25,7 +26,7 @@ from hdjax.effects.position import (
     PositionDependentStiffness,
     RipplingMotorFriction,
 )
-from hdjax.effects.presliding import DahlMotorFriction, LuGreMotorFriction
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
 from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
 from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
@@ -46,6 +47,8 @@ CATALOGUE: tuple[type[Effect], ...] = (
     DahlMotorFriction,
     LuGreMotorFriction,
     LoadFriction,
+    StribeckLoadFriction,
+    LuGreLoadFriction,
     KinematicError,
     KinematicHarmonic,
     KinematicSidebands,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, MotorSideEffect
+from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect
 from hdjax.parameters import Scalar
 
 # Where the corner is this share of what the friction does to the rate in a step (its reach), half of the sign is the
@@ -84,6 +84,28 @@ class DryMotorFriction(DryFriction, MotorSideEffect):
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return -self.dry(motion, drive)
+
+
+class DryLoadFriction(DryFriction, LoadSideEffect):
+    """Dry friction against the load, and viscous friction beside it."""
+
+    opposes: ClassVar[str] = "omega_l"
+
+    transition: eqx.AbstractVar[Scalar]
+    b: eqx.AbstractVar[Scalar]
+
+    @property
+    def corner(self) -> Scalar:
+        return self.transition
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.dry(motion, drive) - self.b * load_rate(motion)
+
+
+def load_rate(motion: Motion) -> Array:
+    """The load's own rate, which a reduced drive lacks."""
+    assert motion.omega_l is not None
+    return motion.omega_l
 
 
 def motor_rate(motion: Motion) -> Array:

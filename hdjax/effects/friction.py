@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
-from hdjax.effects.dry import DryFriction, DryMeshFriction, DryMotorFriction, motor_rate
-from hdjax.effects.effect import Effect, LoadSideEffect, Motion, Scales
+from hdjax.effects.dry import DryLoadFriction, DryMeshFriction, DryMotorFriction, load_rate, motor_rate
+from hdjax.effects.effect import Effect, Motion, Scales
 from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
@@ -142,12 +142,11 @@ class StribeckMotorFriction(DryMotorFriction):
         return super().torque(motion, drive, state) - self.b * motor_rate(motion)
 
 
-class LoadFriction(DryFriction, LoadSideEffect):
+class LoadFriction(DryLoadFriction):
     """Friction torque `T_c sgn(omega_l) + b omega_l` against the load, its sign smoothed over `transition`."""
 
     family: ClassVar[str] = "load_friction"
     name: ClassVar[str] = "load_friction"
-    opposes: ClassVar[str] = "omega_l"
 
     T_c: Scalar = parameter(
         0.0, unit="N m", doc="Coulomb torque at the load", source="EFFECTS", bounds=(0.0, 1e4), role="strength"
@@ -162,10 +161,35 @@ class LoadFriction(DryFriction, LoadSideEffect):
     def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         return self.T_c
 
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        assert motion.omega_l is not None
-        return -self.dry(motion, drive) - self.b * motion.omega_l
 
-    @property
-    def corner(self) -> Scalar:
-        return self.transition
+class StribeckLoadFriction(DryLoadFriction):
+    """Load friction whose Coulomb part is larger near standstill, as [`StribeckMotorFriction`][] is on the motor:
+    bearings and seals that stick before they slide.
+    """
+
+    family: ClassVar[str] = "load_friction"
+    name: ClassVar[str] = "stribeck_load_friction"
+
+    T_c: Scalar = parameter(
+        0.0, unit="N m", doc="Coulomb torque at the load", source="EFFECTS", bounds=(0.0, 1e4), role="strength"
+    )
+    T_excess: Scalar = parameter(
+        0.0, unit="N m", doc="static torque above Coulomb", source="EFFECTS", bounds=(0.0, 1e4), role="strength"
+    )
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+    transition: Scalar = parameter(unit="rad/s", doc="rate over which the sign turns", bounds=(0.0, 1e3), role="shape")
+    omega_s: Scalar = parameter(
+        unit="rad/s",
+        doc="Stribeck rate",
+        source="EFFECTS: 1e-3 to 0.1 rad/s at the output",
+        bounds=(0.0, 1e3),
+        role="shape",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        fractions = (0.2, 0.05, 0.6)
+        return tuple(cls(transition=0.01 * scales.omega_l, omega_s=f * scales.omega_l) for f in fractions)
+
+    def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
+        return self.T_c + self.T_excess * exponential(-((load_rate(motion) / self.omega_s) ** 2))

@@ -1,5 +1,6 @@
-"""Motor friction with memory: bristles that bend before they slide."""
+"""Friction of a shaft with memory: bristles that bend before they slide."""
 
+import abc
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -7,13 +8,13 @@ from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.bristle import SETTLING, bristle_rate
-from hdjax.effects.dry import motor_rate
-from hdjax.effects.effect import Effect, Motion, MotorSideEffect, Scales
+from hdjax.effects.dry import load_rate, motor_rate
+from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
 from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
-# Bristles of this share of a radian over the omega_m of a period: from well resolved to nearly Coulomb.
+# Bristles of this share of what the shaft turns in a radian of a period: from well resolved to nearly Coulomb.
 _BENDS = (0.1, 0.02, 0.5)
 
 
@@ -36,13 +37,13 @@ class DahlMotorFriction(MotorSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(bend=bend, settling=scales.time_step) for bend in _bends(scales))
+        return tuple(cls(bend=bend, settling=scales.time_step) for bend in _bends(scales.omega_m, scales))
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return -self.T_c * state[0] / self.bend - self.b * motor_rate(motion)
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
-        return _bent(self.bend, motion)
+        return _bent(self.bend, None if motion is None else motor_rate(motion))
 
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
         return bristle_rate(motor_rate(motion), state[0], self.bend, self.settling)[None]
@@ -54,20 +55,18 @@ class DahlMotorFriction(MotorSideEffect):
         return {"sigma_0": (self.T_c / self.bend, "N m/rad")}
 
 
-class LuGreMotorFriction(MotorSideEffect):
-    """LuGre friction `sigma_0 z + sigma_1 z' + b omega_m` against the motor (Canudas de Wit et al. 1995), where
-    `z' = omega_m - sigma_0 |omega_m| z / g`.
+class _LuGre(Effect):
+    """LuGre friction `sigma_0 z + sigma_1 z' + b omega` against a shaft (Canudas de Wit et al. 1995), where
+    `z' = omega - sigma_0 |omega| z / g`.
 
-    `g = T_c (1 + excess exp(-(omega_m / omega_s)^2))`, `sigma_0 = T_c / bend` and `sigma_1 = sigma_0 tau`, so that the
+    `g = T_c (1 + excess exp(-(omega / omega_s)^2))`, `sigma_0 = T_c / bend` and `sigma_1 = sigma_0 tau`, so that the
     bristles saturate at `bend` times the Stribeck level whatever T_c is, and nothing is left of them without it.
     """
 
-    family: ClassVar[str] = "motor_friction"
-    name: ClassVar[str] = "lugre_motor_friction"
     states: ClassVar[tuple[str, ...]] = ("z",)
 
     T_c: Scalar = parameter(
-        0.0, unit="N m", doc="Coulomb torque at the motor", source=SOURCE, bounds=(0.0, 1e3), role="strength"
+        0.0, unit="N m", doc="Coulomb torque at the shaft", source=SOURCE, bounds=(0.0, 1e4), role="strength"
     )
     b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source=SOURCE, role="strength")
     excess: Scalar = parameter(
@@ -86,30 +85,36 @@ class LuGreMotorFriction(MotorSideEffect):
         bounds=(0.0, 1e4),
         role="shape",
     )
-    bend: Scalar = parameter(unit="rad", doc="motor angle within which it slides", bounds=(0.0, 10.0), role="shape")
+    bend: Scalar = parameter(unit="rad", doc="angle within which it slides", bounds=(0.0, 10.0), role="shape")
     tau: Scalar = parameter(
         0.0, unit="s", doc="damping of the bristles over their stiffness", bounds=(0.0, 1e3), role="shape"
     )
     settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
 
+    @staticmethod
+    @abc.abstractmethod
+    def rate_of(motion: Motion) -> Array:
+        """The shaft's rate."""
+
     @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        shape = {"omega_s": 0.2 * scales.omega_m, "tau": 0.3 / scales.natural_frequency, "settling": scales.time_step}
-        return tuple(cls(bend=bend, **shape) for bend in _bends(scales))
+    def at_rates(cls, rate: float, scales: Scales) -> tuple[Effect, ...]:
+        """What may be proposed for a shaft that turns at such rates [rad/s]."""
+        shape = {"omega_s": 0.2 * rate, "tau": 0.3 / scales.natural_frequency, "settling": scales.time_step}
+        return tuple(cls(bend=bend, **shape) for bend in _bends(rate, scales))
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         (slipping,) = self.state_rates(motion, state)
-        return -self.T_c * (state[0] + self.tau * slipping) / self.bend - self.b * motor_rate(motion)
+        return -self.T_c * (state[0] + self.tau * slipping) / self.bend - self.b * self.rate_of(motion)
 
     def _level(self, motion: Motion) -> Array:
-        return 1.0 + self.excess * exponential(-((motor_rate(motion) / self.omega_s) ** 2))
+        return 1.0 + self.excess * exponential(-((self.rate_of(motion) / self.omega_s) ** 2))
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "1"]:
-        return _bent(self.bend, motion)
+        return _bent(self.bend, None if motion is None else self.rate_of(motion))
 
     def state_rates(self, motion: Motion, state: Array) -> Float[Array, "1"]:
         limit = self.bend * self._level(motion)
-        return bristle_rate(motor_rate(motion), state[0], limit, self.settling)[None]
+        return bristle_rate(self.rate_of(motion), state[0], limit, self.settling)[None]
 
     def state_scale(self) -> Float[Array, "1"]:
         return self.bend[None]
@@ -122,13 +127,41 @@ class LuGreMotorFriction(MotorSideEffect):
         }
 
 
-def _bends(scales: Scales) -> tuple[float, ...]:
-    """Motor angles, as shares of what the motor turns within a radian of the natural oscillation."""
-    angle = scales.omega_m / scales.natural_frequency
-    return tuple(share * angle for share in _BENDS)
+class LuGreMotorFriction(_LuGre, MotorSideEffect):
+    """LuGre friction against the motor."""
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "lugre_motor_friction"
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return cls.at_rates(scales.omega_m, scales)
+
+    @staticmethod
+    def rate_of(motion: Motion) -> Array:
+        return motor_rate(motion)
 
 
-def _bent(bend: Array, motion: Motion | None) -> Float[Array, "1"]:
-    """A motor that has long turned has bent its bristles its way."""
-    omega = None if motion is None else motion.omega_m
-    return (jnp.zeros_like(bend) if omega is None else bend * jnp.sign(omega))[None]
+class LuGreLoadFriction(_LuGre, LoadSideEffect):
+    """LuGre friction against the load."""
+
+    family: ClassVar[str] = "load_friction"
+    name: ClassVar[str] = "lugre_load_friction"
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return cls.at_rates(scales.omega_l, scales)
+
+    @staticmethod
+    def rate_of(motion: Motion) -> Array:
+        return load_rate(motion)
+
+
+def _bends(rate: float, scales: Scales) -> tuple[float, ...]:
+    """Angles, as shares of what the shaft turns within a radian of the natural oscillation."""
+    return tuple(share * rate / scales.natural_frequency for share in _BENDS)
+
+
+def _bent(bend: Array, rate: Array | None) -> Float[Array, "1"]:
+    """A shaft that has long turned has bent its bristles its way."""
+    return (jnp.zeros_like(bend) if rate is None else bend * jnp.sign(rate))[None]
