@@ -17,7 +17,19 @@ from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge, coming, lasting_share, long_gains, trained
+from fitting.trial import (
+    LEAST_GAIN,
+    Data,
+    Setting,
+    Trial,
+    challenge,
+    coming,
+    first_pass,
+    lasting_share,
+    long_gains,
+    to_the_end,
+    trained,
+)
 from fitting.uncertainty import Estimate, Uncertainty, uncertainty
 from hdjax import Hold, ReducedModel
 from hdjax.effects import Effect
@@ -114,20 +126,22 @@ def look(
     behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
     suspects = [lead for lead in behind if lead not in worth]
 
-    def refit(leads: Sequence[Lead], setting: Setting, give_up_above: float = np.inf) -> None:
+    def refit(leads: Sequence[Lead], setting: Setting, share: float = _HOPELESS) -> None:
+        begun = []
         with _programs_ahead(before, leads[1:], data, setting):
             for lead in leads:
                 progress(f"refitting with {lead.effect.name}")
-                best = min((t.training.objective for t in refitted.values()), default=np.inf)
-                hopeless = _on_the_way(before, best, _HOPELESS)
-                trial = try_lead(before, lead, data, setting, min(give_up_above, hopeless))
-                if trial is not None and np.isfinite(trial.held_out.objective):
-                    refitted[lead.effect.name] = trial
+                begun.append((lead, _begin(before, lead, data, setting)))
+        # The one that has come farthest goes on first: beside it most others need not.
+        for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
+            best = min((t.training.objective for t in refitted.values()), default=np.inf)
+            trial = _go_on(before, lead, found, data, setting, _on_the_way(before, best, share))
+            if trial is not None and np.isfinite(trial.held_out.objective):
+                refitted[lead.effect.name] = trial
 
     def refit_beside(best: Trial, leads: Sequence[Lead]) -> None:
         # What is to come near it in its first pass needs its steps.
-        fine = setting.with_steps_of(best.training)
-        refit(leads, fine, _on_the_way(before, best.training.objective, 1.0 - _NEAR_TIE))
+        refit(leads, setting.with_steps_of(best.training), 1.0 - _NEAR_TIE)
 
     first = first_of_each_family(worth, suspects)
     with _programs_ahead(before, first[1:], data, setting):
@@ -301,7 +315,12 @@ def _programs_ahead(before: Trial, leads: Sequence[Lead], data: Data, setting: S
 
 def try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
     """Refit with the effect, from the first-order estimate, from what is typical, and from what the model's own
-    parameters may stand for."""
+    parameters may stand for; None where it does not come as far as it is to."""
+    return _go_on(before, lead, _begin(before, lead, data, setting), data, setting, give_up_above)
+
+
+def _begin(before: Trial, lead: Lead, data: Data, setting: Setting) -> Fit:
+    """The first pass of such a refit."""
     model = before.model
     known = model.parameters()
     moved = {}
@@ -317,18 +336,13 @@ def try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_ab
         *(model.with_effects(effect) for effect in lead.effect.typical(swing)),
         *(model.replace(values).with_effects(effect) for values, effect in lead.effect.imitated(model.drive, swing)),
     ]
-    trial = challenge(
-        starts,
-        data,
-        before.hold,
-        setting,
-        champion=before,
-        give_up_above=give_up_above,
-        own_states=lead.own_states,
-    )
-    if trial is None:
-        return None
-    return replace(trial, lasting=lasting_share(lead.effect, before, trial))
+    return first_pass(starts, data, before.hold, setting, champion=before, own_states=lead.own_states)
+
+
+def _go_on(before: Trial, lead: Lead, begun: Fit, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
+    """The rest of it, as far as it is worth it."""
+    trial = to_the_end(begun, data, before.hold, setting, champion=before, give_up_above=give_up_above)
+    return None if trial is None else replace(trial, lasting=lasting_share(lead.effect, before, trial))
 
 
 def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:

@@ -25,7 +25,7 @@ from fitting.outliers import with_weights
 from fitting.posing import segment_length
 from fitting.screening import programs_ahead
 from fitting.surprise import SURPRISED, surprise
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, halo_for
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, gone_on, halo_for
 from fitting.unknown import Unknown, learn_supported
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
@@ -289,7 +289,7 @@ def _add_effects(
         found += 1
         setting = setting.with_steps_of(current.training)
         # What a trial has not quite reached the next look would take for a further effect.
-        current = attempt(current.model, data, current.hold, setting, start=current)
+        current = gone_on(current, data, setting)
         rounds.append(this)
         progress(f"found {this.winner.name}")
     dropped = _holds_given_up(rounds, base.hold, current.hold)

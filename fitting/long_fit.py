@@ -48,6 +48,27 @@ def over_whole_stretches(found: Fit) -> Fit:
     return _again(found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=True)
 
 
+def with_memory_carried(found: Fit, *, hold_parameters: bool = False) -> Fit:
+    """A fit over short horizons that has gone by way of horizons as long as the stretches, where that leaves less.
+
+    What an effect remembers is not seen, and where it slips it forgets its start: on a short segment a start that is
+    far off hardly changes the error, and finds no way back. Over a whole stretch it follows from the motion.
+
+    Args:
+        found: a fit over short horizons.
+        hold_parameters: whether only initial states are fitted.
+    """
+    carried = _again(
+        found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=hold_parameters
+    )
+    if not follows(carried):
+        return found
+    back = _again(
+        carried, carried.model, horizon=found.horizon, substeps=found.substeps, hold_parameters=hold_parameters
+    )
+    return min(found, back, key=lambda fit: fit.objective)
+
+
 def follows(found: Fit) -> bool:
     """Whether the simulation errs by less than half of how much each output moves."""
     segments = found.problem.segments

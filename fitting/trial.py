@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit, needed_substeps
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.free_run import FreeRun, free_run, rms_error
-from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed
+from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed, with_memory_carried
 from fitting.posing import pose_ahead, states_from
 from hdjax import Hold, Model
 from hdjax.effects import Effect
@@ -110,6 +111,20 @@ def attempt(
     return _judged(training, data, hold, setting)
 
 
+def gone_on(trial: Trial, data: Data, setting: Setting) -> Trial:
+    """A trial after another pass of its fit; the same where that gains nothing.
+
+    Args:
+        trial: as it stands.
+        data: the stretches.
+        setting: how they are cut.
+    """
+    training = trained(trial.model, data, trial.hold, setting, trial.training)
+    if training.objective > trial.training.objective - _LEAST_PROGRESS:
+        return trial
+    return _judged(training, data, trial.hold, setting)
+
+
 def challenge(
     models: Sequence[Model],
     data: Data,
@@ -132,7 +147,20 @@ def challenge(
         give_up_above: a lower objective that it must reach.
         own_states: where the own states of the first model's last effect start, in each segment.
     """
-    limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
+    first = first_pass(models, data, hold, setting, champion=champion, own_states=own_states)
+    return to_the_end(first, data, hold, setting, champion=champion, give_up_above=give_up_above)
+
+
+def first_pass(
+    models: Sequence[Model],
+    data: Data,
+    hold: Hold,
+    setting: Setting,
+    *,
+    champion: Trial,
+    own_states: Float[np.ndarray, "segments own"] | None = None,
+) -> Fit:
+    """The best start of a challenger, as one pass from each tells it; arguments as in [`challenge`][]."""
 
     def begun(model: Model) -> Fit:
         return trained(
@@ -146,8 +174,16 @@ def challenge(
             own_states=own_states if model is models[0] else None,
         )
 
-    # One pass each tells the best start; that one alone is followed to the end.
-    first = min(map(begun, models), key=lambda found: found.objective)
+    best = min(map(begun, models), key=lambda found: found.objective)
+    return with_memory_carried(best) if _may_remember_better(best) else best
+
+
+def to_the_end(
+    first: Fit, data: Data, hold: Hold, setting: Setting, *, champion: Trial, give_up_above: float = np.inf
+) -> Trial | None:
+    """A challenger followed from its first pass to the end, as far as it is worth it; arguments as in
+    [`challenge`][]."""
+    limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
     if first.objective > limit:
         return None
     setting = setting.fine_enough(first)
@@ -241,7 +277,14 @@ def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
         hold_parameters=True,
         least_progress=_LEAST_PROGRESS,
     )
+    if _may_remember_better(held_out):
+        held_out = with_memory_carried(held_out, hold_parameters=True)
     return Trial(training.model, training, held_out, hold)
+
+
+def _may_remember_better(found: Fit) -> bool:
+    """Whether an effect with memory leaves more than noise."""
+    return any(e.states for e in found.model.effects) and not leaves_white_noise(found)
 
 
 def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:

@@ -125,12 +125,16 @@ class Dahl(MeshTorqueEffect):
         return {"T_c": (self.k * self.yield_twist, "N m")}
 
 
+# Of a sampling interval. What a slipping spring errs by grows with its square; a step of an interval resolves it still.
+_SETTLING = 0.5
+_SHARE = "yield twist over that of the spring that slips last"
+
+
 class MaxwellSlip(MeshTorqueEffect):
     """Torque `k_1 z_1 + k_2 z_2 + k_3 z_3`: springs that slip, each at its own twist.
 
-    Each z follows the twist until it is its yield twist away, and then slips. The three yield at `yield_twist` and at
-    half and a quarter of it, so that one shape parameter serves them all. The corners are rounded a little, see
-    [`slip_rate`][].
+    Each z follows the twist until it is its yield twist away, and then slips (see [`slip_rate`][]). The three yield at
+    `yield_twist` and at half and a quarter of it, so that one shape parameter serves them all.
     """
 
     family: ClassVar[str] = "hysteresis"
@@ -141,10 +145,10 @@ class MaxwellSlip(MeshTorqueEffect):
         0.0, unit="N m/rad", doc="spring that slips last", source=SLIP, bounds=(0.0, 1e12), role="strength"
     )
     k_2: Scalar = parameter(
-        0.0, unit="N m/rad", doc="spring that slips at a half", source=SLIP, bounds=(0.0, 1e12), role="strength"
+        0.0, unit="N m/rad", doc="spring that slips second", source=SLIP, bounds=(0.0, 1e12), role="strength"
     )
     k_3: Scalar = parameter(
-        0.0, unit="N m/rad", doc="spring that slips at a quarter", source=SLIP, bounds=(0.0, 1e12), role="strength"
+        0.0, unit="N m/rad", doc="spring that slips first", source=SLIP, bounds=(0.0, 1e12), role="strength"
     )
     yield_twist: Scalar = parameter(
         unit="rad",
@@ -154,18 +158,24 @@ class MaxwellSlip(MeshTorqueEffect):
         plausible=(1e-4, 1e-3),
         role="shape",
     )
-    settling: Scalar = parameter(unit="s", doc=SETTLING, bounds=(0.0, 1e3))
+    share_2: Scalar = parameter(0.5, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2))
+    share_3: Scalar = parameter(0.25, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2))
+    settling: Scalar = parameter(
+        unit="s", doc="within which what runs ahead of a slipping spring comes back", bounds=(0.0, 1e3)
+    )
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return tuple(cls(yield_twist=fraction * scales.x, settling=scales.time_step) for fraction in (0.5, 1.5, 0.2))
+        settling = _SETTLING * scales.time_step
+        return tuple(cls(yield_twist=fraction * scales.x, settling=settling) for fraction in (0.5, 1.5, 0.2))
 
     @property
     def _yields(self) -> Float[Array, "3"]:
-        return jnp.stack([self.yield_twist, 0.5 * self.yield_twist, 0.25 * self.yield_twist])
+        return jnp.stack([self.yield_twist, self.share_2 * self.yield_twist, self.share_3 * self.yield_twist])
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
-        return self.k_1 * state[0] + self.k_2 * state[1] + self.k_3 * state[2]
+        z_1, z_2, z_3 = (jnp.clip(z, -d, d) for z, d in zip(state, self._yields, strict=True))
+        return self.k_1 * z_1 + self.k_2 * z_2 + self.k_3 * z_3
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "3"]:
         return jnp.zeros_like(self._yields)
@@ -177,3 +187,12 @@ class MaxwellSlip(MeshTorqueEffect):
 
     def state_scale(self) -> Float[Array, "3"]:
         return self._yields
+
+
+class UnevenMaxwellSlip(MaxwellSlip):
+    """[`MaxwellSlip`][] whose springs slip where the data say: the shares of `yield_twist` are fitted."""
+
+    name: ClassVar[str] = "uneven_maxwell_slip"
+
+    share_2: Scalar = parameter(0.5, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2), role="shape")
+    share_3: Scalar = parameter(0.25, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2), role="shape")
