@@ -14,8 +14,8 @@ SPRINGS = ((900.0, 0.06), (1800.0, 0.025), (1800.0, 0.008))
 
 
 def slipping(forcing: np.ndarray, *, substeps: int = 20) -> np.ndarray:
-    """Dynamic error of `x'' = gain u - mu x' - omega_0^2 (x + alpha x^3) - sum k_i z_i`, where each z_i follows x and is
-    cut at its limit after every step."""
+    """Dynamic error of `x'' = gain u - mu x' - omega_0^2 (x + alpha x^3) - sum k_i z_i`, where each z_i follows x and
+    is cut at its limit after every step."""
     h = rig.REDUCED_STEP / substeps
     x = v = 0.0
     z = [0.0] * len(SPRINGS)
