@@ -32,7 +32,7 @@ def slip_rate(rate: Array, z: Array, limit: Array, settling: Array) -> Array:
 
     The spring's deflection is z cut at the limit: while the motion goes on, z runs ahead of it by no more than the
     path of one `settling`, from where it comes back as the motion slows down (a plastic element with a little
-    viscosity, after Perzyna 1966). No step is too long for that, and the corner stays sharp. Arguments as in
-    [`bristle_rate`][].
+    viscosity, after Perzyna 1966). The corner stays sharp, and steps of up to two settling times resolve it. Arguments
+    as in [`bristle_rate`][].
     """
     return rate - (z - jnp.clip(z, -limit, limit)) / settling
