@@ -26,6 +26,9 @@ LEAST_GAIN = 1e-3
 _TRIAL_STEPS = 25
 # A few steps that together lower the objective by less than half of this are not worth another.
 _LEAST_PROGRESS = 0.1 * LEAST_GAIN
+# What a first pass may fall short of because of what effects remember: it must have come so far towards what it is to
+# reach.
+_MOST_OF_THE_WAY = 2.0 / 3.0
 
 
 class Setting(eqx.Module):
@@ -174,8 +177,7 @@ def first_pass(
             own_states=own_states if model is models[0] else None,
         )
 
-    best = min(map(begun, models), key=lambda found: found.objective)
-    return with_memory_carried(best) if _may_remember_better(best) else best
+    return min(map(begun, models), key=lambda found: found.objective)
 
 
 def to_the_end(
@@ -183,7 +185,10 @@ def to_the_end(
 ) -> Trial | None:
     """A challenger followed from its first pass to the end, as far as it is worth it; arguments as in
     [`challenge`][]."""
-    limit = min(give_up_above, champion.training.objective + LEAST_GAIN)
+    before = champion.training.objective
+    limit = min(give_up_above, before + LEAST_GAIN)
+    if first.objective <= before - _MOST_OF_THE_WAY * (before - limit) and _may_remember_better(first):
+        first = with_memory_carried(first)
     if first.objective > limit:
         return None
     setting = setting.fine_enough(first)
