@@ -43,9 +43,14 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     return long if check.objective < start.objective + _LOSS else start
 
 
-def over_whole_stretches(found: Fit) -> Fit:
-    """The same parameters over horizons as long as the stretches; only initial states are fitted."""
-    return _again(found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=True)
+def over_whole_stretches(found: Fit, *, hold_parameters: bool = True) -> Fit:
+    """The same model over horizons as long as the stretches.
+
+    Args:
+        found: a fit over short horizons.
+        hold_parameters: whether only initial states are fitted.
+    """
+    return _again(found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=hold_parameters)
 
 
 def with_memory_carried(found: Fit, *, hold_parameters: bool = False) -> Fit:
@@ -58,9 +63,7 @@ def with_memory_carried(found: Fit, *, hold_parameters: bool = False) -> Fit:
         found: a fit over short horizons.
         hold_parameters: whether only initial states are fitted.
     """
-    carried = _again(
-        found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=hold_parameters
-    )
+    carried = over_whole_stretches(found, hold_parameters=hold_parameters)
     if not follows(carried):
         return found
     back = _again(

@@ -94,9 +94,15 @@ def test_uneven_springs_slip_at_shares_of_the_last_one():
 def test_the_area_of_a_slip_loop_does_not_depend_on_the_rate(omega):
     """4 sum k_i d_i (X - d_i) at every rate, as long as the settling time is short against the period."""
     size = 2e-3
-    x, states = along_sine(eqx.tree_at(lambda e: e.settling, SLIP, jnp.asarray(3e-3 / omega)), size, omega, cycles=2)
+
+    def moved(omega):
+        effect = eqx.tree_at(lambda e: e.settling, SLIP, jnp.asarray(3e-3 / omega))
+        return along_sine(effect, size, omega, cycles=2)
+
+    x, states = moved(omega)
     area = np.trapezoid(slip_torque(states)[-2001:], x[-2001:])
     assert area == pytest.approx(sum(4 * k * d * (size - d) for k, d in SPRINGS), rel=1e-3)
+    np.testing.assert_allclose(states, moved(1.0)[1], atol=1e-9 * 6e-4)
 
 
 @settings(max_examples=40)
@@ -107,8 +113,7 @@ def test_the_area_of_a_slip_loop_does_not_depend_on_the_rate(omega):
 )
 def test_a_slipping_spring_takes_any_motion(rates, limit, steps):
     """However narrow its limit and however fast the motion, it runs ahead by no more than the path of a step or of a
-    settling time, and comes back within the limit once the motion has
-    stopped."""
+    settling time, and comes back within the limit once the motion has stopped."""
     settling = 1e-3
     h, z, fastest = steps * settling, 0.0, max(map(abs, rates))
     for v in [*rates, *[0.0] * (5 + int(30 / steps))]:
