@@ -17,6 +17,9 @@ _SHARE_OF_BEST = 0.05
 _THE_SAME = 1e-6
 # Families whose likeliest form is refitted inside the equations in each round.
 _FAMILIES = 5
+# Each state of a form's own is followed, and its start fitted, in each segment: one with several goes first in its
+# family only where no other explains at least this share of what it does.
+_FEWER_STATES = 0.25
 # Further forms of the best one's family, and of each that comes near it, that compete there.
 _FORMS = 3
 # Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
@@ -46,12 +49,18 @@ def first_of_each_family(leads: Sequence[Lead], suspects: Sequence[Lead] = ()) -
     families: dict[str, list[Lead]] = {}
     for lead in leads:
         families.setdefault(lead.effect.family, []).append(lead)
-    found = [_simplest([a for a in forms if a.gain >= NEARLY * forms[0].gain]) for forms in families.values()]
-    found = found[:_FAMILIES]
+    found = [_likeliest(forms) for forms in families.values()][:_FAMILIES]
     for lead in suspects:
         if lead.effect.family not in {other.effect.family for other in found}:
             found.append(lead)
     return found
+
+
+def _likeliest(forms: Sequence[Lead]) -> Lead:
+    """The form of a family, best first, that goes first."""
+    lean = [a for a in forms if len(a.effect.states) < 2 and a.gain >= _FEWER_STATES * forms[0].gain]
+    near = lean or list(forms)
+    return _simplest([a for a in near if a.gain >= NEARLY * near[0].gain])
 
 
 def _simplest(leads: Sequence[Lead]) -> Lead:

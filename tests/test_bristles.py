@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hdjax import Drive
 from hdjax.effects import Effect, Motion
 from hdjax.effects.bristle import bristle_rate, slip_rate
-from hdjax.effects.hysteresis import Dahl, MaxwellSlip, UnevenMaxwellSlip
+from hdjax.effects.hysteresis import Dahl, MaxwellSlip
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0)
@@ -67,8 +67,7 @@ def slip_torque(states: np.ndarray, effect: MaxwellSlip = SLIP) -> np.ndarray:
     return np.asarray(jax.vmap(lambda s: effect.torque(motion, DRIVE, s))(jnp.asarray(states)))
 
 
-@pytest.mark.parametrize("form", (MaxwellSlip, UnevenMaxwellSlip))
-def test_maxwell_slip_is_a_sum_of_elastoplastic_elements(form):
+def test_maxwell_slip_is_a_sum_of_elastoplastic_elements():
     """With minor loops, to what the motion changes its rate by within a settling time: the corners are sharp."""
     samples = 4000
     t = np.linspace(0.0, 2 * np.pi, samples + 1)
@@ -76,16 +75,15 @@ def test_maxwell_slip_is_a_sum_of_elastoplastic_elements(form):
     rate = lambda t: 1.5e-3 * np.cos(t) + 2.5e-3 * np.cos(5 * t)  # noqa: E731
     step = t[1]
     rates = np.stack([rate(t[:-1]), rate(t[:-1] + step / 2), rate(t[1:])], axis=1)
-    effect = form(**{name: getattr(SLIP, name) for name in vars(SLIP)})
-    states = np.asarray(followed(effect, jnp.asarray(x), jnp.asarray(rates), jnp.asarray(step)))
-    torque = slip_torque(states, effect)
+    states = np.asarray(followed(SLIP, jnp.asarray(x), jnp.asarray(rates), jnp.asarray(step)))
+    torque = slip_torque(states)
     ideal = sum(k * elastoplastic(x, d) for k, d in SPRINGS)
     assert np.abs(ideal).max() == pytest.approx(sum(k * d for k, d in SPRINGS))
     assert np.abs(torque - ideal).max() < 2e-3 * np.abs(ideal).max()
 
 
-def test_uneven_springs_slip_at_shares_of_the_last_one():
-    effect = UnevenMaxwellSlip(k_1=1.0, k_2=10.0, k_3=100.0, yield_twist=6e-4, share_2=0.7, share_3=0.1, settling=1e-3)
+def test_springs_slip_at_shares_of_the_last_one():
+    effect = MaxwellSlip(k_1=1.0, k_2=10.0, k_3=100.0, yield_twist=6e-4, share_2=0.7, share_3=0.1, settling=1e-3)
     far = slip_torque(np.full((1, 3), 1.0), effect)
     assert far[0] == pytest.approx(6e-4 * (1.0 + 10.0 * 0.7 + 100.0 * 0.1))
 

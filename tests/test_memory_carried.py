@@ -7,7 +7,7 @@ import rig
 from fitting.estimate import fit
 from fitting.experiment import Stretch, experiment_from_log
 from fitting.long_fit import with_memory_carried
-from hdjax.effects.hysteresis import UnevenMaxwellSlip
+from hdjax.effects.hysteresis import MaxwellSlip
 
 COUNT, HORIZON, NOISE = 6000, 64, 1e-4
 SPRINGS = ((900.0, 0.06), (1800.0, 0.025), (1800.0, 0.008))
@@ -44,7 +44,7 @@ def test_what_springs_remember_comes_from_the_whole_motion():
     logged = experiment_from_log(rig.reduced_log(slipping(forcing), forcing, noise=NOISE), hold="zero-order")
     truth = {"k_1": 900.0, "k_2": 1800.0, "k_3": 1800.0, "yield_twist": 0.06, "share_2": 25 / 60, "share_3": 8 / 60}
     wrong = {name: 0.7 * value for name, value in truth.items() if name.startswith("k_")}
-    guess = UnevenMaxwellSlip(**wrong, yield_twist=0.05, settling=0.5 * rig.REDUCED_STEP)
+    guess = MaxwellSlip(**wrong, yield_twist=0.05, settling=0.5 * rig.REDUCED_STEP)
     paths = ("omega_0", "alpha", "mu", *(f"{guess.name}.{name}" for name in truth))
     model = rig.reduced_model().with_effects(guess)
     short = fit(model, [Stretch(logged, 0, COUNT)], paths, horizon=HORIZON, substeps=4, max_steps=25)

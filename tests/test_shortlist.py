@@ -7,6 +7,7 @@ from fitting.shortlist import first_of_each_family, further_forms, worth_a_refit
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.creep import Creep
+from hdjax.effects.hysteresis import BoucWen, MaxwellSlip
 from hdjax.effects.stiffness import QuadraticStiffness
 
 CREEP = Lead(Creep(k=1.0, tau=1.0, span=1.0), {}, 1.0)
@@ -41,3 +42,10 @@ def test_of_what_is_the_same_to_first_order_the_catalogues_first_form_goes_first
     assert first_of_each_family(same) == same[1:]
     more = [Lead(UndampedBacklash(b=0.0), {}, 0.002), Lead(Backlash(b=0.0), {}, 0.002 * (1.0 - 1e-3))]
     assert first_of_each_family(more) == more[:1]
+
+
+def test_a_form_of_several_states_goes_first_only_where_it_explains_far_more():
+    slip = Lead(MaxwellSlip(yield_twist=1.0, settling=1.0), {}, 1.0)
+    near, far = (Lead(BoucWen(memory_twist=1.0), {}, gain) for gain in (0.3, 0.2))
+    assert first_of_each_family([slip, near]) == [near]
+    assert first_of_each_family([slip, far]) == [slip]

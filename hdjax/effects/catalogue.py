@@ -16,7 +16,7 @@ from hdjax.effects.friction import (
     StribeckLoadFriction,
     StribeckMotorFriction,
 )
-from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen, UnevenMaxwellSlip
+from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
 from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
 from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
@@ -66,7 +66,6 @@ CATALOGUE: tuple[type[Effect], ...] = (
     SharpBoucWen,
     Dahl,
     MaxwellSlip,
-    UnevenMaxwellSlip,
     Creep,
     Cogging,
     SingleOrderCogging,

@@ -133,8 +133,8 @@ _SHARE = "yield twist over that of the spring that slips last"
 class MaxwellSlip(MeshTorqueEffect):
     """Torque `k_1 z_1 + k_2 z_2 + k_3 z_3`: springs that slip, each at its own twist.
 
-    Each z follows the twist until it is its yield twist away, and then slips (see [`slip_rate`][]). The three yield at
-    `yield_twist` and at half and a quarter of it, so that one shape parameter serves them all.
+    Each z follows the twist until it is its yield twist away, and then slips (see [`slip_rate`][]). The last one slips
+    at `yield_twist`, the others at shares of it.
     """
 
     family: ClassVar[str] = "hysteresis"
@@ -158,8 +158,8 @@ class MaxwellSlip(MeshTorqueEffect):
         plausible=(1e-4, 1e-3),
         role="shape",
     )
-    share_2: Scalar = parameter(0.5, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2))
-    share_3: Scalar = parameter(0.25, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2))
+    share_2: Scalar = parameter(0.5, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2), role="shape")
+    share_3: Scalar = parameter(0.25, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2), role="shape")
     settling: Scalar = parameter(
         unit="s", doc="within which what runs ahead of a slipping spring comes back", bounds=(0.0, 1e3)
     )
@@ -187,12 +187,3 @@ class MaxwellSlip(MeshTorqueEffect):
 
     def state_scale(self) -> Float[Array, "3"]:
         return self._yields
-
-
-class UnevenMaxwellSlip(MaxwellSlip):
-    """[`MaxwellSlip`][] whose springs slip where the data say: the shares of `yield_twist` are fitted."""
-
-    name: ClassVar[str] = "uneven_maxwell_slip"
-
-    share_2: Scalar = parameter(0.5, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2), role="shape")
-    share_3: Scalar = parameter(0.25, unit="1", doc=_SHARE, source=SLIP, bounds=(0.0, 1e2), role="shape")
