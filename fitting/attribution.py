@@ -12,6 +12,7 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
+from fitting.long_fit import freedom_of_states
 from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
@@ -400,9 +401,12 @@ def _p_worse(difference: np.ndarray) -> float:
 
 def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting: Setting) -> list[Verdict]:
     """Among competitors that can't be told apart, one with plausible values and the fewest parameters leads, as long as
-    it gains nearly as much in free runs along whole stretches: short segments hide what adds up slowly."""
-    tied = [v for v in verdicts if v.trial is not None and not v.separable]
-    near = [v for v in tied if v.gain > (1.0 - _NEAR_TIE) * verdicts[0].gain - LEAST_GAIN]
+    it gains nearly as much in free runs along whole held-out stretches: short segments hide what adds up slowly, and
+    let what an effect remembers start where it suits them."""
+    best = verdicts[0].gain
+    freely = best - _freedom_of_memory(verdicts[0], before)
+    least = (1.0 - _NEAR_TIE) * best - LEAST_GAIN
+    near = [v for v in verdicts if v.trial is not None and (v.gain > freely or (not v.separable and v.gain > least))]
     if len(near) < 2:
         return verdicts
     trials = [v.trial for v in near if v.trial is not None]
@@ -410,7 +414,18 @@ def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting:
     least = max(gains) - max(LEAST_GAIN, _SAME_GAIN * max(gains))
     close = [v for v, gain in zip(near, gains, strict=True) if gain >= least]
     leader = min(close, key=lambda v: (_beyond_real_drives(v), _size(v), -v.gain))
-    return [leader] + [v for v in verdicts if v is not leader]
+    # Whole stretches have told it from one that only short segments preferred.
+    if leader.separable:
+        tied = {v.name: v in close for v in near}
+        verdicts = [eqx.tree_at(lambda v: v.separable, v, not tied.get(v.name, not v.separable)) for v in verdicts]
+    return sorted(verdicts, key=lambda v: v.name != leader.name)
+
+
+def _freedom_of_memory(verdict: Verdict, before: Trial) -> float:
+    """What of a gain the starts of hidden states may make, which are fitted to each short segment."""
+    assert verdict.trial is not None
+    own = len(verdict.trial.model.state_names) - len(before.model.state_names)
+    return freedom_of_states(verdict.trial.held_out, own)
 
 
 def _beyond_real_drives(verdict: Verdict) -> bool:

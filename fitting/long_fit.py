@@ -36,7 +36,8 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=_longest(start), substeps=substeps)
-    explains = with_gaps_closed(long) <= start.objective + _freedom_of_states(start) + _LOSS
+    motion = len(start.model.motion_states)
+    explains = with_gaps_closed(long) <= start.objective + freedom_of_states(start, motion) + _LOSS
     if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
@@ -91,12 +92,17 @@ def _longest(found: Fit) -> int:
     return max(len(s) for s in found.stretches)
 
 
-def _freedom_of_states(found: Fit) -> float:
-    """By how much the fitted initial states of short segments lower the objective over nothing but noise."""
+def freedom_of_states(found: Fit, states: int) -> float:
+    """By how much fitting so many initial states of each short segment lowers the objective over nothing but noise.
+
+    Args:
+        found: a fit over short horizons.
+        states: of each segment.
+    """
     segments = found.problem.segments
     kept = np.asarray(segments.weight).sum(axis=1)
     outputs = segments.measured.shape[-1]
-    own = int(np.sum((kept > 0) & ~np.asarray(segments.joined))) * len(found.model.motion_states)
+    own = int(np.sum((kept > 0) & ~np.asarray(segments.joined))) * states
     return -0.5 * outputs * float(np.log1p(-min(0.5, own / (kept.sum() * outputs))))
 
 

@@ -14,6 +14,7 @@ from fitting.attribution import Verdict, look
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
 from fitting.free import effect_paths
+from fitting.long_fit import freedom_of_states
 from fitting.measurement_noise import MeasurementNoise
 from fitting.posing import segment_length
 from fitting.trial import Setting, Trial, attempt, halo_for
@@ -114,6 +115,28 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
 
     monkeypatch.setattr(attribution, "long_gains", long_gains)
     assert attribution._simplest_first(tied, before, {}, SETTING)[0].name == leader
+
+
+@pytest.mark.parametrize(
+    ("share", "creep_long", "leader"),
+    [(0.5, 1.0, "torque_bias"), (0.5, 3.0, "creep"), (1.5, 1.0, "creep")],
+)
+def test_what_the_starts_of_hidden_states_may_gain_tells_nothing(
+    verdicts, share: float, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
+):
+    """A form with memory that is ahead over short segments by a share of that leads only where it does over whole
+    stretches; then these tell the two apart."""
+    before, found = verdicts
+    bias, creep = found["torque_bias"], found["creep"]
+    ahead = share * freedom_of_states(creep.trial.held_out, 1)
+    ordered = [
+        Verdict("creep", creep.family, creep.trial, 0.1, 0.005, False),
+        Verdict("torque_bias", bias.family, bias.trial, 0.1 - ahead, 0.005, True),
+    ]
+    long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
+    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, data, setting: [long[id(t)] for t in trials])
+    first, second = attribution._simplest_first(ordered, before, {}, SETTING)
+    assert (first.name, first.separable, second.separable) == (leader, False, True)
 
 
 def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monkeypatch: pytest.MonkeyPatch):
