@@ -1,8 +1,6 @@
 """Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Collection, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -12,29 +10,18 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
+from fitting.lead_refit import begin, go_on, programs_coming, try_hold
 from fitting.long_fit import freedom_of_states
 from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.sight import look_ahead
-from fitting.trial import (
-    LEAST_GAIN,
-    Data,
-    Setting,
-    Trial,
-    challenge,
-    coming,
-    first_pass,
-    lasting_share,
-    long_gains,
-    to_the_end,
-    trained,
-)
+from fitting.trial import LEAST_GAIN, Data, Setting, Trial, long_gains
 from fitting.uncertainty import Estimate, Uncertainty, uncertainty
-from hdjax import Hold, ReducedModel
+from hdjax import ReducedModel
 from hdjax.effects import Effect
-from hdjax.parameters import as_scalar, own_parameters
+from hdjax.parameters import own_parameters
 
 SIGNIFICANCE = 0.01
 """Largest p-value of an accepted effect: the chance that the best of the catalogue does as well on noise."""
@@ -42,9 +29,6 @@ SIGNIFICANCE = 0.01
 
 # Standard errors by which a strength must differ from zero: one percent of chance over a hundred forms and shapes.
 _BEST_OF_MANY = 3.9
-# Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
-# one finds the way.
-_HOLD_STEPS = 3
 # What is tied with the best gains as much but for this share; so it must in its first pass to be worth another.
 _NEAR_TIE = 0.1
 # A family of which one form gains this share of what the best of all does may have one that does better.
@@ -129,14 +113,14 @@ def look(
 
     def refit(leads: Sequence[Lead], setting: Setting, share: float = _HOPELESS) -> None:
         begun = []
-        with _programs_ahead(before, leads[1:], data, setting):
+        with programs_coming(before, leads[1:], data, setting):
             for lead in leads:
                 progress(f"refitting with {lead.effect.name}")
-                begun.append((lead, _begin(before, lead, data, setting)))
+                begun.append((lead, begin(before, lead, data, setting)))
         # The one that has come farthest goes on first: beside it most others need not.
         for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
             best = min((t.training.objective for t in refitted.values()), default=np.inf)
-            trial = _go_on(before, lead, found, data, setting, _on_the_way(before, best, share))
+            trial = go_on(before, lead, found, data, setting, _on_the_way(before, best, share))
             if trial is not None and np.isfinite(trial.held_out.objective):
                 refitted[lead.effect.name] = trial
 
@@ -145,7 +129,7 @@ def look(
         refit(leads, setting.with_steps_of(best.training), 1.0 - _NEAR_TIE)
 
     first = first_of_each_family(worth, suspects)
-    with _programs_ahead(before, first[1:], data, setting):
+    with programs_coming(before, first[1:], data, setting):
         refit(first[:1], setting)
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
@@ -168,7 +152,7 @@ def look(
         if hold == before.hold:
             continue
         progress(f"refitting with a {hold} torque")
-        trial = _try_hold(before, data, hold, setting)
+        trial = try_hold(before, data, hold, setting)
         gain = -np.inf if trial is None else trial.gain_over(before)
         found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
     found.sort(key=lambda v: (v.trial is None, -v.gain))
@@ -302,66 +286,6 @@ def _on_the_way(before: Trial, best: float, share: float) -> float:
 
 def _reaches(trial: Trial | None, objective: float) -> bool:
     return trial is not None and trial.training.objective <= objective
-
-
-@contextmanager
-def _programs_ahead(before: Trial, leads: Sequence[Lead], data: Data, setting: Setting) -> Iterator[None]:
-    """Have the programs of refits to come made beside what is done meanwhile; what has not begun then is called off."""
-    with ExitStack() as stack:
-        for lead in leads:
-            model = before.model.with_effects(_with_positive_strengths(lead.effect))
-            stack.callback(coming(model, data, before.hold, setting))
-        yield
-
-
-def try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
-    """Refit with the effect, from the first-order estimate, from what is typical, and from what the model's own
-    parameters may stand for; None where it does not come as far as it is to."""
-    return _go_on(before, lead, _begin(before, lead, data, setting), data, setting, give_up_above)
-
-
-def _begin(before: Trial, lead: Lead, data: Data, setting: Setting) -> Fit:
-    """The first pass of such a refit."""
-    model = before.model
-    known = model.parameters()
-    moved = {}
-    for path, change in lead.drive_changes.items():
-        value, info = known[path]
-        new = float(value) + change
-        # First-order changes may overshoot; a positive parameter stays positive.
-        moved[path] = max(new, 0.3 * float(value)) if info.positive else new
-    first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
-    swing = scales(before.training.stretches, model)
-    starts = [
-        first,
-        *(model.with_effects(effect) for effect in lead.effect.typical(swing)),
-        *(model.replace(values).with_effects(effect) for values, effect in lead.effect.imitated(model.drive, swing)),
-    ]
-    return first_pass(starts, data, before.hold, setting, champion=before, own_states=lead.own_states)
-
-
-def _go_on(before: Trial, lead: Lead, begun: Fit, data: Data, setting: Setting, give_up_above: float) -> Trial | None:
-    """The rest of it, as far as it is worth it."""
-    trial = to_the_end(begun, data, before.hold, setting, champion=before, give_up_above=give_up_above)
-    return None if trial is None else replace(trial, lasting=lasting_share(lead.effect, before, trial))
-
-
-def _try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial | None:
-    """Refit under another hold. It acts on the same motion, so that a few steps from the present fit tell whether it
-    is worth more."""
-    near = trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS, reweigh=False)
-    if near.objective > before.training.objective + LEAST_GAIN:
-        return None
-    return challenge([near.model], data, hold, setting, champion=before)
-
-
-def _with_positive_strengths(effect: Effect) -> Effect:
-    """The effect with every positive strength off zero, where its logarithm can move."""
-    for name, info in own_parameters(effect):
-        if info.role == "strength" and info.positive:
-            value = float(getattr(effect, name))
-            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, as_scalar(max(value, 1e-6)))
-    return effect
 
 
 def _segment_squares(held_out: Fit, weigh: Fit) -> np.ndarray:

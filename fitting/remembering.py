@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.along import place_of
-from fitting.attribution import try_lead
+from fitting.lead_refit import try_lead
 from fitting.learned_look import LearnedLook, own_functions
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import worth_a_refit
