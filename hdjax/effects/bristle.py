@@ -7,8 +7,11 @@ bristle that yields within the path of one interval then is Coulomb friction tha
 which is all that such a log can tell; a stiffness beyond it is not identifiable and makes no difference.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
+
+from hdjax.where import where
 
 SETTLING = "shortest time in which a bristle may slip through: a sampling interval"
 
@@ -22,9 +25,11 @@ def bristle_rate(rate: Array, z: Array, limit: Array, settling: Array) -> Array:
         limit: where it saturates [rad].
         settling: shortest time constant [s].
     """
+    # No quotients: each would be one more division for every direction of a derivative.
+    by_limit = 1.0 / limit
     # Of a size below `limit / settling`.
-    rate = rate / jnp.sqrt(1.0 + (rate * settling / limit) ** 2)
-    return rate - jnp.abs(rate) * z / limit
+    rate = rate * jax.lax.rsqrt(1.0 + jnp.square(rate * (settling * by_limit)))
+    return rate - jnp.abs(rate) * z * by_limit
 
 
 def slip_rate(rate: Array, z: Array, limit: Array, settling: Array) -> Array:
@@ -35,4 +40,15 @@ def slip_rate(rate: Array, z: Array, limit: Array, settling: Array) -> Array:
     viscosity, after Perzyna 1966). The corner stays sharp, and steps of up to two settling times resolve it. Arguments
     as in [`bristle_rate`][].
     """
-    return rate - (z - jnp.clip(z, -limit, limit)) / settling
+    return rate - (z - kept_within(z, limit)) * (1.0 / settling)
+
+
+def kept_within(z: Array, limit: Array) -> Array:
+    """z, cut at the limit on both sides.
+
+    Args:
+        z: any number.
+        limit: positive.
+    """
+    # A choice: what `clip` has for derivatives counts how many of its arguments are equal, with a division each.
+    return where(z > limit, limit, where(z < -limit, -limit, z))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.bristle import SETTLING, bristle_rate, slip_rate
+from hdjax.effects.bristle import SETTLING, bristle_rate, kept_within, slip_rate
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.elementary import power
 from hdjax.parameters import Scalar, parameter
@@ -174,7 +174,7 @@ class MaxwellSlip(MeshTorqueEffect):
         return jnp.stack([self.yield_twist, self.share_2 * self.yield_twist, self.share_3 * self.yield_twist])
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
-        z_1, z_2, z_3 = (jnp.clip(z, -d, d) for z, d in zip(state, self._yields, strict=True))
+        z_1, z_2, z_3 = (kept_within(z, d) for z, d in zip(state, self._yields, strict=True))
         return self.k_1 * z_1 + self.k_2 * z_2 + self.k_3 * z_3
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, "3"]:
