@@ -340,8 +340,9 @@ def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting:
     leader = min(close, key=lambda v: (_beyond_real_drives(v), _size(v), -v.gain))
     # Whole stretches have told it from one that only short segments preferred.
     if leader.separable:
-        tied = {v.name: v in close for v in near}
-        verdicts = [eqx.tree_at(lambda v: v.separable, v, not tied.get(v.name, not v.separable)) for v in verdicts]
+        known, tied = ({v.name for v in some} for some in (near, close))
+        apart = [v.name not in tied if v.name in known else v.separable for v in verdicts]
+        verdicts = [eqx.tree_at(lambda v: v.separable, v, a) for v, a in zip(verdicts, apart, strict=True)]
     return sorted(verdicts, key=lambda v: v.name != leader.name)
 
 
