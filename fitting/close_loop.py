@@ -169,7 +169,7 @@ def close_loop(
 
     surprised = None
     if decision == "effect_found":
-        surprised = surprise(final, before, after, validation, noise=noise, halo=setting.halo)
+        surprised = surprise(final, before, after, current.held_out, noise=noise, halo=setting.halo)
         if surprised is not None and surprised > SURPRISED:
             decision = "unexplained"
             # What follows over long times may be learned in the place of names that do not.

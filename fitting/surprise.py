@@ -8,7 +8,6 @@ from jaxtyping import Array, Float
 
 from fitting.compare import EXPLAINED, Account
 from fitting.estimate import Fit
-from fitting.experiment import Stretch
 from fitting.prediction_band import PredictionBand, prediction_bands
 
 SURPRISED = 1.25
@@ -19,13 +18,13 @@ def surprise(
     final: Fit,
     before: Account,
     after: Account,
-    validation: Sequence[Stretch],
+    held_out: Fit,
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int,
 ) -> float | None:
-    """Rms by which free runs of held-out stretches are off, over the rms that their bands allow: noise, and what noise
-    leaves open of parameters and initial state.
+    """Rms by which free runs of held-out stretches are off, over the rms that their bands allow: what short segments
+    leave, and what it leaves open of parameters and initial state.
 
     Near one where the model is right, a chaotic one as well: its bands grow as its errors do. None where the model
     explains the free runs' error (no form is exact, and bands know nothing of that), or where its bands leave the
@@ -35,15 +34,18 @@ def surprise(
         final: the model with its effects.
         before: the base model's account.
         after: the final model's.
-        validation: the held-out stretches.
-        noise: covariance of the measurement noise.
+        held_out: the final model on short segments of the held-out stretches, which show noise with a memory whole.
+        noise: covariance of the measurement noise, as shorter pieces tell it.
         halo: intervals of torque before a stretch.
     """
-    variance = float(noise[-1, -1])
+    short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
+    variance = float(short[-1, -1])
     at_first = before.validation_rmse**2 - variance
     if after.validation_rmse**2 - variance <= (1.0 - EXPLAINED) * at_first:
         return None
-    bands = prediction_bands(final, after.uncertainty, validation, noise=noise, halo=halo, runs=after.validation)
+    bands = prediction_bands(
+        final, after.uncertainty, held_out.stretches, noise=short, halo=halo, runs=after.validation
+    )
     return over_bands(bands)
 
 
