@@ -19,7 +19,7 @@ from fitting.errors import DataError
 from fitting.estimate import lost
 from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
-from fitting.long_fit import long_fit
+from fitting.long_fit import lasts, long_fit
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
@@ -327,7 +327,11 @@ def _without(name: str, current: Trial, base: Trial, data: Data, setting: Settin
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:
     left = excess(trusted.held_out, noise)
     if trusted is base:
-        return "model_sufficient" if unknown is None and np.max(left) < EXCESS else "unexplained"
+        if unknown is not None:
+            return "unexplained"
+        # Pieces of half a period take the slow part of noise with a memory for motion.
+        is_noise = np.max(left) < EXCESS or lasts(base.held_out, np.log(SURPRISED))
+        return "model_sufficient" if is_noise else "unexplained"
     at_first = excess(base.held_out, noise)
     explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
     misfit = np.argmax(at_first)

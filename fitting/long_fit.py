@@ -87,6 +87,20 @@ def with_gaps_closed(found: Fit) -> float:
     return found.objective + 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
 
 
+def lasts(found: Fit, loss: float) -> bool:
+    """Whether the model follows whole stretches, and leaves no more there than over short horizons, but for so much of
+    the objective. Noise of the outputs passes, whatever its colour; a torque that the model lacks moves the drive ever
+    farther.
+
+    Args:
+        found: a fit over short horizons.
+        loss: of the objective.
+    """
+    whole = over_whole_stretches(found)
+    motion = len(found.model.motion_states)
+    return follows(whole) and bool(with_gaps_closed(whole) <= found.objective + freedom_of_states(found, motion) + loss)
+
+
 def _longest(found: Fit) -> int:
     """Samples of the longest stretch."""
     return max(len(s) for s in found.stretches)
