@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.special import chdtrc
 
 from fitting.arrow import chains
@@ -60,21 +60,29 @@ def ljung_box(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> tupl
 
 def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
     """Autocovariance that the fitted initial states take out of white noise as large as the residual."""
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
-    slopes = np.asarray(_by_first_state(linearise(problem, fit.unknowns), problem.segments.joined))
-    first = np.linalg.inv(np.asarray(problem.whitening))[-1]
-    weight = np.asarray(problem.segments.weight) > 0
+    first = np.linalg.inv(np.asarray(fit.problem.whitening))[-1]
+    weight = np.asarray(fit.problem.segments.weight) > 0
     segments, samples = weight.shape
-    chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
-    basis = _orthonormal(slopes, chain)
-    white = basis[:, : samples * first.shape[0]].reshape(segments, samples, first.shape[0], -1)
+    basis, chain = basis_of_states(fit)
     # From whitened outputs back to the dynamic error.
-    error = np.einsum("o,snok->snk", first, white)[weight]
+    error = np.einsum("o,snok->snk", first, basis.reshape(segments, samples, first.shape[0], -1))[weight]
     owner = np.repeat(chain, samples).reshape(segments, samples)[weight]
     place = np.arange(owner.size) - np.searchsorted(owner, owner)
     apart = np.zeros((int(owner[-1]) + 1, error.shape[1], int(place.max()) + 1))
     apart[owner, :, place] = error
     return autocovariance(apart, lags).sum(axis=(0, 1))
+
+
+def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directions"], Int[np.ndarray, " segments"]]:
+    """What the initial states that a fit has fitted can do to its whitened outputs, and the simulation (a chain of
+    joined segments) to which each segment belongs.
+
+    The columns of each chain are orthonormal over its rows and those of the prior of its hidden states.
+    """
+    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    slopes = np.asarray(_by_first_state(linearise(problem, fit.unknowns), problem.segments.joined))
+    chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
+    return _orthonormal(slopes, chain)[:, : problem.segments.measured[0].size], chain
 
 
 @jit_small

@@ -19,8 +19,9 @@ from fitting.errors import DataError
 from fitting.estimate import lost
 from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split
-from fitting.long_fit import lasts, long_fit
+from fitting.long_fit import long_fit
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
+from fitting.noise_memory import noise_with_memory
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
 from fitting.screening import programs_ahead
@@ -69,6 +70,8 @@ class Loop(eqx.Module):
         unknown: what was learned, where the catalogue does not explain what is missing, or not all of it.
         evidence: what each effect of the final model does, and what the data say of it.
         noise: covariance of the measurement noise of the outputs.
+        noise_memory: for how long [s] what is left over remembers itself, where it is more than short pieces tell of
+            the noise and was taken for noise with a memory; None elsewhere.
         residual_before: diagnostics of what the base model leaves over.
         residual_after: likewise of the final model.
         hold: what the torque does between samples, as used.
@@ -91,6 +94,7 @@ class Loop(eqx.Module):
     unknown: Unknown | None
     evidence: tuple[Evidence, ...]
     noise: Float[Array, "outputs outputs"]
+    noise_memory: float | None
     residual_before: ResidualDiagnostics
     residual_after: ResidualDiagnostics
     hold: Hold = eqx.field(static=True)
@@ -153,6 +157,13 @@ def close_loop(
     best = named if unknown is None else unknown.trial
     noise = seen_noise.and_beside(best.training).covariance
     decision = _decide(base, trusted, unknown, noise)
+    slow = None
+    if decision == "unexplained" and unknown is None:
+        # Pieces of half a period take the slow part of noise with a memory for motion.
+        slow = noise_with_memory(trusted.held_out)
+        if slow is not None:
+            noise = slow.covariance
+            decision = "model_sufficient" if trusted is base else "effect_found"
     if decision == "effect_found" and np.max(excess(trusted.held_out, noise)) < EXCESS:
         # What the names leave is hardly more than noise.
         unknown = None
@@ -212,6 +223,7 @@ def close_loop(
         unknown=unknown,
         evidence=seen,
         noise=noise,
+        noise_memory=None if slow is None else slow.memory(training[0].experiment.time_step),
         residual_before=diagnose(base.training),
         residual_after=diagnose(current.training),
         hold=current.hold,
@@ -327,11 +339,7 @@ def _without(name: str, current: Trial, base: Trial, data: Data, setting: Settin
 def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[Array, "outputs outputs"]) -> Decision:
     left = excess(trusted.held_out, noise)
     if trusted is base:
-        if unknown is not None:
-            return "unexplained"
-        # Pieces of half a period take the slow part of noise with a memory for motion.
-        is_noise = np.max(left) < EXCESS or lasts(base.held_out, np.log(SURPRISED))
-        return "model_sufficient" if is_noise else "unexplained"
+        return "model_sufficient" if unknown is None and np.max(left) < EXCESS else "unexplained"
     at_first = excess(base.held_out, noise)
     explained = 1.0 - (left**2 - 1.0) / np.maximum(at_first**2 - 1.0, 1e-12)
     misfit = np.argmax(at_first)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
-from fitting.free_run import FreeRun, free_run, rms_error
+from fitting.free_run import FreeRun, free_run, motor_rms_error, rms_error
 from fitting.identifiability import Identifiability, identifiability
 from fitting.profile import with_profiles
 from fitting.uncertainty import Uncertainty, uncertainty
@@ -47,6 +47,16 @@ class Account(eqx.Module):
     def validation_rmse(self) -> float:
         """Rms error of the dynamic error on held-out stretches."""
         return rms_error(self.validation)
+
+    @property
+    def training_motor_rmse(self) -> float | None:
+        """Rms error of the motor's angle on training stretches; None for a reduced model."""
+        return motor_rms_error(self.training)
+
+    @property
+    def validation_motor_rmse(self) -> float | None:
+        """Likewise on held-out stretches."""
+        return motor_rms_error(self.validation)
 
 
 def account(

@@ -31,7 +31,7 @@ class FreeRun(eqx.Module):
         time: sample stamps [s].
         predicted: dynamic error [rad].
         measured: likewise.
-        motor_angle: predicted motor angle [rad], or None for a reduced model.
+        motor_error: measured minus predicted motor angle [rad], or None for a reduced model.
         weight: 1 for a sample whose measurement counts, 0 for the others; None where all count.
     """
 
@@ -39,7 +39,7 @@ class FreeRun(eqx.Module):
     time: Float[np.ndarray, " n"]
     predicted: Float[np.ndarray, " n"]
     measured: Float[np.ndarray, " n"]
-    motor_angle: Float[np.ndarray, " n"] | None
+    motor_error: Float[np.ndarray, " n"] | None
     weight: Float[np.ndarray, " n"] | None = None
 
     @property
@@ -60,7 +60,16 @@ class FreeRun(eqx.Module):
 
 def rms_error(runs: Sequence[FreeRun]) -> float:
     """Rms of measured minus predicted over several runs [rad]; infinite where a run left the numbers."""
-    square = np.concatenate([r.squared_error for r in runs])
+    return _rms(np.concatenate([r.squared_error for r in runs]))
+
+
+def motor_rms_error(runs: Sequence[FreeRun]) -> float | None:
+    """Likewise of the motor's angle; None for a reduced model."""
+    errors = [r.motor_error[r.counts] for r in runs if r.motor_error is not None]
+    return _rms(np.concatenate(errors) ** 2) if errors else None
+
+
+def _rms(square: Float[np.ndarray, " counted"]) -> float:
     return float(np.sqrt(np.mean(square))) if np.isfinite(square).all() else np.inf
 
 
@@ -107,14 +116,17 @@ def free_run(
     for stretch, output in zip(stretches, outputs, strict=True):
         n = len(stretch)
         part = slice(stretch.start, stretch.stop)
-        motor = output[:n, 0] * float(model.drive.N) if isinstance(model, TwoInertiaModel) else None
+        measured = stretch.experiment.measured[part]
+        motor = None
+        if isinstance(model, TwoInertiaModel):
+            motor = (measured[:, 0] - output[:n, 0]) * float(model.drive.N)
         runs.append(
             FreeRun(
                 name=stretch.name,
                 time=stretch.experiment.time[part],
                 predicted=output[:n, -1],
-                measured=stretch.experiment.measured[part, -1],
-                motor_angle=motor,
+                measured=measured[:, -1],
+                motor_error=motor,
                 weight=stretch.weight,
             )
         )

@@ -36,7 +36,8 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=_longest(start), substeps=substeps)
-    explains = _leaves_no_more(long, start, _LOSS)
+    motion = len(start.model.motion_states)
+    explains = with_gaps_closed(long) <= start.objective + freedom_of_states(start, motion) + _LOSS
     if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
@@ -84,28 +85,6 @@ def with_gaps_closed(found: Fit) -> float:
     not follow the log for so long."""
     gap = np.asarray(linearise(found.problem, found.unknowns).gap) * np.asarray(found.problem.gap_weight)
     return found.objective + 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
-
-
-def lasts(found: Fit, loss: float) -> bool:
-    """Whether the model follows whole stretches, and leaves no more there than over short horizons, but for so much of
-    the objective.
-
-    Noise of the outputs passes, coloured as well where its memory is short beside a horizon. A torque on motor or load
-    that the model lacks moves the drive ever farther; one inside the mesh may pass.
-
-    Args:
-        found: a fit over short horizons.
-        loss: of the objective.
-    """
-    whole = over_whole_stretches(found)
-    return follows(whole) and _leaves_no_more(whole, found, loss)
-
-
-def _leaves_no_more(long: Fit, short: Fit, loss: float) -> bool:
-    """Whether long horizons leave no more than short ones do beyond what their many initial states take off, but for so
-    much of the objective."""
-    allowed = freedom_of_states(short, len(short.model.motion_states)) + loss
-    return bool(with_gaps_closed(long) <= short.objective + allowed)
 
 
 def _longest(found: Fit) -> int:

@@ -1,14 +1,12 @@
 """The fit over whole logs is taken where it tells more, and only there."""
 
 import jax.numpy as jnp
-import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import rig
 from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch, experiment_from_log
-from fitting.long_fit import lasts, long_fit
+from fitting.experiment import Stretch
+from fitting.long_fit import long_fit
 from fitting.uncertainty import uncertainty
 from hdjax.effects.backlash import Backlash
 
@@ -43,15 +41,3 @@ def test_a_long_simulation_tells_more_of_a_smooth_motion():
     before, after = (uncertainty(f).estimates["K"] for f in (short, long))
     assert after.std < 0.2 * before.std
     assert abs(after.value - rig.K) < 4.0 * after.std
-
-
-@pytest.mark.parametrize("friction", [0.0, 2e-3], ids=["nothing is missing", "motor friction is missing"])
-def test_noise_with_a_memory_lasts_over_whole_stretches_and_a_missing_torque_does_not(friction: float):
-    random = np.random.default_rng(5)
-    slow = np.asarray(lfilter([np.sqrt(1.0 - 0.9**2)], [1.0, -0.9], random.normal(size=(COUNT, 2)), axis=0))
-    torque = rig.drive_torque(COUNT, rms=0.3, seed=5)
-    motion = rig.drive_motion(torque, motor_friction=(friction, 1.0))
-    motion[:, :2] += 3.0 * slow * [rig.MOTOR_NOISE, rig.LOAD_NOISE]
-    logged = experiment_from_log(rig.drive_log(motion, torque), hold="zero-order", N=rig.N)
-    found = fit(rig.drive_model(), [Stretch(logged, 0, COUNT)], PATHS[:3], horizon=HORIZON, substeps=1)
-    assert lasts(found, np.log(1.25)) == (friction == 0.0)

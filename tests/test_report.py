@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -673,10 +673,30 @@ def test_what_is_no_number_leaves_a_gap_in_a_figure():
     ],
 )
 def test_the_summary_claims_no_gain_where_the_error_rises(after: float | None, said: str):
-    report = {
-        "before": {"rmse": {"validation": 1e-5}},
-        "after": {"rmse": {"validation": after}},
-        "units": {"dynamic_error": "rad"},
-        "noise": {"dynamic_error": 1e-6},
-    }
-    assert said in _change("It", report)
+    assert said in _change("It", _changed(1e-5, after, motor=(None, None)))
+
+
+@pytest.mark.parametrize(
+    ("after", "motor", "said"),
+    [
+        (
+            8.7e-7,
+            (0.2, 1e-4),
+            "It shows in the motor's angle, whose held-out error falls by 99.95 %, from 200 mrad to 0.1",
+        ),
+        (8.8e-7, (0.2, 1e-4), "It shows in the motor's angle"),
+        (8.7e-7, (None, 1e-4), "from a simulation that diverged to 100 µrad"),
+        (8.7e-7, (0.2, 0.2), "It removes 0 % of the held-out error"),
+        (1e-7, (0.2, 1e-4), "It removes 89 % of the held-out error"),
+    ],
+)
+def test_the_summary_tells_of_the_motor_what_the_dynamic_error_does_not_show(
+    after: float, motor: tuple[float | None, float], said: str
+):
+    assert said in _change("It", _changed(8.7e-7, after, motor=motor))
+
+
+def _changed(before: float, after: float | None, *, motor: tuple[float | None, float | None]) -> dict[str, Any]:
+    stages = zip(("before", "after"), (before, after), motor, strict=True)
+    found = {s: {"rmse": {"validation": x}, "rmse_motor_angle": {"validation": m}} for s, x, m in stages}
+    return found | {"units": {"dynamic_error": "rad"}, "noise": {"dynamic_error": 1e-6}}

@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,7 @@ class Case:
         seed: of the study.
         faint: whether what is hidden is drawn near its detection limit instead of from its usual range.
         coloured: whether the noise is; where None, by chance.
+        remembering: whether all of the noise has a memory instead.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Case:
     seed: int
     faint: bool = False
     coloured: bool | None = None
+    remembering: bool = False
 
 
 class NoExperimentError(RuntimeError):
@@ -133,6 +135,11 @@ def pair_cases(count: int, seed: int) -> list[Case]:
     return [Case(f"pair-{i}", _pair(stream(seed, f"pair-{i}"), families), seed) for i in range(count)]
 
 
+def with_remembering_noise(case: Case) -> Case:
+    """A case of the same kind whose noise has a memory altogether: another drive, since its name is another."""
+    return replace(case, name=f"{case.name}-remembering", remembering=True)
+
+
 def _pair(random: np.random.Generator, families: Sequence[str]) -> tuple[Form, ...]:
     """Two forms that change different parameters of the mechanism: a second motor friction would replace the first."""
     while True:
@@ -174,7 +181,8 @@ def _attempt(case: Case, random: np.random.Generator) -> Drawn | None:
     if any(form.straight for form in case.forms):
         base = base._replace(k3=0.0)
     by_chance = bool(random.uniform() < 0.3)
-    encoders = draw_encoders(random, colour=by_chance if case.coloured is None else case.coloured)
+    colour = by_chance if case.coloured is None else case.coloured
+    encoders = draw_encoders(random, colour=colour, remembering=case.remembering)
     heats = any(form.heats for form in case.forms) or random.uniform() < 0.15
     turning = TURNING[:2] if any(form.family in _OF_ANGLE for form in case.forms) else TURNING
     bench = _Bench(base, encoders, dt, substeps_of(dt), _excitations(random, base, counts, dt, turning), heats)

@@ -24,7 +24,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from fitting.files import write_whole
 from hdjax.program_cache import forget
-from undeclared.drawing import Case, NoExperimentError, clean_cases, draw, pair_cases, single_cases
+from undeclared.drawing import (
+    Case,
+    NoExperimentError,
+    clean_cases,
+    draw,
+    pair_cases,
+    single_cases,
+    with_remembering_noise,
+)
 from undeclared.hidden import FAMILIES
 from undeclared.recording import record
 from undeclared.sindy import sindy_is_there
@@ -70,6 +78,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--pairs", type=int, default=0, help="with two hidden effects of different families")
     parser.add_argument("--kinds", nargs="+", choices=FAMILIES, default=[f for f in FAMILIES if f != "unknown"])
     parser.add_argument("--leave-out", action="store_true", help="take the hidden families out of the catalogue")
+    parser.add_argument("--remembering", action="store_true", help="noise that has a memory altogether in every case")
     parser.add_argument("--only", nargs="+", help="cases of these names alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder of the results, one JSON a case")
@@ -88,6 +97,8 @@ def _cases(args: argparse.Namespace) -> list[Case]:
         *clean_cases(args.clean, args.seed),
         *pair_cases(args.pairs, args.seed),
     ]
+    if args.remembering:
+        cases = [with_remembering_noise(case) for case in cases]
     return [case for case in cases if not args.only or case.name in args.only]
 
 

@@ -50,7 +50,7 @@ def spectrum(
         "spectrum",
         "left_over",
         "Spectrum of the residual",
-        "Lines and humps above the noise level are physics that the model lacks.",
+        "Lines and humps above the noise level are physics that the model lacks, or noise that is not white.",
         figure(traces, 340, **layout),
     )
 
@@ -98,7 +98,7 @@ def autocorrelation(before: ResidualDiagnostics, after: ResidualDiagnostics | No
         "left_over",
         "Memory of the residual",
         "At lag zero it is 1. The grey band holds 95 % of the lags of white noise. "
-        "A residual that stays outside it is not noise.",
+        "A residual that stays outside it is not white: the model lacks something, or the noise has a memory.",
         figure(traces, 300, **layout),
     )
 

@@ -60,7 +60,7 @@ def report_dict(
         "decision": outcome.decision,
         "summary": "",
         "units": units,
-        "noise": {"dynamic_error": noise},
+        "noise": {"dynamic_error": noise, "memory": outcome.noise_memory if is_loop else None},
         "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
         "identifiability": identifiability_dict(outcome.after.identifiability, units),

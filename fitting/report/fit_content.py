@@ -77,8 +77,9 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
         notes.append("The free run diverges on held-out data: the model doesn't stand for this drive.")
     elif missing:
         notes.append(
-            "The residual is not noise: the model lacks something. Its parameters absorb a part of it, so that the "
-            "truth may lie outside the intervals. `hdjax close-loop` looks for what is missing."
+            "The residual is not white noise: the model lacks something, or the sensors' noise has a memory. What is "
+            "missing is absorbed in part by the parameters, so that the truth may lie outside the intervals. "
+            "`hdjax close-loop` looks for it."
         )
         if over_noise < _DRIFTED:
             notes.append("The estimate of the measurement noise holds a part of what is missing: don't lean on it.")

@@ -38,13 +38,15 @@ def account_dict(
         "derived": {name: _derived_dict(name, q) for name, q in figures.items()},
         "correlations": _correlations(account.uncertainty),
         "rmse": {"training": account.training_rmse, "validation": account.validation_rmse},
+        "rmse_motor_angle": {"training": account.training_motor_rmse, "validation": account.validation_motor_rmse},
     }
 
 
 def no_account() -> dict[str, Any]:
     """Likewise where no second model was fitted."""
     empty = {"effects": [], "parameters": {}, "derived": {}, "correlations": []}
-    return empty | {"rmse": {"training": None, "validation": None}}
+    none = {"training": None, "validation": None}
+    return empty | {"rmse": none, "rmse_motor_angle": dict(none)}
 
 
 def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start: Model | None = None) -> dict[str, Any]:

@@ -7,6 +7,9 @@ from fitting import formatting
 from fitting.report.separating import plain_family
 from fitting.report.unknown import place_and_variables
 
+# What changes the error by less than this share hardly shows in it.
+_HARDLY = 0.1
+
 _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
 
 
@@ -25,6 +28,7 @@ def summary(report: Mapping[str, Any]) -> str:
         return (
             f"The model suffices: on held-out data it errs by {_against_noise(before, noise, unit)}, and none of the "
             f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
+            + _remembering(report)
         )
     if decision == "effect_found":
         opening = (
@@ -37,7 +41,7 @@ def summary(report: Mapping[str, Any]) -> str:
             rest = f" More than noise is left, which has no name: a learned {_learned(report)}, stands for it."
         several = bool(rest) or len(families) > 1
         change = _change("Together they" if several else "It", report, several=several)
-        return f"{opening}: {found}.{rest} {change}"
+        return f"{opening}: {found}.{rest} {change}{_remembering(report)}"
     left = report["unexplained"]
     opening = "Something is missing that the catalogue does not explain."
     if families:
@@ -58,6 +62,18 @@ def summary(report: Mapping[str, Any]) -> str:
     )
 
 
+def _remembering(report: Mapping[str, Any]) -> str:
+    """What it rests on that the noise is as large as it is said to be; empty where short pieces tell it."""
+    memory = report["noise"]["memory"]
+    if memory is None:
+        return ""
+    return (
+        f" What is left over remembers itself for about {formatting.quantity(memory, 's', digits=2)}, and was taken "
+        "for noise of the sensors, since whole stretches leave no more of it than such noise would. Something as slow "
+        "that nothing tried here can follow would look the same."
+    )
+
+
 def _learned(report: Mapping[str, Any]) -> str:
     unknown = report["unknown"]
     return place_and_variables(unknown["place"], unknown["variables"], unknown["period"], unknown["memory"])
@@ -68,6 +84,13 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
     before, after = (report[stage]["rmse"]["validation"] for stage in ("before", "after"))
     unit, s = report["units"]["dynamic_error"], "" if several else "s"
     then, now = _rmse(before, unit), _against_noise(after, report["noise"]["dynamic_error"], unit, like=before)
+    motor = [report[stage]["rmse_motor_angle"]["validation"] for stage in ("before", "after")]
+    if not _falls(before, after) and _falls(*motor):
+        first, last = (_rmse(value, "rad", motor[0]) for value in motor)
+        return (
+            f"{subject} show{s} in the motor's angle, whose held-out error falls by {_removed(*motor)}, from {first} "
+            f"to {last}. Hardly in the dynamic error, which is off by {then} before and {now} after."
+        )
     if before is not None and (after is None or after > before):
         where = "short segments alone; over whole held-out stretches the error rises"
         return f"{subject} explain{s} {where} from {then} to {now}."
@@ -86,6 +109,11 @@ def _against_noise(value: float | None, noise: float, unit: str, like: float | N
     if value is None:
         return _rmse(value, unit)
     return f"{_rmse(value, unit, like)} rms ({formatting.number(value / noise)} times the measurement noise)"
+
+
+def _falls(before: float | None, after: float | None) -> bool:
+    """Whether an error falls by more than hardly."""
+    return after is not None and (before is None or after < (1.0 - _HARDLY) * before)
 
 
 def _removed(before: float | None, after: float | None) -> str:

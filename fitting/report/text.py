@@ -30,6 +30,9 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     for key, label in (("training", "training"), ("validation", "held out")):
         values = "".join(f"{plain(a['rmse'][key]):>14}" for _, a in shown)
         lines.append(f"    {label:12}{values} {unit}")
+    if report["after"]["effects"] and report["before"]["rmse_motor_angle"]["validation"] is not None:
+        values = "".join(f"{plain(a['rmse_motor_angle']['validation']):>14}" for _, a in shown)
+        lines.append(f"    {'motor angle':12}{values} rad, held out")
     lines.append(f"    {'noise':12}{plain(report['noise']['dynamic_error']):>14} {unit}")
     lines.append("[Parameters]")
     lines += _parameter_lines(final["parameters"])
