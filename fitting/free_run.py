@@ -31,16 +31,18 @@ class FreeRun(eqx.Module):
         time: sample stamps [s].
         predicted: dynamic error [rad].
         measured: likewise.
-        motor_error: measured minus predicted motor angle [rad], or None for a reduced model.
+        motor_angle: predicted motor angle [rad], or None for a reduced model.
         weight: 1 for a sample whose measurement counts, 0 for the others; None where all count.
+        measured_motor_angle: [rad], or None for a reduced model.
     """
 
     name: str = eqx.field(static=True)
     time: Float[np.ndarray, " n"]
     predicted: Float[np.ndarray, " n"]
     measured: Float[np.ndarray, " n"]
-    motor_error: Float[np.ndarray, " n"] | None
+    motor_angle: Float[np.ndarray, " n"] | None
     weight: Float[np.ndarray, " n"] | None = None
+    measured_motor_angle: Float[np.ndarray, " n"] | None = None
 
     @property
     def counts(self) -> Bool[np.ndarray, " n"]:
@@ -65,7 +67,11 @@ def rms_error(runs: Sequence[FreeRun]) -> float:
 
 def motor_rms_error(runs: Sequence[FreeRun]) -> float | None:
     """Likewise of the motor's angle; None for a reduced model."""
-    errors = [r.motor_error[r.counts] for r in runs if r.motor_error is not None]
+    errors = [
+        (r.measured_motor_angle - r.motor_angle)[r.counts]
+        for r in runs
+        if r.motor_angle is not None and r.measured_motor_angle is not None
+    ]
     return _rms(np.concatenate(errors) ** 2) if errors else None
 
 
@@ -117,17 +123,18 @@ def free_run(
         n = len(stretch)
         part = slice(stretch.start, stretch.stop)
         measured = stretch.experiment.measured[part]
-        motor = None
+        motor = measured_motor = None
         if isinstance(model, TwoInertiaModel):
-            motor = (measured[:, 0] - output[:n, 0]) * float(model.drive.N)
+            motor, measured_motor = (y[:, 0] * float(model.drive.N) for y in (output[:n], measured))
         runs.append(
             FreeRun(
                 name=stretch.name,
                 time=stretch.experiment.time[part],
                 predicted=output[:n, -1],
                 measured=measured[:, -1],
-                motor_error=motor,
+                motor_angle=motor,
                 weight=stretch.weight,
+                measured_motor_angle=measured_motor,
             )
         )
     return tuple(runs)

@@ -9,7 +9,7 @@ import pytest
 import fitting.free_run as module
 import rig
 from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.free_run import WINDOW, FreeRun, free_run, rms_error
+from fitting.free_run import WINDOW, FreeRun, free_run, motor_rms_error, rms_error
 from hdjax import Model
 
 COUNT = 600
@@ -43,6 +43,8 @@ def test_the_truth_is_reproduced(moving: Experiment):
     assert found.rmse < 2.0 * X_NOISE
     # The free motor drifts off with the error of its rate.
     assert np.max(np.abs(found.motor_angle - truth[:, 0])) < 0.02
+    drift = np.sqrt(np.mean((moving.motor_angle[:COUNT] - found.motor_angle) ** 2))
+    assert motor_rms_error((found,)) == pytest.approx(drift, rel=1e-9)
     np.testing.assert_array_equal(found.time, moving.time[:COUNT])
 
 
