@@ -16,8 +16,8 @@ from fitting.autocorrelation import autocovariance, basis_of_states
 from fitting.estimate import Fit, half_log_determinant
 from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed
 
-# Draws of such noise: of so many hardly one bends as little by chance as all of them. Samples until a draw has
-# forgotten its start.
+# Draws of such noise: what bends less than all of so many does hardly so by chance. Samples until a draw has forgotten
+# its start.
 _DRAWS = 99
 _START = 2000
 # The longest memory that is told from a drift [samples].

@@ -37,7 +37,7 @@ from fitting.report import (
     write_report,
 )
 from fitting.report.limits import limits, parameter_note
-from fitting.report.summary import _change
+from fitting.report.summary import _change, _remembering
 from fitting.starting_values import starting_models
 from fitting.uncertainty import Estimate, Uncertainty
 from fitting.web_page import environment
@@ -694,6 +694,12 @@ def test_the_summary_tells_of_the_motor_what_the_dynamic_error_does_not_show(
     after: float, motor: tuple[float | None, float], said: str
 ):
     assert said in _change("It", _changed(8.7e-7, after, motor=motor))
+
+
+@pytest.mark.parametrize(("memory", "said"), [(0.028, "remembers itself for about 28 ms"), (None, "")])
+def test_the_summary_tells_where_the_noise_was_told_from_what_is_missing_by_its_memory(memory: float | None, said: str):
+    sentence = _remembering({"noise": {"memory": memory}})
+    assert said in sentence and bool(sentence) == (memory is not None)
 
 
 def _changed(before: float, after: float | None, *, motor: tuple[float | None, float | None]) -> dict[str, Any]:
