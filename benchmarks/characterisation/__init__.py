@@ -1,0 +1,1 @@
+"""What the command line gives, recorded before and after a change."""
