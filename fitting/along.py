@@ -15,6 +15,7 @@ from fitting.experiment import Segments, Stretch
 from fitting.followed import NODES, Followed
 from fitting.instants import at_instants
 from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
+from hdjax.compilation import jit_small
 from hdjax.effects import (
     Conditions,
     Effect,
@@ -27,7 +28,6 @@ from hdjax.effects import (
 )
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedReading, LearnedTorque
 from hdjax.parameters import Scalar, parameter
-from hdjax.program_cache import jit_small
 from hdjax.signals import polynomial
 
 PART = 0.5 * (NODES + 1.0)[None, None, :]

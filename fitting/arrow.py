@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.residual import Blocks, LinearisedResidual, Unknowns, blocks_of_columns, seeds
-from hdjax.program_cache import jit_small
+from hdjax.compilation import jit_small
 from hdjax.where import where
 
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large

@@ -10,13 +10,12 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
-from fitting.lead_refit import begin, go_on, programs_coming, try_hold
+from fitting.lead_refit import begin, go_on, try_hold
 from fitting.long_fit import freedom_of_states
 from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
 from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
-from fitting.sight import look_ahead
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, long_gains
 from fitting.uncertainty import Estimate, Uncertainty, uncertainty
 from hdjax import ReducedModel
@@ -113,10 +112,9 @@ def look(
 
     def refit(leads: Sequence[Lead], setting: Setting, share: float = _HOPELESS) -> None:
         begun = []
-        with programs_coming(before, leads[1:], data, setting):
-            for lead in leads:
-                progress(f"refitting with {lead.effect.name}")
-                begun.append((lead, begin(before, lead, data, setting)))
+        for lead in leads:
+            progress(f"refitting with {lead.effect.name}")
+            begun.append((lead, begin(before, lead, data, setting)))
         # The one that has come farthest goes on first: beside it most others need not.
         for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
             best = min((t.training.objective for t in refitted.values()), default=np.inf)
@@ -129,11 +127,9 @@ def look(
         refit(leads, setting.with_steps_of(best.training), 1.0 - _NEAR_TIE)
 
     first = first_of_each_family(worth, suspects)
-    with programs_coming(before, first[1:], data, setting):
-        refit(first[:1], setting)
+    refit(first[:1], setting)
     leader = refitted.get(first[0].effect.name) if first else None
     if leader is not None and leaves_white_noise(leader.training):
-        look_ahead(leader.training)
         refit_beside(leader, [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])])
     else:
         refit(first[1:], setting)

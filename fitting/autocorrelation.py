@@ -7,10 +7,10 @@ from jaxtyping import Array, Float, Int
 from scipy.special import chdtrc
 
 from fitting.arrow import chains
+from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.residual import Blocks
-from fitting.solve import linearise
-from hdjax.program_cache import jit_small
+from hdjax.compilation import jit_small
 
 # Directions of a chain's first state that its samples hardly see.
 _BLIND = 1e-12

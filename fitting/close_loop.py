@@ -24,7 +24,6 @@ from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.noise_memory import noise_with_memory
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
-from fitting.screening import programs_ahead
 from fitting.surprise import SURPRISED, surprise
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, gone_on, halo_for
 from fitting.unknown import Unknown, learn_supported
@@ -142,8 +141,8 @@ def close_loop(
     clock = Clock()
     data: Data = {h: split(e) for h, e in experiments.items()}
     progress("finding starting values")
-    with programs_ahead(model, next(iter(data.values()))[0], catalogue):
-        base, setting, hold, data = _base_trial(model, data, hold)
+
+    base, setting, hold, data = _base_trial(model, data, hold)
     clock.lap("base fit")
     base, clocked = with_clocks_set(base, data, setting, progress=progress)
     late, data = put_back(data[hold][0], clocked[hold][0]), clocked

@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 
 from fitting.compare import Account
 from hdjax import Drive, Model
-from hdjax.program_cache import jit_small
+from hdjax.compilation import jit_small
 
 Quantities = Mapping[str, tuple[Array, str]]
 """Value and unit by name."""

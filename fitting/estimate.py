@@ -10,14 +10,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.arrow import projected
+from fitting.engines import linearise
 from fitting.experiment import Stretch, scales
 from fitting.free import FreeParameters
 from fitting.posing import initial_states, pose
 from fitting.residual import RUNAWAY, Problem, Unknowns
-from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, linearise, solve
+from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from hdjax import Model
+from hdjax.compilation import jit_small
 from hdjax.lanes import spread
-from hdjax.program_cache import jit_small
 
 REWEIGHTINGS = 3
 """Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""

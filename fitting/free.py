@@ -48,12 +48,15 @@ class FreeParameters(eqx.Module):
         """The model with the values that the vector stands for."""
         if not self.paths:
             return model
+        return model.replace(dict(zip(self.paths, self.values(vector), strict=True)))
+
+    def values(self, vector: Float[Array, " parameters"]) -> list[Array | np.ndarray]:
+        """The physical values that the vector stands for."""
         library, (entries, scale) = _library(vector, self.scale)
-        values = {
-            path: library.exp(library.clip(v, -_LARGEST_LOG, _LARGEST_LOG)) if positive else v * s
-            for path, positive, v, s in zip(self.paths, self.logarithmic, entries, scale, strict=True)
-        }
-        return model.replace(values)
+        return [
+            library.exp(library.clip(v, -_LARGEST_LOG, _LARGEST_LOG)) if positive else v * s
+            for positive, v, s in zip(self.logarithmic, entries, scale, strict=True)
+        ]
 
     def slopes(self, model: Model) -> Float[Array, " parameters"]:
         """Derivative of each physical value with respect to its entry of the vector."""

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fitting.engines import linearise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
 from fitting.posing import suggested_substeps
 from fitting.residual import Problem, Unknowns, simulate_segments
-from fitting.solve import linearise
 from hdjax import Model, TwoInertiaModel
 from hdjax.lanes import jit_lanes
 

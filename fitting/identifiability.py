@@ -9,16 +9,16 @@ from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
 from fitting.arrow import project
+from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.formatting import words
 from fitting.residual import Blocks, Problem
 from fitting.sandwich import directions
-from fitting.solve import linearise
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import TwoInertiaModel
+from hdjax.compilation import jit_small
 from hdjax.parameters import ParameterInfo
-from hdjax.program_cache import jit_small
 
 # Two standard errors along a direction that are more than 40 % leave it open.
 _WEAK = 0.2

@@ -1,7 +1,5 @@
 """A lead of the first look, or another hold of the torque, put inside the equations and refitted."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import equinox as eqx
@@ -15,7 +13,6 @@ from fitting.trial import (
     Setting,
     Trial,
     challenge,
-    coming,
     first_pass,
     lasting_share,
     to_the_end,
@@ -28,23 +25,6 @@ from hdjax.parameters import as_scalar, own_parameters
 # Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
 # one finds the way.
 _HOLD_STEPS = 3
-
-
-@contextmanager
-def programs_coming(before: Trial, leads: Sequence[Lead], data: Data, setting: Setting) -> Iterator[None]:
-    """Have the programs of refits to come made beside what is done meanwhile; what has not begun then is called off.
-
-    Args:
-        before: the current model.
-        leads: what will be put inside it.
-        data: the stretches.
-        setting: how they are cut.
-    """
-    with ExitStack() as stack:
-        for lead in leads:
-            model = before.model.with_effects(_with_positive_strengths(lead.effect))
-            stack.callback(coming(model, data, before.hold, setting))
-        yield
 
 
 def try_lead(before: Trial, lead: Lead, data: Data, setting: Setting, give_up_above: float) -> Trial | None:

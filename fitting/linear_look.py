@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.along import acting_at_knots, conditions_at_knots, motions, unit_pushes
+from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.explained import explained, solved, without_untold
 from fitting.followed import Followed, follow
 from fitting.residual import Blocks, Problem
 from fitting.sight import where_it_goes
-from fitting.solve import linearise
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
 from hdjax.where import where

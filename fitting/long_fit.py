@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from fitting.engines import linearise
 from fitting.estimate import Fit, fit, needed_substeps
-from fitting.solve import linearise
 from hdjax import Model
 
 _STEPS = 20

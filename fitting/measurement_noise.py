@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.engines import linearise
 from fitting.estimate import REWEIGHTINGS, Fit, weighed, zeros_like
 from fitting.experiment import Stretch, cut, scales
 from fitting.posing import initial_states, natural_frequency
 from fitting.residual import RUNAWAY, Blocks, Problem, Unknowns
-from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, linearise, solve
+from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
 from hdjax.lanes import spread
 
 # So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.

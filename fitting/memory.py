@@ -1,7 +1,6 @@
 """The own states of effects along a motion: settled where it starts, then driven by it."""
 
 import functools
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -10,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.along import PART, Along
-from fitting.instants import INSTANTS, through_instants
+from fitting.instants import through_instants
+from hdjax.compilation import jit_small
 from hdjax.effects import Effect, Motion
-from hdjax.program_cache import jit_small
 from hdjax.where import where
 
 # Steps in a sample interval, along a motion that is a straight line in between.
@@ -88,20 +87,6 @@ def own_between(start: OwnStates, end: OwnStates) -> Float[np.ndarray, "segments
     """Own states at the nodes of each interval, in a straight line from its start to its end."""
     part = PART[..., None, None]
     return start[:, :, None] * (1.0 - part) + end[:, :, None] * part
-
-
-def prepare_own(stacked: Effect, proposals: int, motion: Motion) -> Callable[[], object]:
-    """Have the program behind [`own_states`][] made beside what else is done; what is returned calls it off.
-
-    Args:
-        stacked: proposals of one form.
-        proposals: how many.
-        motion: any, at [`fitting.instants.INSTANTS`][] instants.
-    """
-    own = (len(stacked.states), proposals)
-    no, carried, given = (jnp.asarray(a) for a in (np.zeros(INSTANTS, bool), np.zeros(own), np.zeros((INSTANTS, *own))))
-    intervals = _Intervals(motion, motion, jnp.asarray(np.zeros(INSTANTS)), no, no)
-    return _driven.prepare(stacked, carried, intervals, given)
 
 
 @jit_small

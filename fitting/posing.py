@@ -1,6 +1,6 @@
 """What a fit solves, as data and model pose it: segments, where their simulations start, steps, what is free."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.engines import with_engine
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import free_parameters
 from fitting.residual import Problem, Unknowns
-from fitting.solve import linearise
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import spread
 
@@ -48,38 +48,10 @@ def pose(
     outputs = segments.measured.shape[-1]
     unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
     problem = Problem(model, free, segments, *unweighed, substeps=substeps)
+    problem = with_engine(problem)
+    if problem.kernel is not None:
+        return problem, unknowns
     return spread((problem, unknowns), states.shape[0])
-
-
-def pose_ahead(
-    model: Model,
-    stretches: Sequence[Stretch],
-    paths: Sequence[str],
-    *,
-    horizon: int,
-    halo: int,
-    substeps: int,
-    count: int,
-) -> Callable[[], object]:
-    """Have the program of a coming fit made beside what else is done; arguments as in [`fitting.estimate.fit`][].
-
-    Returns:
-        What calls it off, where it has not begun.
-    """
-    states = jnp.zeros((count, len(model.state_names)))
-    problem, unknowns = pose(
-        model,
-        stretches,
-        paths,
-        horizon=horizon,
-        length=None,
-        halo=halo,
-        substeps=substeps,
-        hold_parameters=False,
-        count=count,
-        states=states,
-    )
-    return linearise.prepare(problem, unknowns)
 
 
 def segment_length(horizon: int) -> int:

@@ -19,7 +19,6 @@ from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
 from fitting.estimate import Fit
 from fitting.residual import Problem, Unknowns, residual_with_blocks
 from fitting.uncertainty import Uncertainty
-from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
 # Points on each side, in units of the interval that the parabola gives; further rounds reach this much further.
@@ -213,12 +212,12 @@ def _cost(problem: Problem, unknowns: Unknowns) -> float:
     return float(_evaluate(problem, unknowns))
 
 
-@jit_kept
+@eqx.filter_jit
 def _evaluate(problem: Problem, unknowns: Unknowns) -> Array:
     return jnp.sum(residual_with_blocks(unknowns, problem).rows ** 2)
 
 
-@jit_kept
+@eqx.filter_jit
 def _solve_lanes(
     problem: Problem, parameters: Float[Array, "lanes parameters"], states: Float[Array, "lanes segments states"]
 ) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes segments states"], Float[Array, " lanes"]]:

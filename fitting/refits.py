@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fitting.arrow import normal_equations
+from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.residual import Blocks, Problem, Unknowns, residual
-from fitting.solve import linearise
 from hdjax.lanes import jit_lanes
 
 # Data that run side by side; more would not fit into the processor's cache.

@@ -1,7 +1,7 @@
 """What an effect of little strength would do along a motion: a force, or a change of what the encoders read."""
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.along import ERROR, INPUT, SLOPE, Along, at_nodes, conditions_between, motions, place_of
+from fitting.along import ERROR, INPUT, SLOPE, Along, at_nodes, conditions_between, place_of
 from fitting.experiment import Segments
 from fitting.followed import NODES, WEIGHTS, Followed
 from fitting.free import strength_paths
-from fitting.instants import INSTANTS, at_instants
-from fitting.memory import Memory, memory_of, own_between, own_states, prepare_own
+from fitting.instants import at_instants
+from fitting.memory import Memory, memory_of, own_between, own_states
 from hdjax import Drive, Model, PiecewisePolynomial
+from hdjax.compilation import jit_small
 from hdjax.effects import (
     ActuatorEffect,
-    Conditions,
     Effect,
     MeshGeometryEffect,
     MeshTorqueEffect,
@@ -30,7 +30,6 @@ from hdjax.effects import (
 )
 from hdjax.effects.learned import LearnedMotorTorque
 from hdjax.parameters import own_value
-from hdjax.program_cache import jit_small
 
 # What a sensor effect adds.
 _READING = "reading"
@@ -93,33 +92,6 @@ def regressors(
         starts, ends = at_instants(_straight_lines, shape[:2], seen.pushes[name], _padded(values))
         at_start, at_end = at_start + np.asarray(starts)[..., :columns], at_end + np.asarray(ends)[..., :columns]
     return Regressors(at_start, at_end, np.zeros((*shape, columns))), memory
-
-
-def prepare(model: Model, alike: Iterable[Sequence[Effect]], *, has_temperature: bool) -> list[Callable[[], object]]:
-    """Have the programs behind [`regressors`][] that are the same for all logs made beside what else is done.
-
-    Args:
-        model: the equations; the values don't matter.
-        alike: proposals of one form after the other.
-        has_temperature: whether logs have a temperature.
-
-    Returns:
-        What calls them off, as far as they have not begun.
-    """
-    bare = replace(model, effects=())
-    each = jnp.asarray(np.zeros(INSTANTS))
-    states = jnp.asarray(np.zeros((INSTANTS, len(bare.state_names))))
-    motion = motions(bare, states, Conditions(each, each if has_temperature else None))
-    called_off = []
-    for proposals in alike:
-        stacked, count = _stacked(proposals), len(proposals)
-        if stacked.states:
-            called_off.append(prepare_own(stacked, count, motion))
-        if _takes_inertia(stacked) or isinstance(stacked, ActuatorEffect):
-            continue
-        own = jnp.asarray(np.zeros((INSTANTS, len(stacked.states), count)))
-        called_off.append(_columns.prepare(bare, stacked, motion, own))
-    return called_off
 
 
 def _stacked(proposals: Sequence[Effect]) -> Effect:

@@ -10,14 +10,14 @@ from jaxtyping import Array, Bool, Float, Int
 from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
-from hdjax.program_cache import jit_kept
+from hdjax.engine import Kernel
 from hdjax.simulate import march
 from hdjax.where import where
 
 # A simulation that runs away, or leaves the numbers, is this many standard deviations off: a rejected step. (Its own
 # size would overflow where it is squared.)
-_LOST = 1e8
-RUNAWAY = 1e-3 * _LOST
+LOST = 1e8
+RUNAWAY = 1e-3 * LOST
 """Standard deviations beyond which a simulation has lost its way; the weights may have changed since."""
 
 
@@ -39,6 +39,7 @@ class Problem(eqx.Module):
         solver: explicit Runge-Kutta solver of diffrax.
         substeps: its steps in each sample interval; data, so that finer steps need no other program.
         unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
+        kernel: machine code that does the same faster, see [`fitting.machine_code`][]; None where XLA does it.
     """
 
     model: Model
@@ -50,6 +51,7 @@ class Problem(eqx.Module):
     solver: dfx.AbstractERK = dfx.Tsit5()
     substeps: Int[Array, ""] = eqx.field(converter=_as_integer, default=1)
     unroll: bool = eqx.field(static=True, default=True)
+    kernel: Kernel | None = None
 
 
 class Unknowns(eqx.Module):
@@ -80,7 +82,7 @@ class Blocks(eqx.Module):
     before_by_state: Float[Array, "segments states states"]
 
 
-@jit_kept
+@eqx.filter_jit
 def simulate_segments(
     problem: Problem, unknowns: Unknowns, intervals: Int[Array, ""] | None = None
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
@@ -125,11 +127,11 @@ def residual(
     error = where(weight > 0, (problem.segments.measured - outputs) * weight, 0.0)
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
     rows = white.reshape(white.shape[0], -1)
-    rows = where(jnp.abs(rows) < _LOST, rows, _LOST)
+    rows = where(jnp.abs(rows) < LOST, rows, LOST)
     joined = problem.segments.joined[:, None]
     rows = jnp.concatenate([rows, where(joined, 0.0, _state_prior(problem, unknowns))], axis=1)
     gap = unknowns.states - jnp.roll(end, 1, axis=0)
-    gap = where(jnp.abs(gap) < _LOST, gap, _LOST)
+    gap = where(jnp.abs(gap) < LOST, gap, LOST)
     return rows, where(joined, gap, 0.0)
 
 

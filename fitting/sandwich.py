@@ -18,12 +18,12 @@ from jaxtyping import Array, Float
 from scipy.special import fdtri
 
 from fitting.arrow import chains, project
+from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.experiment import Segments
 from fitting.posing import natural_frequency
 from fitting.residual import Blocks, Problem
-from fitting.solve import linearise
-from hdjax.program_cache import jit_small
+from hdjax.compilation import jit_small
 
 # Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.
 _MANY_CHAINS = 20

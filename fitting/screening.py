@@ -6,8 +6,7 @@ each effect's strength and gain to first order (a score test), on held-out data 
 surrogates of the residual gives the law of the best gain where there is nothing to find.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -16,18 +15,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimate import Fit
-from fitting.experiment import Segments, Stretch, scales
+from fitting.experiment import Segments, scales
 from fitting.explained import explained, solved
 from fitting.followed import Followed
 from fitting.free import strength_paths
-from fitting.regressors import Regressors, prepare
+from fitting.regressors import Regressors
 from fitting.residual import Blocks
 from fitting.sight import Sight, batches, follow_on, sight
 from fitting.spectral_lines import spectral_lines
 from fitting.surrogates import DRAWS
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, Scales, applicable
-from hdjax.program_cache import jit_kept
 
 
 class Lead(eqx.Module):
@@ -114,24 +112,6 @@ def _applicable(
     return applicable(catalogue, scales, has_motor=isinstance(model, TwoInertiaModel))
 
 
-@contextmanager
-def programs_ahead(model: Model, stretches: Sequence[Stretch], catalogue: Sequence[type[Effect]]) -> Iterator[None]:
-    """Have those programs of a first look that are the same for all logs made beside what is done meanwhile; what has
-    not begun then is called off.
-
-    Args:
-        model: the equations; the values don't matter.
-        stretches: of the logs.
-        catalogue: forms to look at.
-    """
-    found = _applicable(catalogue, scales(stretches, model), model)
-    warm = all(s.experiment.temperature is not None for s in stretches)
-    with ExitStack() as stack:
-        for call_off in prepare(model, found.values(), has_temperature=warm):
-            stack.callback(call_off)
-        yield
-
-
 class _Score(eqx.Module):
     """Inner products of sensitivities with each other, with the residual, and with its surrogates.
 
@@ -159,7 +139,7 @@ def _score(sight: Sight, forces: Regressors) -> _Score:
     return _Score(gram, gradient, against, rows)
 
 
-@jit_kept
+@eqx.filter_jit
 def _inner_products(
     found: Blocks,
     followed: Followed,

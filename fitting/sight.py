@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.along import Along, along
+from fitting.engines import linearise
 from fitting.estimate import Fit, lost
 from fitting.experiment import Segments
 from fitting.explained import without_untold
@@ -22,7 +23,6 @@ from fitting.memory import Memory
 from fitting.posing import STEP_ANGLE, suggested_substeps
 from fitting.regressors import Regressors, regressors
 from fitting.residual import Blocks, Problem
-from fitting.solve import linearise
 from fitting.surrogates import surrogates
 from hdjax.effects import Effect
 from hdjax.where import where
@@ -174,11 +174,6 @@ def _filled(parts: Sequence[tuple[Regressors, Regressors]]) -> tuple[Regressors,
         return np.concatenate([*columns, np.zeros((*columns[0].shape[:-1], missing))], axis=-1)
 
     return jax.tree.map(joined, *parts)
-
-
-def look_ahead(training: Fit) -> None:
-    """Have the program that follows a model's motion made beside what else is done, before [`sight`][] asks for it."""
-    follow.prepare(_looked_at(training), training.unknowns)
 
 
 def _looked_at(fit: Fit) -> Problem:

@@ -12,9 +12,10 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
-from fitting.residual import Blocks, LinearisedResidual, Problem, Unknowns, blocks, moved_residual, seen_residual
-from hdjax.lanes import jit_lanes, on_one_device, placed_like
-from hdjax.program_cache import jit_small
+from fitting.engines import linearise
+from fitting.residual import Blocks, LinearisedResidual, Problem, Unknowns, moved_residual, seen_residual
+from hdjax.compilation import jit_small
+from hdjax.lanes import on_one_device, placed_like
 
 FIRST_DAMPING, NEARBY_DAMPING = 1e-3, 1e-9
 """Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other
@@ -107,9 +108,7 @@ def solve(
         return placed_like(Unknowns(jnp.asarray(np.asarray(wide.parameters)[:count]), wide.states), start)
 
     while not done:
-        seen = linearise(problem, at(ahead))
-        wide = _widened(seen.by_parameter), _widened(seen.before_by_parameter)
-        seen = on_one_device(eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), seen, wide))
+        seen = on_one_device(linearise(problem, at(ahead), unknowns.parameters.size))
         if carried is None:
             carried = _begin(unknowns, seen, rules)
         unknowns, ahead, carried, *flags = _step(unknowns, carried, seen, rules)
@@ -130,12 +129,6 @@ def _widened(by_parameter: Shaped[Array | np.ndarray, "*before parameters"]) -> 
 def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
     """What is left over at the given unknowns, by the program of the fit."""
     return _left_over(problem, on_one_device(linearise(problem, unknowns).residual))
-
-
-@jit_lanes
-def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
-    """[`fitting.residual.blocks`][] at the given unknowns, by the program of the fit."""
-    return blocks(problem, unknowns)
 
 
 class _Sight(eqx.Module):

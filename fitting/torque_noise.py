@@ -21,8 +21,8 @@ from fitting.followed import Followed, follow
 from fitting.residual import Problem
 from fitting.sandwich import Linearised, Record
 from hdjax import Model
+from hdjax.compilation import jit_small
 from hdjax.effects import Conditions
-from hdjax.program_cache import jit_small
 from hdjax.where import where
 
 # Draws of torque noise whose mean periodogram stands for its expectation.

@@ -1,6 +1,6 @@
 """A model on trial: fitted to the training stretches, judged on those it has not seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.free_run import FreeRun, free_run, rms_error
 from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed, with_memory_carried
-from fitting.posing import pose_ahead, states_from
+from fitting.posing import states_from
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -254,21 +254,6 @@ def trained(
         give_up_above=give_up_above,
         least_progress=_LEAST_PROGRESS,
     )
-
-
-def coming(model: Model, data: Data, hold: Hold, setting: Setting) -> Callable[[], object]:
-    """Have the program of a coming fit made beside what else is done.
-
-    Args:
-        model: equations; the values don't matter.
-        data: the stretches.
-        hold: what the torque does between samples.
-        setting: how the data are cut.
-
-    Returns:
-        What calls it off, where it has not begun.
-    """
-    return pose_ahead(model, data[hold][0], fitted_paths(model), **setting.options)
 
 
 def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,43 +10,37 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from hdjax.program_cache import Kept, jit_kept, jit_small
+from hdjax.compilation import jit_small, jit_with
 
 _Tree = TypeVar("_Tree")
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 # A Runge-Kutta step's stages then fit into the registers of a processor that has such: twice as fast.
-_WIDE: Any = {"compiler_options": {"xla_cpu_prefer_vector_width": 512}}
+_WIDE: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
 # With fewer lanes to each device, what the devices tell each other would take longer than what they save.
 _LEAST_LANES = 8
 
 
-class Lanes(Generic[_Arguments, _Result]):
-    """A function of arrays that the devices share; see [`jit_lanes`][]."""
+def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """`eqx.filter_jit` for programs whose lanes [`hdjax.simulate.march`][] moves, compiled for wide vectors and shared
+    by the devices that hold their arrays."""
+    return _on_devices(function, jit_with(function, _WIDE))
 
-    def __init__(self, kept: Kept[_Arguments, _Result]):
-        self._kept = kept
-        functools.update_wrapper(self, kept)
 
-    def __call__(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+def jit_small_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """[`jit_lanes`][] for programs of little work, as [`jit_small`][hdjax.compilation.jit_small]."""
+    return _on_devices(function, jit_small(function))
+
+
+def _on_devices(
+    function: Callable[_Arguments, _Result], jitted: Callable[_Arguments, _Result]
+) -> Callable[_Arguments, _Result]:
+    @functools.wraps(function)
+    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         args, kwargs = _together((args, kwargs))
-        return self._kept(*args, **kwargs)
+        return jitted(*args, **kwargs)
 
-    def prepare(self, *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Callable[[], object]:
-        """As [`hdjax.program_cache.Kept.prepare`][]."""
-        args, kwargs = _together((args, kwargs))
-        return self._kept.prepare(*args, **kwargs)
-
-
-def jit_lanes(function: Callable[_Arguments, _Result]) -> Lanes[_Arguments, _Result]:
-    """[`jit_kept`][hdjax.program_cache.jit_kept] for programs whose lanes [`hdjax.simulate.march`][] moves. None can be
-    called inside another."""
-    return Lanes(jit_kept(function, **_WIDE))
-
-
-def jit_small_lanes(function: Callable[_Arguments, _Result]) -> Lanes[_Arguments, _Result]:
-    """[`jit_lanes`][] for programs of little work, as [`jit_small`][hdjax.program_cache.jit_small]."""
-    return Lanes(jit_small(function))
+    return called
 
 
 def _together(tree: _Tree) -> _Tree:

@@ -10,8 +10,6 @@ import jax
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from hdjax.program_cache import forget
-
 # Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
 # by tests. What a user's command compiles is made well, as `jit_small` says.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false")
@@ -63,4 +61,3 @@ def few_programs() -> Iterator[None]:
     mappings = Path("/proc/self/maps")
     if mappings.exists() and mappings.read_text().count("\n") > 20_000:
         jax.clear_caches()
-        forget()

@@ -1,7 +1,6 @@
 """The linear response along a motion: against differences of simulations that know nothing of it."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -15,9 +14,9 @@ from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.followed import Followed, follow, respond
 from fitting.free import base_paths, strength_paths
-from fitting.regressors import prepare, regressors
+from fitting.regressors import regressors
 from fitting.residual import simulate_segments
-from hdjax import PiecewisePolynomial, program_cache
+from hdjax import PiecewisePolynomial
 from hdjax.effects import Effect
 from hdjax.effects.actuation import InputDelay, TorqueBias
 from hdjax.effects.creep import Creep
@@ -25,7 +24,6 @@ from hdjax.effects.damping import DisplacementDamping, QuadraticDamping
 from hdjax.effects.effect import Scales
 from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.load import GravityLoad, LoadDisturbance
-from hdjax.effects.sensing import MotorEncoderEccentricity
 from hdjax.effects.stiffness import QuadraticStiffness
 from hdjax.effects.thermal import ThermalStiffness
 
@@ -132,24 +130,3 @@ def test_own_states_follow_the_motion_and_go_on():
     np.testing.assert_array_equal(later.at_starts[0], memory.at_ends[0])
     np.testing.assert_allclose(later.at_starts[1, 0], z[border + 64], atol=0.02 * size)
     assert abs(afresh.at_starts[0, 0, 0] - z[border]) > 0.1 * size
-
-
-def test_the_programs_of_a_look_do_not_depend_on_the_log(
-    found: Fit, followed: Followed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """What is prepared before there is a motion is what then looks along it: nothing is made twice."""
-    made = []
-    make = program_cache._made
-    monkeypatch.setattr(program_cache, "_made", lambda *args: made.append(args[1].__name__) or make(*args))
-    forms = [QuadraticDamping(), Creep(tau=0.01, span=1e-3), KinematicError(), MotorEncoderEccentricity()]
-    kept_before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        prepare(found.model, [[form, form] for form in forms], has_temperature=False)
-        seen = along(found.model, followed, found.problem.segments, found.stretches)
-        for form in forms:
-            regressors(seen, [form, form])
-        assert made.count("_columns") == len(forms) and made.count("_driven") == made.count("_motions") == 1
-    finally:
-        jax.config.update("jax_compilation_cache_dir", kept_before)
-        program_cache.forget()

@@ -1,17 +1,11 @@
 """How a fit is posed: starting states, steps and horizons, and the program that it will run."""
 
-from pathlib import Path
-
-import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import rig
-from fitting.estimate import fit
 from fitting.experiment import Stretch, cut, experiment_from_log
-from fitting.posing import initial_states, pose_ahead, short_horizon, states_from, suggested_substeps
-from hdjax import program_cache
+from fitting.posing import initial_states, short_horizon, states_from, suggested_substeps
 from hdjax.effects.creep import Creep
 from hdjax.effects.hysteresis import BoucWen
 
@@ -66,24 +60,3 @@ def test_states_of_another_model_are_taken_by_name():
     mixed = np.asarray(states_from(creeping, model, jnp.asarray(states + 1.0)))
     assert creeping.state_names[4:] == ("creep.z", "bouc_wen.z")
     np.testing.assert_array_equal(mixed[:, [0, 1, 2, 3, 5]], states + 1.0)
-
-
-def test_the_program_of_a_coming_fit_is_made_beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What is prepared is what the fit then runs: nothing is made twice."""
-    made = []
-    make = program_cache._made
-    monkeypatch.setattr(program_cache, "_made", lambda *args: made.append(args[1].__name__) or make(*args))
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    try:
-        stretches, model = whole(rig.reduced_experiment(300)), rig.reduced_model()
-        options = {"horizon": 128, "halo": 0, "substeps": 2, "count": 3}
-        model = model.with_effects(BoucWen(k=10.0, memory_twist=1e-3))
-        pose_ahead(model, stretches, ("mu", "bouc_wen.k"), **options)
-        found = fit(
-            model, stretches, ("mu", "bouc_wen.k"), max_steps=2, begin_anew=False, retry_states=False, **options
-        )
-        assert made.count("linearise") == 1 and np.isfinite(found.objective)
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-        program_cache.forget()

@@ -9,11 +9,11 @@ import pytest
 from scipy.optimize import least_squares
 
 import rig
+from fitting.engines import linearise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
 from fitting.posterior import Posterior, posterior
 from fitting.residual import Unknowns
-from fitting.solve import linearise
 from fitting.uncertainty import Uncertainty, uncertainty
 
 COUNT, HORIZON = 256, 64

@@ -23,7 +23,6 @@ import jax
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from fitting.files import write_whole
-from hdjax.program_cache import forget
 from undeclared.drawing import (
     Case,
     NoExperimentError,
@@ -62,7 +61,6 @@ def main() -> None:
                 continue
             # A process may map only so much memory, and each program takes some; what is kept on disk stays.
             jax.clear_caches()
-            forget()
             write_whole({path: json.dumps(result, indent=1, allow_nan=False) + "\n"})
             print(f"{number:4d} of {len(cases)}  {_line(result)}", flush=True)
         if path.exists():

@@ -16,7 +16,6 @@ from hdjax.design.response_measures import ResponseMeasure, responses
 from hdjax.design.robustness import CRITERIA, Criterion, Draws, worst_share
 from hdjax.design.variables import Variable, values
 from hdjax.parameters import Scalar
-from hdjax.program_cache import jit_kept
 from hdjax.where import where
 
 LANES = 4
@@ -189,7 +188,7 @@ def appraise(study: Study, shares: Float[np.ndarray, "designs variables"], *, la
     return Appraisals(rows, slopes, parts)
 
 
-@jit_kept
+@eqx.filter_jit
 def _appraised(study: Study, shares: Array) -> tuple[Array, Array, Array]:
     def of_one(row: Array) -> tuple[Array, Array, Array]:
         slopes, (rows, parts) = jax.jacfwd(study.judged, has_aux=True)(row)

@@ -1,0 +1,168 @@
+"""The residual by machine code: the same numbers as [`fitting.residual`][] gives by XLA, without compiling a program
+for each model."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.residual import LOST, Blocks, Problem, Unknowns
+from hdjax import Model, PiecewisePolynomial
+from hdjax.effects import ActuatorEffect
+from hdjax.engine import Kernel, Lanes, march_lanes, threads
+from hdjax.engine.equations import split_model
+from hdjax.parameters import as_scalar
+from hdjax.where import where
+
+# The model's constants come in tables of so many, so that few sizes of them make few programs.
+_CONSTANTS = 32
+
+
+def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | None = None) -> Lanes:
+    """What the machine code needs of a problem.
+
+    Args:
+        problem: what is solved.
+        unknowns: where.
+        kernel: of the problem's model.
+        width: columns of the derivatives by parameters, those behind the last parameter zero; one each where None.
+    """
+    segments, free = problem.segments, problem.free
+    # Outside a program of JAX numpy does this, for which nothing is compiled.
+    library: Any = jnp if _is_traced((problem, unknowns)) else np
+    values = free.values(unknowns.parameters)
+    model = problem.model.replace(dict(zip(free.paths, values, strict=True))) if free.paths else problem.model
+    slopes = free.slopes(model) * library.asarray(problem.active)
+    _, others, _ = split_model(problem.model, kernel.paths)
+    constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
+    more = 0 if width is None else width - len(free.paths)
+    whole = library.any(library.asarray(segments.joined))
+    numbers = [library.asarray(problem.substeps), whole, threads()]
+    return Lanes(
+        free=library.pad(library.asarray(values, dtype=float).reshape(-1), (0, more)),
+        slopes=library.pad(library.asarray(slopes), (0, more)),
+        constants=library.pad(constants, (0, -constants.size % _CONSTANTS)),
+        states=unknowns.states,
+        knots=segments.torque.knots,
+        measured=segments.measured,
+        weight=segments.weight,
+        joined=library.asarray(segments.joined, dtype=float),
+        whitening=problem.whitening,
+        settings=library.stack([library.asarray(n, dtype=np.int64) for n in numbers]),
+        signals=_signals(problem, model, kernel),
+    )
+
+
+def _is_traced(tree: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _signals(problem: Problem, model: Model, kernel: Kernel) -> tuple[Array, ...]:
+    """The torque that acts, what else comes in, and how the torque depends on parameters."""
+    segments = problem.segments
+    actuators = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
+    torque, slopes = segments.torque.coefficients, ()
+    if actuators:
+        paths = tuple(kernel.paths[i] for i in kernel.acting)
+        values = jnp.stack([as_scalar(model.get(p)) for p in paths]) if paths else jnp.zeros(0)
+        torque, slopes = _acting(actuators, paths, values, segments.torque)
+    beside = {"load torque": segments.load_torque, "temperature": segments.temperature}
+    found = [beside[name] for name in kernel.signals]
+    return torque, *(s.coefficients for s in found if s is not None), *slopes
+
+
+class _Actuators(eqx.Module):
+    """Effects on the torque, on their own."""
+
+    effects: tuple[ActuatorEffect, ...]
+
+
+@eqx.filter_jit
+def _acting(
+    actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
+) -> tuple[Array, tuple[Array, ...]]:
+    """The torque that acts, and its derivatives by the parameters at the paths."""
+
+    def places(own: tuple[ActuatorEffect, ...]) -> list[Any]:
+        by_name = {e.name: e for e in own}
+        return [getattr(by_name[name], field) for name, field in (p.split(".") for p in paths)]
+
+    def acts(values: Array) -> Array:
+        own = tuple(actuators)
+        if paths:
+            own = eqx.tree_at(places, own, list(values))
+
+        def one(torque: PiecewisePolynomial) -> Array:
+            for effect in own:
+                torque = effect.actuate(torque)
+            return torque.coefficients
+
+        return jax.vmap(one)(torque)
+
+    if not paths:
+        return acts(values), ()
+    found, moved = jax.vmap(lambda unit: jax.jvp(acts, (values,), (unit,)), out_axes=(None, 0))(jnp.eye(len(paths)))
+    return found, tuple(moved)
+
+
+def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | None = None) -> Blocks:
+    """[`fitting.residual.blocks`][] by machine code; arguments as in [`lanes_of`][]."""
+    kernel = problem.kernel
+    assert kernel is not None
+    lanes = lanes_of(problem, unknowns, kernel, width)
+    return _blocks(kernel.jacobian, lanes, kernel.hidden)
+
+
+@eqx.filter_jit
+def _blocks(address: Array, lanes: Lanes, hidden: int) -> Blocks:
+    found = march_lanes(address, lanes, hidden, "jacobian")
+    joined = lanes.joined[:, None] > 0
+    gap = lanes.states - jnp.roll(found.end, 1, axis=0)
+    near = jnp.abs(gap) < LOST
+
+    def before(slope: Array | None) -> Array:
+        assert slope is not None
+        moved = jnp.roll(slope, 1, axis=0)
+        return where((joined & near)[:, :, None] & jnp.isfinite(moved), moved, 0.0)
+
+    # A state that has run away stands for itself: nothing before it moves the gap.
+    own = where((joined & ~near)[:, :, None], jnp.eye(gap.shape[1]), 0.0)
+    return Blocks(
+        residual=found.rows,
+        by_parameter=jnp.asarray(found.by_parameter),
+        by_state=jnp.asarray(found.by_state),
+        gap=where(joined, where(near, gap, LOST), 0.0),
+        before_by_parameter=before(found.end_by_parameter),
+        before_by_state=before(found.end_by_state) + own,
+    )
+
+
+def simulated(
+    problem: Problem, unknowns: Unknowns, address: Array | np.ndarray
+) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
+    """[`fitting.residual.simulate_segments`][] by machine code."""
+    kernel = problem.kernel
+    assert kernel is not None
+    return _simulated(address, lanes_of(problem, unknowns, kernel), kernel.hidden)
+
+
+@eqx.filter_jit
+def _simulated(address: Array, lanes: Lanes, hidden: int) -> tuple[Array, Array]:
+    segments, samples, outputs = lanes.measured.shape
+    plain = eqx.tree_at(
+        lambda s: (s.measured, s.weight, s.whitening, s.settings),
+        lanes,
+        (
+            jnp.zeros_like(lanes.measured),
+            jnp.ones_like(lanes.weight),
+            -jnp.eye(outputs),
+            jnp.asarray(lanes.settings).at[1].set(1),
+        ),
+    )
+    found = march_lanes(address, plain, hidden, "values")
+    rows = found.rows[:, : samples * outputs].reshape(segments, samples, outputs)
+    return where(jnp.abs(rows) < LOST, rows, jnp.inf), found.end

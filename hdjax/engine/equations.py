@@ -1,0 +1,211 @@
+"""A model's equations as one graph of scalars, with their derivatives."""
+
+import dataclasses
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from hdjax.dynamics import Model
+from hdjax.effects import ActuatorEffect, Conditions, Rubbing
+from hdjax.engine.derivatives import Tangent, derivatives
+from hdjax.engine.graph import PARAMETER, VARYING, Graph, Node
+from hdjax.engine.translate import Nodes, traced, translated
+from hdjax.rubbing import over_step
+
+LOAD, TEMPERATURE = "load torque", "temperature"
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Some of the equations.
+
+    Attributes:
+        values: by row.
+        slopes: their derivatives that are not zero, by direction: `("parameter", i)`, `("state", i)`, `("held", i)`.
+    """
+
+    values: tuple[Node, ...]
+    slopes: tuple[Tangent, ...]
+
+    def rows_along(self, kind: str) -> list[int]:
+        """The rows that have a derivative in a direction of this kind."""
+        return [i for i, t in enumerate(self.slopes) if any(d[0] == kind for d in t)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Equations:
+    """All that a simulation with sensitivities needs of a model.
+
+    Attributes:
+        graph: of all nodes here.
+        paths: the parameters that derivatives are by.
+        acting: those of them that change the logged torque, and nothing else.
+        constants: how many further numbers the model holds.
+        states: how many.
+        signals: what comes in along time, beside the torque: `LOAD`, `TEMPERATURE`.
+        rates: of the states.
+        held: what is computed once for a whole step.
+        outputs: what is read.
+        prior: how far the effects' own states start from where they are expected, in units of their prior.
+    """
+
+    graph: Graph
+    paths: tuple[str, ...]
+    acting: tuple[int, ...]
+    constants: int
+    states: int
+    signals: tuple[str, ...]
+    rates: Part
+    held: Part
+    outputs: Part
+    prior: Part
+
+
+def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[Array], Callable[..., Model]]:
+    """A model as numbers: the parameters at the paths, all other arrays, and what puts them together again."""
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, tree = jax.tree.flatten(arrays)
+
+    def joined(free: Sequence[Array], others: Sequence[Array]) -> Model:
+        whole = eqx.combine(jax.tree.unflatten(tree, others), rest)
+        return whole.replace(dict(zip(paths, free, strict=True))) if paths else whole
+
+    return [model.get(p) for p in paths], leaves, joined
+
+
+def structure(model: Model, paths: Sequence[str], signals: Sequence[str]) -> Hashable:
+    """What two models have in common that the same machine code serves."""
+    arrays, rest = eqx.partition(model, eqx.is_inexact_array)
+    leaves, tree = jax.tree.flatten(arrays)
+    fixed, fixed_tree = jax.tree.flatten(rest)
+    whole = tuple((np.asarray(a).shape, np.asarray(a).tobytes()) if eqx.is_array(a) else a for a in fixed)
+    return tree, fixed_tree, whole, tuple(a.shape for a in leaves), tuple(paths), tuple(signals)
+
+
+def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slopes: bool = True) -> Equations:
+    """Translate a model.
+
+    Args:
+        model: its values don't matter, except for whole numbers and truth values.
+        paths: dotted paths of the parameters that derivatives are by.
+        signals: what comes in along time beside the torque.
+        slopes: whether derivatives are wanted.
+
+    Raises:
+        UntranslatableError: where the model uses a function that is not known here.
+    """
+    free, others, joined = split_model(model, paths)
+    graph = Graph()
+    count = len(model.state_names)
+    numbers = {
+        "parameter": _leaves(graph, "parameter", (len(free),), PARAMETER),
+        "state": _leaves(graph, "state", (count,), VARYING),
+    }
+    constants, used = [], 0
+    for leaf in others:
+        nodes = np.array(
+            [graph.leaf(("constant", used + i), PARAMETER) for i in range(leaf.size)] + [None], dtype=object
+        )[:-1]
+        constants.append(nodes.reshape(leaf.shape))
+        used += leaf.size
+    surroundings = [np.array(graph.leaf(name), dtype=object) for name in (("signal", 0), ("time",), ("step",))] + [
+        np.array(graph.leaf(("signal", 1 + i)), dtype=object) for i in range(len(signals))
+    ]
+    half = np.float64(0.5)
+
+    def around(torque: Array, time: Array, found: Sequence[Array]) -> tuple[Array, Array, Conditions]:
+        beside = dict(zip(signals, found, strict=True))
+        load = beside.get(LOAD, jnp.zeros_like(torque))
+        return torque, load, Conditions(time=time, temperature=beside.get(TEMPERATURE))
+
+    def translate(function: Callable[..., Any], *extra: Nodes) -> list[Nodes]:
+        examples = [np.zeros(n.shape) + half for n in extra]
+        program = traced(
+            lambda free, others, state, around, *extra: function(joined(free, others), state, around, *extra),
+            list(free),
+            others,
+            [half] * count,
+            [half] * len(surroundings),
+            *examples,
+        )
+        arguments = [
+            *(np.array(n, dtype=object) for n in numbers["parameter"]),
+            *constants,
+            *(np.array(n, dtype=object) for n in numbers["state"]),
+            *surroundings,
+            *extra,
+        ]
+        return translated(graph, program, arguments)
+
+    names: list[str] = []
+
+    def before_step(model: Model, state: list[Array], surrounding: list[Array]) -> list[Array]:
+        torque, time, step, *beside = surrounding
+        found = over_step(model, state, *around(torque, time, beside), step)
+        names[:] = sorted(found or {})
+        return [part for name in names for part in ((found or {})[name].sign, (found or {})[name].reach)]
+
+    held = translate(before_step)
+    frozen = _leaves(graph, "held", (len(held),), VARYING)
+
+    def rates(model: Model, state: list[Array], surrounding: list[Array], held: Array) -> list[Array]:
+        torque, time, step, *beside = surrounding
+        torque, load, conditions = around(torque, time, beside)
+        if names:
+            rubbing = {n: Rubbing(held[2 * i], held[2 * i + 1]) for i, n in enumerate(names)}
+            conditions = dataclasses.replace(conditions, rubbing=rubbing)
+        return model.component_rates(state, torque, load, conditions)
+
+    moved = translate(rates, frozen)
+    outputs = translate(lambda model, state, surrounding: model.outputs(jnp.stack(state)))[0]
+    hidden = translate(_prior)[0] if count > len(model.motion_states) else np.empty(0, dtype=object)
+
+    one = graph.constant(1.0)
+    acting = _acting(model, paths)
+    seeds: dict[Node, Tangent] = {}
+    for kind, nodes in (*numbers.items(), ("held", frozen)):
+        seeds |= {node: {(kind, i): one} for i, node in enumerate(nodes)}
+    torque = graph.leaf(("signal", 0))
+    seeds[torque] = {("parameter", p): graph.leaf(("signal", 1 + len(signals) + i)) for i, p in enumerate(acting)}
+
+    def part(nodes: Sequence[Any]) -> Part:
+        flat = tuple(n[()] if isinstance(n, np.ndarray) else n for n in nodes)
+        found = derivatives(graph, flat, seeds) if slopes else dict.fromkeys(flat, {})
+        return Part(flat, tuple(found[n] for n in flat))
+
+    return Equations(
+        graph=graph,
+        paths=tuple(paths),
+        acting=acting,
+        constants=used,
+        states=count,
+        signals=tuple(signals),
+        rates=part(moved),
+        held=part(held),
+        outputs=part(list(outputs)),
+        prior=part(list(hidden)),
+    )
+
+
+def _leaves(graph: Graph, name: str, shape: tuple[int], level: int) -> Nodes:
+    found = np.empty(shape, dtype=object)
+    for (i,) in np.ndindex(shape):
+        found[i] = graph.leaf((name, i), level)
+    return found
+
+
+def _acting(model: Model, paths: Sequence[str]) -> tuple[int, ...]:
+    names = {e.name for e in model.effects if isinstance(e, ActuatorEffect)}
+    return tuple(i for i, path in enumerate(paths) if path.partition(".")[0] in names)
+
+
+def _prior(model: Model, state: list[Array], surrounding: list[Array]) -> Array:
+    motion = len(model.motion_states)
+    whole = jnp.stack(state)
+    scale = jax.lax.stop_gradient(jnp.concatenate([e.state_scale() for e in model.effects if e.states]))
+    return (whole[motion:] - model.settled(whole[:motion])[motion:]) / scale

@@ -1,0 +1,187 @@
+"""A graph of scalar expressions, in which equal expressions are one node."""
+
+import math
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+Node = int
+"""A node's place in its graph. Arguments stand before what is made of them."""
+
+CONSTANT, PARAMETER, VARYING = 0, 1, 2
+"""What a node depends on: nothing, what stays the same during a simulation, or the motion."""
+
+COMPARISONS = {"eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater}
+COMPARISONS["ge"] = np.greater_equal
+LOGICAL = {"and": np.logical_and, "or": np.logical_or, "not": np.logical_not, "xor": np.logical_xor}
+FUNCTIONS = {
+    "abs": np.abs,
+    "sign": np.sign,
+    "sqrt": np.sqrt,
+    "round": np.rint,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "exp": np.exp,
+    "expm1": np.expm1,
+    "log": np.log,
+    "tanh": np.tanh,
+    "is_finite": np.isfinite,
+}
+_ARITHMETIC = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "max": np.maximum,
+    "min": np.minimum,
+}
+_OPERATIONS = {
+    **COMPARISONS,
+    **LOGICAL,
+    **FUNCTIONS,
+    **_ARITHMETIC,
+    "select": np.where,
+    "given": lambda value, *partials: value,
+}
+
+
+class Graph:
+    """Expressions of scalars, made node by node; a node that is there already is found again.
+
+    Attributes:
+        nodes: each as its operation and what that is applied to: `("constant", value)`, `("leaf", name)`, or an
+            operation and nodes. `("given", value, argument, partial, ...)` is the value, with its partial derivatives.
+        level: what each depends on, see [`CONSTANT`][].
+    """
+
+    def __init__(self):
+        self.nodes: list[tuple[Any, ...]] = []
+        self.level: list[int] = []
+        self._found: dict[tuple[Hashable, ...], Node] = {}
+
+    def constant(self, value: float | bool) -> Node:
+        """A number, or a truth value."""
+        value = value if isinstance(value, bool) else float(value)
+        # Told apart by type and by sign, which equality is not: True is 1.0, and 0.0 is -0.0.
+        return self._make(("constant", value), (type(value), repr(value)), CONSTANT)
+
+    def leaf(self, name: Hashable, level: int = VARYING) -> Node:
+        """What comes in under a name."""
+        return self._make(("leaf", name), ("leaf", name), level)
+
+    def known(self, node: Node) -> float | bool | None:
+        """The value of a constant node; None of any other."""
+        operation, *rest = self.nodes[node]
+        return rest[0] if operation == "constant" else None
+
+    def apply(self, operation: str, *arguments: Node) -> Node:
+        """An operation on nodes; simplified where some of them are known."""
+        values = [self.known(a) for a in arguments]
+        if operation not in ("given", "leaf") and None not in values:
+            with np.errstate(all="ignore"):
+                return self.constant(_OPERATIONS[operation](*values).item())
+        simpler = self._simplified(operation, arguments, values)
+        if simpler is not None:
+            return simpler
+        if operation in ("add", "mul", "max", "min", "and", "or", "eq", "ne") and arguments[0] > arguments[1]:
+            arguments = arguments[::-1]
+        return self._make((operation, *arguments), (operation, *arguments), max(self.level[a] for a in arguments))
+
+    def power(self, base: Node, exponent: int) -> Node:
+        """A whole power, as products."""
+        if exponent < 0:
+            return self.apply("div", self.constant(1.0), self.power(base, -exponent))
+        if exponent == 0:
+            return self.constant(1.0)
+        if exponent == 1:
+            return base
+        half = self.power(base, exponent // 2)
+        square = self.apply("mul", half, half)
+        return self.apply("mul", square, base) if exponent % 2 else square
+
+    def needed(self, wanted: Iterable[Node]) -> list[Node]:
+        """The nodes that the wanted ones are made of, themselves included, in order."""
+        found: set[Node] = set()
+        stack = list(wanted)
+        while stack:
+            node = stack.pop()
+            if node in found:
+                continue
+            found.add(node)
+            stack.extend(self.arguments(node))
+        return sorted(found)
+
+    def arguments(self, node: Node) -> Sequence[Node]:
+        """The nodes that a node's value is computed from."""
+        operation, *rest = self.nodes[node]
+        if operation in ("constant", "leaf"):
+            return ()
+        return rest[:1] if operation == "given" else rest
+
+    def evaluate(self, wanted: Sequence[Node], leaves: Mapping[Hashable, Any]) -> list[Any]:
+        """Values of nodes where leaves are numbers or arrays of one shape: no compilation, one numpy call a node."""
+        value: dict[Node, Any] = {}
+        with np.errstate(all="ignore"):
+            for node in self.needed(wanted):
+                operation, *rest = self.nodes[node]
+                if operation == "constant":
+                    value[node] = rest[0]
+                elif operation == "leaf":
+                    value[node] = leaves[rest[0]]
+                else:
+                    value[node] = _OPERATIONS[operation](*(value[a] for a in self.arguments(node)))
+        return [value[node] for node in wanted]
+
+    def _make(self, node: tuple[Any, ...], key: tuple[Hashable, ...], level: int) -> Node:
+        if key not in self._found:
+            self._found[key] = len(self.nodes)
+            self.nodes.append(node)
+            self.level.append(level)
+        return self._found[key]
+
+    def _simplified(self, operation: str, arguments: Sequence[Node], values: Sequence[Any]) -> Node | None:
+        """A simpler node of the same value; None where there is none. Zero times anything is zero here: no simulation
+        that goes on holds an infinity."""
+        first, second = arguments[0], arguments[-1]
+        x, y = values[0], values[-1]
+        if operation == "mul":
+            for value, other in ((x, second), (y, first)):
+                if value == 0.0:
+                    return self.constant(0.0)
+                if value == 1.0:
+                    return other
+                if value == -1.0:
+                    return self.apply("neg", other)
+        elif operation == "add":
+            if x == 0.0:
+                return second
+            if y == 0.0:
+                return first
+        elif operation == "sub":
+            if y == 0.0:
+                return first
+            if x == 0.0:
+                return self.apply("neg", second)
+        elif operation == "div":
+            if x == 0.0:
+                return first
+            if y is not None and y != 0.0 and math.frexp(y)[0] in (0.5, -0.5):
+                return self.apply("mul", first, self.constant(1.0 / y))
+            # Divided once for a whole simulation, rather than in each of its stages.
+            if self.level[second] < VARYING and self.level[first] == VARYING:
+                return self.apply("mul", first, self.apply("div", self.constant(1.0), second))
+        elif operation == "neg" and self.nodes[first][0] == "neg":
+            return self.nodes[first][1]
+        elif operation == "select":
+            if x is not None:
+                return arguments[1] if x else arguments[2]
+            if arguments[1] == arguments[2]:
+                return arguments[1]
+        elif operation in ("max", "min", "and", "or") and first == second:
+            return first
+        elif operation in ("and", "or") and (x is not None or y is not None):
+            value, other = (x, second) if x is not None else (y, first)
+            return other if value == (operation == "and") else self.constant(operation == "or")
+        return None

@@ -1,0 +1,145 @@
+"""A model's machine code, and how programs of JAX call it."""
+
+import dataclasses
+import functools
+import os
+import threading
+from collections.abc import Hashable, Sequence
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hdjax.dynamics import Model
+from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, equations, structure
+from hdjax.engine.handler import register
+from hdjax.engine.machine import compiled
+from hdjax.engine.march import MARCH, March, Mode
+
+_LOCK = threading.Lock()
+
+
+class Kernel(eqx.Module):
+    """Machine code of a model's march.
+
+    Attributes:
+        paths: the parameters that it has derivatives by.
+        acting: those of them that change the logged torque.
+        signals: what comes in along time beside the torque.
+        hidden: how many states are effects' own.
+        jacobian: address of the march with derivatives.
+        values: of the one without; None where it was not asked for.
+    """
+
+    paths: tuple[str, ...] = eqx.field(static=True)
+    acting: tuple[int, ...] = eqx.field(static=True)
+    signals: tuple[str, ...] = eqx.field(static=True)
+    hidden: int = eqx.field(static=True)
+    jacobian: Int[np.ndarray | Array, ""]
+    values: Int[np.ndarray | Array, ""] | None
+
+
+@dataclasses.dataclass
+class _Made:
+    equations: Equations
+    addresses: dict[tuple[Mode, Hashable], int] = dataclasses.field(default_factory=dict)
+
+
+_MADE: dict[Hashable, _Made] = {}
+
+
+def kernel(
+    model: Model, paths: Sequence[str], *, loaded: bool, solver: dfx.AbstractERK, values: bool = False
+) -> Kernel:
+    """The machine code of a model; made once for all models of the same structure.
+
+    Args:
+        model: the equations.
+        paths: dotted paths of the parameters that derivatives are by.
+        loaded: whether there is a load torque.
+        solver: explicit Runge-Kutta solver of diffrax; its tableau is used.
+        values: whether the march without derivatives is wanted as well.
+
+    Raises:
+        UntranslatableError: where the model uses a function that the engine does not know.
+    """
+    warm = any(e.needs_temperature for e in model.effects)
+    signals = (LOAD,) * loaded + (TEMPERATURE,) * warm
+    key = structure(model, paths, signals)
+    with _LOCK:
+        if key not in _MADE:
+            _MADE[key] = _Made(equations(model, paths, signals))
+        made = _MADE[key]
+        jacobian = _address(made, "jacobian", solver)
+        plain = _address(made, "values", solver) if values else None
+    return Kernel(tuple(paths), made.equations.acting, signals, len(made.equations.prior.values), jacobian, plain)
+
+
+def _address(made: _Made, mode: Mode, solver: dfx.AbstractERK) -> np.ndarray:
+    key = mode, type(solver)
+    if key not in made.addresses:
+        register()
+        (made.addresses[key],) = compiled(March(made.equations, solver, mode).module, MARCH)
+    return np.array(made.addresses[key], dtype=np.int64)
+
+
+class Lanes(eqx.Module):
+    """The data of a march; see [`hdjax.engine.march.OPERANDS`][] for what each is.
+
+    Attributes:
+        signals: coefficients of the torque, of what else comes in, and of the torque's derivatives by the parameters
+            that change it.
+    """
+
+    free: Float[Array | np.ndarray, " width"]
+    slopes: Float[Array | np.ndarray, " width"]
+    constants: Float[Array | np.ndarray, " constants"]
+    states: Float[Array | np.ndarray, "segments states"]
+    knots: Float[Array | np.ndarray, "segments knots"]
+    measured: Float[Array | np.ndarray, "segments samples outputs"]
+    weight: Float[Array | np.ndarray, "segments samples"]
+    joined: Float[Array | np.ndarray, " segments"]
+    whitening: Float[Array | np.ndarray, "outputs outputs"]
+    settings: Int[Array | np.ndarray, "3"]
+    signals: tuple[Float[Array | np.ndarray, "segments intervals powers"], ...]
+
+
+class Marched(eqx.Module):
+    """Results of a march: whitened rows, the states in which segments end, and where asked for their derivatives."""
+
+    rows: Float[Array, "segments rows"]
+    end: Float[Array, "segments states"]
+    by_parameter: Float[Array, "segments rows width"] | None = None
+    by_state: Float[Array, "segments rows states"] | None = None
+    end_by_parameter: Float[Array, "segments states width"] | None = None
+    end_by_state: Float[Array, "segments states states"] | None = None
+
+
+def march_lanes(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode) -> Marched:
+    """March all segments by machine code; inside programs of JAX or outside.
+
+    Args:
+        address: of the code.
+        lanes: the data.
+        hidden: how many states are effects' own.
+        mode: with derivatives or without.
+    """
+    segments, samples, outputs = lanes.measured.shape
+    states, width = lanes.states.shape[1], lanes.free.shape[0]
+    rows = samples * outputs + hidden
+    shapes = [(segments, rows), (segments, states)]
+    if mode == "jacobian":
+        shapes += [(segments, rows, width), (segments, rows, states), (segments, states, width)]
+        shapes += [(segments, states, states)]
+    results = [jax.ShapeDtypeStruct(shape, np.dtype("float64")) for shape in shapes]
+    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
+    call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")
+    return Marched(*call(address, *operands, *lanes.signals))
+
+
+@functools.cache
+def threads() -> int:
+    """How many threads share a march: the processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
