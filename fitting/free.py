@@ -15,7 +15,7 @@ from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
 # A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
-_LARGEST_LOG = 100.0
+LARGEST_LOG = 100.0
 
 
 class FreeParameters(eqx.Module):
@@ -54,7 +54,7 @@ class FreeParameters(eqx.Module):
         """The physical values that the vector stands for."""
         library, (entries, scale) = _library(vector, self.scale)
         return [
-            library.exp(library.clip(v, -_LARGEST_LOG, _LARGEST_LOG)) if positive else v * s
+            library.exp(library.clip(v, -LARGEST_LOG, LARGEST_LOG)) if positive else v * s
             for positive, v, s in zip(self.logarithmic, entries, scale, strict=True)
         ]
 

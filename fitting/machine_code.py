@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.free import LARGEST_LOG
 from fitting.residual import LOST, Blocks, Problem, Unknowns
 from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect
-from hdjax.engine import Kernel, Lanes, march_lanes, threads
+from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
 from hdjax.parameters import as_scalar
 from hdjax.where import where
@@ -41,7 +42,7 @@ def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | 
     constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
     more = 0 if width is None else width - len(free.paths)
     whole = library.any(library.asarray(segments.joined))
-    numbers = [library.asarray(problem.substeps), whole, threads()]
+    numbers = [library.asarray(problem.substeps), whole, threads(), 0]
     return Lanes(
         free=library.pad(library.asarray(values, dtype=float).reshape(-1), (0, more)),
         slopes=library.pad(library.asarray(slopes), (0, more)),
@@ -120,6 +121,69 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
 @eqx.filter_jit
 def _blocks(address: Array, lanes: Lanes, hidden: int) -> Blocks:
     found = march_lanes(address, lanes, hidden, "jacobian")
+    return _blocks_of(lanes, found, found.rows)
+
+
+class Task(eqx.Module):
+    """A problem of which a program of JAX can look at any point.
+
+    Attributes:
+        address: of the machine code.
+        lanes: the data; what is free and the states are replaced.
+        logarithmic: which parameters move by their logarithm.
+        scale: unit of each of the others.
+        active: 1 for a parameter that may move, 0 for one that is held, or that there is not.
+        hidden: how many states are effects' own.
+    """
+
+    address: Array | np.ndarray
+    lanes: Lanes
+    logarithmic: np.ndarray
+    scale: np.ndarray
+    active: np.ndarray
+    hidden: int = eqx.field(static=True)
+
+    def look(self, unknowns: Unknowns) -> tuple[Blocks, Float[Array, "segments rows"]]:
+        """The residual at a point: in place of its rows and their derivatives the triangular factor of these, which has
+        the same normal equations; and the rows."""
+        vector = unknowns.parameters
+        value = where(self.logarithmic, jnp.exp(jnp.clip(vector, -LARGEST_LOG, LARGEST_LOG)), vector * self.scale)
+        slope = where(self.logarithmic, value, self.scale) * self.active
+        lanes = eqx.tree_at(lambda s: (s.free, s.slopes, s.states), self.lanes, (value, slope, unknowns.states))
+        found = march_lanes(self.address, lanes, self.hidden, "jacobian", reduced=True)
+        assert found.factor is not None
+        return _blocks_of(lanes, found, found.factor), found.rows
+
+
+def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
+    """A problem for programs of JAX; None where there is no machine code, or where effects change the torque, for which
+    each model needs a program of its own.
+
+    Args:
+        problem: what is solved.
+        unknowns: any.
+        width: room for the parameters.
+    """
+    kernel = problem.kernel
+    if kernel is None or any(isinstance(e, ActuatorEffect) for e in problem.model.effects):
+        return None
+    lanes = lanes_of(problem, unknowns, kernel, width)
+    settings = np.array(lanes.settings)
+    settings[-1] = 1
+    free = problem.free
+    more = (0, width - len(free.paths))
+    return Task(
+        address=kernel.jacobian,
+        lanes=eqx.tree_at(lambda s: s.settings, lanes, settings),
+        logarithmic=np.pad(np.array(free.logarithmic, dtype=bool), more),
+        scale=np.pad(np.asarray(free.scale), more, constant_values=1.0),
+        active=np.pad(np.asarray(problem.active), more),
+        hidden=kernel.hidden,
+    )
+
+
+def _blocks_of(lanes: Lanes, found: Marched, residual: Array) -> Blocks:
+    """The blocks behind the results of a march."""
     joined = lanes.joined[:, None] > 0
     gap = lanes.states - jnp.roll(found.end, 1, axis=0)
     near = jnp.abs(gap) < LOST
@@ -132,7 +196,7 @@ def _blocks(address: Array, lanes: Lanes, hidden: int) -> Blocks:
     # A state that has run away stands for itself: nothing before it moves the gap.
     own = where((joined & ~near)[:, :, None], jnp.eye(gap.shape[1]), 0.0)
     return Blocks(
-        residual=found.rows,
+        residual=residual,
         by_parameter=jnp.asarray(found.by_parameter),
         by_state=jnp.asarray(found.by_state),
         gap=where(joined, where(near, gap, LOST), 0.0),

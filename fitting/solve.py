@@ -4,6 +4,8 @@ That one has nothing of the model in it, so that models with as many parameters 
 own program it would be compiled again for each, and take longer than the rest of it.
 """
 
+import time
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,9 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
 from fitting.engines import linearise
+from fitting.machine_code import Task, task
 from fitting.residual import Blocks, LinearisedResidual, Problem, Unknowns, moved_residual, seen_residual
 from hdjax.compilation import jit_small
 from hdjax.lanes import on_one_device, placed_like
+from hdjax.where import where
 
 FIRST_DAMPING, NEARBY_DAMPING = 1e-3, 1e-9
 """Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other
@@ -25,6 +29,11 @@ weights."""
 # a corner that leaps to zero shows no slope there, and never comes back.
 _LONGEST_LOG = 1.0
 
+
+# Seconds until a program is left: an interrupt waits as long.
+_BURST = 0.3
+# What a step takes for a sample and a sensitivity, in seconds: a first guess.
+_SAMPLE = 1.5e-8
 
 # What steps are made by is compiled for multiples of so many parameters.
 _WIDTH = 4
@@ -96,11 +105,41 @@ def solve(
         damping: of the first step, see [`FIRST_DAMPING`][].
         least_progress: share of the sum of squares that a few steps must take off it for the iteration to go on.
     """
-    count = start.parameters.shape[0]
     longest = np.where(_widened(np.array(problem.free.logarithmic)), _LONGEST_LOG, np.inf)
     numbers = (jnp.asarray(np.asarray(a)) for a in (longest, max_steps, damping, least_progress))
     rules = _Rules(*on_one_device((problem.segments.joined, problem.gap_weight)), *numbers)
-    unknowns = ahead = Unknowns(_widened(start.parameters), on_one_device(start.states))
+    unknowns = Unknowns(_widened(start.parameters), on_one_device(start.states))
+    looked_at = task(problem, start, unknowns.parameters.size)
+    if looked_at is None:
+        return _solve_by_host(problem, start, unknowns, rules)
+    return _solve_in_bursts(problem, start, unknowns, rules, looked_at)
+
+
+def _solve_in_bursts(problem: Problem, start: Unknowns, unknowns: Unknowns, rules: _Rules, looked_at: Task) -> Solution:
+    """The whole iteration as one program, left now and then so that it can be interrupted."""
+    segments, count = problem.segments, start.parameters.shape[0]
+    tangents = unknowns.parameters.size + unknowns.states.shape[1]
+    guess = _SAMPLE * segments.weight.size * tangents * int(problem.substeps)
+    point, left, burst = None, None, int(np.clip(_BURST / guess, 1, 1000))
+    while point is None or not bool(point.done):
+        begun = time.perf_counter()
+        most = np.asarray(burst)
+        if point is None:
+            point, left = _begin_iteration(unknowns, rules, looked_at, most, problem.whitening, segments.measured)
+        else:
+            point, left = _iterate(point, rules, looked_at, most, problem.whitening, segments.measured)
+        point.done.block_until_ready()
+        each = (time.perf_counter() - begun) / burst
+        burst = int(np.clip(_BURST / each, 1, 1000))
+    assert left is not None
+    found = Unknowns(jnp.asarray(np.asarray(point.unknowns.parameters)[:count]), point.unknowns.states)
+    return Solution(found, left, bool(point.success), int(point.steps))
+
+
+def _solve_by_host(problem: Problem, start: Unknowns, unknowns: Unknowns, rules: _Rules) -> Solution:
+    """The iteration step by step, where each model's residual is a program of its own."""
+    count = start.parameters.shape[0]
+    ahead = unknowns
     rows = carried = None
     steps, done, success = 0, False, False
 
@@ -117,6 +156,77 @@ def solve(
         steps += 1
     assert rows is not None
     return Solution(at(unknowns), _left_over(problem, rows), success, steps)
+
+
+class _Point(eqx.Module):
+    """Where an iteration stands.
+
+    Attributes:
+        unknowns: the best so far.
+        ahead: where to look next.
+        carried: arrays of the solver's state.
+        rows: of the residual at the best.
+        steps: how many were taken.
+        done: whether the iteration has ended.
+        success: whether it has succeeded.
+    """
+
+    unknowns: Unknowns
+    ahead: Unknowns
+    carried: list[Array]
+    rows: Float[Array, "segments rows"]
+    steps: Int[Array, ""]
+    done: Bool[Array, ""]
+    success: Bool[Array, ""]
+
+
+@jit_small
+def _begin_iteration(
+    unknowns: Unknowns, rules: _Rules, looked_at: Task, most: Array, whitening: Array, measured: Array
+) -> tuple[_Point, LeftOver]:
+    """The first steps of an iteration; arguments as in [`_iterate`][]."""
+    blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(looked_at.look, unknowns))
+    carried, no = _arrays(_fresh(unknowns, blank[0], rules)), jnp.zeros((), bool)
+    first = _Point(unknowns, unknowns, carried, blank[1], jnp.zeros((), int), no, no)
+    return _run(first, rules, looked_at, most, whitening, measured)
+
+
+@jit_small
+def _iterate(
+    point: _Point, rules: _Rules, looked_at: Task, most: Array, whitening: Array, measured: Array
+) -> tuple[_Point, LeftOver]:
+    """Go on from a point.
+
+    Args:
+        point: where the iteration stands.
+        rules: what it goes by.
+        looked_at: what is minimised.
+        most: steps after which to come back, at the end of the iteration or before.
+        whitening: of the outputs.
+        measured: the outputs.
+
+    Returns:
+        Where the iteration has come to, and what is left over there.
+    """
+    return _run(point, rules, looked_at, most, whitening, measured)
+
+
+def _run(
+    point: _Point, rules: _Rules, looked_at: Task, most: Array, whitening: Array, measured: Array
+) -> tuple[_Point, LeftOver]:
+    last = point.steps + most
+
+    def step(point: _Point) -> _Point:
+        return _taken(point, *looked_at.look(point.ahead), rules)
+
+    end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < last), step, point)
+    return end, _of_rows(end.rows, whitening, measured, looked_at.lanes.weight)
+
+
+def _taken(point: _Point, seen: Blocks, rows: Array, rules: _Rules) -> _Point:
+    best, ahead, carried, accepted, done, success = _step(point.unknowns, point.carried, seen, rules)
+    kept = where(accepted | (point.steps == 0), rows, point.rows)
+    return _Point(best, ahead, carried, kept, point.steps + 1, done, success)
 
 
 def _widened(by_parameter: Shaped[Array | np.ndarray, "*before parameters"]) -> Shaped[Array, "*before wide"]:

@@ -102,7 +102,7 @@ class Lanes(eqx.Module):
     weight: Float[Array | np.ndarray, "segments samples"]
     joined: Float[Array | np.ndarray, " segments"]
     whitening: Float[Array | np.ndarray, "outputs outputs"]
-    settings: Int[Array | np.ndarray, "3"]
+    settings: Int[Array | np.ndarray, "4"]
     signals: tuple[Float[Array | np.ndarray, "segments intervals powers"], ...]
 
 
@@ -115,9 +115,12 @@ class Marched(eqx.Module):
     by_state: Float[Array, "segments rows states"] | None = None
     end_by_parameter: Float[Array, "segments states width"] | None = None
     end_by_state: Float[Array, "segments states states"] | None = None
+    factor: Float[Array, "segments reduced"] | None = None
 
 
-def march_lanes(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode) -> Marched:
+def march_lanes(
+    address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode, *, reduced: bool = False
+) -> Marched:
     """March all segments by machine code; inside programs of JAX or outside.
 
     Args:
@@ -125,14 +128,16 @@ def march_lanes(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int,
         lanes: the data.
         hidden: how many states are effects' own.
         mode: with derivatives or without.
+        reduced: whether the last of the lanes' settings asks for the triangular factor in place of the Jacobian.
     """
     segments, samples, outputs = lanes.measured.shape
     states, width = lanes.states.shape[1], lanes.free.shape[0]
     rows = samples * outputs + hidden
     shapes = [(segments, rows), (segments, states)]
     if mode == "jacobian":
-        shapes += [(segments, rows, width), (segments, rows, states), (segments, states, width)]
-        shapes += [(segments, states, states)]
+        height = width + states + 1 if reduced else rows
+        shapes += [(segments, height, width), (segments, height, states), (segments, states, width)]
+        shapes += [(segments, states, states), (segments, height if reduced else 0)]
     results = [jax.ShapeDtypeStruct(shape, np.dtype("float64")) for shape in shapes]
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
     call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")

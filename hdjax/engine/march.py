@@ -31,18 +31,24 @@ OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measur
 OPERANDS += ("settings",)
 """What comes in, in order; behind it the signals: torque, those of `Equations.signals`, and derivatives of the torque
 by each of `Equations.acting`. `settings` are solver steps in a sample interval, whether the end of a segment is wanted,
-and threads. There may be more numbers in `free` and `slopes` than the model has parameters; their columns are zero."""
+threads, and whether the Jacobian is to be reduced. There may be more numbers in `free` and `slopes` than the model has
+parameters; their columns are zero."""
 
 RESULTS: dict[Mode, tuple[str, ...]] = {
     "values": ("rows", "end"),
-    "jacobian": ("rows", "end", "by_parameter", "by_state", "end_by_parameter", "end_by_state"),
+    "jacobian": ("rows", "end", "by_parameter", "by_state", "end_by_parameter", "end_by_state", "factor"),
 }
-"""What goes out, in order."""
+"""What goes out, in order. Where `settings` ask for it, `by_parameter` and `by_state` are not those of the rows but the
+triangular factor of each segment's columns with its residual, and `factor` the factor's last column: sums of squares,
+gradient and normal equations are the same, and the Jacobian is never written."""
 
 MARCH = "march"
 """The function's name in its module."""
 
 MOST_THREADS = 64
+
+# Less of a column's square than this is left where it depends on those before it: rounding.
+_DEPENDENT = 1e-13
 _POWERS = 6
 
 
@@ -244,7 +250,7 @@ class March:
         prepare = self._prepare()
         names = [n for n in OPERANDS if n not in ("address", "settings")]
         names += [f"signal {i}" for i in range(self.signals)] + list(RESULTS[self.mode])
-        names += ["substeps", "whole", "segments", "samples", "width", "blocks", "next", "scalars"]
+        names += ["substeps", "whole", "segments", "samples", "width", "reduced", "blocks", "next", "scalars"]
         names += [f"first {i}" for i in range(self.signals)] + [f"powers {i}" for i in range(self.signals)]
         self.call = {name: i for i, name in enumerate(names)}
         self._gather = self._lane_by_lane("gather", reads=True)
@@ -319,6 +325,7 @@ class March:
         settings = data(b, operands, OPERANDS.index("settings"), I64)
         put("substeps", code.load(settings, 0))
         put("whole", code.load(settings, 1))
+        put("reduced", code.load(settings, 3))
         put("width", dimension(b, operands, OPERANDS.index("free"), 0))
         segments = dimension(b, operands, OPERANDS.index("weight"), 0)
         put("segments", segments)
@@ -394,6 +401,8 @@ class _Block:
         self.dense = code.array(len(self.rates_by_parameter) * m.parameters * stages)
         self.held_dense = code.array(m.held * m.parameters)
         self.read_dense = code.array(m.outputs * m.parameters)
+        self.collected = code.array((self.tangents + 1) * max(m.outputs, 1))
+        self.products = code.array((self.tangents + 1) ** 2 if self.jacobian else 0)
 
     def _got(self, name: str, kind: Any = F64) -> ir.Value:
         """An entry of the call: an integer, or where numbers stand."""
@@ -435,6 +444,8 @@ class _Block:
         for t in range(self.tangents):
             for i in range(m.states):
                 c.store(c.number(1.0 if t - m.parameters == i else 0.0), self.moved, t * m.states + i)
+        with c.loop((self.tangents + 1) ** 2 if self.jacobian else 0) as k:
+            c.store(c.number(0.0), self.products, k)
         self._write_prior()
         with c.loop(self.samples) as i:
             self._record(i)
@@ -442,6 +453,10 @@ class _Block:
             with c.builder.if_then(go):
                 self._interval(i)
         self._write_end()
+        if self.jacobian:
+            reduced = c.builder.icmp_signed("!=", self._got("reduced", I64), c.i(0))
+            with c.builder.if_then(reduced):
+                self._factorise()
 
     def _choose_segments(self) -> None:
         """The lanes' segments; behind the last one it stands again, and what it writes is the same."""
@@ -498,21 +513,20 @@ class _Block:
             for p in range(m.outputs)
         ]
         lost = c.number(LOST)
-        inside = []
+        inside, values = [], []
         for p in range(m.outputs):
             white = c.total([c.mul(w, e) for w, e in zip(whitening[p], errors, strict=True)])
             assert white is not None
             inside.append(c.smaller(c.called("fabs", white), lost))
-            value = b.select(inside[p], white, lost)
-            self._put(self._got("rows"), self.rows, c.plus(c.times(i, m.outputs), p), value)
+            values.append(b.select(inside[p], white, lost))
+            self._put(self._got("rows"), self.rows, c.plus(c.times(i, m.outputs), p), values[p])
         if not self.jacobian:
             return
         scale = c.builder.fneg(weight)
         slopes = m.equations.outputs.slopes
         self._fill(m.read, self.read_results, slopes, range(m.outputs), self.read_dense, 0)
 
-        def columns(count: int, first: int, result: str, own: bool) -> None:
-            width = self._width(count, own)
+        def columns(count: int, first: int, own: bool) -> None:
             with c.loop(count) as t:
                 moved = self._tangent(c.plus(t, first))
                 change = [c.total(self._along_states(m.read, self.read_results, s, moved)) for s in slopes]
@@ -527,22 +541,80 @@ class _Block:
                 for p in range(m.outputs):
                     white = c.total([c.mul(w, x) for w, x in zip(whitening[p], change, strict=True)])
                     assert white is not None
-                    row_at = c.plus(c.times(i, m.outputs), p)
-                    self._put_column(result, width, row_at, t, self._finite(white, inside[p]))
-            with c.loop(width, count) as t:
-                for p in range(m.outputs):
-                    self._put_column(result, width, c.plus(c.times(i, m.outputs), p), t, c.number(0.0))
+                    c.store(self._finite(white, inside[p]), self._columns_of(p), c.plus(t, first))
 
-        columns(m.parameters, 0, "by_parameter", own=True)
-        columns(m.states, m.parameters, "by_state", own=False)
+        columns(m.parameters, 0, own=True)
+        columns(m.states, m.parameters, own=False)
+        for p in range(m.outputs):
+            self._put_row(c.plus(c.times(i, m.outputs), p), self._columns_of(p), values[p])
 
-    def _width(self, count: int, by_parameter: bool) -> ir.Value:
-        """How many columns a result has."""
-        return self._got("width", I64) if by_parameter else self.code.i(count)
+    def _columns_of(self, row: int) -> ir.Value:
+        """Where the derivatives of a row, and then its value, are collected."""
+        return self.code.place(self.collected, row * (self.tangents + 1))
 
-    def _put_column(self, result: str, width: ir.Value, row: ir.Value, t: ir.Value, value: ir.Value) -> None:
-        c = self.code
-        self._put(self._got(result), c.times(self.rows, width), c.plus(c.times(row, width), t), value)
+    def _put_row(self, row: ir.Value, columns: ir.Value, value: ir.Value) -> None:
+        """Write a row of the Jacobian, or take it into the products of the columns with each other."""
+        c, b = self.code, self.code.builder
+        reduced = b.icmp_signed("!=", self._got("reduced", I64), c.i(0))
+        c.store(value, columns, self.tangents)
+        with b.if_else(reduced) as (taken, written):
+            with taken, c.loop(self.tangents + 1) as i:
+                left = c.load(columns, i)
+                with c.loop(self.tangents + 1, i) as j:
+                    place = c.plus(c.times(i, self.tangents + 1), j)
+                    product = c.mul(left, c.load(columns, j))
+                    c.store(c.add(c.load(self.products, place), product), self.products, place)
+            with written:
+                self._write_row(row, columns, self.rows)
+
+    def _write_row(self, row: ir.Value, columns: ir.Value, rows: ir.Value) -> None:
+        """Derivatives of one of so many rows; zero behind the last parameter."""
+        c, m = self.code, self.march
+        width = self._got("width", I64)
+        for first, last, count, result in (
+            (0, m.parameters, width, "by_parameter"),
+            (m.parameters, self.tangents, c.i(m.states), "by_state"),
+        ):
+
+            def put(t: ir.Value, value: ir.Value, count=count, result=result) -> None:
+                self._put(self._got(result), c.times(rows, count), c.plus(c.times(row, count), t), value)
+
+            with c.loop(last - first) as t:
+                put(t, c.load(columns, c.plus(t, first)))
+            with c.loop(count, last - first) as t:
+                put(t, c.number(0.0))
+
+    def _factorise(self) -> None:
+        """The triangular factor of the products (Cholesky); a column that depends on those before it has no row."""
+        c, b = self.code, self.code.builder
+        count = self.tangents + 1
+        rows = c.plus(self._got("width", I64), self.march.states + 1)
+        zero = c.number(0.0)
+        with c.loop(count) as k:
+            c.store(c.load(self.products, c.times(k, count + 1)), self.collected, k)
+        with c.loop(count) as k:
+            pivot = c.load(self.products, c.times(k, count + 1))
+            told = c.smaller(c.mul(c.number(_DEPENDENT), c.load(self.collected, k)), pivot)
+            root = c.called("sqrt", b.select(told, pivot, c.number(1.0)))
+            scale = b.select(told, b.fdiv(c.number(1.0), root), zero)
+            mine = c.place(self.products, c.times(k, count))
+            with c.loop(count) as j:
+                left = b.icmp_signed("<", j, k)
+                value = c.mul(c.load(mine, j), scale)
+                c.store(b.select(left, zero, value), mine, j)
+            with c.loop(count, c.plus(k, 1)) as i:
+                factor = c.load(mine, i)
+                with c.loop(count, i) as j:
+                    place = c.plus(c.times(i, count), j)
+                    less = c.sub(c.load(self.products, place), c.mul(factor, c.load(mine, j)))
+                    c.store(less, self.products, place)
+            self._write_row(k, mine, rows)
+            self._put(self._got("factor"), rows, k, c.load(mine, self.tangents))
+        with c.loop(self.tangents) as t:
+            c.store(zero, self.collected, t)
+        with c.loop(rows, count) as k:
+            self._write_row(k, self.collected, rows)
+            self._put(self._got("factor"), rows, k, zero)
 
     def _finite(self, value: ir.Value, as_well: ir.Value) -> ir.Value:
         """A derivative; zero where it is none."""
@@ -589,31 +661,26 @@ class _Block:
         self._at_state()
         self._run(m.expected, self.prior_results)
         fresh = b.fcmp_ordered("==", self._lanes(self._got("joined"), 1, 0), c.number(0.0))
-        first = c.times(self.samples, m.outputs)
+        top = c.times(self.samples, m.outputs)
         zero, lost = c.number(0.0), c.number(LOST)
         for h, node in enumerate(m.equations.prior.values):
             value = self._node(m.expected, node, self.prior_results)
             inside = c.smaller(c.called("fabs", value), lost)
             value = b.select(fresh, b.select(inside, value, lost), zero)
-            row = c.plus(first, h)
+            row = c.plus(top, h)
             self._put(self._got("rows"), self.rows, row, value)
             if not self.jacobian:
                 continue
             both = b.and_(fresh, inside)
             slopes = m.equations.prior.slopes[h]
-            for kind, count, result in (
-                ("parameter", m.parameters, "by_parameter"),
-                ("state", m.states, "by_state"),
-            ):
-                width = self._width(count, kind == "parameter")
+            for kind, first, count in (("parameter", 0, m.parameters), ("state", m.parameters, m.states)):
                 for t in range(count):
                     slope = slopes.get((kind, t))
                     change = zero if slope is None else self._node(m.expected, slope, self.prior_results)
                     if kind == "parameter":
                         change = c.mul(change, self._slope(c.i(t)))
-                    self._put_column(result, width, row, c.i(t), self._finite(change, both))
-                with c.loop(width, count) as t:
-                    self._put_column(result, width, row, t, zero)
+                    c.store(self._finite(change, both), self._columns_of(0), first + t)
+            self._put_row(row, self._columns_of(0), value)
 
     def _write_end(self) -> None:
         c, m = self.code, self.march
@@ -625,7 +692,7 @@ class _Block:
             (True, 0, m.parameters, "end_by_parameter"),
             (False, m.parameters, m.states, "end_by_state"),
         ):
-            width = self._width(count, own)
+            width = self._got("width", I64) if own else c.i(count)
 
             def put(i: int, t: ir.Value, change: ir.Value, width=width, result=result) -> None:
                 self._put(self._got(result), c.times(width, m.states), c.plus(c.times(width, i), t), change)

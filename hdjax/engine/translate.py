@@ -303,7 +303,7 @@ _ELEMENTWISE: dict[str, Callable[..., Node]] = {
     "acos": _by_jax(lambda x: _arctangent2(jnp.sqrt((1.0 - x) * (1.0 + x)), x)),
     "cbrt": _by_jax(lambda x: jnp.sign(x) * jnp.exp(jnp.log(jnp.abs(x)) / 3.0)),
     "exp2": _by_jax(lambda x: jnp.exp(x * math.log(2.0))),
-    "stop_gradient": lambda graph, e, a: a,
+    "stop_gradient": lambda graph, e, a: graph.apply("given", a),
     "copy": lambda graph, e, a: a,
     "copy_p": lambda graph, e, a: a,
     "optimization_barrier": lambda graph, e, a: a,
