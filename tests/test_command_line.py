@@ -1,7 +1,9 @@
 """What a user types: one sentence and an exit code where it can't be done, and a file where it can."""
 
+import importlib.metadata
 import importlib.util
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -112,6 +114,36 @@ BAD_LOGS: dict[str, tuple[Callable[[], dict[str, np.ndarray]], int, Sequence[str
     "too short": (lambda: {n: c[:150] for n, c in table().items()}, 1, ("150 rows", "200")),
     "mirrored": (lambda: spoiled(load_angle=np.negative), 1, ("sign = -1",)),
 }
+
+
+HEAVY = ("hdjax", "jax", "matplotlib", "numpy", "plotly", "polars", "scipy")
+ANSWER_AND_TELL = """\
+import sys
+from fitting.command_line import main
+try:
+    main(sys.argv[1:])
+except SystemExit as end:
+    assert not end.code, end.code
+print(*(name for name in {heavy!r} if name in sys.modules), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("--version",), ("--help",), ("fit", "--help"), ("speeds", "--help"), ("sweep", "--help")],
+    ids=" ".join,
+)
+def test_what_needs_no_computation_imports_nothing_for_it(arguments: Sequence[str]):
+    program = ANSWER_AND_TELL.format(heavy=HEAVY)
+    answer = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip()
+    assert answer.stderr.split() == []
+
+
+@pytest.mark.parametrize("start", [("-m", "hdjax"), ("-c", "from fitting.command_line import main; main()")])
+def test_the_version_is_that_of_the_package(start: Sequence[str]):
+    answer = subprocess.run([sys.executable, *start, "--version"], capture_output=True, text=True, check=True)
+    assert answer.stdout.split() == [importlib.metadata.version("hdjax")]
 
 
 def test_a_reader_that_leaves_early_is_no_error(

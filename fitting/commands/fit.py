@@ -1,0 +1,117 @@
+"""The commands that fit logs: `hdjax fit | close-loop | demo`."""
+
+from pathlib import Path
+
+from fitting.commands.options import DriveFileOption, ExperimentLimits, Logs, wanted
+from fitting.commands.start import start_jax
+from fitting.errors import InputError
+
+
+def fit(
+    logs: Logs,
+    /,
+    *,
+    drive: DriveFileOption,
+    out: Path,
+    posterior: bool = False,
+    seed: int = 0,
+    next_experiment: bool = False,
+    limits: ExperimentLimits = ExperimentLimits(),
+    workers: int = 0,
+    scheduler: str | None = None,
+) -> None:
+    """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
+
+    Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
+    run that was cut off goes on where it stopped. Quasi-static logs (twist and joint torque) give stiffness, knees,
+    hysteresis and lost motion instead.
+
+    Parameters
+    ----------
+    out
+        Folder for report.html, report.json and, but for quasi-static logs, model.json; of a folder of logs for
+        fleet.parquet.
+    posterior
+        Draw from the posterior as well (minutes), and write the draws to posterior.parquet. Needs the extra
+        `posterior`.
+    seed
+        Of the draws.
+    next_experiment
+        Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
+        and write it to next_experiment.csv.
+    workers
+        Of a folder: processes on this machine that share its logs; threads where 0.
+    scheduler
+        Of a folder: address of a Dask scheduler whose workers do it, for instance tcp://10.0.0.1:8786.
+    """
+    asked = wanted(limits, next_experiment)
+    folder = next((path for path in logs if path.is_dir()), None)
+    if (workers or scheduler) and folder is None:
+        raise InputError(f"{logs[0]}: --workers and --scheduler are for a folder of logs; give the folder")
+    if workers < 0:
+        raise InputError(f"--workers must be 0 or more, but is {workers}")
+    if asked is not None and folder is not None:
+        raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
+    if posterior and folder is not None:
+        raise InputError(f"{folder}: --posterior is for log files of one drive, but this is a folder; name its logs")
+    start_jax()
+    if folder is not None:
+        from fitting.commands.run_fleet import fit_folder
+
+        fit_folder(logs, drive, out, workers, scheduler)
+        return
+    from fitting.commands.run_fit import fit_logs
+
+    fit_logs(logs, drive, out, seed if posterior else None, asked)
+
+
+def close_loop(
+    logs: Logs,
+    /,
+    *,
+    drive: DriveFileOption,
+    out: Path,
+    max_effects: int = 3,
+    seed: int = 0,
+    next_experiment: bool = False,
+    limits: ExperimentLimits = ExperimentLimits(),
+) -> None:
+    """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
+
+    Quasi-static logs (twist and joint torque) are explained without inertia: the equation is the torque-twist line.
+
+    Parameters
+    ----------
+    out
+        Folder for report.html, report.json and, but for quasi-static logs, model.json.
+    max_effects
+        Effects to add at most.
+    seed
+        Of the surrogates behind the p-values.
+    next_experiment
+        Where explanations are tied, look for the motor torque that would tell them apart within limits (minutes), and
+        write it to next_experiment.csv.
+    """
+    if max_effects < 0:
+        raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
+    asked = wanted(limits, next_experiment)
+    start_jax()
+    from fitting.commands.run_close_loop import close_loop_on_logs
+
+    close_loop_on_logs(logs, drive, out, max_effects, seed, asked)
+
+
+def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
+    """Simulate a drive with an effect that nobody declared, close the loop on its logs, and say where the report is.
+
+    Parameters
+    ----------
+    out
+        Folder for the logs and the report.
+    seed
+        Of torque and noise.
+    """
+    start_jax()
+    from fitting.commands.run_close_loop import demonstrate
+
+    demonstrate(out, seed)

@@ -1,0 +1,79 @@
+"""The commands that run a model: `hdjax predict | simulate`."""
+
+from pathlib import Path
+from typing import Literal
+
+from fitting.commands.options import DriveFileOption
+from fitting.commands.start import start_jax
+from fitting.errors import InputError
+
+
+def predict(model: Path, log: Path, /, *, drive: DriveFileOption, out: Path) -> None:
+    """Run a fitted model freely along a log and write the dynamic error that it predicts.
+
+    The log's outputs are used in the first 50 samples only, for the initial state.
+
+    Parameters
+    ----------
+    model
+        model.json of a report.
+    log
+        The log that supplies torque and time stamps.
+    out
+        CSV file with the columns time, dynamic_error.
+    """
+    start_jax()
+    from fitting.commands.run_predict import write_prediction
+
+    write_prediction(model, log, drive, out)
+
+
+def simulate(
+    *,
+    out: Path,
+    model: Path | None = None,
+    preset: str = "HDC-40-050",
+    forcing: Literal["harmonic", "chirp", "multisine"] = "multisine",
+    amplitude: float = 0.5,
+    frequency: float = 10.0,
+    frequency_end: float = 100.0,
+    duration: float = 4.0,
+    rate: float = 2000.0,
+    noise: float = 0.0,
+    seed: int = 0,
+) -> None:
+    """Simulate a drive under a zero-order-held motor torque and write it as a log.
+
+    Parameters
+    ----------
+    out
+        CSV file with the columns time, motor_angle, load_angle, motor_torque (or time, dynamic_error, forcing).
+    model
+        model.json of a report; a preset where not given.
+    preset
+        Name of a drive with published parameters.
+    forcing
+        Shape of the motor torque.
+    amplitude
+        Its peak (multisine: rms) [N m].
+    frequency
+        Its frequency, or where a chirp or multisine begins [Hz].
+    frequency_end
+        Where a chirp or multisine ends [Hz].
+    duration
+        Length of the log [s].
+    rate
+        Sampling rate [Hz].
+    noise
+        Rms noise of each angle [rad at the output].
+    seed
+        Of phases and noise.
+    """
+    for name, value in {"duration": duration, "rate": rate, "frequency": frequency}.items():
+        if not value > 0:
+            raise InputError(f"--{name} must be positive, but is {value}")
+    start_jax()
+    from fitting.commands.run_simulate import Forcing, write_simulation
+
+    torque = Forcing(forcing, amplitude, frequency, frequency_end, duration, rate)
+    write_simulation(out, torque, model=model, preset=preset, noise=noise, seed=seed)

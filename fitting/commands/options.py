@@ -1,0 +1,93 @@
+"""Options that several commands share, and checks of them."""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from fitting.errors import InputError
+
+Logs = Annotated[
+    list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
+]
+DriveFileOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ExperimentLimits:
+    """Limits of the next experiment; what the logs have reached where not given."""
+
+    largest_torque: Annotated[float | None, Parameter(help="Of the next experiment: torque [N m], or forcing.")] = None
+    largest_speed: Annotated[float | None, Parameter(help="Of the next experiment: motor speed [rad/s].")] = None
+    largest_travel: Annotated[
+        float | None, Parameter(help="Of the next experiment: how far the output may turn from its start [rad].")
+    ] = None
+    largest_twist: Annotated[
+        float | None, Parameter(help="Of the next experiment: dynamic error [rad]; none where not given.")
+    ] = None
+    duration: Annotated[float | None, Parameter(help="Of the next experiment [s].")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class DriveOptions:
+    """Which drive a command works on.
+
+    Attributes:
+        preset: Name of a drive with published parameters.
+        model: model.json of a report, in place of a preset. Of its effects only `speeds` uses one, the kinematic error.
+        K: Torsional stiffness [N m/rad] in place of the drive's own.
+        alpha: Cubic stiffness coefficient [rad^-2] in place of the drive's own.
+        B_sp: Mesh damping [N m s/rad] in place of the drive's own.
+    """
+
+    preset: str = "HDC-40-050"
+    model: Path | None = None
+    K: Annotated[float | None, Parameter(name="--K")] = None
+    alpha: Annotated[float | None, Parameter(name="--alpha")] = None
+    B_sp: Annotated[float | None, Parameter(name="--B_sp")] = None
+
+
+def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits | None:
+    """The limits where a next experiment is wanted, None where not.
+
+    Raises:
+        InputError: where limits are stated for an experiment that nobody wants.
+    """
+    if next_experiment:
+        return options
+    if options != ExperimentLimits():
+        raise InputError(
+            "--largest-torque, --largest-speed, --largest-travel, --largest-twist and --duration are limits of the "
+            "next experiment; add --next-experiment"
+        )
+    return None
+
+
+def require_number(name: str, value: float, *, positive: bool = True) -> None:
+    """Refuse what is no number, or not above zero.
+
+    Raises:
+        InputError: that names the option.
+    """
+    if not math.isfinite(value) or (positive and value <= 0.0):
+        raise InputError(f"{name} must be a {'positive ' if positive else ''}number, but is {value:g}")
+
+
+def require_folder(path: Path | None) -> None:
+    """Refuse a folder that can't be written to, before minutes of work are done for it. Nothing is made.
+
+    Raises:
+        InputError: where it, or the place in which it would be made, is no folder or is not open for writing.
+    """
+    if path is None:
+        return
+    place = next(p for p in (path, *path.absolute().parents) if p.exists())
+    if not place.is_dir():
+        raise InputError(f"--out must be a folder, but {place} is a file")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"--out must be open for writing, but {place} is not; give another folder")

@@ -1,0 +1,58 @@
+"""What `hdjax design` does."""
+
+import json
+from pathlib import Path
+
+from rich.console import Console
+
+from fitting.commands.pictures import show_files
+from fitting.design_file import read_design_file
+from fitting.design_report import design_dict, design_text
+from fitting.errors import DataError
+from fitting.files import write_whole
+from hdjax.design import confirm, optimise
+from hdjax.design.study import LANES
+
+
+def design_file(spec: Path, out: Path, *, plot: bool) -> None:
+    """Find the design that a design file asks for, write it, and show it.
+
+    Args:
+        spec: design file.
+        out: folder.
+        plot: whether it is drawn.
+
+    Raises:
+        InputError: for a bad file.
+        DataError: where no design keeps the limits.
+    """
+    asked = read_design_file(spec)
+    study, search = asked.study, asked.search
+    # Beside many draws, designs side by side only wait for the slowest.
+    lanes = max(1, min(search.starts, LANES, 64 // (1 if study.draws is None else len(study.draws.values))))
+    console = Console(stderr=True)
+    with console.status("compiling") as status:
+        try:
+            found = optimise(
+                study,
+                search.starts,
+                seed=search.seed,
+                lanes=lanes,
+                progress=lambda count: status.update(f"searching: {count} designs appraised"),
+            )
+        except ValueError as error:
+            raise DataError(f"{spec}: {error}; change the ranges in [variables]") from error
+        status.update("sweeping around the optimum")
+        proof = confirm(study, found.best, width=search.width, points=search.points, seed=search.seed, lanes=lanes)
+    files: dict[Path, str | bytes] = {
+        out / "design.json": json.dumps(design_dict(study, found, proof), indent=1, allow_nan=False) + "\n"
+    }
+    if plot:
+        from fitting.design_plot import summary
+
+        files[out / "design.png"] = summary(study, found, proof)
+    write_whole(files)
+    print(design_text(study, found, proof))
+    show_files(files)
+    if not found.best.feasible:
+        raise DataError(f"{spec}: no design that was found keeps all limits; widen [variables] or loosen [limits]")

@@ -1,0 +1,45 @@
+"""What `hdjax fit` does with a folder of logs."""
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
+
+from fitting.drive_file import read_drive_file
+from fitting.errors import DataError, InputError
+from fitting.fleet import fit_fleet, fleet_text
+
+
+def fit_folder(folders: list[Path], drive: Path, out: Path, workers: int, scheduler: str | None) -> None:
+    """Fit each log of a folder on its own, into one table, and show it.
+
+    Args:
+        folders: one.
+        drive: drive file.
+        out: folder of the table.
+        workers: processes on this machine; threads where 0.
+        scheduler: address of a Dask scheduler, or None.
+
+    Raises:
+        InputError: for several folders, or a bad drive file.
+        DataError: where no log could be fitted.
+    """
+    if len(folders) > 1:
+        raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
+    read_drive_file(drive)
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("logs", total=None)
+        table = fit_fleet(
+            folders[0],
+            drive,
+            out,
+            workers=workers,
+            scheduler=scheduler,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print(fleet_text(table))
+    print(f"Table: {out / 'fleet.parquet'}")
+    if not (table["state"] == "fitted").any():
+        raise DataError(f"{folders[0]}: none of its {len(table)} logs could be fitted; the reasons stand above")

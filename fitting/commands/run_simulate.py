@@ -1,0 +1,82 @@
+"""What `hdjax simulate` does."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import numpy as np
+
+from fitting.commands.table import write_table
+from fitting.errors import InputError
+from fitting.model_file import read_model
+from hdjax import PRESETS, Chirp, Harmonic, TwoInertiaModel, random_phase_multisine, sampled, simulate
+
+
+@dataclass(frozen=True)
+class Forcing:
+    """A motor torque, and how it is sampled.
+
+    Attributes:
+        shape: of the torque.
+        amplitude: peak, or rms of a multisine [N m].
+        frequency: its own, or where it begins [Hz].
+        frequency_end: where it ends [Hz].
+        duration: of the log [s].
+        rate: of its samples [Hz].
+    """
+
+    shape: Literal["harmonic", "chirp", "multisine"]
+    amplitude: float
+    frequency: float
+    frequency_end: float
+    duration: float
+    rate: float
+
+
+def write_simulation(out: Path, torque: Forcing, *, model: Path | None, preset: str, noise: float, seed: int) -> None:
+    """Simulate a drive and write its log.
+
+    Args:
+        out: CSV file.
+        torque: of the motor, held from sample to sample.
+        model: model.json of a report, or None for a preset.
+        preset: name of a drive.
+        noise: rms of each angle [rad at the output].
+        seed: of phases and noise.
+
+    Raises:
+        InputError: for an unknown preset, a bad model, or a band without a line.
+    """
+    if preset not in PRESETS:
+        raise InputError(f"--preset must be one of {', '.join(PRESETS)}, but is {preset}")
+    system = TwoInertiaModel(PRESETS[preset]()) if model is None else read_model(model).model
+    time = np.arange(max(2, round(torque.duration * torque.rate))) / torque.rate
+    applied = np.asarray(jax.vmap(_function(torque, seed))(time))
+    motion = simulate(system, sampled(time, applied, hold="zero-order"), time, rtol=1e-9, atol=1e-12)
+    random = np.random.default_rng(seed)
+    if isinstance(system, TwoInertiaModel):
+        outputs = np.asarray(motion.outputs)
+        motor = outputs[:, 0] + noise * random.normal(size=time.size)
+        load = outputs[:, 0] - outputs[:, 1] + noise * random.normal(size=time.size)
+        columns = {"motor_angle": motor * float(system.drive.N), "load_angle": load, "motor_torque": applied}
+    else:
+        x = np.asarray(motion.dynamic_error) + noise * random.normal(size=time.size)
+        columns = {"dynamic_error": x, "forcing": applied}
+    write_table(out, {"time": time} | columns)
+    print(f"Log: {out}")
+
+
+def _function(torque: Forcing, seed: int) -> Callable:
+    first, last = 2 * np.pi * torque.frequency, 2 * np.pi * torque.frequency_end
+    if torque.shape == "harmonic":
+        return Harmonic(torque.amplitude, first)
+    if torque.shape == "chirp":
+        return Chirp(torque.amplitude, first, last, torque.duration)
+    try:
+        return random_phase_multisine(
+            rms=torque.amplitude, omega_min=first, omega_max=last, period=torque.duration, key=jax.random.key(seed)
+        )
+    except ValueError as error:
+        raise InputError(f"--frequency, --frequency-end and --duration do not go together: {error}") from error

@@ -1,0 +1,94 @@
+"""What `hdjax sweep` does."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress
+
+from fitting.errors import InputError
+from fitting.files import write_whole
+from fitting.sweep_file import read_sweep_file
+from hdjax.sweep import sweep
+
+_MEBIBYTE = 1 << 20
+
+
+def sweep_file(spec: Path, out: Path, *, workers: int, scheduler: str | None, memory: int, plot: bool) -> None:
+    """Work out what a sweep file asks for, write it, and show it.
+
+    Args:
+        spec: sweep file.
+        out: folder of the store.
+        workers: processes on this machine; this one alone where 0.
+        scheduler: address of a Dask scheduler, or None.
+        memory: for the chunks in work [MiB].
+        plot: whether the summary is drawn.
+
+    Raises:
+        InputError: for a bad file, or without the extra `sweep`.
+    """
+    asked = read_sweep_file(spec)
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    try:
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+            task = bar.add_task("choosing the route", total=None)
+
+            def told(done: int, total: int) -> None:
+                bar.update(task, description="points", completed=done, total=total)
+
+            result = sweep(
+                asked.model,
+                asked.forcing,
+                asked.request,
+                store=out,
+                workers=workers,
+                scheduler=scheduler,
+                memory=memory * _MEBIBYTE,
+                progress=told,
+            )
+    except (ValueError, ImportError) as error:
+        raise InputError(f"{spec}: {error}") from error
+    folder = out / result.attrs["request"]
+    _write_result(result, folder / "result.zarr")
+    if plot:
+        from fitting.sweep_plot import summary
+
+        write_whole({folder / "summary.png": summary(result)})
+    print(_text(result))
+    print(f"Result: {folder / 'result.zarr'}")
+
+
+def _write_result(result, path: Path) -> None:
+    """The result under its name only when it is whole."""
+    waiting = path.with_name(f".{path.name}")
+    shutil.rmtree(waiting, ignore_errors=True)
+    result.to_zarr(waiting, mode="w", consolidated=False)
+    shutil.rmtree(path, ignore_errors=True)
+    waiting.rename(path)
+
+
+def _text(result) -> str:
+    """What a terminal shows of a sweep."""
+    a = result.attrs
+    lines = [
+        f"{a['points']} points: {a['route']}",
+        f"Error on {a['checked_points']} drawn points against {a['checked_against']}: "
+        f"{a['checked_error']:.1e} at most, {a['checked_median_error']:.1e} in the median",
+    ]
+    if not a["tolerance_kept"]:
+        lines.append(
+            f"The asked tolerance of {a['tolerance']:g} is not kept on these points: some motions magnify errors"
+        )
+    if "motions" in result:
+        several, lost = int((result.motions > 1).sum()), int(result.lost.sum())
+        missing = f"; at {lost} one was not found, mostly at a fold" if lost else ""
+        lines.append(f"{several} points have several steady motions{missing}")
+    for name in ("peak", "amplitude", "settling_time"):
+        if name in result and np.isfinite(result[name]).any():
+            lines.append(
+                f"{name}: {float(result[name].min()):.4g} to {float(result[name].max()):.4g} {result[name].units}"
+            )
+    return "\n".join(lines)
