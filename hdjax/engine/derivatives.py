@@ -83,7 +83,8 @@ def _partials(graph: Graph, node: Node, found: Mapping[Node, Tangent]) -> list[t
     return [(a, law()) for a, law in zip(rest, laws, strict=True) if found[a]]
 
 
-_Apply, _Constant = Callable[..., Node], Callable[[float], Node]
+_Apply = Callable[..., Node]
+_Constant = Callable[[float], Node]
 
 
 def _division(apply: _Apply, constant: _Constant, q: Node, a: Node, b: Node):
@@ -97,7 +98,8 @@ _RULES = {
     "mul": lambda apply, c, y, a, b: [lambda: b, lambda: a],
     "div": _division,
     "neg": lambda apply, c, y, a: [lambda: c(-1.0)],
-    "abs": lambda apply, c, y, a: [lambda: apply("sign", a)],
+    # At zero as from the right, as in JAX.
+    "abs": lambda apply, c, y, a: [lambda: apply("select", apply("ge", a, c(0.0)), c(1.0), c(-1.0))],
     "sqrt": lambda apply, c, y, a: [lambda: apply("div", c(0.5), y)],
     "exp": lambda apply, c, y, a: [lambda: y],
     "expm1": lambda apply, c, y, a: [lambda: apply("add", y, c(1.0))],

@@ -12,8 +12,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from hdjax.elementary import cosine_and_sine
 from hdjax.engine.graph import Graph, Node
+from hdjax.where import where
 
-Nodes = np.ndarray
+Nodes = np.ndarray[Any, np.dtype[np.object_]]
 """Nodes in the shape of an array."""
 
 _LONGEST_LOOP = 64
@@ -70,14 +71,15 @@ def _constants(graph: Graph, array: Any) -> Nodes:
         raise UntranslatableError(f"a constant of type {array.dtype}")
     found = np.empty(array.shape, dtype=object)
     for index in np.ndindex(array.shape):
-        found[index] = graph.constant(array[index].item())
+        value = array[index].item()
+        found[index] = graph.constant(value if isinstance(value, bool) else float(value))
     return found
 
 
 def _translate(graph: Graph, equation: Any, arguments: list[Nodes], values_only: bool) -> list[Nodes]:
     name, parameters = equation.primitive.name, equation.params
     inner = parameters.get("jaxpr") or parameters.get("call_jaxpr")
-    if name in ("pjit", "jit", "closed_call", "remat", "checkpoint", "custom_vjp_call"):
+    if name in ("pjit", "jit", "closed_call", "remat2", "checkpoint", "custom_vjp_call"):
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
         return translated(graph, closed, arguments, values_only=values_only)
     if name == "custom_jvp_call":
@@ -108,7 +110,7 @@ def _with_own_derivative(
     if values_only:
         return values
     entries = [(k, index) for k, a in enumerate(arguments) for index in np.ndindex(a.shape)]
-    moving = [e for e in entries if graph.known(arguments[e[0]][e[1]]) is None]
+    moving = [e for e in entries if graph.known(arguments[e[0]].item(*e[1])) is None]
     if not moving:
         return values
     rule, constants, zeros = parameters["jvp_jaxpr_fun"].call_wrapped(*(False for _ in arguments))
@@ -127,8 +129,8 @@ def _with_own_derivative(
             given: list[Node] = []
             for (k, index), slope in zip(moving, slopes, strict=True):
                 partial = slope[o]
-                if partial is not None and graph.known(partial[place]) != 0.0:
-                    given += [arguments[k][index], partial[place]]
+                if partial is not None and graph.known(partial.item(*place)) != 0.0:
+                    given += [arguments[k].item(*index), partial.item(*place)]
             result[place] = graph.apply("given", value[place], *given) if given else value[place]
         results.append(result)
     return results
@@ -167,7 +169,7 @@ def _by_jax(function: Callable[..., Any]) -> Callable[..., Node]:
 
     def rule(graph: Graph, equation: Any, *nodes: Node) -> Node:
         (found,) = translated(graph, program(len(nodes)), [np.array(n, dtype=object) for n in nodes])
-        return found[()]
+        return found.item()
 
     return rule
 
@@ -210,7 +212,7 @@ def _choose(graph: Graph, equation: Any, which: Node, *cases: Node) -> Node:
     return found
 
 
-def _sum(graph: Graph, nodes: Sequence[Node], operation: str = "add", start: float = 0.0) -> Node:
+def _sum(graph: Graph, nodes: Sequence[Node], operation: str = "add", start: float | bool = 0.0) -> Node:
     return functools.reduce(lambda a, b: graph.apply(operation, a, b), nodes) if len(nodes) else graph.constant(start)
 
 
@@ -220,49 +222,100 @@ def _pow(graph: Graph, equation: Any, base: Node, exponent: Node) -> Node:
         return graph.power(base, int(known))
     if known == 0.5:
         return graph.apply("sqrt", base)
-    return graph.apply("exp", graph.apply("mul", exponent, graph.apply("log", base)))
+    return _any_power(graph, equation, base, exponent)
 
 
-def _asinh(x):
-    a = jnp.abs(x)
-    return jnp.sign(x) * jnp.log1p(a + a * a / (1.0 + jnp.sqrt(1.0 + a * a)))
+@jax.custom_jvp
+def _power(base, exponent):
+    """No number of a negative base, whatever the exponent."""
+    positive = base > 0.0
+    at_zero = where(exponent > 0.0, 0.0, where(exponent == 0.0, 1.0, math.inf))
+    beside = where(base == 0.0, at_zero, math.nan)
+    return where(positive, jnp.exp(exponent * jnp.log(where(positive, base, 1.0))), beside)
+
+
+@_power.defjvp
+def _power_jvp(primals, tangents):
+    (base, exponent), (moved, bent) = primals, tangents
+    value = _power(base, exponent)
+    # One power less than none is none, and a zero stays one whatever its exponent.
+    by_base = where(exponent == 0.0, 0.0, exponent * _power(base, exponent - 1.0))
+    by_exponent = jnp.log(where(base == 0.0, 1.0, base)) * value
+    return value, by_base * moved + by_exponent * bent
+
+
+_any_power = _by_jax(_power)
+
+
+def _with_slope(function: Callable[[Any], Any], slope: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+    """A function whose derivative is a formula of its argument and value: what its parts give would be less exact."""
+    found = jax.custom_jvp(function)
+
+    def rule(primals, tangents):
+        value = found(*primals)
+        return value, slope(primals[0], value) * tangents[0]
+
+    found.defjvp(rule)
+    return found
+
+
+# Beyond it the square of a number, or one beside it, is nothing worth having.
+_HUGE = 1e100
 
 
 def _log1p(x):
     # Kahan: the rounding of 1 + x is taken back.
     u = 1.0 + x
-    return jnp.where(u == 1.0, x, jnp.log(u) * x / jnp.where(u == 1.0, 1.0, u - 1.0))
+    huge = u > _HUGE
+    small = where((u == 1.0) | huge, 1.0, u - 1.0)
+    return where(u == 1.0, x, jnp.log(u) * where(huge, 1.0, where(u == 1.0, 1.0, x) / small))
 
 
-@jax.custom_jvp
+def _asinh(x):
+    size = jnp.abs(x)
+    huge = size > _HUGE
+    a = where(huge, 1.0, size)
+    near = _log1p(a + a * a / (1.0 + jnp.sqrt(1.0 + a * a)))
+    return jnp.sign(x) * where(huge, jnp.log(where(huge, size, 1.0)) + math.log(2.0), near)
+
+
+def _acosh(x):
+    huge = x > _HUGE
+    a = where(huge, 2.0, x) - 1.0
+    near = _log1p(a + jnp.sqrt(a * (a + 2.0)))
+    return where(huge, jnp.log(where(huge, x, 1.0)) + math.log(2.0), near)
+
+
+def _sinh(x):
+    return 0.5 * (jnp.expm1(x) - jnp.expm1(-x))
+
+
+def _cosh(x):
+    return 0.5 * (jnp.exp(x) + jnp.exp(-x))
+
+
 def _arctangent(x):
     """By two halvings of the angle, then a series on tangents below tan(pi / 16)."""
     a = jnp.abs(x)
     large = a > 1.0
-    t = jnp.where(large, 1.0 / jnp.where(large, a, 1.0), a)
+    t = where(large, 1.0 / where(large, a, 1.0), a)
     for _ in range(2):
         t = t / (1.0 + jnp.sqrt(1.0 + t * t))
     total = jnp.zeros_like(t)
     for k in range(13, -1, -1):
         total = total * (t * t) + (-1.0) ** k / (2 * k + 1)
     angle = 4.0 * t * total
-    return jnp.sign(x) * jnp.where(large, math.pi / 2 - angle, angle)
-
-
-@_arctangent.defjvp
-def _arctangent_jvp(primals, tangents):
-    (x,), (moved,) = primals, tangents
-    return _arctangent(x), moved / (1.0 + x * x)
+    return jnp.sign(x) * where(large, math.pi / 2 - angle, angle)
 
 
 @jax.custom_jvp
 def _arctangent2(y, x):
     swapped = jnp.abs(y) > jnp.abs(x)
-    over, under = jnp.where(swapped, x, y), jnp.where(swapped, y, x)
-    t = _arctangent(over / jnp.where(under == 0.0, 1.0, under))
-    right = jnp.where(swapped, jnp.where(y >= 0.0, math.pi / 2, -math.pi / 2) - t, t)
-    turned = jnp.where(y >= 0.0, math.pi, -math.pi)
-    return jnp.where(swapped | (x >= 0.0), right, right + turned)
+    over, under = where(swapped, x, y), where(swapped, y, x)
+    t = _arctangent(over / where(under == 0.0, 1.0, under))
+    right = where(swapped, where(y >= 0.0, math.pi / 2, -math.pi / 2) - t, t)
+    turned = where(y >= 0.0, math.pi, -math.pi)
+    return where(swapped | (x >= 0.0), right, right + turned)
 
 
 @_arctangent2.defjvp
@@ -276,6 +329,9 @@ _ELEMENTWISE: dict[str, Callable[..., Node]] = {
     **{name: _operation(name) for name in ("add", "sub", "mul", "neg", "max", "min", "abs", "sign", "sqrt")},
     **{name: _operation(name) for name in ("floor", "ceil", "exp", "expm1", "log", "tanh", "is_finite")},
     **{name: _operation(name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor")},
+    # Total orders: what asks for them has put away what is no number.
+    "lt_to": _operation("lt"),
+    "le_to": _operation("le"),
     "add_any": _operation("add"),
     "div": _divide,
     "round": lambda graph, e, a: _round(graph, e, a),
@@ -290,14 +346,14 @@ _ELEMENTWISE: dict[str, Callable[..., Node]] = {
     "sin": _by_jax(lambda x: cosine_and_sine(x)[1]),
     "cos": _by_jax(lambda x: cosine_and_sine(x)[0]),
     "tan": _by_jax(lambda x: cosine_and_sine(x)[1] / cosine_and_sine(x)[0]),
-    "log1p": _by_jax(_log1p),
-    "logistic": _by_jax(lambda x: 1.0 / (1.0 + jnp.exp(-x))),
-    "sinh": _by_jax(lambda x: 0.5 * (jnp.expm1(x) - jnp.expm1(-x))),
-    "cosh": _by_jax(lambda x: 0.5 * (jnp.exp(x) + jnp.exp(-x))),
-    "asinh": _by_jax(_asinh),
-    "acosh": _by_jax(lambda x: jnp.log(x + jnp.sqrt(x * x - 1.0))),
-    "atanh": _by_jax(lambda x: 0.5 * (_log1p(x) - _log1p(-x))),
-    "atan": _by_jax(_arctangent),
+    "log1p": _by_jax(_with_slope(_log1p, lambda x, y: 1.0 / (1.0 + x))),
+    "logistic": _by_jax(_with_slope(lambda x: 1.0 / (1.0 + jnp.exp(-x)), lambda x, y: y * (1.0 - y))),
+    "sinh": _by_jax(_with_slope(_sinh, lambda x, y: _cosh(x))),
+    "cosh": _by_jax(_with_slope(_cosh, lambda x, y: _sinh(x))),
+    "asinh": _by_jax(_with_slope(_asinh, lambda x, y: 1.0 / jnp.sqrt(1.0 + x * x))),
+    "acosh": _by_jax(_with_slope(_acosh, lambda x, y: 1.0 / jnp.sqrt((x - 1.0) * (x + 1.0)))),
+    "atanh": _by_jax(_with_slope(lambda x: 0.5 * (_log1p(x) - _log1p(-x)), lambda x, y: 1.0 / ((1.0 - x) * (1.0 + x)))),
+    "atan": _by_jax(_with_slope(_arctangent, lambda x, y: 1.0 / (1.0 + x * x))),
     "atan2": _by_jax(_arctangent2),
     "asin": _by_jax(lambda x: _arctangent2(x, jnp.sqrt((1.0 - x) * (1.0 + x)))),
     "acos": _by_jax(lambda x: _arctangent2(jnp.sqrt((1.0 - x) * (1.0 + x)), x)),
@@ -313,8 +369,11 @@ _ELEMENTWISE: dict[str, Callable[..., Node]] = {
 def _round(graph: Graph, equation: Any, a: Node) -> Node:
     if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
         return graph.apply("round", a)
-    # Halves away from zero.
-    up = graph.apply("floor", graph.apply("add", graph.apply("abs", a), graph.constant(0.5)))
+    # Halves away from zero. (The sum of a half and the number just below it is one.)
+    size = graph.apply("abs", a)
+    down = graph.apply("floor", size)
+    far = graph.apply("ge", graph.apply("sub", size, down), graph.constant(0.5))
+    up = graph.apply("add", down, graph.apply("select", far, graph.constant(1.0), graph.constant(0.0)))
     return graph.apply("mul", graph.apply("sign", a), up)
 
 
@@ -336,7 +395,9 @@ def _pad(graph: Graph, equation: Any, a: Nodes, value: Nodes) -> Nodes:
     for axis, (low, high, inner) in enumerate(equation.params["padding_config"]):
         if low < 0 or high < 0 or inner:
             raise UntranslatableError("the primitive `pad` with holes or negative widths")
-        a = np.pad(a, [(low, high) if i == axis else (0, 0) for i in range(a.ndim)], constant_values=value[()])
+        shape = [*a.shape[:axis], -1, *a.shape[axis + 1 :]]
+        before, after = (np.full([n if k < 0 else k for k in shape], value[()], dtype=object) for n in (low, high))
+        a = np.concatenate([before, a, after], axis=axis)
     return a
 
 
@@ -354,7 +415,7 @@ def _dot(graph: Graph, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     return found.reshape([a.shape[i] for i in rest_a] + [b.shape[i] for i in rest_b])
 
 
-def _reduced(operation: str, start: float) -> Callable[..., Nodes]:
+def _reduced(operation: str, start: float | bool) -> Callable[..., Nodes]:
     def rule(graph: Graph, equation: Any, a: Nodes) -> Nodes:
         axes = equation.params["axes"]
         kept = [i for i in range(a.ndim) if i not in axes]
@@ -370,10 +431,30 @@ def _reduced(operation: str, start: float) -> Callable[..., Nodes]:
 def _cumulative(graph: Graph, equation: Any, a: Nodes) -> Nodes:
     axis, back = equation.params["axis"], equation.params["reverse"]
     rows = np.moveaxis(a, axis, 0)[:: -1 if back else 1]
-    sums = [rows[0]]
-    for row in rows[1:]:
-        sums.append(_each(functools.partial(graph.apply, "add"), sums[-1], row))
-    return np.moveaxis(np.stack(sums)[:: -1 if back else 1], 0, axis)
+    sums = [rows[:1]]
+    for i in range(1, len(rows)):
+        sums.append(_each(functools.partial(graph.apply, "add"), sums[-1], rows[i : i + 1]))
+    return np.moveaxis(np.concatenate(sums)[:: -1 if back else 1], 0, axis)
+
+
+def _place_of(better: str) -> Callable[..., Nodes]:
+    """Where the first of the best entries along an axis stands."""
+
+    def rule(graph: Graph, equation: Any, a: Nodes) -> Nodes:
+        (axis,) = equation.params["axes"]
+        rows = np.moveaxis(a, axis, -1)
+        found = np.empty(rows.shape[:-1], dtype=object)
+        for place in np.ndindex(found.shape):
+            best, index = rows[place][0], graph.constant(0.0)
+            for i, node in enumerate(rows[place][1:], 1):
+                beats = graph.apply(better, node, best)
+                best, index = (
+                    graph.apply("select", beats, *pair) for pair in ((node, best), (graph.constant(float(i)), index))
+                )
+            found[place] = index
+        return found
+
+    return rule
 
 
 def _gathered(graph: Graph, equation: Any, a: Nodes, index: Nodes) -> Nodes:
@@ -386,14 +467,14 @@ def _gathered(graph: Graph, equation: Any, a: Nodes, index: Nodes) -> Nodes:
 
 def _dynamic_slice(graph: Graph, equation: Any, a: Nodes, *index: Nodes) -> Nodes:
     sizes = equation.params["slice_sizes"]
-    starts = [graph.known(i[()]) for i in index]
+    starts = [graph.known(i.item()) for i in index]
     if None not in starts:
         whole = [int(s) for s in starts if s is not None]
         begins = [min(max(s, 0), n - k) for s, n, k in zip(whole, a.shape, sizes, strict=True)]
         return a[tuple(slice(s, s + k) for s, k in zip(begins, sizes, strict=True))]
     if sizes[0] != 1 or tuple(sizes[1:]) != a.shape[1:]:
         raise UntranslatableError("the primitive `dynamic_slice` of several rows")
-    return _picked(graph, a, index[0][()], keep=True)
+    return _picked(graph, a, index[0].item(), keep=True)
 
 
 def _picked(graph: Graph, a: Nodes, index: Node, *, keep: bool) -> Nodes:
@@ -431,6 +512,8 @@ _STRUCTURAL: dict[str, Callable[..., Nodes]] = {
     "reduce_prod": _reduced("mul", 1.0),
     "reduce_and": _reduced("and", True),
     "reduce_or": _reduced("or", False),
+    "argmax": _place_of("gt"),
+    "argmin": _place_of("lt"),
     "cumsum": _cumulative,
     "iota": _iota,
 }
