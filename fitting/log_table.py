@@ -1,19 +1,14 @@
 """The raw columns of a log file, in the file's own names and units, whatever its format."""
 
-import os
 import zlib
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
-
-import numpy as np
-import polars as pl
 
 from fitting.array_log import read_hdf5, read_mat
 from fitting.errors import InputError
 from fitting.mdf_log import read_mdf
-from fitting.raw_table import RawColumn, RawTable, column_from_text, not_numbers
+from fitting.raw_table import RawTable
 from fitting.text_log import read_text
 
 # A packed file of more than this is no log of a drive but a mistake, or a trap.
@@ -56,8 +51,10 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
         if error.strerror:
             raise InputError(f"{path}: the log cannot be read ({error.strerror}); check its permissions") from error
         raise _unreadable(path, suffix, error) from error
-    except (Exception, pl.exceptions.PanicException) as error:
-        # Readers of binary formats meet corrupt bytes with whatever exception is at hand.
+    except BaseException as error:
+        # Readers of binary formats meet corrupt bytes with whatever exception is at hand; polars' is no `Exception`.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         raise _unreadable(path, suffix, error) from error
 
 
@@ -90,38 +87,10 @@ def _text(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTab
 
 
 def _parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    with _quiet():
-        names = tuple(pl.read_parquet_schema(source))
-        found = [name for name in wanted if name in names]
-        frame = pl.read_parquet(source, columns=found, use_statistics=False)
-    return RawTable(names, {n: _column_from_series(path, frame[n]) for n in found})
+    # Loaded here: most logs are text.
+    from fitting.parquet_log import read_parquet
 
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep off the terminal what Rust writes there of corrupt bytes, before it raises."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-def _column_from_series(path: Path, series: pl.Series) -> RawColumn:
-    kind = series.dtype
-    if kind in (pl.String, pl.Categorical, pl.Enum):
-        return column_from_text(series.cast(pl.String), comma_parts_cells=False)
-    if isinstance(kind, pl.Datetime | pl.Duration | pl.Time):
-        per_second = 1e9 if isinstance(kind, pl.Time) else {"ms": 1e3, "us": 1e6, "ns": 1e9}[kind.time_unit or "us"]
-        seconds = series.to_physical().cast(pl.Float64) / per_second
-        return RawColumn(seconds.fill_null(float("nan")).to_numpy().astype(np.float64), unit="s")
-    if not (kind.is_numeric() or kind == pl.Boolean):
-        raise not_numbers(path, series.name, f"is of type {kind}")
-    values = series.cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    return RawColumn(np.array(values, dtype=np.float64))
+    return read_parquet(path, source, wanted)
 
 
 def _mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:

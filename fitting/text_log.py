@@ -3,13 +3,11 @@
 import csv
 import re
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
-import polars as pl
-
 from fitting.errors import InputError
-from fitting.raw_table import RawColumn, RawTable, column_from_text, split_unit
+from fitting.plain_numbers import plain_columns
+from fitting.raw_table import RawColumn, RawTable, split_unit
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
@@ -58,10 +56,10 @@ def read_text(path: Path, raw: bytes, wanted: tuple[str, ...]) -> RawTable:
     width = max(dialect.width, len(header))
     places = [p for name in wanted if (p := _place(path, header, name)) is not None]
     asked = [name for name in wanted if _place(path, header, name) is not None]
-    frame = _cells(lines[first:], dialect.delimiter, width, sorted(set(places)))
+    found = _columns(lines[first:], dialect.delimiter, width, sorted(set(places)))
     columns = {}
     for name, place in zip(asked, places, strict=True):
-        column = column_from_text(frame[f"c{place}"], comma_parts_cells=dialect.delimiter == ",")
+        column = found[place]
         stated = split_unit(header[place])[1] if header[place] != name else None
         below = unit_row[place] if place < len(unit_row) else None
         columns[name] = RawColumn(
@@ -190,31 +188,12 @@ def _place(path: Path, header: list[str], wanted: str) -> int | None:
     return None
 
 
-def _cells(lines: list[str], delimiter: str, width: int, places: list[int]) -> pl.DataFrame:
-    """The cells of some columns as text; rows that are too short end blank, longer ones are cut."""
-    if delimiter == " ":
-        lines = [" ".join(line.split()) for line in lines]
-    source = "\n".join(line for line in lines if line.strip()).encode()
-    if b'"' in source:
-        rows = sum(bool(line.strip()) and not line.startswith("#") for line in lines)
-        try:
-            found = _parsed(source, delimiter, width, places, '"')
-        except pl.exceptions.PolarsError:
-            found = None
-        # A quotation mark that stands alone swallows the rest of the file.
-        if found is not None and found.height == rows:
-            return found
-    return _parsed(source, delimiter, width, places, None)
+def _columns(lines: list[str], delimiter: str, width: int, places: list[int]) -> dict[int, RawColumn]:
+    plain = plain_columns(lines, delimiter, places)
+    if plain is not None:
+        return {place: RawColumn(values) for place, values in zip(places, plain, strict=True)}
+    # Loaded here: most logs are plain numbers.
+    from fitting.text_cells import cells, column_from_text
 
-
-def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote: str | None) -> pl.DataFrame:
-    return pl.read_csv(
-        BytesIO(source),
-        separator=delimiter,
-        comment_prefix="#",
-        quote_char=quote,
-        has_header=False,
-        schema={f"c{i}": pl.String for i in range(width)},
-        columns=places,
-        truncate_ragged_lines=True,
-    )
+    frame = cells(lines, delimiter, width, places)
+    return {p: column_from_text(frame[f"c{p}"], comma_parts_cells=delimiter == ",") for p in places}

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from fitting.errors import InputError
+from fitting.plain_numbers import plain_columns
 from fitting.raw_table import RawTable, split_unit
+from fitting.text_cells import cells, column_from_text
 from fitting.text_log import read_text
 
 TIME = [0.0, 0.5, 1.0, 1.5]
@@ -170,3 +172,42 @@ def test_a_header_alone_names_the_columns():
 )
 def test_units_in_headers(header: str, expected: tuple[str, str | None]):
     assert split_unit(header) == expected
+
+
+PLAIN = {
+    "comma": ("0,1.5,7\n0.5,-2.25e-3,8\n", ","),
+    "blanks": (" 0  1.5 7\n0.5 -2.25E-3   8\n", " "),
+    "tab": ("0\t1.5\t7\n\n0.5\t-2.25e-3\t8\n", "\t"),
+    "blank after delimiter": ("0; 1.5;7 \n0.5 ;-2.25e-3; 8\n", ";"),
+    "row too long": ("0,1.5,7\n0.5,-2.25e-3,8,9\n", ","),
+}
+OTHER = {
+    "empty cell": ("0,1.5,7\n0.5,,8\n", ","),
+    "word": ("0,1.5,7\n0.5,nan,8\n", ","),
+    "row too short": ("0,1.5,7\n0.5\n", ","),
+    "decimal comma": ("0;1,5;7\n0,5;-2,25;8\n", ";"),
+    "thousands": ("0;1.500.000;7\n0.5;2.250;8\n", ";"),
+    "hash": ("0,1.5,7\n#0.5,2,8\n", ","),
+    "quotation mark": ('0,"1.5",7\n0.5,2,8\n', ","),
+    "beyond all numbers": ("0,1e999,7\n0.5,2,8\n", ","),
+    "lone sign": ("0,-,7\n0.5,2,8\n", ","),
+    "two numbers": ("0;1 5;7\n0.5;2;8\n", ";"),
+}
+
+
+@pytest.mark.parametrize(("text", "delimiter"), PLAIN.values(), ids=PLAIN.keys())
+def test_plain_numbers_are_those_of_the_reader_for_any_spelling(text: str, delimiter: str):
+    lines, places = text.splitlines(), [0, 1]
+    plain = plain_columns(lines, delimiter, places)
+    assert plain is not None
+    frame = cells(lines, delimiter, 3, places)
+    for place in places:
+        other = column_from_text(frame[f"c{place}"], comma_parts_cells=delimiter == ",")
+        np.testing.assert_array_equal(plain[place], other.values)
+        assert len(other.text_rows) == 0
+    np.testing.assert_array_equal(plain, [[0.0, 0.5], [1.5, -2.25e-3]])
+
+
+@pytest.mark.parametrize(("text", "delimiter"), OTHER.values(), ids=OTHER.keys())
+def test_what_is_not_plain_is_left_to_the_reader_for_any_spelling(text: str, delimiter: str):
+    assert plain_columns(text.splitlines(), delimiter, [0, 1]) is None

@@ -4,7 +4,6 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-import polars as pl
 
 from fitting.posterior import Posterior
 
@@ -50,6 +49,9 @@ def _says(found: Posterior) -> str:
 
 def draws_table(found: Posterior) -> bytes:
     """The draws as a Parquet file: `chain`, `draw`, and each parameter in the unit of the report."""
+    # Loaded here: few fits draw from the posterior.
+    import polars as pl
+
     chains, draws, _ = found.values.shape
     columns = {"chain": np.repeat(np.arange(chains), draws), "draw": np.tile(np.arange(draws), chains)}
     columns |= {path: found.values[:, :, i].ravel() for i, path in enumerate(found.paths)}
