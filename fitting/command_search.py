@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize
 
 from fitting.discrimination import (
     Bench,
@@ -253,6 +252,9 @@ def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
         of_limits = -2.0 * found.over[:, None] * found.over_slopes
         last = np.concatenate([-np.ones(told.shape[0]), np.zeros(of_limits.shape[0])])
         return np.nan_to_num(np.concatenate([np.concatenate([told, of_limits]), last[:, None]], axis=1))
+
+    # Loaded here: only the search for a next experiment needs it.
+    from scipy.optimize import minimize
 
     size = begun.evaluation.coefficients.size
     least = float(np.min(_logarithm(begun.evaluation.divergences)))

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.linalg import block_diag, eigh, null_space
 
 from fitting.along import ERROR, SLOPE, place_of, unit_reading
 from fitting.estimate import Fit
@@ -349,6 +348,8 @@ def _roughness(axes: Sequence[Axis]) -> np.ndarray:
 def _roughness_along(axis: Axis) -> np.ndarray:
     if isinstance(axis, SignAxis):
         beside = [] if axis.beside is None else [_roughness_along(axis.beside)]
+        from scipy.linalg import block_diag
+
         return np.asarray(block_diag(_ROUGHNESS_OF_A_SIGN, *beside))
     if isinstance(axis, AngleAxis | PeriodicAxis):
         order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
@@ -375,6 +376,8 @@ def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.nd
 def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Combinations of functions, smoothest first, each of unit rms on the data, uncorrelated with each other and with
     what is known already (the basis of Demmler and Reinsch 1975)."""
+    from scipy.linalg import eigh, null_space
+
     moment = raw.T @ raw / len(raw)
     free = null_space((raw.T @ known / len(raw)).T, rcond=1e-8) if known.shape[1] else np.eye(raw.shape[1])
     inside = free.T @ moment @ free

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from fitting.errors import DataError
 from fitting.findings import Finding
@@ -165,13 +164,27 @@ def _dropouts(values: np.ndarray, noise: float) -> Iterator[tuple[int, int]]:
     """First row and one past the last of each few samples in a row that stand off between two cliffs."""
     change = np.diff(values)
     step = np.abs(change)
-    usual = median_filter(step, 4 * LONGEST_DROPOUT + 1, mode="nearest")
-    cliffs = np.flatnonzero(step > np.maximum(CLIFF * usual, DROPOUT * max(noise, _resolution(values))))
-    for down, up in zip(cliffs[:-1], cliffs[1:], strict=True):
-        heights = change[down], change[up]
-        returns = abs(values[up + 1] - values[down]) < 0.3 * min(map(abs, heights))
-        if up - down <= LONGEST_DROPOUT and heights[0] * heights[1] < 0 and returns:
-            yield int(down) + 1, int(up) + 1
+    high = step > DROPOUT * max(noise, _resolution(values))
+    # Few steps have another one behind them that takes back what they did: only there the steps around are looked at.
+    near = np.zeros(len(step), dtype=bool)
+    for behind in range(1, min(LONGEST_DROPOUT, len(step) - 1) + 1):
+        down = np.flatnonzero(high[:-behind] & high[behind:])
+        for between in range(behind + 1):
+            near[down[_returns(values, change, down, down + behind)] + between] = True
+    rows = np.flatnonzero(high & near)
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.pad(step, 2 * LONGEST_DROPOUT, mode="edge"), 4 * LONGEST_DROPOUT + 1
+    )
+    cliffs = rows[step[rows] > CLIFF * np.median(around[rows], axis=1)]
+    down, up = cliffs[:-1], cliffs[1:]
+    found = (up - down <= LONGEST_DROPOUT) & _returns(values, change, down, up)
+    yield from zip((down[found] + 1).tolist(), (up[found] + 1).tolist(), strict=True)
+
+
+def _returns(values: np.ndarray, change: np.ndarray, down: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Whether a later step brings back the value from before an earlier one."""
+    smaller = np.minimum(np.abs(change[down]), np.abs(change[up]))
+    return (change[down] * change[up] < 0) & (np.abs(values[up + 1] - values[down]) < 0.3 * smaller)
 
 
 def _spread(off: np.ndarray) -> float:

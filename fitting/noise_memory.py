@@ -10,7 +10,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.signal import lfilter
 
 from fitting.autocorrelation import autocovariance, basis_of_states
 from fitting.estimate import Fit, half_log_determinant
@@ -123,6 +122,9 @@ def _taken_by_states(found: Fit, drawn: Float[np.ndarray, "draws samples outputs
 
 
 def _drawn(noise: NoiseWithMemory, count: int) -> Float[np.ndarray, "draws samples outputs"]:
+    # Loaded here: it takes as long as jax, and only noise with a memory needs it.
+    from scipy.signal import lfilter
+
     random = np.random.default_rng(0)
     together = np.linalg.cholesky(np.asarray(noise.covariance)).T
     white = random.normal(size=(_DRAWS, count, len(together))) @ together

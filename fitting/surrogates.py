@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.fft import prev_fast_len
 
 from fitting.estimate import Fit
 from fitting.spectral_lines import STANDS_OUT, surroundings
@@ -17,6 +16,8 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave: with a
     phase of its own it would still be explained by that effect.
     """
+    from scipy.fft import prev_fast_len
+
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0
     error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T

@@ -8,13 +8,14 @@ them, by one pass against time.
 """
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import nnls
+from scipy.special import kolmogorov
 
 from fitting.estimate import Fit
 from fitting.followed import Followed, follow
@@ -117,14 +118,47 @@ def _variances(
     level = np.full(power.size, power.mean())
     found = np.zeros(shapes.shape[1])
     for _ in range(_REWEIGHTINGS):
-        found, _ = nnls(shapes / level[:, None], power / level)
+        found = nonnegative(shapes / level[:, None], power / level)
         level = np.maximum(shapes @ found, 1e-6 * power.mean())
-    # Loaded here: it takes as long as jax, and other commands do without.
-    from scipy.stats import kstest
-
     # Of the right spectrum, the periodogram is an exponential variable.
-    adequate = kstest(1.0 - np.exp(-power / level), "uniform").pvalue > _REFUSED
+    adequate = uniformity(1.0 - np.exp(-power / level)) > _REFUSED
     return found if adequate and found[-1] > 0.0 else None
+
+
+def nonnegative(
+    shapes: Float[np.ndarray, "lines sources"], power: Float[np.ndarray, " lines"]
+) -> Float[np.ndarray, " sources"]:
+    """Least squares with coefficients that are not negative, by trying each set of the two or three sources.
+
+    It stands for `scipy.optimize.nnls`: with what that module imports it takes as long as the rest of a fit's imports.
+    """
+    # Answers to torque noise may be many orders of magnitude larger than those to noise of an encoder.
+    scale = np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
+    gram, moment = (shapes / scale).T @ (shapes / scale), (shapes / scale).T @ power
+    best, most = np.zeros(moment.size), 0.0
+    for size in range(1, moment.size + 1):
+        for chosen in map(list, combinations(range(moment.size), size)):
+            found = np.linalg.lstsq(gram[np.ix_(chosen, chosen)], moment[chosen])[0]
+            # What the sum of squares falls by.
+            gain = float(moment[chosen] @ found)
+            if (found >= 0.0).all() and gain > most:
+                best, most = np.zeros(moment.size), gain
+                best[chosen] = found
+    return best / scale
+
+
+def uniformity(values: Float[np.ndarray, " n"]) -> float:
+    """p-value of Kolmogorov's test for the uniform law from 0 to 1, with Stephens's correction for few values.
+
+    It stands for `scipy.stats.kstest`, whose module takes as long to load as jax.
+
+    References:
+        Stephens, M. A. (1970), Journal of the Royal Statistical Society B 32, 115-122.
+    """
+    ordered, count = np.sort(values), values.size
+    above, below = np.arange(1, count + 1) / count - ordered, ordered - np.arange(count) / count
+    root = np.sqrt(count)
+    return float(kolmogorov((root + 0.12 + 0.11 / root) * max(above.max(), below.max())))
 
 
 def _unit(record: Record, output: int) -> Float[np.ndarray, "n outputs draws"]:

@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
+from scipy.stats import kstest
 
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import experiment_from_log, split
 from fitting.free import base_paths
 from fitting.sandwich import covariance, linearised
-from fitting.torque_noise import torque_noise_covariance
+from fitting.torque_noise import nonnegative, torque_noise_covariance, uniformity
 
 COUNT, DRAWS = 700, 48
 # Little damping: what the noise leaves is nearly a line at the resonance, and there are few periods of it.
@@ -83,3 +85,26 @@ def test_another_colour_is_not_torque_noise():
         regression.chunk,
     )
     assert torque_noise_covariance(found, changed, covariance(regression).unit) is None
+
+
+@pytest.mark.parametrize("sources", [1, 2, 3])
+def test_nonnegative_coefficients_are_those_of_nnls(sources: int):
+    random = np.random.default_rng(sources)
+    bound = 0
+    for _ in range(100):
+        shapes = np.abs(random.normal(size=(60, sources))) * 10.0 ** random.uniform(-6.0, 6.0, sources)
+        power = shapes @ (random.normal(size=sources) / shapes.mean(axis=0)) + random.normal(size=60)
+        expected, _ = nnls(shapes, power)
+        bound += int((expected == 0.0).any())
+        # Both work with the columns' products, which have twice the digits of the answer.
+        np.testing.assert_allclose(nonnegative(shapes, power), expected, rtol=1e-6, atol=1e-9 * expected.max())
+    # Of a hundred, chance puts neither all nor none on the bound.
+    assert 10 < bound < 100
+
+
+@pytest.mark.parametrize(("count", "power"), [(100, 0.7), (1000, 1.0), (9000, 0.97), (20000, 1.01)])
+def test_uniformity_is_that_of_kolmogorov(count: int, power: float):
+    values = np.random.default_rng(count).uniform(size=count) ** power
+    expected = kstest(values, "uniform").pvalue
+    # The correction for few values errs by some per cent of the p-value where that is below 0.1 (Stephens 1970).
+    assert uniformity(values) == pytest.approx(expected, rel=0.1)
