@@ -1,0 +1,68 @@
+"""Units as people write them: what a table knows is what pint says."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pint
+import pytest
+
+from fitting.unit_strings import USUAL, UnitError, convert, parse_number, to_base
+
+
+@pytest.fixture(scope="module")
+def registry() -> pint.UnitRegistry:
+    return pint.UnitRegistry()
+
+
+# pint takes the last two spellings for others.
+@pytest.mark.parametrize("unit", [u for u in USUAL if u not in ("Nm", "mNm")])
+def test_usual_units_are_those_of_pint(unit: str, registry: pint.UnitRegistry):
+    target, factor = USUAL[unit]
+    assert factor == pytest.approx(float(registry.Quantity(1.0, unit.replace("rev", "turn")).m_as(target)), rel=1e-15)
+    values = np.array([-1.5, 0.0, 2.0])
+    np.testing.assert_allclose(convert(values, unit, target), factor * values, rtol=1e-15)
+    # A factor before it takes the unit to pint, as any expression that is not in the table.
+    slow, name = to_base(values, f"1 * ({unit})")
+    quick, quick_name = to_base(values, unit)
+    assert quick_name == name == target
+    np.testing.assert_allclose(quick, slow, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "value"),
+    [
+        ("5.26 g m^2", "kg m^2", 5.26e-3),
+        ("5.26e-4 kg m^2", "kg m^2", 5.26e-4),
+        ("-3deg", "rad", -np.pi / 60.0),
+        ("rev / 65536", "rad", 2.0 * np.pi / 65536),
+        ("rev/2^17", "rad", 2.0 * np.pi / 2**17),
+        ("rev / 2**17", "rad", 2.0 * np.pi / 2**17),
+        ("1/16777216 revolution", "rad", 2.0 * np.pi / 16777216),
+        ("1/min", "rad/s", np.pi / 30.0),
+        ("5 rad / 100", "rad", 0.05),
+        ("mNm", "N m", 1e-3),
+        ("10 N cm", "N m", 0.1),
+    ],
+)
+def test_numbers_with_their_units(text: str, target: str, value: float):
+    assert parse_number(text, target) == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "text", ["0 deg", "rev / 0", "N m / deg", "Nm / 2 / 3 furlong", "5 kg m^2", "deg deg", "1e999 rad"]
+)
+def test_what_is_no_angle_is_refused(text: str):
+    with pytest.raises(UnitError):
+        convert(np.ones(2), text, "rad")
+
+
+def test_usual_units_need_no_pint():
+    program = (
+        "import sys, numpy\n"
+        "from fitting.unit_strings import convert, to_base\n"
+        "convert(numpy.ones(2), 'rev / 2^17', 'rad'), convert(numpy.ones(2), 'ms', 's')\n"
+        "to_base(numpy.ones(2), 'deg')\n"
+        "assert 'pint' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
