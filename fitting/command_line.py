@@ -1,6 +1,7 @@
 """The command line: `hdjax fit | close-loop | predict | simulate | sweep | design | demo | amplitudes | seed-tables |
 speeds`."""
 
+import atexit
 import gc
 import os
 import sys
@@ -25,8 +26,10 @@ for command in (amplitudes, seed_tables, speeds, sweep, design, fit, close_loop,
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 the data can't support the request, 2 bad usage or bad input."""
-    # Making programs leaves millions of small objects that stay: Python would go through them again and again.
-    gc.set_threshold(200_000)
+    # Libraries and compiled programs leave millions of small objects that stay. Python would go through them again and
+    # again, and once more at the end, which takes as long as loading jax.
+    gc.set_threshold(500_000)
+    atexit.register(gc.freeze)
     try:
         app(arguments, exit_on_error=False, print_error=False)
         sys.stdout.flush()

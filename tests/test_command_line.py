@@ -140,6 +140,21 @@ def test_what_needs_no_computation_imports_nothing_for_it(arguments: Sequence[st
     assert answer.stderr.split() == []
 
 
+NEEDLESS = (
+    *("blackjax", "dask", "h5py", "matplotlib", "pandas", "pint", "polars", "rich"),
+    *("scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.stats"),
+)
+
+
+def test_a_fit_of_a_plain_log_imports_no_more_than_it_needs(tmp_path: Path):
+    log, drive = write_table(tmp_path / "log.csv", table()), write_drive(tmp_path)
+    program = ANSWER_AND_TELL.format(heavy=NEEDLESS)
+    command = [sys.executable, "-c", program, "fit", str(log), "--drive", str(drive), "--out", str(tmp_path / "out")]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "[Parameters]" in answer.stdout
+    assert answer.stderr.split() == []
+
+
 @pytest.mark.parametrize("start", [("-m", "hdjax"), ("-c", "from fitting.command_line import main; main()")])
 def test_the_version_is_that_of_the_package(start: Sequence[str]):
     answer = subprocess.run([sys.executable, *start, "--version"], capture_output=True, text=True, check=True)

@@ -1,5 +1,6 @@
 """What a terminal shows while a command works."""
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -8,10 +9,12 @@ class Spinner:
     """A spinner on a terminal, nothing in a pipe."""
 
     def __init__(self):
-        from rich.console import Console
+        self._status: Any = None
+        if sys.stderr.isatty():
+            from rich.console import Console
 
-        console = Console(stderr=True)
-        self._status: Any = console.status("starting") if console.is_terminal else None
+            console = Console(stderr=True)
+            self._status = console.status("starting") if console.is_terminal else None
 
     def __enter__(self) -> Callable[[str], None]:
         if self._status is not None:
