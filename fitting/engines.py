@@ -1,15 +1,26 @@
 """Which engine evaluates a residual: machine code where this processor and the model allow it, XLA otherwise."""
 
+import dataclasses
 import functools
-from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.machine_code import blocks_by_machine_code, simulated
-from fitting.residual import Blocks, Problem, Unknowns, blocks, simulate_segments
+from fitting.machine_code import blocks_by_machine_code, residual_by_machine_code, simulated
+from fitting.residual import (
+    Blocks,
+    LinearisedResidual,
+    Problem,
+    Unknowns,
+    blocks,
+    moved_residual,
+    residual,
+    seen_residual,
+    simulate_segments,
+)
 from hdjax.engine import UntranslatableError, kernel
 from hdjax.lanes import jit_lanes
 
@@ -25,8 +36,6 @@ def with_engine(problem: Problem, *, values: bool = False) -> Problem:
 
 
 def _with_kernel(problem: Problem, values: bool) -> Problem:
-    import dataclasses
-
     loaded = problem.segments.load_torque is not None
     made = kernel(problem.model, problem.free.paths, loaded=loaded, solver=problem.solver, values=values)
     return dataclasses.replace(problem, kernel=made)
@@ -62,17 +71,14 @@ def linearise(problem: Problem, unknowns: Unknowns, width: int | None = None) ->
     """
     if problem.kernel is not None:
         return blocks_by_machine_code(problem, unknowns, width)
-    found = linearise_by_xla(problem, unknowns)
-    return found if width is None else widened(found, width)
+    found = _linearise_by_xla(problem, unknowns)
+    return found if width is None else _widened(found, width)
 
 
-linearise_by_xla = jit_lanes(blocks)
+_linearise_by_xla = jit_lanes(blocks)
 
 
-def widened(found: Blocks, width: int) -> Blocks:
-    """The same with columns of zeros behind those of the last parameter."""
-    import equinox as eqx
-
+def _widened(found: Blocks, width: int) -> Blocks:
     def wide(columns: Array) -> Array:
         return jnp.asarray(np.pad(np.asarray(columns), [(0, 0)] * 2 + [(0, width - columns.shape[-1])]))
 
@@ -80,10 +86,43 @@ def widened(found: Blocks, width: int) -> Blocks:
     return eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), found, tuple(map(wide, places)))
 
 
-def simulate(problem: Problem, unknowns: Unknowns) -> tuple[Float[Array, "segments samples outputs"], Any]:
-    """Outputs of a problem's model on each segment, and the state it ends in, by its engine."""
-    if problem.kernel is None:
-        return simulate_segments(problem, unknowns)
+def blocks_inside(problem: Problem, unknowns: Unknowns) -> Blocks:
+    """[`linearise`][] inside a program of JAX."""
+    return blocks(problem, unknowns) if problem.kernel is None else blocks_by_machine_code(problem, unknowns)
+
+
+def residual_inside(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
+    """[`fitting.residual.residual`][] inside a program of JAX, by the problem's engine."""
+    if problem.kernel is None or problem.kernel.values is None:
+        return residual(problem, unknowns)
+    return residual_by_machine_code(problem, unknowns)
+
+
+def simulate(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
+    """Outputs of a problem's model on each segment, and the state it ends in, by the engine that suits it."""
     ready = with_engine(problem, values=True)
-    assert ready.kernel is not None and ready.kernel.values is not None
-    return simulated(ready, unknowns, ready.kernel.values)
+    return _simulate_by_xla(problem, unknowns) if ready.kernel is None else simulated(ready, unknowns)
+
+
+_simulate_by_xla = jit_lanes(simulate_segments)
+
+
+@eqx.filter_custom_jvp
+def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> LinearisedResidual:
+    """[`fitting.residual.residual`][] with weighted gaps, inside a program of JAX; its derivative is a product with
+    the blocks rather than a second simulation."""
+    rows, gap = residual_inside(problem, unknowns)
+    return LinearisedResidual(rows, gap * problem.gap_weight[None])
+
+
+@residual_with_blocks.def_jvp
+def _residual_jvp(primals, tangents):
+    unknowns, problem = primals
+    tangent, _ = tangents
+    found = blocks_inside(problem, unknowns)
+    joined, weight = problem.segments.joined, problem.gap_weight
+    return seen_residual(found, weight), moved_residual(found, weight, joined, tangent)

@@ -50,7 +50,7 @@ class FreeParameters(eqx.Module):
             return model
         return model.replace(dict(zip(self.paths, self.values(vector), strict=True)))
 
-    def values(self, vector: Float[Array, " parameters"]) -> list[Array | np.ndarray]:
+    def values(self, vector: Float[Array, " parameters"]) -> list[Any]:
         """The physical values that the vector stands for."""
         library, (entries, scale) = _library(vector, self.scale)
         return [

@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.engines import linearise
+from fitting.engines import linearise, simulate
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
 from fitting.posing import suggested_substeps
-from fitting.residual import Problem, Unknowns, simulate_segments
+from fitting.residual import Problem, Unknowns
 from hdjax import Model, TwoInertiaModel
-from hdjax.lanes import jit_lanes
 
 WINDOW = 50
 """Samples from which the initial state is taken."""
@@ -117,7 +116,7 @@ def free_run(
         jnp.asarray(np.ones(states.shape[1])),
         substeps=substeps,
     )
-    outputs = np.asarray(_simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states)))
+    outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
     runs = []
     for stretch, output in zip(stretches, outputs, strict=True):
         n = len(stretch)
@@ -168,11 +167,6 @@ def fitted_starts(
         hold_parameters=True,
         count=count,
     )
-
-
-@jit_lanes
-def _simulate(problem: Problem, unknowns: Unknowns) -> Array:
-    return simulate_segments(problem, unknowns)[0]
 
 
 def _holds(like: Fit, count: int, window: int) -> bool:

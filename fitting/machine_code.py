@@ -184,8 +184,7 @@ def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
 
 def _blocks_of(lanes: Lanes, found: Marched, residual: Array) -> Blocks:
     """The blocks behind the results of a march."""
-    joined = lanes.joined[:, None] > 0
-    gap = lanes.states - jnp.roll(found.end, 1, axis=0)
+    joined, gap = lanes.joined[:, None] > 0, _gap(lanes, found)
     near = jnp.abs(gap) < LOST
 
     def before(slope: Array | None) -> Array:
@@ -199,19 +198,36 @@ def _blocks_of(lanes: Lanes, found: Marched, residual: Array) -> Blocks:
         residual=residual,
         by_parameter=jnp.asarray(found.by_parameter),
         by_state=jnp.asarray(found.by_state),
-        gap=where(joined, where(near, gap, LOST), 0.0),
+        gap=gap,
         before_by_parameter=before(found.end_by_parameter),
         before_by_state=before(found.end_by_state) + own,
     )
 
 
-def simulated(
-    problem: Problem, unknowns: Unknowns, address: Array | np.ndarray
-) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
-    """[`fitting.residual.simulate_segments`][] by machine code."""
+def residual_by_machine_code(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
+    """[`fitting.residual.residual`][] by machine code that has no derivatives."""
     kernel = problem.kernel
-    assert kernel is not None
-    return _simulated(address, lanes_of(problem, unknowns, kernel), kernel.hidden)
+    assert kernel is not None and kernel.values is not None
+    lanes = lanes_of(problem, unknowns, kernel)
+    found = march_lanes(kernel.values, lanes, kernel.hidden, "values")
+    return found.rows, _gap(lanes, found)
+
+
+def _gap(lanes: Lanes, found: Marched) -> Array:
+    """How far each joined segment starts from where the one before it ends."""
+    gap = lanes.states - jnp.roll(found.end, 1, axis=0)
+    return where(lanes.joined[:, None] > 0, where(jnp.abs(gap) < LOST, gap, LOST), 0.0)
+
+
+def simulated(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
+    """[`fitting.residual.simulate_segments`][] by machine code that has no derivatives."""
+    kernel = problem.kernel
+    assert kernel is not None and kernel.values is not None
+    return _simulated(kernel.values, lanes_of(problem, unknowns, kernel), kernel.hidden)
 
 
 @eqx.filter_jit

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.arrow import normal_equations, project
+from fitting.engines import blocks_inside
 from fitting.estimate import Fit
-from fitting.residual import Problem, Unknowns, blocks
+from fitting.residual import Problem, Unknowns
 from fitting.uncertainty import Uncertainty
 from hdjax.where import where
 
@@ -185,7 +186,7 @@ def _density_and_gradient(change: Array, given: tuple[Problem, Unknowns]) -> tup
 
     def refine(_, carried):
         states, _, _ = carried
-        found = blocks(problem, Unknowns(parameters, states))
+        found = blocks_inside(problem, Unknowns(parameters, states))
         value = -0.5 * jnp.sum(found.residual**2)
         gradient = -jnp.einsum("srp,sr->p", project(found, joined), found.residual)
         held = eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), found, replace_fn=jnp.zeros_like)

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fitting.engines import linearise, with_engine
 from fitting.estimate import Fit, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
 from fitting.normal_law import NORMAL_95
-from fitting.residual import Problem, Unknowns, blocks
+from fitting.residual import Problem, Unknowns
 from fitting.uncertainty import Uncertainty
-from hdjax.lanes import jit_lanes
 
 
 class PredictionBand(eqx.Module):
@@ -120,7 +120,7 @@ def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) 
 
 def _slopes(problem: Problem, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states."""
-    found = _blocks(problem, unknowns)
+    found = linearise(with_engine(problem), unknowns)
     count, samples, outputs = problem.segments.measured.shape
     shape = (count, samples, outputs, -1)
     by_parameter, by_state = (
@@ -158,6 +158,3 @@ def _band(
         std_state=np.linalg.norm(spread, axis=1),
         std_noise=std_noise,
     )
-
-
-_blocks = jit_lanes(blocks)

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
+from fitting.engines import residual_with_blocks
 from fitting.estimate import Fit
-from fitting.residual import Problem, Unknowns, residual_with_blocks
+from fitting.residual import Problem, Unknowns
 from fitting.uncertainty import Uncertainty
 from hdjax.where import where
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fitting.arrow import normal_equations
-from fitting.engines import linearise
+from fitting.engines import linearise, residual_inside, with_engine
 from fitting.estimate import Fit
-from fitting.residual import Blocks, Problem, Unknowns, residual
+from fitting.residual import Blocks, Problem, Unknowns
 from hdjax.lanes import jit_lanes
 
 # Data that run side by side; more would not fit into the processor's cache.
@@ -34,7 +34,7 @@ def refits(
         The free vector (see [`fitting.free.FreeParameters`][]) by draw, and how far the last step still moved it, in
         standard errors of the joint estimate.
     """
-    problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
+    problem = with_engine(eqx.tree_at(lambda p: p.model, found.problem, found.model), values=True)
     return _refits(problem, found.unknowns, linearise(problem, found.unknowns), jnp.asarray(measured), steps)
 
 
@@ -45,7 +45,7 @@ def _refits(problem: Problem, start: Unknowns, at_start: Blocks, measured: Array
 
         def improved(_, unknowns_and_moved: tuple[Unknowns, Array]) -> tuple[Unknowns, Array]:
             unknowns, _ = unknowns_and_moved
-            rows, gap = residual(own, unknowns)
+            rows, gap = residual_inside(own, unknowns)
             system = normal_equations(
                 eqx.tree_at(lambda b: (b.residual, b.gap), at_start, (rows, gap)), problem.segments.joined
             )

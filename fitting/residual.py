@@ -199,38 +199,21 @@ def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, j
 
 class LinearisedResidual(eqx.Module):
     """What the least squares solver of optimistix minimises the squares of: residual and weighted gaps. (Their
-    derivatives are carried along by [`residual_with_blocks`][].)"""
+    derivatives are carried along by [`fitting.engines.residual_with_blocks`][].)"""
 
     rows: Float[Array, "segments rows"]
     gap: Float[Array, "segments states"]
 
 
-@eqx.filter_custom_jvp
-def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> LinearisedResidual:
-    """[`residual`][] with weighted gaps, whose derivative is a product with [`blocks`][] rather than a second
-    simulation."""
-    rows, gap = residual(problem, unknowns)
-    return LinearisedResidual(rows, gap * problem.gap_weight[None])
-
-
-@residual_with_blocks.def_jvp
-def _residual_jvp(primals, tangents):
-    unknowns, problem = primals
-    tangent, _ = tangents
-    found = blocks(problem, unknowns)
-    joined, weight = problem.segments.joined, problem.gap_weight
-    return seen_residual(found, weight), moved_residual(found, weight, joined, tangent)
-
-
 def seen_residual(found: Blocks, gap_weight: Float[Array, " states"]) -> LinearisedResidual:
-    """What [`residual_with_blocks`][] is where the blocks are of."""
+    """What [`fitting.engines.residual_with_blocks`][] is where the blocks are of."""
     return LinearisedResidual(found.residual, found.gap * gap_weight[None])
 
 
 def moved_residual(
     found: Blocks, gap_weight: Float[Array, " states"], joined: Bool[Array, " segments"], tangent: Unknowns
 ) -> LinearisedResidual:
-    """How [`residual_with_blocks`][] changes there along a tangent, parts of which may be None."""
+    """How [`fitting.engines.residual_with_blocks`][] changes there along a tangent, parts of which may be None."""
     rows, gap = jnp.zeros_like(found.residual), jnp.zeros_like(found.gap)
     if tangent.parameters is not None:
         rows = rows + jnp.einsum("srp,p->sr", found.by_parameter, tangent.parameters)

@@ -10,10 +10,11 @@ from scipy.optimize import least_squares
 
 import rig
 from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, normal_equations, project
+from fitting.engines import residual_with_blocks
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths, free_parameters
 from fitting.posing import initial_states
-from fitting.residual import Blocks, Problem, Unknowns, blocks, residual, residual_with_blocks
+from fitting.residual import Blocks, Problem, Unknowns, blocks, residual
 from fitting.solve import evaluate
 from fitting.solve import solve as solve_by_steps
 

@@ -95,13 +95,13 @@ def at_rest(noise: float) -> Experiment:
 
 def test_rates_are_exactly_zero_at_rest_and_not_in_motion(moving: Experiment, monkeypatch: pytest.MonkeyPatch):
     starts = []
-    simulate = module._simulate
+    simulate = module.simulate
 
     def spy(problem, unknowns):
         starts.append(np.asarray(unknowns.states))
         return simulate(problem, unknowns)
 
-    monkeypatch.setattr(module, "_simulate", spy)
+    monkeypatch.setattr(module, "simulate", spy)
     run(at_rest(1.0))
     run(moving)
     assert (starts[0][:, 2:] == 0.0).all()

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from hdjax.dynamics import Model
 from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, equations, structure
-from hdjax.engine.handler import register
+from hdjax.engine.handler import called, register
 from hdjax.engine.machine import compiled
 from hdjax.engine.march import MARCH, March, Mode
 
@@ -111,8 +111,8 @@ class Marched(eqx.Module):
 
     rows: Float[Array, "segments rows"]
     end: Float[Array, "segments states"]
-    by_parameter: Float[Array, "segments rows width"] | None = None
-    by_state: Float[Array, "segments rows states"] | None = None
+    by_parameter: Float[Array, "segments height width"] | None = None
+    by_state: Float[Array, "segments height states"] | None = None
     end_by_parameter: Float[Array, "segments states width"] | None = None
     end_by_state: Float[Array, "segments states states"] | None = None
     factor: Float[Array, "segments reduced"] | None = None
@@ -142,6 +142,16 @@ def march_lanes(
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
     call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")
     return Marched(*call(address, *operands, *lanes.signals))
+
+
+def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode) -> Marched:
+    """[`march_lanes`][] outside programs of JAX, of numpy's arrays to such: none is compiled for their shapes."""
+    lanes = jax.tree.map(np.ascontiguousarray, lanes)
+    shapes = jax.eval_shape(lambda lanes: march_lanes(address, lanes, hidden, mode), lanes)
+    results = jax.tree.map(lambda s: np.empty(s.shape), shapes)
+    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
+    called(int(address), [np.asarray(address), *operands, *lanes.signals], jax.tree.leaves(results))
+    return results
 
 
 @functools.cache
