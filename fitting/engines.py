@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib
 
 import equinox as eqx
 import jax
@@ -58,6 +59,12 @@ def unusable() -> str | None:
     """Why there is no machine code on this machine; None where there is."""
     if jax.default_backend() != "cpu":
         return f"the computation runs on a {jax.default_backend()}"
+    try:
+        importlib.import_module("hdjax.engine.handler").register()
+    except ImportError:
+        return "llvmlite is not installed"
+    except Exception as error:  # whatever stops a compiler on a processor that nobody has tried
+        return f"no machine code can be made on this machine ({type(error).__name__}: {error})"
     return None
 
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from fitting.free import LARGEST_LOG
@@ -59,7 +60,7 @@ def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | 
 
 
 def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _signals(problem: Problem, model: Model, kernel: Kernel) -> tuple[Array, ...]:
@@ -119,7 +120,7 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
 
 
 @eqx.filter_jit
-def _blocks(address: Array, lanes: Lanes, hidden: int) -> Blocks:
+def _blocks(address: Array | np.ndarray, lanes: Lanes, hidden: int) -> Blocks:
     found = march_lanes(address, lanes, hidden, "jacobian")
     return _blocks_of(lanes, found, found.rows)
 
@@ -231,7 +232,7 @@ def simulated(
 
 
 @eqx.filter_jit
-def _simulated(address: Array, lanes: Lanes, hidden: int) -> tuple[Array, Array]:
+def _simulated(address: Array | np.ndarray, lanes: Lanes, hidden: int) -> tuple[Array, Array]:
     segments, samples, outputs = lanes.measured.shape
     plain = eqx.tree_at(
         lambda s: (s.measured, s.weight, s.whitening, s.settings),

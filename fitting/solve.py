@@ -123,7 +123,7 @@ def _solve_in_bursts(problem: Problem, start: Unknowns, unknowns: Unknowns, rule
     point, left, burst = None, None, int(np.clip(_BURST / guess, 1, 1000))
     while point is None or not bool(point.done):
         begun = time.perf_counter()
-        most = np.asarray(burst)
+        most = jnp.asarray(np.asarray(burst))
         if point is None:
             point, left = _begin_iteration(unknowns, rules, looked_at, most, problem.whitening, segments.measured)
         else:
@@ -220,7 +220,7 @@ def _run(
         return _taken(point, *looked_at.look(point.ahead), rules)
 
     end = jax.lax.while_loop(lambda p: ~p.done & (p.steps < last), step, point)
-    return end, _of_rows(end.rows, whitening, measured, looked_at.lanes.weight)
+    return end, _of_rows(end.rows, whitening, measured, jnp.asarray(looked_at.lanes.weight))
 
 
 def _taken(point: _Point, seen: Blocks, rows: Array, rules: _Rules) -> _Point:

@@ -19,7 +19,8 @@ def jit_with(
     function: Callable[_Arguments, _Result], compiler_options: dict[str, Any]
 ) -> Callable[_Arguments, _Result]:
     """`eqx.filter_jit` with options of the compiler; inside another program, which has options of its own, without."""
-    outside, inside = eqx.filter_jit(function, compiler_options=compiler_options), eqx.filter_jit(function)
+    options: Any = {"compiler_options": compiler_options}
+    outside, inside = eqx.filter_jit(function, **options), eqx.filter_jit(function)
 
     @functools.wraps(function)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:

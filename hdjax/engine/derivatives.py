@@ -1,11 +1,12 @@
 """Forward derivatives on a graph of scalars, of those directions alone that exist."""
 
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from hdjax.engine.graph import Graph, Node
 
-Tangent = dict[Hashable, Node]
-"""Derivatives that are not zero, by direction."""
+Tangent = dict[Any, Node]
+"""Derivatives that are not zero, by direction: whatever name stands for it."""
 
 
 def derivatives(graph: Graph, wanted: Iterable[Node], seeds: Mapping[Node, Tangent]) -> dict[Node, Tangent]:

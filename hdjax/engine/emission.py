@@ -23,7 +23,9 @@ class Vectors:
     """Instructions on vectors of so many lanes; on plain numbers where it is one."""
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
-        self.builder, self.lanes = builder, lanes
+        # Of no type that a checker knows: it would ask of each instruction whether it has a value.
+        self.builder: Any = builder
+        self.lanes = lanes
         self.numbers: Any = F64 if lanes == 1 else ir.VectorType(F64, lanes)
         self.integers: Any = I64 if lanes == 1 else ir.VectorType(I64, lanes)
         self.bits: Any = BIT if lanes == 1 else ir.VectorType(BIT, lanes)

@@ -174,7 +174,7 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
     seeds[torque] = {("parameter", p): graph.leaf(("signal", 1 + len(signals) + i)) for i, p in enumerate(acting)}
 
     def part(nodes: Sequence[Any]) -> Part:
-        flat = tuple(n[()] if isinstance(n, np.ndarray) else n for n in nodes)
+        flat: tuple[Any, ...] = tuple(n[()] if isinstance(n, np.ndarray) else n for n in nodes)
         found = derivatives(graph, flat, seeds) if slopes else dict.fromkeys(flat, {})
         return Part(flat, tuple(found[n] for n in flat))
 

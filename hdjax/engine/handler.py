@@ -2,8 +2,11 @@
 
 import ctypes
 import functools
+from collections.abc import Sequence
+from typing import Any
 
 import jax
+import numpy as np
 from llvmlite import ir
 
 from hdjax.engine.emission import F64, I8, I32, I64
@@ -22,19 +25,19 @@ _DATA, _DIMENSIONS = 24, 40
 _VERSION = (0, 3)
 
 
-def at(builder: ir.IRBuilder, base: ir.Value, offset: int, kind: ir.Type) -> ir.Value:
+def at(builder: Any, base: ir.Value, offset: int, kind: ir.Type) -> ir.Value:
     """What stands at an offset in bytes."""
     place = builder.gep(base, [ir.Constant(I64, offset)])
     return builder.load(builder.bitcast(place, kind.as_pointer()))
 
 
-def data(builder: ir.IRBuilder, table: ir.Value, index: int, kind: ir.Type = F64) -> ir.Value:
+def data(builder: Any, table: ir.Value, index: int, kind: ir.Type = F64) -> ir.Value:
     """Where the numbers of an operand or a result stand."""
     buffer = builder.load(builder.gep(table, [ir.Constant(I64, index)]))
     return builder.bitcast(at(builder, buffer, _DATA, POINTER), kind.as_pointer())
 
 
-def dimension(builder: ir.IRBuilder, table: ir.Value, index: int, axis: int) -> ir.Value:
+def dimension(builder: Any, table: ir.Value, index: int, axis: int) -> ir.Value:
     """How long an axis of an operand or a result is."""
     buffer = builder.load(builder.gep(table, [ir.Constant(I64, index)]))
     return at(builder, at(builder, buffer, _DIMENSIONS, POINTER), 8 * axis, I64)
@@ -67,3 +70,26 @@ def register() -> str:
     capsule.restype, capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
     jax.ffi.register_ffi_target(TARGET, capsule(handler, b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
     return TARGET
+
+
+def called(address: int, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
+    """Call machine code from Python, which compiles no program for the arrays' shapes as JAX would.
+
+    Args:
+        address: of the code.
+        operands: what it reads.
+        results: what it writes.
+    """
+    kept = []
+
+    def table(arrays: Sequence[np.ndarray]) -> int:
+        buffers = np.zeros((len(arrays), _DIMENSIONS // 8 + 1), np.int64)
+        for buffer, array in zip(buffers, arrays, strict=True):
+            kept.append(np.array(array.shape, np.int64))
+            buffer[_DATA // 8], buffer[_DIMENSIONS // 8] = array.ctypes.data, kept[-1].ctypes.data
+        places = buffers.ctypes.data + buffers.strides[0] * np.arange(len(arrays))
+        kept.extend([buffers, places])
+        return places.ctypes.data
+
+    code = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
+    code(table(operands), table(results))

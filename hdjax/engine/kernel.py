@@ -5,6 +5,7 @@ import functools
 import os
 import threading
 from collections.abc import Hashable, Sequence
+from typing import Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -14,9 +15,9 @@ from jaxtyping import Array, Float, Int
 
 from hdjax.dynamics import Model
 from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, equations, structure
-from hdjax.engine.handler import called, register
-from hdjax.engine.machine import compiled
-from hdjax.engine.march import MARCH, March, Mode
+
+# What stands on llvmlite is loaded where machine code is made or called: without it XLA does all.
+Mode = Literal["values", "jacobian"]
 
 _LOCK = threading.Lock()
 
@@ -80,6 +81,10 @@ def kernel(
 def _address(made: _Made, mode: Mode, solver: dfx.AbstractERK) -> np.ndarray:
     key = mode, type(solver)
     if key not in made.addresses:
+        from hdjax.engine.handler import register
+        from hdjax.engine.machine import compiled
+        from hdjax.engine.march import MARCH, March
+
         register()
         (made.addresses[key],) = compiled(March(made.equations, solver, mode).module, MARCH)
     return np.array(made.addresses[key], dtype=np.int64)
@@ -130,6 +135,8 @@ def march_lanes(
         mode: with derivatives or without.
         reduced: whether the last of the lanes' settings asks for the triangular factor in place of the Jacobian.
     """
+    from hdjax.engine.handler import register
+
     segments, samples, outputs = lanes.measured.shape
     states, width = lanes.states.shape[1], lanes.free.shape[0]
     rows = samples * outputs + hidden
@@ -146,6 +153,8 @@ def march_lanes(
 
 def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode) -> Marched:
     """[`march_lanes`][] outside programs of JAX, of numpy's arrays to such: none is compiled for their shapes."""
+    from hdjax.engine.handler import called
+
     lanes = jax.tree.map(np.ascontiguousarray, lanes)
     shapes = jax.eval_shape(lambda lanes: march_lanes(address, lanes, hidden, mode), lanes)
     results = jax.tree.map(lambda s: np.empty(s.shape), shapes)

@@ -7,7 +7,7 @@ and parameters. These are the same for all tangents, which then go through the s
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import diffrax as dfx
 import numpy as np
@@ -18,14 +18,13 @@ from hdjax.engine.emission import F64, I8, I64, Vectors, emitted, is_truth
 from hdjax.engine.equations import Equations, Part
 from hdjax.engine.graph import PARAMETER, VARYING, Node
 from hdjax.engine.handler import ENTRY, POINTER, data, dimension
+from hdjax.engine.kernel import Mode
 
 LANES = 8
 """Segments in a block: one wide register, or two or four narrow ones that hide each other's latencies."""
 
 LOST = 1e8
 """A whitened error beyond this many standard deviations, or no number at all, is counted as this many."""
-
-Mode = Literal["values", "jacobian"]
 
 OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measured", "weight", "joined", "whitening")
 OPERANDS += ("settings",)
@@ -54,7 +53,7 @@ _POWERS = 6
 
 def tableau(solver: dfx.AbstractERK) -> tuple[list[list[float]], list[float], list[float]]:
     """Weights within the stages, nodes, and weights of the result; without stages at the end that carry no weight."""
-    table = solver.tableau
+    table: Any = solver.tableau
     weights = [float(w) for w in np.asarray(table.b_sol)]
     nodes = [0.0, *(float(c) for c in np.asarray(table.c))]
     lower: list[list[float]] = [[], *([float(w) for w in np.asarray(row)] for row in table.a_lower)]
@@ -143,7 +142,8 @@ class March:
     """
 
     def __init__(self, equations: Equations, solver: dfx.AbstractERK, mode: Mode):
-        self.equations, self.mode = equations, mode
+        self.equations = equations
+        self.mode: Mode = mode
         self.lower, self.nodes, self.weights = tableau(solver)
         self.module = ir.Module("march")
         e = equations
@@ -306,7 +306,7 @@ class March:
         call, scalars = code.array(len(self.call), I64), code.array(len(self.scalars), F64)
         threads = code.array(MOST_THREADS, I64)
 
-        def put(name: str, value: ir.Value) -> None:
+        def put(name: str, value: Any) -> None:
             whole = value if value.type == I64 else b.ptrtoint(value, I64)
             code.store(whole, call, self.call[name])
 
@@ -787,7 +787,7 @@ class _Block:
         c, m = self.code, self.march
         rates = m.equations.rates
         old = self._tangent(t)
-        held = []
+        held: list[Any] = []
         for k, slopes in enumerate(m.equations.held.slopes):
             terms = self._along_states(m.before, self.held_results, slopes, old)
             own = None
@@ -797,11 +797,11 @@ class _Block:
         rows = {row: k for k, row in enumerate(self.rates_by_parameter)}
         found: list[list[ir.Value | None]] = []
         for j in range(len(m.nodes)):
-            now = [c.total([old[i], self._weighted_tangents(m.lower[j], found, i)]) for i in range(m.states)]
+            now: list[Any] = [c.total([old[i], self._weighted_tangents(m.lower[j], found, i)]) for i in range(m.states)]
             results = c.place(self.stage_results, j * m.rates.size)
-            stage: list[ir.Value | None] = []
+            stage: list[Any] = []
             for i in range(m.states):
-                terms: list[ir.Value | None] = list(self._along_states(m.rates, results, rates.slopes[i], now))
+                terms: list[ir.Value | None] = [*self._along_states(m.rates, results, rates.slopes[i], now)]
                 for direction, node in rates.slopes[i].items():
                     if direction[0] == "held" and held[direction[1]] is not None:
                         terms.append(c.mul(self._node(m.rates, node, results), held[direction[1]]))

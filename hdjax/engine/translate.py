@@ -131,7 +131,7 @@ def _with_own_derivative(
                 partial = slope[o]
                 if partial is not None and graph.known(partial.item(*place)) != 0.0:
                     given += [arguments[k].item(*index), partial.item(*place)]
-            result[place] = graph.apply("given", value[place], *given) if given else value[place]
+            result[place] = graph.apply("given", value.item(*place), *given) if given else value.item(*place)
         results.append(result)
     return results
 
