@@ -37,8 +37,14 @@ def with_engine(problem: Problem, *, values: bool = False) -> Problem:
 
 
 def _with_kernel(problem: Problem, values: bool) -> Problem:
-    loaded = problem.segments.load_torque is not None
-    made = kernel(problem.model, problem.free.paths, loaded=loaded, solver=problem.solver, values=values)
+    made = kernel(
+        problem.model,
+        problem.free.paths,
+        loaded=problem.segments.load_torque is not None,
+        warm=problem.segments.temperature is not None,
+        solver=problem.solver,
+        values=values,
+    )
     return dataclasses.replace(problem, kernel=made)
 
 

@@ -52,7 +52,13 @@ _MADE: dict[Hashable, _Made] = {}
 
 
 def kernel(
-    model: Model, paths: Sequence[str], *, loaded: bool, solver: dfx.AbstractERK, values: bool = False
+    model: Model,
+    paths: Sequence[str],
+    *,
+    loaded: bool,
+    warm: bool = True,
+    solver: dfx.AbstractERK,
+    values: bool = False,
 ) -> Kernel:
     """The machine code of a model; made once for all models of the same structure.
 
@@ -60,13 +66,15 @@ def kernel(
         model: the equations.
         paths: dotted paths of the parameters that derivatives are by.
         loaded: whether there is a load torque.
+        warm: whether the drive's temperature is known.
         solver: explicit Runge-Kutta solver of diffrax; its tableau is used.
         values: whether the march without derivatives is wanted as well.
 
     Raises:
+        ValueError: where an effect needs a temperature that is not known.
         UntranslatableError: where the model uses a function that the engine does not know.
     """
-    warm = any(e.needs_temperature for e in model.effects)
+    warm = warm and any(e.needs_temperature for e in model.effects)
     signals = (LOAD,) * loaded + (TEMPERATURE,) * warm
     key = structure(model, paths, signals)
     with _LOCK:
