@@ -167,7 +167,8 @@ def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int
     shapes = jax.eval_shape(lambda lanes: march_lanes(address, lanes, hidden, mode), lanes)
     results = jax.tree.map(lambda s: np.empty(s.shape), shapes)
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
-    called(int(address), [np.asarray(address), *operands, *lanes.signals], jax.tree.leaves(results))
+    arrays = [np.asarray(a) for a in (address, *operands, *lanes.signals)]
+    called(int(address), arrays, jax.tree.leaves(results))
     return results
 
 

@@ -58,7 +58,8 @@ def tableau(solver: dfx.AbstractERK) -> tuple[list[list[float]], list[float], li
     nodes = [0.0, *(float(c) for c in np.asarray(table.c))]
     lower: list[list[float]] = [[], *([float(w) for w in np.asarray(row)] for row in table.a_lower)]
     while weights[-1] == 0.0:
-        weights.pop(), nodes.pop(), lower.pop()
+        for row in (weights, nodes, lower):
+            row.pop()
     return lower, nodes, weights
 
 
@@ -801,7 +802,7 @@ class _Block:
             results = c.place(self.stage_results, j * m.rates.size)
             stage: list[Any] = []
             for i in range(m.states):
-                terms: list[ir.Value | None] = [*self._along_states(m.rates, results, rates.slopes[i], now)]
+                terms: list[Any] = [*self._along_states(m.rates, results, rates.slopes[i], now)]
                 for direction, node in rates.slopes[i].items():
                     if direction[0] == "held" and held[direction[1]] is not None:
                         terms.append(c.mul(self._node(m.rates, node, results), held[direction[1]]))
