@@ -1,0 +1,317 @@
+"""The march by machine code is that by XLA, however it is called and whatever its data are like."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_engine_equations import LARGE, models
+
+import rig
+from fitting.engines import linearise, residual_with_blocks, simulate, with_engine
+from fitting.experiment import Experiment, Stretch, cut
+from fitting.free import fitted_paths, free_parameters
+from fitting.machine_code import _gap, lanes_of, task
+from fitting.residual import LOST, Blocks, Problem, Unknowns, blocks
+from hdjax import Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
+from hdjax.effects import CATALOGUE
+from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY
+from hdjax.engine import march_lanes
+from hdjax.engine.kernel import march_arrays
+from hdjax.signals import HOLDS
+
+COUNT, LENGTH, HALO = 330, 32, 3  # eleven segments: a whole block, and one that is not full; the last is part padding
+FIELDS = tuple(f.name for f in dataclasses.fields(Blocks))
+SETTINGS = np.arange(4)
+SUBSTEPS, WHOLE, THREADS, REDUCED = SETTINGS
+
+
+def experiment(
+    model: Model, *, hold: Hold = "zero-order", loaded: bool = False, warm: bool = False, jitter: float = 0.0
+) -> Experiment:
+    """A record of a base drive; what the logs carry does not have to go together for two engines to agree."""
+    random = np.random.default_rng(5)
+    torque = rig.drive_torque(COUNT)
+    stamps = rig.STEP * (np.arange(COUNT) + jitter * random.uniform(-1, 1, COUNT))
+    if isinstance(model, TwoInertiaModel):
+        motion = rig.drive_motion(torque, state=(0.5, 0.009, 10.0, 0.3), substeps=2)
+        measured = np.stack([motion[:, 0] / rig.N, motion[:, 0] / rig.N - motion[:, 1]], axis=1)
+    else:
+        forcing = rig.reduced_forcing(COUNT)
+        torque, measured = forcing, rig.reduced_motion(forcing, step=rig.STEP)[:, :1]
+    smooth = np.cumsum(random.normal(size=COUNT))
+    load = sampled(stamps, 0.3 * smooth, hold="linear") if loaded else None
+    warmth = sampled(stamps, 303.0 + smooth, hold="linear") if warm else None
+    return Experiment("log", stamps, sampled(stamps, torque, hold=hold), load, measured, None, temperature=warmth)
+
+
+def problem_of(
+    model: Model, *, joined: bool = False, substeps: int = 1, missing: float = 0.0, **data
+) -> tuple[Problem, Unknowns]:
+    """Posed by hand, away from any optimum."""
+    record = experiment(model, **data)
+    beside = record.load_torque is not None or record.temperature is not None
+    segments = cut([Stretch(record, 0, len(record))], LENGTH, halo=0 if beside else HALO)
+    random = np.random.default_rng(7)
+    count = len(segments.joined)
+    if joined:
+        segments = eqx.tree_at(lambda s: s.joined, segments, jnp.arange(count) % 4 != 0)
+    keep = random.uniform(size=segments.weight.shape) >= missing
+    segments = eqx.tree_at(lambda s: s.weight, segments, segments.weight * keep.astype(float))
+    outputs, paths = segments.measured.shape[-1], fitted_paths(model)
+    whitening = jnp.asarray([[1e5, 0.0], [-3e4, 1e6]])[:outputs, :outputs]
+    free = free_parameters(model, paths, {"alpha": 2e4})
+    states = np.asarray(segments.measured)[:, 0]
+    if isinstance(model, TwoInertiaModel):
+        rates = random.normal(size=(count, 2)) * [5.0, 0.1]
+        motion = np.stack([rig.N * states[:, 0], states[:, 0] - states[:, 1], *rates.T], axis=1)
+    else:
+        motion = np.stack([states[:, 0], 30.0 * random.normal(size=count)], axis=1)
+    own = jax.vmap(model.settled)(jnp.asarray(motion))
+    scale = np.concatenate([np.zeros(motion.shape[1]), *(e.state_scale() for e in model.effects if e.states)])
+    unknowns = Unknowns(free.pack(model), own + 0.2 * scale * random.normal(size=own.shape))
+    active = jnp.asarray(np.ones(len(paths)))
+    gap_weight = jnp.asarray(np.ones(own.shape[1]))
+    return Problem(model, free, segments, whitening, active, gap_weight, substeps=substeps), unknowns
+
+
+_blocks_by_xla = eqx.filter_jit(blocks)
+
+
+def apart(problem: Problem, unknowns: Unknowns) -> dict[str, np.ndarray]:
+    """How far machine code is from XLA, each number relative to the largest of its column."""
+    wanted, found = _blocks_by_xla(problem, unknowns), linearise(with_engine(problem), unknowns)
+    result = {}
+    for name in FIELDS:
+        ours, theirs = (np.asarray(getattr(b, name)) for b in (found, wanted))
+        assert ours.shape == theirs.shape and np.isfinite(ours).all()
+        size = np.max(np.abs(theirs), axis=(0, 1) if theirs.ndim == 3 else None, keepdims=True, initial=0.0)
+        if name == "before_by_state":
+            # It was the identity at the segment's start: a state that is forgotten leaves the rounding of one.
+            size = np.maximum(size, 1.0)
+        result[name] = np.abs(ours - theirs) / np.where(size > 0, size, 1.0)
+    return result
+
+
+def assert_agreement(problem: Problem, unknowns: Unknowns):
+    """All samples but those that rounding may put on the other side of a corner, of which there are few."""
+    found = apart(problem, unknowns)
+    off = {name: int(np.sum(d > 1e-12)) for name, d in found.items()}
+    total = {name: max(d.size, 1) for name, d in found.items()}
+    worst = {name: float(d.max(initial=0.0)) for name, d in found.items()}
+    assert all(off[n] <= 1e-3 * total[n] for n in FIELDS), f"{off} of {total}, worst {worst}"
+
+
+TYPICAL = {
+    "kinematic_error": {"loaded": True, "joined": True, "substeps": 2, "hold": "band-limited"},
+    "motor_friction": {"jitter": 0.2, "missing": 0.3},
+    "maxwell_slip": {"joined": True, "hold": "linear"},
+    "input_delay": {"loaded": True, "hold": "cubic", "jitter": 0.1},
+}
+
+
+@pytest.mark.parametrize("name", TYPICAL)
+def test_it_agrees_with_xla(name: str):
+    assert_agreement(*problem_of(models()[name], **TYPICAL[name]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize("name", models())
+def test_every_form_agrees_with_xla(name: str, loaded: bool):
+    model = models()[name]
+    if loaded and isinstance(model, ReducedModel):
+        pytest.skip("a reduced drive has no load torque")
+    warm = any(e.needs_temperature for e in model.effects) or loaded
+    assert_agreement(*problem_of(model, loaded=loaded, warm=warm, joined=loaded, substeps=2 if loaded else 1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("name", ["stribeck_motor_friction", "input_delay", "input_lag", "several at once"])
+def test_every_hold_agrees_with_xla(name: str, hold: Hold, jitter: float):
+    assert_agreement(*problem_of(models()[name], hold=hold, jitter=jitter, joined=True, missing=0.1))
+
+
+def test_all_forms_are_compared():
+    named = set(models())
+    assert {form.name for form in (*CATALOGUE, *LEARNED_WITH_MEMORY)} <= named and len(LARGE) > 3
+
+
+# -- how it is called --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def several() -> tuple[Problem, Unknowns]:
+    """A drive with friction, a state of its own, and a torque sensor that is off."""
+    problem, unknowns = problem_of(models()["several at once"], joined=True, missing=0.1)
+    return with_engine(problem, values=True), unknowns
+
+
+def equal(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def with_setting(lanes, place: int, value: int):
+    settings = np.array(lanes.settings)
+    settings[place] = value
+    return eqx.tree_at(lambda s: s.settings, lanes, settings)
+
+
+def test_the_same_bits_whatever_the_number_of_threads(several):
+    problem, unknowns = several
+    lanes = lanes_of(problem, unknowns, problem.kernel)
+    found = [
+        march_lanes(problem.kernel.jacobian, with_setting(lanes, THREADS, n), problem.kernel.hidden, "jacobian")
+        for n in (1, 2, 5, 1000)
+    ]
+    assert np.abs(found[0].rows).max() > 0
+    for other in found[1:]:
+        equal(found[0], other)
+
+
+def test_inside_and_outside_of_programs(several):
+    """A call from Python, from JAX without and with `jit`, the address being data; and without derivatives."""
+    problem, unknowns = several
+    kernel = problem.kernel
+    lanes = lanes_of(problem, unknowns, kernel)
+    plain = march_lanes(kernel.jacobian, lanes, kernel.hidden, "jacobian")
+    jitted = eqx.filter_jit(lambda address, lanes: march_lanes(address, lanes, kernel.hidden, "jacobian"))
+    equal(plain, jitted(kernel.jacobian, lanes))
+    equal(plain, march_arrays(kernel.jacobian, lanes, kernel.hidden, "jacobian"))
+    signals = lanes.signals[: len(lanes.signals) - len(kernel.acting)]
+    values = march_lanes(kernel.values, dataclasses.replace(lanes, signals=signals), kernel.hidden, "values")
+    np.testing.assert_allclose(values.rows, plain.rows, rtol=1e-12, atol=1e-12 * np.abs(plain.rows).max())
+    np.testing.assert_allclose(values.end, plain.end, rtol=1e-12)
+    assert values.by_parameter is None
+    # More room than there are parameters.
+    wide = linearise(problem, unknowns, width=lanes.free.size + 5)
+    narrow = linearise(problem, unknowns)
+    assert (np.asarray(wide.by_parameter)[..., lanes.free.size :] == 0).all()
+    np.testing.assert_array_equal(np.asarray(wide.by_parameter)[..., : lanes.free.size], narrow.by_parameter)
+    np.testing.assert_array_equal(wide.by_state, narrow.by_state)
+
+
+def test_vmap_is_a_loop(several):
+    problem, unknowns = several
+    points = [eqx.tree_at(lambda u: u.parameters, unknowns, unknowns.parameters + 0.01 * k) for k in range(3)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *points)
+    together = eqx.filter_jit(lambda p, u: jax.vmap(lambda one: linearise(p, one))(u))(problem, stacked)
+    for k, point in enumerate(points):
+        # Programs of JAX take exponentials of parameters otherwise than numpy: by the last digit.
+        for found, wanted in zip(jax.tree.leaves(together), jax.tree.leaves(linearise(problem, point)), strict=True):
+            np.testing.assert_allclose(found[k], wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+
+
+def test_its_derivative_is_a_product_with_its_blocks(several):
+    problem, unknowns = several
+    random = np.random.default_rng(3)
+    tangent = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)) * jnp.abs(leaf), unknowns)
+    along = eqx.filter_jit(lambda p, u, t: jax.jvp(lambda w: residual_with_blocks(w, p), (u,), (t,)))
+    value, slope = along(problem, unknowns, tangent)
+    found = linearise(problem, unknowns)
+    rows = np.einsum("srp,p->sr", found.by_parameter, tangent.parameters)
+    rows += np.einsum("srq,sq->sr", found.by_state, tangent.states)
+    np.testing.assert_allclose(value.rows, found.residual, rtol=0, atol=1e-12 * np.abs(found.residual).max())
+    np.testing.assert_allclose(slope.rows, rows, atol=1e-12 * np.abs(rows).max())
+    back = np.roll(np.asarray(tangent.states), 1, axis=0)
+    gap = np.where(np.asarray(problem.segments.joined)[:, None], tangent.states, 0.0)
+    gap -= np.einsum("sqp,p->sq", found.before_by_parameter, tangent.parameters)
+    gap -= np.einsum("sqk,sk->sq", found.before_by_state, back)
+    np.testing.assert_allclose(slope.gap, gap, rtol=0, atol=1e-12 * np.abs(gap).max())
+
+
+def test_simulated_outputs_are_measured_minus_residual(several):
+    problem, unknowns = several
+    outputs, end = simulate(problem, unknowns)
+    counts = np.asarray(problem.segments.weight) > 0
+    rows = np.asarray(linearise(problem, unknowns).residual)[:, : 2 * LENGTH].reshape(*counts.shape, 2)
+    error = np.einsum("ij,snj->sni", problem.whitening, problem.segments.measured - outputs)
+    np.testing.assert_allclose(rows[counts], error[counts], atol=1e-10 * np.abs(rows).max())
+    lanes = lanes_of(problem, unknowns, problem.kernel)
+    marched = march_lanes(problem.kernel.jacobian, lanes, problem.kernel.hidden, "jacobian")
+    np.testing.assert_array_equal(np.asarray(_gap(lanes, marched))[0], 0.0)
+    np.testing.assert_allclose(marched.end, end, rtol=1e-13)
+
+
+def products(found: Blocks, count: int) -> np.ndarray:
+    """Of a segment's columns, and the residual, with each other."""
+    columns = np.concatenate([found.by_parameter[..., :count], found.by_state, found.residual[..., None]], axis=2)
+    return np.einsum("srp,srq->spq", columns, columns)
+
+
+@pytest.mark.parametrize("name", ["two inertias", "maxwell_slip", "bouc_wen"])
+def test_the_triangular_factor_has_the_same_normal_equations(name: str):
+    """What a fit needs of the Jacobian, without ever writing it; and a column that depends on others does no harm."""
+    problem, unknowns = problem_of(models()[name], missing=0.1)
+    for held in (False, True):
+        if held:
+            problem = eqx.tree_at(lambda p: p.active, problem, problem.active.at[1].set(0.0))
+        ready = with_engine(problem)
+        full = linearise(ready, unknowns)
+        count = full.by_parameter.shape[2]
+        padded = eqx.tree_at(lambda u: u.parameters, unknowns, jnp.pad(unknowns.parameters, (0, 3)))
+        found, rows = task(ready, unknowns, count + 3).look(padded)
+        np.testing.assert_array_equal(rows, full.residual)
+        whole = [
+            np.concatenate([b.by_parameter[..., :count], b.by_state, b.residual[..., None]], axis=2)
+            for b in (found, full)
+        ]
+        factor, wanted = (np.einsum("srp,srq->spq", w, w) for w in whole)
+        size = np.sqrt(np.einsum("spp->sp", wanted))
+        bound = size[:, :, None] * size[:, None, :]
+        assert np.all(np.abs(factor - wanted) <= 1e-12 * bound)
+        assert (np.asarray(found.by_parameter)[..., count:] == 0).all()
+        np.testing.assert_array_equal(found.gap, full.gap)
+
+
+# -- what runs away ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [1e200, np.inf, np.nan, -3e6])
+def test_a_segment_that_runs_away_is_lost_and_no_other(several, start: float):
+    """Its rows are as large as counts, with no slope; those beside it in the block are what they were, to the bit."""
+    problem, unknowns = several
+    kernel = problem.kernel
+    lost = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[2, 1].set(start))
+    before, after = (
+        march_lanes(kernel.jacobian, lanes_of(problem, u, kernel), kernel.hidden, "jacobian") for u in (unknowns, lost)
+    )
+    others = np.arange(len(before.rows)) != 2
+    for name in ("rows", "by_parameter", "by_state", "end", "end_by_parameter", "end_by_state"):
+        np.testing.assert_array_equal(
+            np.asarray(getattr(after, name))[others], np.asarray(getattr(before, name))[others]
+        )
+    counts = np.repeat(np.asarray(problem.segments.weight)[2] > 0, 2)
+    rows = np.asarray(after.rows)[2, : 2 * LENGTH]
+    # The motor's encoder does not see at once where the load is.
+    assert (rows[counts][1:] == LOST).all() and (rows[~counts] == 0).all()
+    lost_rows = np.flatnonzero(rows == LOST)
+    for slopes in (after.by_parameter, after.by_state):
+        assert (np.asarray(slopes)[2, lost_rows] == 0).all()
+    for leaf in jax.tree.leaves(linearise(problem, lost)):
+        assert np.isfinite(leaf).all()
+
+
+def test_one_that_runs_away_in_the_middle_is_sound_until_then():
+    """A spring that softens lets a drive go that is twisted too far."""
+    model = TwoInertiaModel(rig.drive_model(alpha=-5e4).drive)
+    problem, unknowns = problem_of(model)
+    wild = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[4, 1].add(-8e-3))
+    found = apart(problem, wild)
+    rows = np.asarray(linearise(with_engine(problem), wild).residual)
+    lost = np.abs(rows[4]) >= LOST
+    assert 0 < lost.sum() < lost.size and not lost[0] and (np.abs(np.delete(rows, 4, axis=0)) < LOST).all()
+    slopes = np.asarray(linearise(with_engine(problem), wild).by_parameter)[4]
+    assert (slopes[lost] == 0).all() and np.isfinite(slopes).all()
+    # Up to where it is far away; beyond, errors grow as the motion does.
+    assert all(np.delete(d, 4, axis=0).max(initial=0.0) < 1e-12 for d in (found["residual"], found["by_state"]))
+
+
+def test_a_reduced_drive_agrees_with_xla():
+    drive = ReducedDrive(mu=rig.MU, omega_0=rig.OMEGA_0, alpha=rig.REDUCED_ALPHA, gain=rig.GAIN)
+    assert_agreement(*problem_of(ReducedModel(drive), joined=True))
