@@ -9,16 +9,13 @@ import dataclasses
 import functools
 import itertools
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.optimize import differential_evolution
 
 from hdjax.drive import ReducedDrive
 from hdjax.fourier import FourierSeries
-from hdjax.response.nearest_motion import nearest_motions
+from hdjax.response.nearest_motion import Oscillators, largest, nearest_motions, nearest_waves
 from hdjax.response.seed_data import TABLE_2
 
 PUSH, OMEGA_0, DAMPING, BEND = (1e-3, 1e3), (20.0, 1500.0), (1e-7, 1.0), 1e3
@@ -54,7 +51,7 @@ class AmplitudeFit:
     @functools.cached_property
     def fitted(self) -> tuple[float, ...]:
         """Largest |x| of the nearest stable motions [rad]."""
-        return tuple(float(a) for a in jax.vmap(FourierSeries.largest)(self.motions))
+        return tuple(float(a) for a in largest(self.motions))
 
     @property
     def subharmonic(self) -> tuple[bool, ...]:
@@ -94,12 +91,12 @@ def fit_amplitudes(
     """
     if not omega or len(omega) != len(amplitude) or min(amplitude) <= 0.0:
         raise ValueError("`omega` and `amplitude` must be of one length, with amplitudes above zero")
-    table = jnp.asarray(omega), jnp.asarray(amplitude)
+    table = np.asarray(omega), np.asarray(amplitude)
     edges = np.log(np.geomspace(*OMEGA_0, bands + 1))
     bend = np.arcsinh(BEND / _STRAIGHT)
     found = [
         differential_evolution(
-            lambda points: np.asarray(_misfits(jnp.asarray(points.T), *table)),
+            lambda points: _misfits(points.T, *table),
             [np.log(PUSH), band, np.log(DAMPING), side],
             maxiter=generations,
             popsize=12,
@@ -114,10 +111,9 @@ def fit_amplitudes(
         np.concatenate(parts) for parts in zip(*((f.population, f.population_energies) for f in found), strict=True)
     )
     for k in np.argsort(misfits):
-        drive, A = _drive(jnp.asarray(points[k]), table[1])
-        nearest = nearest_motions(drive, A, *table)
-        if bool(jnp.all(nearest.exists)):
-            A, omega_0, mu, alpha = (float(v) for v in (A, drive.omega_0, drive.mu, drive.alpha))
+        A, omega_0, mu, alpha = (float(v[0]) for v in _parameters(points[k : k + 1], table[1]))
+        nearest = nearest_motions(ReducedDrive(mu=mu, omega_0=omega_0, alpha=alpha), A, *table)
+        if nearest.exists.all():
             return AmplitudeFit(A, omega_0, mu, alpha, tuple(omega), tuple(amplitude), nearest.motion)
     raise ValueError("no parameters give stable motions at every frequency: raise `generations`")
 
@@ -128,20 +124,19 @@ def best_fit_of_table_2() -> AmplitudeFit:
     return fit_amplitudes(tuple(r.omega for r in TABLE_2), tuple(r.analytical for r in TABLE_2))
 
 
-def _drive(point: Float[Array, "4"], amplitude: Float[Array, " rows"]) -> tuple[ReducedDrive, Float[Array, ""]]:
-    """The drive and the amplitude of its forcing that a point of the search means."""
-    a = jnp.exp(jnp.mean(jnp.log(amplitude)))
-    push, omega_0, damping = jnp.exp(point[:3])
-    alpha = _STRAIGHT * jnp.sinh(point[3]) / a**2
-    return ReducedDrive(mu=damping * omega_0, omega_0=omega_0, alpha=alpha), push * omega_0**2 * a
+def _parameters(
+    points: Float[np.ndarray, "*points 4"], amplitude: Float[np.ndarray, " rows"]
+) -> tuple[np.ndarray, ...]:
+    """A, omega_0, mu and alpha that points of the search mean."""
+    a = np.exp(np.mean(np.log(amplitude)))
+    push, omega_0, damping = np.exp(points[:, :3].T)
+    return push * omega_0**2 * a, omega_0, damping * omega_0, _STRAIGHT * np.sinh(points[:, 3]) / a**2
 
 
-@eqx.filter_jit
-def _misfits(points: Float[Array, "points 4"], omega: Array, amplitude: Array) -> Float[Array, " points"]:
+def _misfits(
+    points: Float[np.ndarray, "points 4"], omega: np.ndarray, amplitude: np.ndarray
+) -> Float[np.ndarray, " points"]:
     """Sums of squared log ratios; a missing motion counts as one far off."""
-
-    def misfit(point: Array) -> Array:
-        found = nearest_motions(*_drive(point, amplitude), omega, amplitude, harmonics=_HARMONICS)
-        return jnp.sum(jnp.where(found.exists, jnp.log(found.size / amplitude) ** 2, _FAR**2))
-
-    return jax.vmap(misfit)(points)
+    A, omega_0, mu, alpha = (v[:, None] for v in _parameters(points, amplitude))
+    _, size, exists = nearest_waves(Oscillators(mu, omega_0, alpha, A, omega), amplitude, _HARMONICS)
+    return np.sum(np.where(exists, np.log(np.where(exists, size, 1.0) / amplitude) ** 2, _FAR**2), axis=1)
