@@ -16,7 +16,7 @@ from fitting.free import fitted_paths, free_parameters
 from fitting.machine_code import _gap, lanes_of, task
 from fitting.residual import LOST, Blocks, Problem, Unknowns, blocks
 from hdjax import Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
-from hdjax.effects import CATALOGUE
+from hdjax.effects import CATALOGUE, DryFriction
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY
 from hdjax.engine import march_lanes
 from hdjax.engine.kernel import march_arrays
@@ -48,12 +48,11 @@ def experiment(
 
 
 def problem_of(
-    model: Model, *, joined: bool = False, substeps: int = 1, missing: float = 0.0, **data
+    model: Model, *, joined: bool = False, substeps: int = 1, missing: float = 0.0, halo: int = HALO, **data
 ) -> tuple[Problem, Unknowns]:
     """Posed by hand, away from any optimum."""
     record = experiment(model, **data)
-    beside = record.load_torque is not None or record.temperature is not None
-    segments = cut([Stretch(record, 0, len(record))], LENGTH, halo=0 if beside else HALO)
+    segments = cut([Stretch(record, 0, len(record))], LENGTH, halo=halo)
     random = np.random.default_rng(7)
     count = len(segments.joined)
     if joined:
@@ -98,17 +97,20 @@ def apart(problem: Problem, unknowns: Unknowns) -> dict[str, np.ndarray]:
 def assert_agreement(problem: Problem, unknowns: Unknowns):
     """All samples but those that rounding may put on the other side of a corner, of which there are few."""
     found = apart(problem, unknowns)
-    off = {name: int(np.sum(d > 1e-12)) for name, d in found.items()}
+    # How a drive that comes to rest within a step depends on its parameters is a small difference over another.
+    dry = any(isinstance(e, DryFriction) for e in problem.model.effects)
+    bounds = {name: 1e-9 if dry and "by" in name else 1e-12 for name in FIELDS}
+    off = {name: int(np.sum(d > bounds[name])) for name, d in found.items()}
     total = {name: max(d.size, 1) for name, d in found.items()}
     worst = {name: float(d.max(initial=0.0)) for name, d in found.items()}
     assert all(off[n] <= 1e-3 * total[n] for n in FIELDS), f"{off} of {total}, worst {worst}"
 
 
 TYPICAL = {
-    "kinematic_error": {"loaded": True, "joined": True, "substeps": 2, "hold": "band-limited"},
+    "kinematic_error": {"loaded": True, "halo": 0, "joined": True, "substeps": 2, "hold": "band-limited"},
     "motor_friction": {"jitter": 0.2, "missing": 0.3},
     "maxwell_slip": {"joined": True, "hold": "linear"},
-    "input_delay": {"loaded": True, "hold": "cubic", "jitter": 0.1},
+    "input_delay": {"hold": "cubic", "jitter": 0.1},
 }
 
 
