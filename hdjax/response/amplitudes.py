@@ -8,14 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.dynamics import ReducedModel
 from hdjax.fourier import FourierSeries, harmonic_series
 from hdjax.parameters import as_scalar
 from hdjax.response.continuation import Branch
-from hdjax.response.floquet import is_stable, multipliers, resolving_steps
+from hdjax.response.cubic_motion import ForcedCubic, balanced, closed
 from hdjax.response.harmonic_balance import balance, solve
 from hdjax.response.marching import transient_and_steps
 from hdjax.response.multiple_scales import (
@@ -27,8 +27,8 @@ from hdjax.response.multiple_scales import (
     first_order,
     second_order,
 )
+from hdjax.response.nearest_motion import largest
 from hdjax.response.poincare import PoincareSection, period_of, poincare_section
-from hdjax.response.shooting import shoot, steady_series
 from hdjax.where import where
 
 Kind = Literal["off-resonance", "primary", "super-harmonic", "sub-harmonic"]
@@ -137,90 +137,39 @@ def check_amplitudes(
         omega: forcing frequency [rad/s].
         harmonics: of the forcing frequency in harmonic balance.
     """
-    kind = resonance_kind(float(drive.omega_0), omega)
+    mu, omega_0, alpha = (float(v) for v in (drive.mu, drive.omega_0, drive.alpha))
+    kind = resonance_kind(omega_0, omega)
     # Off resonance the super-harmonic's expansion holds too: its third harmonic is then merely not resonant.
     resonance = KINDS.get(kind, SuperharmonicResonance)
     at = resonance(drive, A)
-    steps = resolving_steps(at.forcing * float(drive.omega_0) / omega)
-    found = _check(at, as_scalar(omega), harmonics, steps)
-    existing = np.flatnonzero(np.asarray(found.exists))
+    first, second = _expansions(at, as_scalar(omega))
+    given = ForcedCubic(mu, omega_0, alpha, A, omega, at.forcing)
+    existing = np.flatnonzero(np.asarray(first.branches.exists)).tolist()
+    sizes = largest(first.harmonics), largest(second.harmonics)
     rows = []
     for slot in existing:
-        first = float(found.first_order[slot])
-        if kind == "off-resonance":
-            first = abs(A / (float(drive.omega_0) ** 2 - omega**2))
+        refined = bool(second.branches.exists[slot])
+        guess = (second if refined else first).series(slot)
+        leading = abs(A / (omega_0**2 - omega**2)) if kind == "off-resonance" else float(sizes[0][slot])
+        x, solved = balanced(given, guess, harmonics * at.forcing)
+        orbit = closed(given, x, harmonics * at.forcing) if solved else None
         rows.append(
             AmplitudeRow(
-                branch=_SLOTS[slot] if existing.size > 1 else "only",
-                stable=bool(found.stable[slot]),
-                first_order=first,
-                second_order=float(found.second_order[slot]) if found.second_exists[slot] else None,
-                balance=float(found.balance[slot]) if found.balanced[slot] else None,
-                time=float(found.time[slot]) if found.closed[slot] else None,
+                branch=_SLOTS[slot] if len(existing) > 1 else "only",
+                stable=orbit is not None and orbit.stable,
+                first_order=leading,
+                second_order=float(sizes[1][slot]) if refined else None,
+                balance=float(largest(x)) if solved else None,
+                time=float(largest(orbit.motion)) if orbit is not None and orbit.converged else None,
             )
         )
     return AmplitudeCheck(float(omega), float(A), kind, tuple(rows))
 
 
-class _Found(eqx.Module):
-    exists: Bool[Array, "3"]
-    first_order: Float[Array, "3"]
-    second_exists: Bool[Array, "3"]
-    second_order: Float[Array, "3"]
-    balanced: Bool[Array, "3"]
-    balance: Float[Array, "3"]
-    closed: Bool[Array, "3"]
-    time: Float[Array, "3"]
-    stable: Bool[Array, "3"]
-
-
-def _check(resonance: Resonance, omega: Array, harmonics: int, steps: int) -> _Found:
-    drive, periods = resonance.drive, resonance.forcing
-    first, second, guesses = _expansions(resonance, omega, harmonics * periods)
-    model = ReducedModel(ReducedDrive(mu=drive.mu, omega_0=drive.omega_0, alpha=drive.alpha))
-    numeric = _numeric(model, harmonic_series(omega, resonance.A), guesses, harmonics * periods, periods, steps)
-    balanced, size, closed, time, stable = numeric
-    return _Found(
-        first.branches.exists,
-        first.harmonics.largest(),
-        second.branches.exists,
-        second.harmonics.largest(),
-        balanced,
-        size,
-        closed,
-        time,
-        stable & balanced,
-    )
-
-
 @eqx.filter_jit
-def _expansions(resonance: Resonance, omega: Array, harmonics: int) -> tuple[SteadyStates, SteadyStates, FourierSeries]:
-    """First and second order, and the better of them on each branch."""
-    first, second = first_order(resonance, omega), second_order(resonance, omega)
-
-    def better(slot: Array) -> FourierSeries:
-        return _where(second.branches.exists[slot], second.series(slot), first.series(slot)).padded(harmonics)
-
-    return first, second, jax.vmap(better)(jnp.arange(3))
-
-
-@eqx.filter_jit
-def _numeric(
-    model: ReducedModel, forcing: FourierSeries, guesses: FourierSeries, harmonics: int, periods: int, steps: int
-) -> tuple[Array, ...]:
-    """By harmonic balance and by time integration, from each guess; one program for all resonances of one period."""
-    system = balance(model, forcing, harmonics=harmonics, subharmonic=periods)
-
-    def numeric(guess: FourierSeries) -> tuple[Array, ...]:
-        steady = solve(system, forcing.omega, guess)
-        x = steady.x
-        start = jnp.stack([x(jnp.zeros(())), x.derivative()(jnp.zeros(()))])
-        orbit = shoot(model, forcing, start, periods=periods)
-        series = steady_series(model, forcing, orbit, harmonics=harmonics)
-        stable = is_stable(multipliers(system, system.unknowns(x), forcing.omega, steps=steps))
-        return steady.converged, x.largest(), orbit.converged & steady.converged, series.largest(), stable
-
-    return jax.vmap(numeric)(guesses)
+def _expansions(resonance: Resonance, omega: Array) -> tuple[SteadyStates, SteadyStates]:
+    """First and second order."""
+    return first_order(resonance, omega), second_order(resonance, omega)
 
 
 def _where(condition: Array, a: FourierSeries, b: FourierSeries) -> FourierSeries:

@@ -100,7 +100,7 @@ class BalancedMotion(eqx.Module):
         return jnp.linalg.norm(above) / (jnp.linalg.norm(unknowns) + 1e-300)
 
     def _left_over(self, unknowns: Array, omega: Array) -> Float[Array, "coordinates projections"]:
-        basis, slope, projection, orders = _waves(self.harmonics, self.samples)
+        basis, slope, projection, orders = waves(self.harmonics, self.samples)
         fundamental = omega / self.subharmonic
         coefficients, mean_torque = self._coefficients(unknowns)
         position, velocity = coefficients @ basis, fundamental * (coefficients @ slope)
@@ -293,7 +293,7 @@ def find_root(
     return unknowns, jnp.any(solved)
 
 
-def _waves(harmonics: int, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def waves(harmonics: int, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Basis functions at the samples, their slopes, the projection back onto them and above, and their orders."""
     angles = np.arange(samples) * (2 * np.pi / samples)
     k = np.arange(1, harmonics + 1)[:, None]

@@ -218,7 +218,7 @@ def largest(motion: FourierSeries) -> Float[np.ndarray, "*motions"]:
     for _ in range(3):
         bend = wave(-(orders**2) * z)
         t = t - np.clip(wave(1j * orders * z) / np.where(bend == 0.0, np.inf, bend), -step, step)
-    return np.max(np.abs(np.concatenate([samples, mean + wave(z)], axis=-1)), axis=-1)
+    return np.asarray(np.max(np.abs(np.concatenate([samples, mean + wave(z)], axis=-1)), axis=-1))
 
 
 def _linear(given: Oscillators, periods: int, orders: np.ndarray) -> Float[np.ndarray, "2 lanes orders"]:
