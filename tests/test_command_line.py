@@ -141,7 +141,8 @@ def test_what_needs_no_computation_imports_nothing_for_it(arguments: Sequence[st
 
 
 NEEDLESS = (
-    *("blackjax", "dask", "h5py", "matplotlib", "pandas", "pint", "polars", "rich"),
+    *("asammdf", "blackjax", "dask", "distributed", "h5py", "jaxcont", "matplotlib", "pandas", "pint", "polars"),
+    *("rich", "xarray", "zarr"),
     *("scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.stats"),
 )
 
