@@ -116,7 +116,7 @@ class Lanes(eqx.Module):
     joined: Float[Array | np.ndarray, " segments"]
     whitening: Float[Array | np.ndarray, "outputs outputs"]
     settings: Int[Array | np.ndarray, "4"]
-    signals: tuple[Float[Array | np.ndarray, "segments intervals powers"], ...]
+    signals: tuple[Float[Array | np.ndarray, "segments _ _"], ...]
 
 
 class Marched(eqx.Module):
