@@ -19,15 +19,17 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from bench_fit import RATE, TRUTH, C, Record, _growth, experiment, record, verdict
 
 from fitting.engines import linearise, with_engine
 from fitting.experiment import Stretch, scales
 from fitting.free import base_paths, fitted_paths
-from fitting.machine_code import task
+from fitting.machine_code import Task, task
 from fitting.posing import pose, short_horizon
 from fitting.residual import Problem, Unknowns, blocks
+from fitting.solve import _WIDTH as WIDTH
 from hdjax import Model, sampled
 from hdjax.effects import CATALOGUE, Effect, Scales
 from hdjax.engine.kernel import _MADE
@@ -99,7 +101,7 @@ class Engines:
         lanes: sensitivities, those by parameters and by initial states.
         xla: one linearisation by XLA.
         code: likewise by machine code, with the Jacobian written.
-        reduced: what a fit needs of it; None where an effect changes the torque.
+        needed: what a fit calls: the Jacobian's triangular factor, but all of it where an effect changes the torque.
         xla_ready: from the model to a callable residual and Jacobian.
         code_ready: likewise.
         kernel: of that, for the machine code itself; the rest is a program of JAX that depends on shapes alone.
@@ -111,16 +113,11 @@ class Engines:
     lanes: int
     xla: float
     code: float
-    reduced: float | None
+    needed: float
     xla_ready: float
     code_ready: float
     kernel: float
     apart: float
-
-    @property
-    def needed(self) -> float:
-        """One linearisation as a fit calls it."""
-        return self.code if self.reduced is None else self.reduced
 
 
 def waited(call: Callable[[], Any]) -> tuple[Any, float]:
@@ -138,27 +135,36 @@ def least(call: Callable[[], Any], repeats: int) -> float:
 _look = eqx.filter_jit(lambda own, unknowns: own.look(unknowns))
 
 
+def as_fitted(ready: Problem, unknowns: Unknowns) -> tuple[Task | None, Unknowns]:
+    """What a fit's program is called with; no task where an effect changes the torque. There is room for more
+    parameters, so that models share a program."""
+    count = len(ready.free.paths)
+    more = -count % WIDTH
+    padded = np.pad(np.asarray(unknowns.parameters), (0, more))
+    return task(ready, unknowns, count + more), dataclasses.replace(unknowns, parameters=jnp.asarray(padded))
+
+
 def both(name: str, problem: Problem, unknowns: Unknowns, repeats: int) -> Engines:
     """Time a model that was never seen by both engines."""
     ready, kernel = waited(lambda: with_engine(problem))
     if ready.kernel is None:
         raise SystemExit(f"{name}: there is no machine code for it here")
-    found, first = waited(lambda: linearise(ready, unknowns))
+    own, padded = as_fitted(ready, unknowns)
+    needed = (lambda: linearise(ready, unknowns)) if own is None else lambda: _look(own, padded)
+    first = waited(needed)[1]
+    reduced = least(needed, repeats)
+    found, _ = waited(lambda: linearise(ready, unknowns))
     code = least(lambda: linearise(ready, unknowns), repeats)
-    own, reduced = task(ready, unknowns, len(problem.free.paths)), None
-    if own is not None:
-        waited(lambda: _look(own, unknowns))
-        reduced = least(lambda: _look(own, unknowns), repeats)
     # A jitted function of its own: what XLA has compiled for another model is not for this one.
     by_xla = jit_lanes(lambda problem, unknowns: blocks(problem, unknowns))
     wanted, xla_first = waited(lambda: by_xla(problem, unknowns))
     xla = least(lambda: by_xla(problem, unknowns), max(2, repeats // 2))
     apart = 0.0
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-        size = np.max(np.abs(theirs), axis=tuple(range(theirs.ndim - 1)), keepdims=True, initial=0.0)
+        size = np.max(np.abs(theirs), axis=(0, 1) if theirs.ndim == 3 else None, keepdims=True, initial=0.0)
         apart = max(apart, float(np.max(np.abs(ours - theirs) / np.where(size > 0, size, 1.0), initial=0.0)))
     lanes = len(problem.free.paths) + unknowns.states.shape[1]
-    return Engines(name, lanes, xla, code, reduced, xla_first - xla, kernel + first - code, kernel, apart)
+    return Engines(name, lanes, xla, code, reduced, xla_first - xla, kernel + first - reduced, kernel, apart)
 
 
 # --- the C program ---------------------------------------------------------------------------------------------------
@@ -322,7 +328,7 @@ def without_weights(problem: Problem) -> Problem:
     keep = np.flatnonzero(full)
 
     def cut(leaf: Any) -> Any:
-        return leaf if leaf is None or np.ndim(leaf) == 0 else jax.numpy.asarray(np.asarray(leaf)[keep])
+        return leaf if leaf is None or np.ndim(leaf) == 0 else jnp.asarray(np.asarray(leaf)[keep])
 
     return dataclasses.replace(problem, segments=jax.tree.map(cut, problem.segments))
 
@@ -343,7 +349,6 @@ def against_c(log: Record, threads: int, repeats: int) -> None:
     unknowns = dataclasses.replace(unknowns, states=unknowns.states[:kept])
     peer = Peer(problem, unknowns, threads, compiler)
     found = both("reduced", problem, unknowns, repeats)
-    assert found.reduced is not None
     peer(written=True)
     peer(written=False)
     ours = linearise(with_engine(problem), unknowns)
@@ -357,7 +362,7 @@ def against_c(log: Record, threads: int, repeats: int) -> None:
         f"\nthe reduced equation, {kept} of {count} segments x {peer.samples} samples, 6 lanes, Tsit5 x 1; {compiler}"
     )
     print(f"{'':<34}{'machine code':>14}{'C':>10}{'XLA':>10}{'C/code':>9}{'XLA/code':>10}   [ms]")
-    for name, own, written in (("the Jacobian written", found.code, True), ("normal equations", found.reduced, False)):
+    for name, own, written in (("the Jacobian written", found.code, True), ("normal equations", found.needed, False)):
         c = least(lambda w=written: peer(written=w), 4 * repeats)
         times = f"{1e3 * own:14.2f}{1e3 * c:10.2f}{1e3 * found.xla:10.2f}"
         print(f"{name:<34}{times}{c / own:9.2f}{found.xla / own:10.1f}")
@@ -403,15 +408,14 @@ def show_goals(base: Engines, effects: Sequence[Engines]) -> None:
 def show_memory(problem: Problem, unknowns: Unknowns) -> None:
     """Peak memory of one linearisation, over that before it."""
     ready = with_engine(problem)
-    own = task(ready, unknowns, len(problem.free.paths))
-    assert own is not None
+    own, padded = as_fitted(ready, unknowns)
     by_xla = jit_lanes(blocks)
     samples = problem.segments.weight.size
     lanes = len(problem.free.paths) + unknowns.states.shape[1]
     print(f"\nmemory of one linearisation, {lanes} lanes{'[B/sample]':>40}{'[B/sample/lane]':>18}")
     kept = 0.0
     for name, call in (
-        ("machine code, what a fit needs", lambda: _look(own, unknowns)),
+        ("machine code, what a fit needs", lambda: _look(own, padded)),
         ("machine code, the Jacobian written", lambda: linearise(ready, unknowns)),
         ("XLA", lambda: by_xla(problem, unknowns)),
     ):
@@ -464,8 +468,6 @@ def main() -> None:
         model = of_some_strength(base.with_effects(effect))
         data = warm if effect.needs_temperature else stretches
         rows.append(both(form.name, *posed(model, data, fitted_paths(model)), args.repeats))
-        # What XLA compiled is of no further use, and a process may hold only so many programs.
-        jax.clear_caches()
     show(rows)
     show_goals(rows[0], rows[1:])
     show_memory(problem, unknowns)
