@@ -1,22 +1,20 @@
 """A fitted motion as effects look at it, and what a unit of each thing that they can add does there."""
 
-import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.experiment import Segments, Stretch
-from fitting.followed import NODES, Followed
-from fitting.instants import at_instants
-from hdjax import Model, PiecewisePolynomial, TwoInertiaModel
-from hdjax.compilation import jit_small
+from fitting.followed import NODES, WEIGHTS, Followed, acting, polynomial, signals_at
+from fitting.machine_code import actuated
+from hdjax import Model, TwoInertiaModel
 from hdjax.effects import (
+    ActuatorEffect,
     Conditions,
     Effect,
     LoadSideEffect,
@@ -27,11 +25,11 @@ from hdjax.effects import (
     Scales,
 )
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedReading, LearnedTorque
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
 from hdjax.parameters import Scalar, parameter
-from hdjax.signals import polynomial
 
-PART = 0.5 * (NODES + 1.0)[None, None, :]
-"""The nodes as parts of an interval, behind segments and samples."""
+PART = 0.5 * (NODES + 1.0)
+"""The nodes as parts of an interval."""
 
 INPUT, ERROR, SLOPE = "input", "error", "slope"
 """What effects add beside a torque at one of the places of [`hdjax.effects.learned`][]."""
@@ -47,6 +45,7 @@ class Along(eqx.Module):
         at_knots: the motion at each knot.
         between: the motion at the nodes of each interval.
         pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
+        carried: and what it adds to the state by the end of the interval, see [`carried`][].
         goes_on: whether a segment goes on where the one before it ends in time, joined or not.
         firsts: the first segment of each stretch.
         ends: segment and knot where each stretch ends.
@@ -57,8 +56,9 @@ class Along(eqx.Module):
     segments: Segments
     at_knots: Motion
     between: Motion
-    pushes: dict[str, Float[Array, "segments samples nodes states"]]
-    goes_on: Bool[Array, " segments"]
+    pushes: dict[str, Float[np.ndarray, "segments samples nodes states"]]
+    carried: dict[str, Float[np.ndarray, "segments samples states nodes"]]
+    goes_on: Bool[np.ndarray, " segments"]
     firsts: Int[np.ndarray, " stretches"]
     ends: Int[np.ndarray, "stretches 2"]
 
@@ -76,57 +76,57 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     pieces = -(-samples // length)
     firsts = np.cumsum(pieces) - pieces
     ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
-    conditions = conditions_between(segments)
+    _, _, conditions = signals_at(model, segments, PART * _width(segments)[..., None])
     at_knots = motions(model, followed.states, conditions_at_knots(segments))
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
-    goes_on = jnp.asarray(continues(segments))
-    return Along(model, followed, segments, at_knots, between, pushes, goes_on, firsts, ends)
+    lands = {name: carried(followed, push) for name, push in pushes.items()}
+    return Along(model, followed, segments, at_knots, between, pushes, lands, continues(segments), firsts, ends)
 
 
-@jit_small
 def conditions_at_knots(segments: Segments) -> Conditions:
     """Time and temperature at each knot, the end of the last interval included."""
-    time = segments.torque.knots[:, segments.halo :]
-    warmth = None if segments.temperature is None else _at_knots(segments.temperature.coefficients, jnp.diff(time))
-    return Conditions(time, warmth)
+    time = np.asarray(segments.torque.knots)[:, segments.halo :]
+    warmth = segments.temperature
+    found = None if warmth is None else jnp.asarray(_at_knots(np.asarray(warmth.coefficients), np.diff(time)))
+    return Conditions(jnp.asarray(time), found)
 
 
-@jit_small
-def acting_at_knots(model: Model, segments: Segments) -> Float[Array, "segments knots"]:
+def acting_at_knots(model: Model, segments: Segments) -> Float[np.ndarray, "segments knots"]:
     """The torque that acts on a drive, or the forcing, at each knot; where it jumps the middle, so that a straight line
     from knot to knot is not late."""
-    acting = jax.vmap(model.actuate)(segments.torque)
-    width = jnp.diff(acting.knots[:, segments.halo :])
-    return _at_knots(acting.coefficients[:, segments.halo :], width)
+    return _at_knots(acting(model, segments)[:, segments.halo :], _width(segments))
 
 
-def at_nodes(signal: PiecewisePolynomial) -> Float[Array, "segments samples nodes"]:
-    """A signal's values at the nodes of each interval."""
-    return polynomial(signal.coefficients[..., None, :], _late(signal.knots))
+def acting_slopes_at_knots(
+    model: Model, paths: Sequence[str], segments: Segments
+) -> Float[np.ndarray, "segments knots parameters"]:
+    """Its derivatives by the parameters at some paths."""
+    effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
+    names = {e.name for e in effects}
+    segment_count, samples = segments.weight.shape
+    found = np.zeros((segment_count, samples + 1, len(paths)))
+    own = [i for i, path in enumerate(paths) if path.partition(".")[0] in names]
+    if own:
+        values = jnp.asarray(np.array([float(model.get(paths[i])) for i in own]))
+        _, slopes = actuated(effects, tuple(paths[i] for i in own), values, segments.torque)
+        width = _width(segments)
+        for i, slope in zip(own, slopes, strict=True):
+            found[..., i] = _at_knots(np.asarray(slope)[:, segments.halo :], width)
+    return found
 
 
-def _late(knots: Float[Array, "segments knots"]) -> Float[Array, "segments samples nodes"]:
-    """How late in its interval each node comes."""
-    return jnp.asarray(PART) * jnp.diff(knots)[..., None]
+def _width(segments: Segments) -> Float[np.ndarray, "segments samples"]:
+    return np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
 
 
-@jit_small
-def conditions_between(segments: Segments) -> Conditions:
-    """Time and temperature at the nodes of each interval."""
-    time = segments.torque.knots[:, segments.halo :]
-    warmth = None if segments.temperature is None else at_nodes(segments.temperature)
-    return Conditions(time[:, :-1, None] + _late(time), warmth)
-
-
-def motions(model: Model, states: Float[Array, "*many states"], conditions: Conditions) -> Motion:
+def motions(model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions) -> Motion:
     """The motion that each of many states means."""
-    return at_instants(functools.partial(_motions, model), states.shape[:-1], states, conditions)
+    return at_instants(_motion, (model, 0), (states, states.ndim - 1), (conditions, states.ndim - 1))
 
 
-@jit_small
-def _motions(model: Model, states: Float[Array, "instants states"], conditions: Conditions) -> Motion:
-    return jax.vmap(model.motion)(states, conditions)
+def _motion(model: Model, state: Array, conditions: Conditions) -> Motion:
+    return model.motion(state, conditions)
 
 
 class _UnitGeometry(MeshGeometryEffect):
@@ -150,39 +150,51 @@ class _UnitGeometry(MeshGeometryEffect):
 
 
 def unit_pushes(
-    model: Model, states: Float[Array, "*many states"], conditions: Conditions
-) -> dict[str, Float[Array, "*many states"]]:
+    model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions
+) -> dict[str, Float[np.ndarray, "*many states"]]:
     """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
     of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
     mesh, and its slope."""
-    return at_instants(functools.partial(_unit_pushes, model), states.shape[:-1], states, conditions)
-
-
-@jit_small
-def _unit_pushes(
-    model: Model, states: Float[Array, "instants states"], conditions: Conditions
-) -> dict[str, Float[Array, "instants states"]]:
     whole = isinstance(model, TwoInertiaModel)
-    forms = [f for f in LEARNED_TORQUES if whole or not f.needs_motor]
-    names = [f.name for f in forms] + ([ERROR, SLOPE] if whole else [])
-
-    def rates(strengths: Array, torque: Array, state: Array, conditions: Conditions) -> Array:
-        # Added afresh, not set by name: the model may have something learned already.
-        torques = [f(axes=(), mixing=jnp.ones((1, 1)), c=(s,)) for f, s in zip(forms, strengths, strict=False)]
-        geometry = [_UnitGeometry(e=strengths[-2], e_slope=strengths[-1])] if whole else []
-        probed = model.with_effects(*torques, *geometry)
-        return probed.rates(state, torque, jnp.zeros_like(torque), conditions)
-
-    find = jax.vmap(jax.jacfwd(rates, argnums=(0, 1)), in_axes=(None, None, 0, 0))
-    by_strength, by_input = find(jnp.zeros(len(names)), jnp.zeros(()), states, conditions)
-    return {name: by_strength[..., i] for i, name in enumerate(names)} | {INPUT: by_input}
+    names = [f.name for f in _torques(model)] + [ERROR, SLOPE] * whole + [INPUT]
+    axes = states.ndim - 1
+    found = slopes_at_instants(_rates, (np.zeros(len(names)), 0), (model, 0), (states, axes), (conditions, axes))
+    return {name: found[..., i] for i, name in enumerate(names)}
 
 
-def unit_reading(model: Model, form: type[LearnedReading]) -> Float[Array, " outputs"]:
+def _torques(model: Model) -> list[type[LearnedTorque]]:
+    return [f for f in LEARNED_TORQUES if isinstance(model, TwoInertiaModel) or not f.needs_motor]
+
+
+def _rates(strengths: Array, model: Model, state: Array, conditions: Conditions) -> Array:
+    """With a unit of each thing times its strength; the last one is the torque."""
+    # Added afresh, not set by name: the model may have something learned already.
+    forms = zip(_torques(model), strengths, strict=False)
+    torques = [form(axes=(), mixing=jnp.ones((1, 1)), c=(strength,)) for form, strength in forms]
+    whole = isinstance(model, TwoInertiaModel)
+    geometry = [_UnitGeometry(e=strengths[-3], e_slope=strengths[-2])] if whole else []
+    probed = model.with_effects(*torques, *geometry)
+    return probed.rates(state, strengths[-1], jnp.zeros_like(strengths[-1]), conditions)
+
+
+def carried(
+    followed: Followed, push: Float[np.ndarray, "segments samples nodes states"]
+) -> Float[np.ndarray, "segments samples states nodes"]:
+    """What pushes at the nodes of each interval add to the state by its end.
+
+    Each counts with its part in the straight line that has the pushes' mean and first moment: a system that is slow
+    against the interval sees the same.
+    """
+    mean, rise = 0.5 * WEIGHTS, 1.5 * WEIGHTS * NODES
+    pushed = np.swapaxes(push, -1, -2)
+    return followed.from_start @ (pushed * (mean - rise)) + followed.from_end @ (pushed * (mean + rise))
+
+
+def unit_reading(model: Model, form: type[LearnedReading]) -> Float[np.ndarray, " outputs"]:
     """What a unit of error of what an encoder reads does to the outputs."""
     bare, at_rest = replace(model, effects=()), jnp.zeros(len(model.motion_states))
     probed = bare.with_effects(form(axes=(), mixing=jnp.ones((1, 1)), c=(jnp.ones(()),)))
-    return probed.outputs(at_rest) - bare.outputs(at_rest)
+    return np.asarray(probed.outputs(at_rest) - bare.outputs(at_rest))
 
 
 def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
@@ -201,8 +213,8 @@ def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
 
 
 def _at_knots(
-    coefficients: Float[Array, "segments samples order"], width: Float[Array, "segments samples"]
-) -> Float[Array, "segments knots"]:
+    coefficients: Float[np.ndarray, "segments samples powers"], width: Float[np.ndarray, "segments samples"]
+) -> Float[np.ndarray, "segments knots"]:
     """A signal's values at the samples and at the end of the last interval; where it jumps the middle."""
     after, before = coefficients[:, :, 0], polynomial(coefficients, width)
-    return jnp.concatenate([after[:, :1], 0.5 * (before[:, :-1] + after[:, 1:]), before[:, -1:]], axis=1)
+    return np.concatenate([after[:, :1], 0.5 * (before[:, :-1] + after[:, 1:]), before[:, -1:]], axis=1)

@@ -1,7 +1,6 @@
 """What an effect does along the fitted motion, and what the data say that it does where no law is assumed."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -21,6 +20,7 @@ from hdjax.effects import (
 )
 from hdjax.effects.learned import Learned, LearnedTorque
 from hdjax.effects.learned_axes import ANGLES
+from hdjax.engine.pointwise import at_instants
 
 # Values of the variable at which the data are asked, in each direction.
 _PLACES = 14
@@ -70,7 +70,7 @@ def evidence(fit: Fit) -> tuple[Evidence, ...]:
 def _evidence(look: Look, effect: Effect) -> Evidence | None:
     assert effect.drawn_against is not None
     value = np.array(getattr(look.motion, effect.drawn_against))
-    does = np.asarray(_done(look.model, effect.name, look.motion, look.followed.states))
+    does = at_instants(_done, (look.followed.states, 2), ((effect.name, look.model), 0), (look.motion, 2))
     weight = np.asarray(look.problem.segments.weight)
     # The last knot of a segment is the first one of the next.
     kept = (np.pad(weight, ((0, 0), (0, 1))) > 0) & np.isfinite(value) & np.isfinite(does)
@@ -100,25 +100,21 @@ def _directions(effect: Effect, motion: Motion) -> np.ndarray:
     return np.where(speed >= 0, 1.0, -1.0)
 
 
-@eqx.filter_jit
-def _done(model: Model, name: str, motion: Motion, states: Array) -> Array:
-    """What the effect does at each knot: its torque, or its error."""
+def _done(state: Array, named: tuple[str, Model], motion: Motion) -> Array:
+    """What the effect of a name does at an instant: its torque, or its error."""
+    name, model = named
     effect = model.effect(name)
     names = model.state_names
-    own = [names.index(f"{name}.{s}") for s in effect.states]
-
-    def at(motion: Motion, state: Array) -> Array:
-        if isinstance(effect, MeshTorqueEffect | ShaftEffect):
-            # A model has the drive that its effects need.
-            return effect.torque(motion, model.drive, state[jnp.asarray(own, dtype=int)])  # pyright: ignore[reportArgumentType]
-        assert isinstance(model.drive, Drive) and motion.theta_m is not None and motion.theta_l is not None
-        if isinstance(effect, MeshGeometryEffect):
-            return effect.error(motion.theta_m)
-        assert isinstance(effect, SensorEffect)
-        theta_m, theta_l = effect.reading(motion.theta_m, motion.theta_l)
-        return (theta_m - motion.theta_m) / model.drive.N - (theta_l - motion.theta_l)
-
-    return jax.vmap(jax.vmap(at))(motion, states)
+    if isinstance(effect, MeshTorqueEffect | ShaftEffect):
+        own = [state[names.index(f"{name}.{s}")] for s in effect.states]
+        # A model has the drive that its effects need.
+        return effect.torque(motion, model.drive, jnp.array(own))  # pyright: ignore[reportArgumentType]
+    assert isinstance(model.drive, Drive) and motion.theta_m is not None and motion.theta_l is not None
+    if isinstance(effect, MeshGeometryEffect):
+        return effect.error(motion.theta_m)
+    assert isinstance(effect, SensorEffect)
+    theta_m, theta_l = effect.reading(motion.theta_m, motion.theta_l)
+    return (theta_m - motion.theta_m) / model.drive.N - (theta_l - motion.theta_l)
 
 
 def _told(

@@ -5,21 +5,21 @@ model answers a force is the same for all of them, so that it is computed once: 
 the deviation on, two more add what a force that runs in a straight line through the interval does.
 """
 
-from collections.abc import Sequence
-from typing import ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.polynomial.polynomial import polyval
 
+from fitting.experiment import Segments
+from fitting.machine_code import actuated, lanes_of
 from fitting.residual import Problem, Unknowns
-from hdjax import Drive, Model, PiecewisePolynomial, ReducedDrive
-from hdjax.dynamics import State
-from hdjax.effects import Conditions, Effect, Motion
+from hdjax import Model, PiecewisePolynomial
+from hdjax.effects import ActuatorEffect, Conditions
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
+from hdjax.engine.response import Pushed, Response, response
 from hdjax.lanes import jit_small_lanes
-from hdjax.signals import polynomial
 from hdjax.simulate import march
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -38,135 +38,128 @@ class Followed(eqx.Module):
         readout: derivative of the outputs by the state, at each sample.
     """
 
-    states: Float[Array, "segments knots states"]
-    between: Float[Array, "segments samples nodes states"]
-    transition: Float[Array, "segments samples states states"]
-    from_start: Float[Array, "segments samples states states"]
-    from_end: Float[Array, "segments samples states states"]
-    readout: Float[Array, "segments samples outputs states"]
+    states: Float[np.ndarray, "segments knots states"]
+    between: Float[np.ndarray, "segments samples nodes states"]
+    transition: Float[np.ndarray, "segments samples states states"]
+    from_start: Float[np.ndarray, "segments samples states states"]
+    from_end: Float[np.ndarray, "segments samples states states"]
+    readout: Float[np.ndarray, "segments samples outputs states"]
 
 
-class _Pushed(Model):
-    """A model whose rates have a straight line through the interval added; its last state is the part of the interval
-    that has passed."""
-
-    model: Model
-    width: Array
-    at_start: Float[Array, " states"]
-    at_end: Float[Array, " states"]
-    drive: Drive | ReducedDrive
-    effects: tuple[Effect, ...]
-    motion_states: ClassVar[tuple[str, ...]] = ()
-
-    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
-        return self.model.motion(state[:-1], conditions)
-
-    def component_rates(
-        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
-    ) -> list[Array]:
-        *own, passed = state
-        found = self.model.component_rates(own, torque, load_torque, conditions)
-        pushed = [
-            rate + start * (1.0 - passed) + end * passed
-            for rate, start, end in zip(found, self.at_start, self.at_end, strict=True)
-        ]
-        return [*pushed, 1.0 / self.width]
-
-    def mobility(self, moved: str, opposed: str) -> Array | float:
-        return self.model.mobility(moved, opposed)
-
-    def outputs(self, state: State) -> Array:
-        return self.model.outputs(state[:-1])
-
-
-@jit_small_lanes
 def follow(problem: Problem, unknowns: Unknowns) -> Followed:
     """Simulate the segments and linearise every sample interval along the way."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
+    kernel = problem.kernel
+    if kernel is None:
+        found = _response_by_xla(problem, unknowns)
+    else:
+        found = response(model, lanes_of(problem, unknowns, kernel), kernel.signals, problem.solver)
+    states, transition, from_start, from_end = (np.asarray(a) for a in vars(found).values())
+    readout = slopes_at_instants(_outputs, (states[:, :-1], 2), (model, 0))
+    return Followed(states, _between(model, states, problem.segments), transition, from_start, from_end, readout)
+
+
+def _outputs(state: Array, model: Model) -> Array:
+    return model.outputs(state)
+
+
+@jit_small_lanes
+def _response_by_xla(problem: Problem, unknowns: Unknowns) -> Response:
+    model = problem.free.unpack(problem.model, unknowns.parameters)
     segments = problem.segments
-    halo = segments.halo
+    options = {"solver": problem.solver, "substeps": problem.substeps, "unroll": problem.unroll}
 
     def one(torque, load_torque, temperature, state):
         acting = model.actuate(torque)
-        own = PiecewisePolynomial(acting.knots[halo:], acting.coefficients[halo:])
-        options = {"solver": problem.solver, "substeps": problem.substeps, "unroll": problem.unroll}
+        own = PiecewisePolynomial(acting.knots[segments.halo :], acting.coefficients[segments.halo :])
         states, end = march(model, own, load_torque, state, temperature=temperature, **options)
-        knots = jnp.concatenate([states, end[None]])
 
-        def through(start, at_start, at_end, begin, width, coefficients, load, warmth):
-            pushed = _Pushed(
-                model=model, width=width, at_start=at_start, at_end=at_end, drive=model.drive, effects=model.effects
-            )
+        def through(start, steady, rising, begin, width, coefficients, load, warmth):
+            pushed = Pushed.of(model, tuple(steady), tuple(rising))
             interval = jnp.stack([begin, begin + width])
             piece = PiecewisePolynomial(interval, coefficients[None])
             on_load, warm = (None if c is None else PiecewisePolynomial(interval, c[None]) for c in (load, warmth))
             initial = jnp.append(start, jnp.zeros_like(width))
             return march(pushed, piece, on_load, initial, temperature=warm, **options)[1][:-1]
 
-        none = jnp.zeros_like(state)
+        none, width = jnp.zeros_like(state), jnp.diff(own.knots)
         linear = jax.jacfwd(through, argnums=(0, 1, 2))
         load, warmth = (None if s is None else s.coefficients for s in (load_torque, temperature))
-        transition, from_start, from_end = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0, 0, 0))(
-            states, none, none, own.knots[:-1], jnp.diff(own.knots), own.coefficients, load, warmth
+        transition, steady, rising = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0, 0, 0))(
+            states, none, none, own.knots[:-1], width, own.coefficients, load, warmth
         )
-        between = _between(model, knots, own, load_torque, temperature)
-        return knots, between, transition, from_start, from_end, jax.vmap(jax.jacfwd(model.outputs))(states)
+        return Response.of(jnp.concatenate([states, end[None]]), transition, steady, rising, width)
 
-    found = jax.vmap(one)(segments.torque, segments.load_torque, segments.temperature, unknowns.states)
-    knots, between, transition, from_start, from_end, readout = found
-    return Followed(knots, between, transition, from_start, from_end, readout)
+    return jax.vmap(one)(segments.torque, segments.load_torque, segments.temperature, unknowns.states)
+
+
+def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments intervals powers"]:
+    """Coefficients of the torque that acts on a drive, or of the forcing; those before each segment come first."""
+    effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
+    if not effects:
+        return np.asarray(segments.torque.coefficients)
+    return np.asarray(actuated(effects, (), jnp.zeros(0), segments.torque)[0])
+
+
+def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray) -> np.ndarray:
+    """Values of polynomials so late in their intervals."""
+    return polyval(late, np.moveaxis(coefficients, -1, 0), tensor=False)
+
+
+def signals_at(
+    model: Model, segments: Segments, late: Float[np.ndarray, "segments samples *nodes"]
+) -> tuple[np.ndarray, np.ndarray, Conditions]:
+    """Torque, load torque and conditions so late in each sample interval."""
+    nodes = (slice(None), slice(None), *[None] * (late.ndim - 2))
+
+    def at(coefficients: Array | np.ndarray) -> np.ndarray:
+        return polynomial(np.asarray(coefficients)[(*nodes, slice(None))], late)
+
+    load, warmth = segments.load_torque, segments.temperature
+    time = np.asarray(segments.torque.knots)[:, segments.halo : -1][nodes] + late
+    conditions = Conditions(jnp.asarray(time), None if warmth is None else jnp.asarray(at(warmth.coefficients)))
+    on_load = np.zeros(late.shape) if load is None else at(load.coefficients)
+    return at(acting(model, segments)[:, segments.halo :]), on_load, conditions
+
+
+def _rates(model: Model, state: Array, torque: Array, load_torque: Array, conditions: Conditions) -> Array:
+    return model.rates(state, torque, load_torque, conditions)
 
 
 def _between(
-    model: Model,
-    knots: Float[Array, "knots states"],
-    torque: PiecewisePolynomial,
-    load_torque: PiecewisePolynomial | None,
-    temperature: PiecewisePolynomial | None,
-) -> Float[Array, "samples nodes states"]:
+    model: Model, knots: Float[np.ndarray, "segments knots states"], segments: Segments
+) -> Float[np.ndarray, "segments samples nodes states"]:
     """States inside the intervals: cubics with the right values and rates at both ends (Hermite)."""
-    width = jnp.diff(torque.knots)
+    width = np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
+    y0, y1 = knots[:, :-1], knots[:, 1:]
 
-    def rise_at(states: Array, late: Array) -> Array:
-        value = polynomial(torque.coefficients, late)
-        load = jnp.zeros_like(late) if load_torque is None else polynomial(load_torque.coefficients, late)
-        warmth = None if temperature is None else polynomial(temperature.coefficients, late)
-        return width[:, None] * jax.vmap(model.rates)(states, value, load, Conditions(torque.knots[:-1] + late, warmth))
+    def rise_at(states: np.ndarray, late: np.ndarray) -> np.ndarray:
+        around = ((a, 2) for a in (states, *signals_at(model, segments, late)))
+        return width[..., None] * at_instants(_rates, (model, 0), *around)
 
-    r0, r1 = rise_at(knots[:-1], jnp.zeros_like(width))[:, None], rise_at(knots[1:], width)[:, None]
-    y0, y1 = knots[:-1, None], knots[1:, None]
-    s = jnp.asarray(0.5 * (NODES + 1.0))[None, :, None]
+    r0, r1 = (r[:, :, None] for r in (rise_at(y0, np.zeros_like(width)), rise_at(y1, width)))
+    y0, y1 = y0[:, :, None], y1[:, :, None]
+    s = 0.5 * (NODES[:, None] + 1.0)
     rise = y1 - y0
     return y0 + s * rise + s * (1.0 - s) * ((1.0 - s) * (r0 - rise) - s * (r1 - rise))
 
 
 def respond(
     followed: Followed,
-    at_start: Float[Array, "segments samples states columns"],
-    at_end: Float[Array, "segments samples states columns"],
-) -> tuple[Float[Array, "segments samples outputs columns"], Float[Array, "segments states columns"]]:
-    """What forces along the motion do to the outputs and to each segment's end, where it starts undisturbed.
+    pushed: Float[np.ndarray, "segments samples states columns"],
+    start: Float[np.ndarray, "#segments states columns"] | float = 0.0,
+) -> tuple[Float[np.ndarray, "segments samples outputs columns"], Float[np.ndarray, "segments states columns"]]:
+    """What forces along the motion do to the outputs and to each segment's end.
 
     Args:
         followed: the motion.
-        at_start: each force at the start of each sample interval.
-        at_end: and at its end; in between it runs in a straight line.
+        pushed: what each force adds to the state by the end of each sample interval.
+        start: where each segment starts.
     """
-
-    def one(followed: Followed, at_start, at_end):
-        pushed = _times(followed.from_start, at_start) + _times(followed.from_end, at_end)
-
-        def step(deviation, inputs):
-            transition, push = inputs
-            return _times(transition, deviation) + push, deviation
-
-        undisturbed = jnp.zeros(pushed.shape[1:])
-        end, deviations = jax.lax.scan(step, undisturbed, (followed.transition, pushed))
-        return _times(followed.readout, deviations), end
-
-    return jax.vmap(one)(followed, at_start, at_end)
-
-
-def _times(matrices: Array, columns: Array) -> Array:
-    """Their product, written out: one of many tiny matrices is slow."""
-    return sum((matrices[..., :, j, None] * columns[..., None, j, :] for j in range(matrices.shape[-1])), jnp.zeros(()))
+    segments, samples, states, columns = pushed.shape
+    deviation = np.broadcast_to(start, (segments, states, columns))
+    outputs = np.empty((segments, samples, followed.readout.shape[2], columns))
+    for i in range(samples):
+        outputs[:, i] = followed.readout[:, i] @ deviation
+        deviation = followed.transition[:, i] @ deviation + pushed[:, i]
+    return outputs, deviation

@@ -8,8 +8,6 @@ from collections.abc import Iterable, Sequence
 from itertools import combinations
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -50,6 +48,7 @@ from hdjax.effects.learned_axes import (
     SignAxis,
     axes_over,
 )
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
 
 # Parts that training data are left out in, in turn.
 _FOLDS = 4
@@ -124,7 +123,7 @@ class LearnedLook(eqx.Module):
         names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
         return Acting(tuple(self.look.pushes[name] for name in names))
 
-    def torque_push(self, place: type[LearnedTorque] | None) -> Float[Array, "segments knots states"]:
+    def torque_push(self, place: type[LearnedTorque] | None) -> Float[np.ndarray, "segments knots states"]:
         """What a unit of torque does at a place; in the mesh where it is none."""
         return self.look.pushes[(place or LearnedMeshTorque).name]
 
@@ -186,7 +185,7 @@ def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
 def own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
     """The free parameters as torques at the place of a form; none of them is an error of an angle."""
     if issubclass(form, LearnedTorque):
-        return np.asarray(parameter_torques(seen.look, seen.torque_push(place_of(form))))
+        return parameter_torques(seen.look, seen.torque_push(place_of(form)))
     return np.zeros((*seen.weight.shape, len(seen.look.problem.free.paths)))
 
 
@@ -196,7 +195,7 @@ def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.n
     if not issubclass(form, LearnedMeshError):
         return (raw,)
     (axis,) = axes
-    return raw, np.asarray(_all_slopes(axis, jnp.asarray(values[axis.variable])))
+    return raw, _slopes_evaluated(axis, values[axis.variable])
 
 
 def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -218,17 +217,19 @@ def _ranges(seen: LearnedLook, variables: tuple[str, ...]) -> dict[str, tuple[fl
 
 
 def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
-    return np.asarray(_all_functions(axis, jnp.asarray(values)))
+    return at_instants(_functions_along, (values, values.ndim), (axis, 0))
 
 
-@eqx.filter_jit
-def _all_slopes(axis: Axis, values: Array) -> Array:
-    return jax.vmap(jax.vmap(jax.jacfwd(axis.functions)))(values)
+def _slopes_evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
+    return slopes_at_instants(_functions_of_one, (values[..., None], values.ndim), (axis, 0))[..., 0]
 
 
-@eqx.filter_jit
-def _all_functions(axis: Axis, values: Array) -> Array:
-    return jax.vmap(jax.vmap(axis.functions))(values)
+def _functions_along(value: Array, axis: Axis) -> Array:
+    return axis.functions(value)
+
+
+def _functions_of_one(value: Array, axis: Axis) -> Array:
+    return axis.functions(value[0])
 
 
 def _simplest(
@@ -282,10 +283,7 @@ def _candidate(
     mixing = _smooth_first(flat, known, roughness)[:, : max(sizes)]
     if mixing.shape[1] == 0:
         return None
-    # One width, one program.
-    width = ((0, 0), (0, 0), (0, max(sizes) - mixing.shape[1]))
-    padded = tuple(np.pad(part @ mixing, width) for part in raw)
-    found = products(seen.look, seen.acting(form), padded).in_parts(_FOLDS)
+    found = products(seen.look, seen.acting(form), tuple(part @ mixing for part in raw)).in_parts(_FOLDS)
     found = _instead_of_own(found, seen.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
     base = _left_out(found, parameters)

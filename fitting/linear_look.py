@@ -4,27 +4,26 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.along import acting_at_knots, conditions_at_knots, motions, unit_pushes
+from fitting.along import acting_at_knots, acting_slopes_at_knots, conditions_at_knots, motions, unit_pushes
 from fitting.engines import linearise
 from fitting.estimate import Fit
-from fitting.explained import explained, solved, without_untold
+from fitting.explained import Answers, solved, without_untold
 from fitting.followed import Followed, follow
-from fitting.residual import Blocks, Problem
+from fitting.residual import Problem
 from fitting.sight import where_it_goes
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
-from hdjax.where import where
+from hdjax.engine.pointwise import slopes_at_instants
 
 # Passes of "least squares, then weigh the outputs by what is left over".
 _REWEIGHTINGS = 2
 
 
-Sizes = tuple[Float[Array | np.ndarray, "segments knots forces"], ...]
+Sizes = tuple[Float[np.ndarray, "segments knots forces"], ...]
 """How much of each thing there is."""
 
 
@@ -33,8 +32,8 @@ class Look(eqx.Module):
 
     Attributes:
         problem: what was solved, at the solution.
-        blocks: its residual and derivatives.
-        followed: the motion and its answer to small forces.
+        followed: the motion.
+        answers: of the residual to what acts along it.
         motion: at each knot.
         conditions: likewise.
         pushes: what a unit of each thing that effects can add does there to the state's rates, by its name.
@@ -42,12 +41,12 @@ class Look(eqx.Module):
     """
 
     problem: Problem
-    blocks: Blocks
     followed: Followed
+    answers: Answers
     motion: Motion
     conditions: Conditions
-    pushes: dict[str, Float[Array, "segments knots states"]]
-    error: Float[Array, "segments samples outputs"]
+    pushes: dict[str, Float[np.ndarray, "segments knots states"]]
+    error: Float[np.ndarray, "segments samples outputs"]
 
     @property
     def model(self) -> Model:
@@ -63,8 +62,8 @@ class Acting(eqx.Module):
         reading: to the outputs, in place of that, where it is no force but an error of what an encoder reads.
     """
 
-    pushes: tuple[Float[Array, "segments knots states"], ...] = ()
-    reading: Float[Array, " outputs"] | None = None
+    pushes: tuple[Float[np.ndarray, "segments knots states"], ...] = ()
+    reading: Float[np.ndarray, " outputs"] | None = None
 
 
 class Products(eqx.Module):
@@ -113,51 +112,55 @@ def look_along(fit: Fit) -> Look:
     """Linearise a fit along its motion."""
     problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
     kept, followed = where_it_goes(fit, follow(problem, fit.unknowns))
-    error = jnp.asarray(fit.error)
+    error = np.where(kept[:, None, None], np.asarray(fit.error), 0.0)
     if not kept.all():
-        weight = where(kept[:, None], problem.segments.weight, 0.0)
+        weight = jnp.asarray(np.where(kept[:, None], np.asarray(problem.segments.weight), 0.0))
         problem = eqx.tree_at(lambda p: p.segments.weight, problem, weight)
-        error = where(kept[:, None, None], error, 0.0)
     conditions = conditions_at_knots(problem.segments)
     if isinstance(fit.model, TwoInertiaModel):
-        conditions = replace(conditions, T_m=acting_at_knots(fit.model, problem.segments))
+        conditions = replace(conditions, T_m=jnp.asarray(acting_at_knots(fit.model, problem.segments)))
+    found = without_untold(linearise(problem, fit.unknowns), problem.free)
+    whitening = np.asarray(fit.problem.whitening)
     return Look(
         problem,
-        without_untold(linearise(problem, fit.unknowns), problem.free),
         followed,
+        Answers.of(found, followed, problem.segments, whitening),
         motions(fit.model, followed.states, conditions),
         conditions,
         unit_pushes(fit.model, followed.states, conditions),
-        error @ fit.problem.whitening.T,
+        error @ whitening.T,
     )
 
 
 def parameter_torques(
-    look: Look, push: Float[Array, "segments knots states"]
-) -> Float[Array, "segments knots parameters"]:
+    look: Look, push: Float[np.ndarray, "segments knots states"]
+) -> Float[np.ndarray, "segments knots parameters"]:
     """The free parameters as torques at one place: what torque there a unit of each stands for, at each knot.
 
     Zero for a parameter that acts at another place.
     """
-    return _parameter_torques(look.problem, look.followed.states, look.conditions, push)
+    free, model, segments = look.problem.free, look.model, look.problem.segments
+    values = np.array([float(model.get(path)) for path in free.paths])
+    torque = acting_at_knots(model, segments)
+    both = np.concatenate([np.broadcast_to(values, (*torque.shape, values.size)), torque[..., None]], axis=-1)
+    around = (look.followed.states, 2), (look.conditions, 2)
+    slopes = slopes_at_instants(_rates_at, (both, 2), ((free.paths, model), 0), *around)
+    by_torque = acting_slopes_at_knots(model, free.paths, segments)
+    found = slopes[..., :-1] + slopes[..., -1:] * by_torque[:, :, None, :]
+    found = found * np.asarray(free.slopes(model))
+    square = np.sum(push**2, axis=-1)[..., None]
+    with np.errstate(all="ignore"):
+        torques = np.einsum("skq,skqp->skp", push, found) / square
+        elsewhere = np.sum((found - push[..., None] * torques[:, :, None, :]) ** 2, axis=(0, 1, 2))
+    there = elsewhere < 1e-12 * np.sum(found**2, axis=(0, 1, 2))
+    return np.where(there, torques, 0.0)
 
 
-@eqx.filter_jit
-def _parameter_torques(problem: Problem, states: Array, conditions: Conditions, push: Array) -> Array:
-    zero = jnp.zeros(())
-    vector = problem.free.pack(problem.model)
-
-    def rates(vector: Array) -> Array:
-        model = problem.free.unpack(problem.model, vector)
-        acting = acting_at_knots(model, problem.segments)
-        return jax.vmap(jax.vmap(lambda s, T, c: model.rates(s, T, zero, c)))(states, acting, conditions)
-
-    found = jax.jacfwd(rates)(vector)
-    square = jnp.sum(push**2, axis=-1)[..., None]
-    torque = jnp.einsum("skq,skqp->skp", push, found) / square
-    elsewhere = jnp.sum((found - push[..., None] * torque[:, :, None, :]) ** 2, axis=(0, 1, 2))
-    there = elsewhere < 1e-12 * jnp.sum(found**2, axis=(0, 1, 2))
-    return where(there, torque, 0.0)
+def _rates_at(both: Array, posed: tuple[tuple[str, ...], Model], state: Array, conditions: Conditions) -> Array:
+    """The state's rates with some values of the parameters at the paths, and a torque."""
+    paths, model = posed
+    moved = model.replace(dict(zip(paths, both[:-1], strict=True))) if paths else model
+    return moved.rates(state, both[-1], jnp.zeros_like(both[-1]), conditions)
 
 
 def products(look: Look, acting: Acting, sizes: Sizes) -> Products:
@@ -169,29 +172,27 @@ def products(look: Look, acting: Acting, sizes: Sizes) -> Products:
             a reading is.
         sizes: how much of each, at each knot; in a straight line between.
     """
-    found = _products(look, acting, tuple(jnp.asarray(a) for a in sizes))
-    return Products(*(np.asarray(a) for a in found))
-
-
-@eqx.filter_jit
-def _products(look: Look, acting: Acting, sizes: Sizes) -> tuple[Array, Array, Array, Array]:
     columns = _columns(look, acting, sizes)
-    error = look.error
-    gram = jnp.einsum("snip,snjq->sijpq", columns, columns)
-    gradient = jnp.einsum("snip,snj->sijp", columns, error)
-    return gram, gradient, jnp.einsum("sni,snj->sij", error, error), jnp.sum(look.problem.segments.weight, axis=1)
+    segments, samples, outputs, count = columns.shape
+    flat = columns.reshape(segments, samples, -1)
+    transposed = np.swapaxes(flat, 1, 2)
+    gram = (transposed @ flat).reshape(segments, outputs, count, outputs, count)
+    gradient = np.swapaxes((transposed @ look.error).reshape(segments, outputs, count, outputs), 2, 3)
+    square = np.swapaxes(look.error, 1, 2) @ look.error
+    return Products(np.swapaxes(gram, 2, 3), gradient, square, np.sum(look.answers.weight, axis=1))
 
 
-def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[Array, "segments samples outputs columns"]:
+def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[np.ndarray, "segments samples outputs columns"]:
     """The whitened outputs' derivative by the free parameters and by each force."""
-    size, reading = sizes[0], jnp.zeros(())
-    forces = jnp.zeros((*size.shape[:2], look.followed.states.shape[-1], size.shape[-1]))
+    followed = look.followed
+    reading: np.ndarray | float = 0.0
+    pushed = np.zeros((*followed.transition.shape[:3], sizes[0].shape[-1]))
     if acting.reading is not None:
-        reading = acting.reading[None, None, :, None] * size[:, :-1, None, :]
+        reading = acting.reading[:, None] * sizes[0][:, :-1, None, :]
     for push, size in zip(acting.pushes, sizes, strict=acting.reading is None):
-        forces = forces + push[..., None] * size[:, :, None, :]
-    segments, whitening = look.problem.segments, look.problem.whitening
-    return explained(look.blocks, look.followed, segments, whitening, forces[:, :-1], forces[:, 1:], reading)
+        starts, ends = followed.from_start @ push[:, :-1, :, None], followed.from_end @ push[:, 1:, :, None]
+        pushed += starts * size[:, :-1, None, :] + ends * size[:, 1:, None, :]
+    return np.concatenate([look.answers.parameters, look.answers.to(pushed, reading)], axis=-1)
 
 
 def surrogate_gains(
@@ -209,7 +210,7 @@ def surrogate_gains(
         surrogates: residuals of the same colour with random phases, by draw, segment and row.
     """
     (gram, gradient), (unseen_gram, unseen_gradient) = (
-        [np.asarray(a) for a in _against(look, unit, tuple(jnp.asarray(one) for one in size), jnp.asarray(drawn))]
+        _against(look, unit, size, drawn)
         for look, unit, size, drawn in zip(looks, acting, sizes, surrogates, strict=True)
     )
     known = len(looks[0].problem.free.paths)
@@ -218,15 +219,14 @@ def surrogate_gains(
         step = np.zeros_like(gradient)
         step[:columns] = solved(gram[:columns, :columns], gradient[:columns])
         loss.append(-2 * np.sum(step * unseen_gradient, axis=0) + np.sum(step * (unseen_gram @ step), axis=0))
-    rows = float(jnp.sum(looks[1].problem.segments.weight)) * looks[1].error.shape[2]
+    rows = float(np.sum(looks[1].answers.weight)) * looks[1].error.shape[2]
     return (loss[0] - loss[1]) / (2 * rows)
 
 
-@eqx.filter_jit
-def _against(look: Look, acting: Acting, sizes: Sizes, surrogates: Array) -> tuple[Array, Array]:
+def _against(look: Look, acting: Acting, sizes: Sizes, surrogates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     columns = _columns(look, acting, sizes)
-    rows = columns.reshape(columns.shape[0], -1, columns.shape[-1])
-    return jnp.einsum("srp,srq->pq", rows, rows), jnp.einsum("srp,dsr->pd", rows, surrogates)
+    rows = columns.reshape(-1, columns.shape[-1])
+    return rows.T @ rows, rows.T @ surrogates.reshape(len(surrogates), -1).T
 
 
 def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:

@@ -71,7 +71,7 @@ def _signals(problem: Problem, model: Model, kernel: Kernel) -> tuple[Array, ...
     if actuators:
         paths = tuple(kernel.paths[i] for i in kernel.acting)
         values = jnp.stack([as_scalar(model.get(p)) for p in paths]) if paths else jnp.zeros(0)
-        torque, slopes = _acting(actuators, paths, values, segments.torque)
+        torque, slopes = actuated(actuators, paths, values, segments.torque)
     beside = {"load torque": segments.load_torque, "temperature": segments.temperature}
     found = [beside[name] for name in kernel.signals]
     return torque, *(s.coefficients for s in found if s is not None), *slopes
@@ -84,7 +84,7 @@ class _Actuators(eqx.Module):
 
 
 @eqx.filter_jit
-def _acting(
+def actuated(
     actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
 ) -> tuple[Array, tuple[Array, ...]]:
     """The torque that acts, and its derivatives by the parameters at the paths."""

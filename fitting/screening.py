@@ -10,17 +10,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from fitting.estimate import Fit
-from fitting.experiment import Segments, scales
-from fitting.explained import explained, solved
-from fitting.followed import Followed
+from fitting.experiment import scales
+from fitting.explained import solved
 from fitting.free import strength_paths
 from fitting.regressors import Regressors
-from fitting.residual import Blocks
 from fitting.sight import Sight, batches, follow_on, sight
 from fitting.spectral_lines import spectral_lines
 from fitting.surrogates import DRAWS
@@ -85,23 +82,23 @@ def screen(
     leads: dict[str, Lead] = {}
     null_gains = np.full(DRAWS, -np.inf)
     sights = sight(training, seed), sight(held_out, seed + 1)
+    known = len(free_now)
     for batch in batches(sights, proposals, follow_on(training, held_out)):
-        fitted, unseen = (_score(*pair) for pair in zip(sights, batch.forces, strict=True))
-        for index, own in batch.columns.items():
-            columns = [len(free_now) + c for c in own]
-            effect = proposals[index]
+        scores = [_score(*pair) for pair in zip(sights, batch.forces, strict=True)]
+        for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
+            fitted, unseen = (score.columns([*range(known), *(known + c for c in own)]) for score in scores)
+            columns = list(range(known, known + len(own)))
             paths = strength_paths(effect)
             info = model.with_effects(effect).parameters()
             positive = [c for c, p in zip(columns, paths, strict=True) if info[p][1].positive]
-            nuisance = list(range(len(free_now)))
-            step, gain = _linear_gain(fitted, unseen, nuisance, columns, positive)
-            null_gains = np.maximum(null_gains, _null_gains(fitted, unseen, nuisance, columns))
+            step, gain = _linear_gain(fitted, unseen, known, positive)
+            null_gains = np.maximum(null_gains, _null_gains(fitted, unseen, known))
             if effect.name in leads and leads[effect.name].gain >= gain:
                 continue
             strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
             filled = model.with_effects(effect).replace(strengths).effect(effect.name)
             changes = {p: step[i] for i, p in enumerate(free_now)}
-            leads[effect.name] = Lead(filled, changes, gain, batch.own_states[index])
+            leads[effect.name] = Lead(filled, changes, gain, states)
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), null_gains)
 
@@ -127,62 +124,46 @@ class _Score(eqx.Module):
     surrogate_gradients: np.ndarray
     rows: float
 
+    def columns(self, which: list[int]) -> "_Score":
+        """Those of some columns alone."""
+        own = self.gram[np.ix_(which, which)], self.gradient[which], self.surrogate_gradients[which]
+        return _Score(*own, self.rows)
+
 
 def _score(sight: Sight, forces: Regressors) -> _Score:
-    seen = sight.seen
+    answers = sight.answers
     # Where the model runs away in every segment, nothing is told.
-    rows = max(float(np.sum(seen.segments.weight)) * sight.residual.shape[-1], 1.0)
-    products = _inner_products(
-        sight.found, seen.followed, seen.segments, sight.whitening, forces, sight.residual, sight.surrogates
-    )
-    gram, gradient, against = (np.asarray(a) for a in products)
-    return _Score(gram, gradient, against, rows)
+    rows = max(float(np.sum(answers.weight)) * sight.residual.shape[-1], 1.0)
+    explained = np.concatenate([answers.parameters, answers.to(forces.pushed, forces.reading)], axis=-1)
+    flat = explained.reshape(-1, explained.shape[-1])
+    against = flat.T @ sight.surrogates.reshape(len(sight.surrogates), -1).T
+    return _Score(flat.T @ flat, flat.T @ sight.residual.reshape(-1), against, rows)
 
 
-@eqx.filter_jit
-def _inner_products(
-    found: Blocks,
-    followed: Followed,
-    segments: Segments,
-    whitening: Float[Array, "outputs outputs"],
-    forces: Regressors,
-    residual: Float[Array, "segments samples outputs"],
-    surrogates: Float[Array, "draws segments rows"],
-) -> tuple[Float[Array, "columns columns"], Float[Array, " columns"], Float[Array, "columns draws"]]:
-    columns = (jnp.asarray(a) for a in (forces.at_start, forces.at_end, forces.reading))
-    explains = explained(found, followed, segments, whitening, *columns)
-    flat = explains.reshape(-1, explains.shape[-1])
-    return (
-        flat.T @ flat,
-        flat.T @ residual.reshape(-1),
-        flat.T @ surrogates.reshape(surrogates.shape[0], -1).T,
-    )
-
-
-def _linear_gain(
-    fitted: _Score, unseen: _Score, nuisance: list[int], own: list[int], positive: list[int]
-) -> tuple[dict[int, float], float]:
-    """Least-squares step of the columns, and what it gains on unseen data beyond refitting what was free already.
+def _linear_gain(fitted: _Score, unseen: _Score, known: int, positive: list[int]) -> tuple[dict[int, float], float]:
+    """Least-squares step of the columns, and what it gains on unseen data beyond refitting those that were free
+    already, the first ones.
 
     A strength that can't be negative is left at zero where it would be.
     """
-    kept = list(own)
+    kept = list(range(known, len(fitted.gram)))
     while True:
-        chosen = nuisance + kept
+        chosen = [*range(known), *kept]
         step = _solve(fitted.gram, fitted.gradient[:, None], chosen)[:, 0]
         wrong = [i for i in kept if i in positive and step[i] < 0]
         if not wrong:
             break
         kept = [i for i in kept if i not in wrong]
-    reference = _solve(fitted.gram, fitted.gradient[:, None], nuisance)[:, 0]
+    reference = _solve(fitted.gram, fitted.gradient[:, None], list(range(known)))[:, 0]
     gain = _loss(unseen, reference[:, None]) - _loss(unseen, step[:, None])
     return dict(enumerate(step.tolist())), float(gain[0] / (2 * unseen.rows))
 
 
-def _null_gains(fitted: _Score, unseen: _Score, nuisance: list[int], own: list[int]) -> np.ndarray:
+def _null_gains(fitted: _Score, unseen: _Score, known: int) -> np.ndarray:
     """[`_linear_gain`][] of each surrogate."""
-    reference = _solve(fitted.gram, fitted.surrogate_gradients, nuisance)
-    step = _solve(fitted.gram, fitted.surrogate_gradients, nuisance + own)
+    reference, step = (
+        _solve(fitted.gram, fitted.surrogate_gradients, list(range(count))) for count in (known, len(fitted.gram))
+    )
     before = _loss(unseen, reference, unseen.surrogate_gradients)
     after = _loss(unseen, step, unseen.surrogate_gradients)
     return (before - after) / (2 * unseen.rows)

@@ -11,20 +11,19 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import kolmogorov
 
 from fitting.estimate import Fit
-from fitting.followed import Followed, follow
+from fitting.explained import through_segments
+from fitting.followed import Followed, follow, respond
 from fitting.residual import Problem
 from fitting.sandwich import Linearised, Record
 from hdjax import Model
-from hdjax.compilation import jit_small
 from hdjax.effects import Conditions
-from hdjax.where import where
+from hdjax.engine.pointwise import slopes_at_instants
 
 # Draws of torque noise whose mean periodogram stands for its expectation.
 _DRAWS = 16
@@ -49,16 +48,16 @@ def torque_noise_covariance(
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
     followed = follow(problem, fit.unknowns)
     random = np.random.default_rng(0)
-    noise = jnp.asarray(random.normal(size=(*problem.segments.weight.shape, _DRAWS)))
-    answers = np.asarray(_answers(problem, followed, noise))
+    noise = random.normal(size=(*problem.segments.weight.shape, _DRAWS))
+    answers = _answers(problem, followed, noise)
     records = regression.records
     in_time = _in_time(records, answers)
     variances = _variances(records, in_time, inverse)
     if variances is None:
         return None
     *encoders, torque = variances
-    slopes = jnp.asarray(_by_segment(records, problem))
-    middle = torque * np.asarray(_torque_scores(problem, followed, slopes))
+    slopes = _by_segment(records, problem)
+    middle = torque * _torque_scores(problem, followed, slopes)
     # Noise of the motor's encoder is in both outputs.
     together = _covariance([r.residual[..., None] for r in records]) - torque * _covariance(in_time)
     together[np.diag_indices(len(encoders))] = encoders
@@ -186,56 +185,60 @@ def _power(series: np.ndarray) -> np.ndarray:
     return np.abs(np.fft.rfft(series, axis=0)) ** 2 / series.shape[0]
 
 
-def _pushes(model: Model, followed: Followed) -> Float[Array, "segments samples states"]:
+def _pushes(model: Model, followed: Followed) -> Float[np.ndarray, "segments samples states"]:
     """What a unit of torque through a sample interval adds to the state at its end."""
-    zero = jnp.zeros(())
-    # The same at any time and temperature.
-    conditions = Conditions(time=zero, temperature=zero)
-    rate = jax.jacfwd(lambda torque: model.rates(model.rest(), torque, zero, conditions))(zero)
+    torque, rest = np.zeros(1), np.asarray(model.rest())
+    rate = slopes_at_instants(_rates, (torque, 0), (model, 0), (rest, 0))[:, 0]
     return (followed.from_start + followed.from_end) @ rate
 
 
-@jit_small
-def _answers(problem: Problem, followed: Followed, noise: Array) -> Float[Array, "segments samples outputs draws"]:
-    """Whitened residual that torque noise leaves, segment after segment; it does not stop where one starts anew."""
-    pushes = _pushes(problem.model, followed)
-
-    def step(deviation, inputs):
-        transition, push, drawn = inputs
-        return transition @ deviation + push[:, None] * drawn[None, :], deviation
-
-    def segment(deviation, inputs):
-        joined, *rest = inputs
-        return jax.lax.scan(step, where(joined, deviation, jnp.zeros_like(deviation)), tuple(rest))
-
-    states = jnp.zeros((followed.states.shape[-1], noise.shape[-1]))
-    _, deviations = jax.lax.scan(segment, states, (problem.segments.joined, followed.transition, pushes, noise))
-    outputs = followed.readout @ deviations * problem.segments.weight[:, :, None, None]
-    return -jnp.einsum("ij,snjd->snid", problem.whitening, outputs)
+def _rates(torque: Array, model: Model, state: Array) -> Array:
+    # The same at any time and temperature.
+    zero = jnp.zeros_like(torque[0])
+    return model.rates(state, torque[0], zero, Conditions(time=zero, temperature=zero))
 
 
-@jit_small
+def _answers(
+    problem: Problem, followed: Followed, noise: Float[np.ndarray, "segments samples draws"]
+) -> Float[np.ndarray, "segments samples outputs draws"]:
+    """Whitened residual that torque noise leaves; it does not stop where a segment goes on where another one ends."""
+    pushed = _pushes(problem.model, followed)[..., None] * noise[:, :, None, :]
+    joined = np.asarray(problem.segments.joined)
+    before = np.roll(respond(followed, pushed)[1], 1, axis=0), np.roll(_across(followed), 1, axis=0)
+    own, across = (np.where(joined[:, None, None], a, 0.0) for a in before)
+    outputs, _ = respond(followed, pushed, through_segments(joined, across, own))
+    return -(np.asarray(problem.whitening) @ outputs) * np.asarray(problem.segments.weight)[:, :, None, None]
+
+
+def _across(followed: Followed) -> Float[np.ndarray, "segments states states"]:
+    """What a deviation of the state at each segment's start is at its end."""
+    states = followed.states.shape[-1]
+    found = np.broadcast_to(np.eye(states), (len(followed.states), states, states))
+    for transition in np.swapaxes(followed.transition, 0, 1):
+        found = transition @ found
+    return found
+
+
 def _torque_scores(
-    problem: Problem, followed: Followed, slopes: Float[Array, "segments samples outputs parameters"]
-) -> Float[Array, "parameters parameters"]:
+    problem: Problem, followed: Followed, slopes: Float[np.ndarray, "segments samples outputs parameters"]
+) -> Float[np.ndarray, "parameters parameters"]:
     """Covariance of J^T r for torque noise of unit variance, by the adjoint of the linear response."""
     pushes = _pushes(problem.model, followed)
-    read = -jnp.einsum("ij,snjk,snip->snkp", problem.whitening, followed.readout, slopes)
-    read = read * problem.segments.weight[:, :, None, None]
+    white = np.asarray(problem.whitening) @ followed.readout
+    read = -np.swapaxes(white, 2, 3) @ slopes * np.asarray(problem.segments.weight)[:, :, None, None]
 
-    def step(costate, inputs):
-        transition, push, seen = inputs
-        score = push @ costate
-        return seen + transition.T @ costate, score
+    def back(costate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Costates where segments start, from those where they end, and scores."""
+        scores = np.zeros((*read.shape[:2], read.shape[-1]))
+        for i in reversed(range(read.shape[1])):
+            scores[:, i] = (pushes[:, i, None, :] @ costate)[:, 0]
+            costate = read[:, i] + np.swapaxes(followed.transition[:, i], 1, 2) @ costate
+        return costate, scores
 
-    def segment(carry, inputs):
-        costate, goes_on = carry
-        joined, *rest = inputs
-        first = where(goes_on, costate, jnp.zeros_like(costate))
-        before, scores = jax.lax.scan(step, first, tuple(rest), reverse=True)
-        return (before, joined), scores
-
-    nothing = (jnp.zeros((followed.states.shape[-1], slopes.shape[-1])), jnp.zeros((), dtype=bool))
-    segments = (problem.segments.joined, followed.transition, pushes, read)
-    _, scores = jax.lax.scan(segment, nothing, segments, reverse=True)
-    return jnp.einsum("snp,snq->pq", scores, scores)
+    own, _ = back(np.zeros((len(read), *read.shape[2:])))
+    goes_on = np.append(np.asarray(problem.segments.joined)[1:], False)
+    across = np.swapaxes(_across(followed), 1, 2)
+    starts = through_segments(goes_on[::-1], across[::-1], own[::-1])[::-1]
+    _, scores = back(np.where(goes_on[:, None, None], np.roll(starts, -1, axis=0), 0.0))
+    flat = scores.reshape(-1, scores.shape[-1])
+    return flat.T @ flat

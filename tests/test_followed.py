@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -73,9 +72,9 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     both = [eqx.tree_at(lambda e: getattr(e, name), effect, jnp.asarray(start + sign * size)) for sign in (0.0, 1.0)]
     slope = (simulated(found, both[1]) - simulated(found, both[0])) / size
     seen = along(found.model, followed, found.problem.segments, found.stretches)
-    forces, _ = jax.tree.map(jnp.asarray, regressors(seen, [effect]))
+    forces, _ = regressors(seen, [effect])
     column = [p.split(".")[1] for p in strength_paths(effect)].index(name)
-    outputs, _ = respond(followed, forces.at_start, forces.at_end)
+    outputs, _ = respond(followed, forces.pushed)
     answer = np.asarray(outputs + forces.reading)[..., column]
     real = np.asarray(found.problem.segments.weight)[:, :, None] > 0
     off = np.where(real, answer - slope, 0.0)

@@ -55,7 +55,8 @@ class Backlash(MeshTorqueEffect):
 
     def torque(self, motion: Motion, drive: Drive | ReducedDrive, state: Array) -> Array:
         x = motion.x
-        engaged = x - jnp.clip(x, -self.b, self.b)
+        # Not `x - clip(x, -b, b)`: where b is zero, that has no derivative by b on either side of the middle.
+        engaged = jnp.sign(x) * jnp.maximum(jnp.abs(x) - self.b, 0.0)
         return drive.stiffness * (restoring(engaged, drive.alpha) - restoring(x, drive.alpha))
 
 

@@ -1,0 +1,152 @@
+"""How a motion answers small forces: what each sample interval makes of a deviation, and of a force through it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdjax.drive import Drive, ReducedDrive
+from hdjax.dynamics import Model, State
+from hdjax.effects import Conditions, Effect, Motion
+from hdjax.engine.equations import LOAD, TEMPERATURE, split_model
+from hdjax.engine.kernel import Lanes, Marched, Mode, kernel, march_arrays
+
+
+class Pushed(Model):
+    """A model with a straight line in time added to its rates; its last state is the time since that began."""
+
+    model: Model
+    steady: tuple[Array, ...]
+    rising: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, model: Model, steady: tuple[Array, ...], rising: tuple[Array, ...]) -> "Pushed":
+        """A model with rates of its states added: constant ones, and such that rise with time."""
+        # What a model must have are properties here, no fields.
+        return cls(model=model, steady=steady, rising=rising)  # pyright: ignore[reportCallIssue]
+
+    # All of its states, as far as anyone asks: no prior is wanted of any.
+    @property
+    def motion_states(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.state_names
+
+    @property
+    def drive(self) -> Drive | ReducedDrive:
+        return self.model.drive
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        return self.model.effects
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return (*self.model.state_names, "passed")
+
+    @property
+    def forces(self) -> tuple[str, ...]:
+        """The paths of the line's numbers."""
+        return tuple(f"{kind}.{i}" for kind in ("steady", "rising") for i in range(len(self.steady)))
+
+    def _at(self, path: str) -> Any:
+        kind, index = path.split(".")
+        return getattr(self, kind)[int(index)]
+
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
+        return self.model.motion(state[:-1], conditions)
+
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
+        *own, passed = state
+        found = self.model.component_rates(own, torque, load_torque, conditions)
+        pushes = zip(found, self.steady, self.rising, strict=True)
+        return [*(rate + steady + rising * passed for rate, steady, rising in pushes), jnp.ones_like(passed)]
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        return self.model.mobility(moved, opposed)
+
+    def outputs(self, state: State) -> Array:
+        return state[:-1]
+
+
+class Response(eqx.Module):
+    """A simulated motion, and its linear response in every sample interval.
+
+    Attributes:
+        states: at each knot, the end of the last interval included; no number where they are lost.
+        transition: what a deviation of the state at an interval's start is at its end.
+        from_start: what a force (a rate of the state) that falls from one to zero through the interval adds.
+        from_end: likewise of one that rises from zero to one.
+    """
+
+    states: Float[Array | np.ndarray, "*segments knots states"]
+    transition: Float[Array | np.ndarray, "*segments samples states states"]
+    from_start: Float[Array | np.ndarray, "*segments samples states states"]
+    from_end: Float[Array | np.ndarray, "*segments samples states states"]
+
+    @classmethod
+    def of(cls, states: Any, transition: Any, steady: Any, rising: Any, width: Any) -> "Response":
+        """From what a steady force adds, and one that is the time since the interval's start."""
+        from_end = rising / width[..., None, None]
+        return cls(states, transition, steady - from_end, from_end)
+
+
+def response(model: Model, lanes: Lanes, signals: Sequence[str], solver: dfx.AbstractERK) -> Response:
+    """Simulate segments and linearise every sample interval along the way.
+
+    Args:
+        model: the equations.
+        lanes: the data; of its numbers those of the model, the parameters and the measurements don't matter.
+        signals: what comes in along time beside the torque.
+        solver: explicit Runge-Kutta solver of diffrax.
+    """
+    # What stands on llvmlite is loaded where it is there.
+    from hdjax.engine.march import LOST
+
+    segments, samples = np.shape(lanes.weight)
+    count = np.shape(lanes.states)[1]
+    zeros = (jnp.asarray(np.zeros(())),) * count
+    pushed = Pushed.of(model, zeros, zeros)
+    around = {"loaded": LOAD in signals, "warm": TEMPERATURE in signals}
+    made = kernel(pushed, pushed.forces, **around, solver=solver, values=True)
+    _, others, _ = split_model(pushed, pushed.forces)
+    halo = np.shape(lanes.knots)[1] - samples - 1
+    knots = np.asarray(lanes.knots)[:, halo:]
+    found = [np.asarray(s) for s in lanes.signals[: 1 + len(signals)]]
+    found = [s[:, s.shape[1] - samples :] for s in found]
+    settings = np.array(lanes.settings)
+    settings[1], settings[3] = 1, 0
+
+    def marched(states: np.ndarray, knots: np.ndarray, signals: list[np.ndarray], mode: Mode) -> Marched:
+        many, length = knots.shape[0], knots.shape[1] - 1
+        data = Lanes(
+            free=np.zeros(2 * count),
+            slopes=np.ones(2 * count),
+            constants=np.concatenate([np.zeros(0), *(np.ravel(np.asarray(a)) for a in others)]),
+            states=np.pad(states, ((0, 0), (0, 1))),
+            knots=knots,
+            measured=np.zeros((many, length, count)),
+            weight=np.ones((many, length)),
+            joined=np.zeros(many),
+            whitening=-np.eye(count),
+            settings=settings,
+            signals=tuple(signals),
+        )
+        assert made.values is not None
+        return march_arrays(made.jacobian if mode == "jacobian" else made.values, data, made.hidden, mode)
+
+    values = marched(np.asarray(lanes.states), knots, found, "values")
+    states = np.concatenate([values.rows.reshape(segments, samples, count), values.end[:, None, :-1]], axis=1)
+    states = np.where(np.abs(states) < LOST, states, np.nan)
+    pairs = np.stack([knots[:, :-1], knots[:, 1:]], axis=-1).reshape(-1, 2)
+    pieces = [s.reshape(-1, 1, s.shape[-1]) for s in found]
+    slopes = marched(states[:, :-1].reshape(-1, count), pairs, pieces, "jacobian")
+    shape = (segments, samples, count, count)
+    assert slopes.end_by_state is not None and slopes.end_by_parameter is not None
+    steady, rising = (slopes.end_by_parameter[:, :-1, i * count :][..., :count].reshape(shape) for i in (0, 1))
+    transition = slopes.end_by_state[:, :-1, :-1].reshape(shape)
+    return Response.of(states, transition, steady, rising, np.diff(knots))

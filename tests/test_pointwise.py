@@ -1,0 +1,100 @@
+"""Functions evaluated at many instants without compilation, against JAX; and what is left to JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hdjax.effects import Motion
+from hdjax.effects.creep import Creep
+from hdjax.engine import pointwise
+from hdjax.engine.driven import own_states_along
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
+
+SHAPES = [(5,), (3, 7), (2, 9000), (3, 5000, 1)]
+
+
+def around(strengths, effect, point):
+    size, name = effect
+    assert name == "some"
+    return {
+        "sine": strengths[0] * jnp.sin(size * point["angle"]) + strengths[1] ** 2,
+        "both": jnp.stack([point["pair"][0] * strengths[1], point["pair"][1], size]),
+    }
+
+
+def sorted_pair(strengths, point):
+    """With a primitive that the graph has no words for."""
+    return strengths * jnp.sort(point["pair"])
+
+
+def points(shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    draw = np.random.default_rng(0)
+    return {"angle": draw.normal(size=shape), "pair": draw.normal(size=(*shape, 2))}
+
+
+def over(function, shape: tuple[int, ...]):
+    """By JAX, along the axes of the instants."""
+    for _ in shape:
+        function = jax.vmap(function)
+    return function
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_values_and_slopes_are_those_of_jax(shape: tuple[int, ...]):
+    looked_at, strengths, effect = points(shape), np.array([0.7, -1.3]), (np.array(1.1), "some")
+    found = at_instants(around, (strengths, 0), (effect, 0), (looked_at, len(shape)))
+    slopes = slopes_at_instants(around, (strengths, 0), (effect, 0), (looked_at, len(shape)))
+    wanted = over(lambda point: around(strengths, effect, point), shape)(looked_at)
+    linear = over(lambda point: jax.jacfwd(around)(strengths, effect, point), shape)(looked_at)
+    for name in wanted:
+        np.testing.assert_allclose(found[name], wanted[name], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(slopes[name], linear[name], rtol=1e-12, atol=1e-12)
+
+
+def test_instants_broadcast():
+    """Each of two effects at each of four points."""
+    sizes, looked_at = np.array([[0.5], [2.0]]), points((4,))
+    strengths = np.array([[[1.0, 2.0]], [[3.0, 4.0]]])
+    found = at_instants(around, (strengths, 2), ((sizes, "some"), 2), (looked_at, 1))
+    assert found["sine"].shape == (2, 4) and found["both"].shape == (2, 4, 3)
+    expected = strengths[..., 0] * np.sin(sizes * looked_at["angle"]) + strengths[..., 1] ** 2
+    np.testing.assert_allclose(found["sine"], expected, rtol=1e-12)
+
+
+def test_jax_takes_over_where_a_function_is_not_known():
+    looked_at, strengths = points((3, 4)), np.array([2.0, 3.0])
+    found = at_instants(sorted_pair, (strengths, 0), (looked_at, 2))
+    slopes = slopes_at_instants(sorted_pair, (strengths, 0), (looked_at, 2))
+    ordered = np.sort(looked_at["pair"], axis=-1)
+    np.testing.assert_allclose(found, strengths * ordered)
+    np.testing.assert_allclose(slopes, ordered[..., None] * np.eye(2))
+
+
+def test_a_function_is_translated_once_for_all_numbers(monkeypatch: pytest.MonkeyPatch):
+    looked_at, strengths = points((6,)), np.array([0.7, -1.3])
+    at_instants(around, (strengths, 0), ((np.array(1.1), "some"), 0), (looked_at, 1))
+
+    def refused(*_):
+        raise AssertionError("translated again")
+
+    monkeypatch.setattr(pointwise, "translated", refused)
+    at_instants(around, (2.0 * strengths, 0), ((np.array(0.1), "some"), 0), (points((8,)), 1))
+
+
+@pytest.mark.parametrize("by_machine_code", [True, False])
+def test_own_states_along_a_straight_line(by_machine_code: bool):
+    """Creep's state follows a ramp of the twist with a lag, in closed form."""
+    width, speed, taus = np.full((2, 40), 2e-3), np.array([0.3, -0.2]), np.array([0.01, 0.05])
+    time = np.pad(np.cumsum(width, axis=1), ((0, 0), (1, 0)))
+    twist = speed[:, None] * time
+    before, after = (Motion(x=jnp.asarray(x), v=jnp.zeros_like(x)) for x in (twist[:, :-1], twist[:, 1:]))
+    creep = Creep(tau=0.01, span=1e-3)
+    effect = jax.tree.map(lambda a: np.broadcast_to(np.asarray(a), 2), creep)
+    effect = jax.tree.map(lambda a, b: np.where(b == 0.01, taus, a), effect, creep)
+    start = np.full((2, 2, 1), 1e-3)
+    found = own_states_along(effect, before, after, width, start, by_machine_code=by_machine_code)
+    t, tau = time[:, :, None], taus[None, None]
+    decay, ramp = np.exp(-t / tau), speed[:, None, None] * t
+    expected = ramp - speed[:, None, None] * tau * (1.0 - decay) + 1e-3 * decay
+    np.testing.assert_allclose(found[..., 0], expected, rtol=1e-6, atol=1e-9)
