@@ -20,7 +20,7 @@ def amplitudes(
 ) -> None:
     """Check the analytic amplitudes of the dynamic error against harmonic balance and time integration.
 
-    Takes a minute or two, most of it compilation.
+    Takes a few seconds; the pictures of --out take half a minute, most of it compilation.
 
     Parameters
     ----------

@@ -11,12 +11,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.dynamics import ReducedModel
-from hdjax.fourier import FourierSeries, harmonic_series
+from hdjax.fourier import FourierSeries
 from hdjax.parameters import as_scalar
 from hdjax.response.continuation import Branch
 from hdjax.response.cubic_motion import ForcedCubic, balanced, closed
-from hdjax.response.harmonic_balance import balance, solve
 from hdjax.response.marching import transient_and_steps
 from hdjax.response.multiple_scales import (
     PrimaryResonance,
@@ -27,7 +25,7 @@ from hdjax.response.multiple_scales import (
     first_order,
     second_order,
 )
-from hdjax.response.nearest_motion import largest
+from hdjax.response.nearest_motion import Oscillators, balanced_waves, largest, largest_of
 from hdjax.response.poincare import PoincareSection, period_of, poincare_section
 from hdjax.where import where
 
@@ -172,10 +170,6 @@ def _expansions(resonance: Resonance, omega: Array) -> tuple[SteadyStates, Stead
     return first_order(resonance, omega), second_order(resonance, omega)
 
 
-def _where(condition: Array, a: FourierSeries, b: FourierSeries) -> FourierSeries:
-    return jax.tree.map(lambda x, y: where(condition, x, y), a, b)
-
-
 def settled(branch: Branch, *, motions: int = 24, off: float = 0.01, transient_periods: int = 1000) -> PoincareSection:
     """Time integration from beside stable motions of a branch: where the branch is right, they settle back onto it.
 
@@ -246,16 +240,27 @@ def error_map(
         mu: dampings over omega_0.
         harmonics: of the forcing frequency in harmonic balance.
     """
-    sigma, strength, mu = (jnp.atleast_1d(jnp.asarray(v, dtype=float)) for v in (sigma, strength, mu))
-    grid = jnp.meshgrid(mu, strength, sigma, indexing="ij")
+    sigma, strength, mu = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (sigma, strength, mu))
+    grid = np.meshgrid(mu, strength, sigma, indexing="ij")
     flat = [g.reshape(-1) for g in grid]
-    first, second = _errors(KINDS[kind], harmonics, *flat)
-    return ErrorMap(sigma, strength, mu, first.reshape(grid[0].shape), second.reshape(grid[0].shape))
+    omega, A, exists, *series = (np.asarray(a) for a in _expanded(KINDS[kind], *map(jnp.asarray, flat)))
+    first, second = series[0] - 1j * series[1], series[2] - 1j * series[3]
+    given = Oscillators(flat[0], np.ones(omega.size), flat[1], A, omega)
+    guess = np.where(exists[:, None], second, first)[:, ::2]
+    waves, solved = balanced_waves(given, guess, harmonics)
+    truth, *sizes = (largest_of(z) for z in (waves, first[:, ::2], second[:, ::2]))
+    errors = (
+        np.where(there, np.abs(size / np.where(there, truth, 1.0) - 1.0), np.inf).reshape(grid[0].shape)
+        for size, there in zip(sizes, (solved, solved & exists), strict=True)
+    )
+    return ErrorMap(*(jnp.asarray(a) for a in (sigma, strength, mu, *errors)))
 
 
 @eqx.filter_jit
-def _errors(expansion: Callable[..., Resonance], harmonics: int, mu: Array, strength: Array, sigma: Array):
-    def at(mu: Array, strength: Array, sigma: Array) -> tuple[Array, Array]:
+def _expanded(expansion: Callable[..., Resonance], mu: Array, strength: Array, sigma: Array) -> tuple[Array, ...]:
+    """Frequency and amplitude of the forcing, whether second order has the motion, and both orders' waves of it."""
+
+    def at(mu: Array, strength: Array, sigma: Array) -> tuple[Array, ...]:
         drive = ReducedDrive(mu=mu, omega_0=1.0, alpha=strength)
         if expansion is PrimaryResonance:
             # The amplitude is one: the frequency response gives the forcing that makes it so.
@@ -265,18 +270,11 @@ def _errors(expansion: Callable[..., Resonance], harmonics: int, mu: Array, stre
         resonance = expansion(drive, A)
         omega = resonance.omega(sigma)
         first, second = first_order(resonance, omega), second_order(resonance, omega)
-        sizes = first.harmonics.largest()
         if expansion is PrimaryResonance:
             slot = jnp.argmin(where(first.branches.exists, jnp.abs(first.branches.amplitude - 1.0), jnp.inf))
         else:
             slot = jnp.argmax(where(first.branches.stable, first.branches.amplitude, -1.0))
-        refined = second.branches.exists[slot]
-        guess = _where(refined, second.series(slot), first.series(slot))
-        system = balance(ReducedModel(drive), harmonic_series(1.0, A), harmonics=harmonics)
-        steady = solve(system, omega, guess)
-        truth = where(steady.converged, steady.x.largest(), 1.0)
-        errors = [jnp.abs(s / truth - 1.0) for s in (sizes[slot], second.harmonics.largest()[slot])]
-        first_error = where(steady.converged, errors[0], jnp.inf)
-        return first_error, where(steady.converged & refined, errors[1], jnp.inf)
+        x, y = first.series(slot), second.series(slot)
+        return omega, resonance.A, second.branches.exists[slot], x.cosine, x.sine, y.cosine, y.sine
 
-    return jax.lax.map(lambda v: at(*v), (mu, strength, sigma), batch_size=256)
+    return jax.vmap(at)(mu, strength, sigma)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax import lax
 from jax.core import Tracer
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxcont.core.scan_continuation import ScanResult, pseudo_arclength_scan
@@ -184,12 +185,12 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
         return branch.residual(u, p, omega)
 
     # The search itself is not differentiated; the correction of what it found is.
-    still, still_omega = jax.lax.stop_gradient((branch, omega))
+    still, still_omega = lax.stop_gradient((branch, omega))
 
     first = start if parameter == "omega" else omega
     u_0, _ = find_root(branch.at(start), first, guess)
     p_0, p_1 = start / scale, end / scale
-    start_and_end = jax.lax.stop_gradient((u_0, p_0, p_1))
+    start_and_end = lax.stop_gradient((u_0, p_0, p_1))
     found = _continued(lambda u, p: still.residual(u, p, still_omega), *start_and_end, steps)
     count, complete = _end(found, p_0, p_1, _longest_step(p_0, p_1, steps), positive=parameter == "omega")
     path = jnp.concatenate([found.states, found.params[:, None]], axis=1)
@@ -253,18 +254,24 @@ def _interpolated(path: Array, tangents: Array, count: Array, p_1: Array, points
 
 def _correct(residual, point: Array, tangent: Array) -> tuple[Array, Array, Array]:
     """Newton steps at right angles to the branch: the point, the branch's direction there, what is left over."""
-    nothing = jnp.zeros(1)
-    for _ in range(_CORRECTIONS):
-        u, p = point[:-1], point[-1]
-        by_unknowns, by_parameter = jax.jacfwd(residual, (0, 1))(u, p)
-        bordered = jnp.concatenate([jnp.column_stack([by_unknowns, by_parameter]), tangent[None]])
-        factors = lu_factor(bordered)
-        for _ in range(_CHORDS):
-            left = residual(point[:-1], point[-1])
-            point = point - lu_solve(factors, jnp.concatenate([left, nothing]))
+
+    def left_over(point: Array) -> Array:
+        return residual(point[:-1], point[-1])
+
+    # Loops, not written out: the residual is most of the program.
+    def corrected(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        point, tangent = carry
+        factors = lu_factor(jnp.concatenate([jax.jacfwd(left_over)(point), tangent[None]]))
+
+        def chord(point: Array, _: None) -> tuple[Array, None]:
+            return point - lu_solve(factors, jnp.append(left_over(point), 0.0)), None
+
+        point, _ = lax.scan(chord, point, length=_CHORDS)
         direction = lu_solve(factors, jnp.zeros_like(point).at[-1].set(1.0))
-        tangent = direction / jnp.linalg.norm(direction)
-    left = jnp.max(jnp.abs(residual(point[:-1], point[-1])))
+        return (point, direction / jnp.linalg.norm(direction)), None
+
+    (point, tangent), _ = lax.scan(corrected, (point, tangent), length=_CORRECTIONS)
+    left = jnp.max(jnp.abs(left_over(point)))
     finite = jnp.isfinite(left) & jnp.all(jnp.isfinite(point))
     return where(finite, point, 0.0), where(finite, tangent, 0.0), where(finite, left, jnp.inf)
 
@@ -315,7 +322,7 @@ def folds(branch: Branch, *, at_most: int = 4) -> Folds:
 
         solver = optx.Newton(_FOLD_TOLERANCE, _FOLD_TOLERANCE)
         given = (branch.system, branch.omega[i])
-        y = optx.root_find(residual, solver, jax.lax.stop_gradient(guess), given, max_steps=30, throw=False).value
+        y = optx.root_find(residual, solver, lax.stop_gradient(guess), given, max_steps=30, throw=False).value
         left = jnp.max(jnp.abs(residual(y, given)))
         return y, jnp.isfinite(left) & (left < _FOLD_SOLVED)
 

@@ -21,7 +21,7 @@ from hdjax.fourier import FourierSeries
 _SAMPLES = 96
 _CORRECTED = 2
 _NEWTON_STEPS = 6
-_SOLVED = 1e-6
+_SOLVED, _BALANCED = 1e-6, 1e-9
 _EXACT = 1e-11
 """Below this relative size of the last Newton step the next one is rounding."""
 _DEFECT = 0.03
@@ -204,21 +204,34 @@ def _largest(waves: np.ndarray, harmonics: int) -> Float[np.ndarray, "lanes moti
 def largest(motion: FourierSeries) -> Float[np.ndarray, "*motions"]:
     """[`FourierSeries.largest`][hdjax.fourier.FourierSeries.largest] without compilation: the largest magnitudes over a
     period, between samples too."""
-    H = motion.harmonics
     z = np.asarray(motion.cosine) - 1j * np.asarray(motion.sine)
-    mean, orders = np.asarray(motion.mean)[..., None], np.arange(1, H + 1)
-    step = 2 * np.pi / (8 * (H + 1))
-    t = np.broadcast_to(np.arange(8 * (H + 1)) * step, (*z.shape[:-1], 8 * (H + 1)))
+    return _largest_of(np.asarray(motion.mean), z, np.arange(1, motion.harmonics + 1))
+
+
+def largest_of(waves: np.ndarray) -> Float[np.ndarray, "*motions"]:
+    """The same of odd harmonics alone, as complex numbers z of `Re(z exp(i k omega t))` along the last axis."""
+    return _largest_of(np.zeros(waves.shape[:-1]), waves, np.arange(1, 2 * waves.shape[-1], 2))
+
+
+def _largest_of(mean: np.ndarray, z: np.ndarray, orders: np.ndarray) -> np.ndarray:
+    count, between = 8 * (orders[-1] + 1), orders[-1] - orders[-2]
+    step = 2 * np.pi / count
+    t = np.broadcast_to(np.arange(count) * step, (*z.shape[:-1], count))
 
     def wave(z: np.ndarray) -> np.ndarray:
-        return np.sum(z[..., None, :] * np.exp(1j * t[..., None] * orders), axis=-1).real
+        # By Horner's rule.
+        turn, total = np.exp(1j * between * t), np.zeros_like(t, dtype=complex)
+        for k in reversed(range(orders.size)):
+            total = total * turn + z[..., k, None]
+        return np.real(total * np.exp(1j * orders[0] * t))
 
-    samples = mean + wave(z)
+    samples = mean[..., None] + wave(z)
     # As there, Newton steps from every sample to a top, none longer than from sample to sample.
     for _ in range(3):
         bend = wave(-(orders**2) * z)
         t = t - np.clip(wave(1j * orders * z) / np.where(bend == 0.0, np.inf, bend), -step, step)
-    return np.asarray(np.max(np.abs(np.concatenate([samples, mean + wave(z)], axis=-1)), axis=-1))
+    tops = mean[..., None] + wave(z)
+    return np.asarray(np.max(np.abs(np.concatenate([samples, tops], axis=-1)), axis=-1))
 
 
 def _linear(given: Oscillators, periods: int, orders: np.ndarray) -> Float[np.ndarray, "2 lanes orders"]:
@@ -240,37 +253,72 @@ def _system(linear: np.ndarray, bend: np.ndarray, mean: bool = False) -> np.ndar
     return whole + bend.reshape(whole.shape)
 
 
+def balanced_waves(
+    given: Oscillators, guess: np.ndarray, harmonics: int, *, steps: int = 64
+) -> tuple[np.ndarray, Bool[np.ndarray, " lanes"]]:
+    """Symmetric motions by harmonic balance, as complex waves of the odd harmonics, and which were solved.
+
+    Args:
+        given: the oscillators, of one axis.
+        guess: waves to start from.
+        harmonics: to keep.
+        steps: of Newton's method, at most.
+    """
+    start = np.zeros((guess.shape[0], _odd(harmonics).orders.size), dtype=complex)
+    kept = min(guess.shape[1], start.shape[1])
+    start[:, :kept] = guess[:, :kept]
+    with np.errstate(all="ignore"):
+        balance = _Balance(given, harmonics, 1)
+        parts, x = balance.solved(_parts(start), steps)
+        solved = balance.missed(parts, x) < _BALANCED
+    return parts[:, : start.shape[1]] - 1j * parts[:, start.shape[1] :], solved
+
+
+class _Balance:
+    """Harmonic balance of motions with odd harmonics of their own frequency, one a lane; unknowns are cosines, then
+    sines."""
+
+    def __init__(self, given: Oscillators, harmonics: int, periods: int):
+        self.odd = _odd(harmonics)
+        self.cubic = given.alpha[:, None]
+        self.linear = _linear(given, periods, self.odd.orders)
+        self.push = np.zeros((given.A.size, 2 * self.odd.orders.size))
+        self.push[:, (periods - 1) // 2] = given.A / given.omega_0**2
+
+    def left_over(self, kept: np.ndarray, x: np.ndarray, of: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Of the equation, over omega_0^2."""
+        spring, damper = self.linear[:, of]
+        cosine, sine = np.split(kept, 2, axis=1)
+        straight = np.concatenate([spring * cosine + damper * sine, spring * sine - damper * cosine], axis=1)
+        return straight + _times(self.cubic[of] * x**3, self.odd.means) - self.push[of]
+
+    def missed(self, kept: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Largest part left over, relative to the motion."""
+        return np.max(np.abs(self.left_over(kept, x)), axis=1) / np.max(np.abs(kept), axis=1)
+
+    def solved(self, kept: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """Newton steps from a start: the unknowns, and the motions at the samples."""
+        kept, moving = kept.copy(), np.arange(kept.shape[0])
+        for _ in range(steps):
+            own = kept[moving]
+            x = _times(own, self.odd.values)
+            slope = _system(self.linear[:, moving], _times(3.0 * self.cubic[moving] * x**2, self.odd.products))
+            change = _solved(slope, self.left_over(own, x, moving))
+            kept[moving] = own - change
+            moving = moving[np.max(np.abs(change), axis=1) > _EXACT * np.max(np.abs(own), axis=1)]
+            if not moving.size:
+                break
+        return kept, _times(kept, self.odd.values)
+
+
 def _corrected(
     given: Oscillators, start: np.ndarray, harmonics: int, periods: int
 ) -> tuple[np.ndarray, Bool[np.ndarray, " lanes"]]:
     """Newton steps to the symmetric motion near `start`, and whether they settled on a stable one."""
-    odd = _odd(harmonics)
-    n = odd.orders.size
-    square, cubic = given.omega_0**2, given.alpha[:, None]
-    linear = _linear(given, periods, odd.orders)
-    push = np.zeros((start.shape[0], 2 * n))
-    push[:, (periods - 1) // 2] = given.A / square
-
-    def left_over(kept: np.ndarray, x: np.ndarray, of: np.ndarray | slice = slice(None)) -> np.ndarray:
-        spring, damper = linear[:, of]
-        cosine, sine = kept[:, :n], kept[:, n:]
-        straight = np.concatenate([spring * cosine + damper * sine, spring * sine - damper * cosine], axis=1)
-        return straight + _times(cubic[of] * x**3, odd.means) - push[of]
-
-    kept = _parts(start)
-    moving = np.arange(start.shape[0])
-    for _ in range(_NEWTON_STEPS):
-        own = kept[moving]
-        x = _times(own, odd.values)
-        slope = _system(linear[:, moving], _times(3.0 * cubic[moving] * x**2, odd.products))
-        change = _solved(slope, left_over(own, x, moving))
-        kept[moving] = own - change
-        moving = moving[np.max(np.abs(change), axis=1) > _EXACT * np.max(np.abs(own), axis=1)]
-        if not moving.size:
-            break
-    x = _times(kept, odd.values)
-    scale = np.max(np.abs(kept), axis=1)
-    settled = np.max(np.abs(left_over(kept, x)), axis=1) < _SOLVED * scale
+    balance, n = _Balance(given, harmonics, periods), start.shape[1]
+    odd, cubic, linear = balance.odd, balance.cubic, balance.linear
+    kept, x = balance.solved(_parts(start), _NEWTON_STEPS)
+    settled = balance.missed(kept, x) < _SOLVED
     settled &= np.linalg.norm(_times(cubic * x**3, odd.above), axis=1) < _DEFECT * np.linalg.norm(kept, axis=1)
     # The determinant has the sign of (1 - m_1)(1 - m_2), m the Floquet multipliers (Hill). A symmetric motion's
     # monodromy is a square, so that no multiplier leaves through -1 (Swift and Wiesenfeld 1984), and damping keeps
