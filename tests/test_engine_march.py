@@ -17,9 +17,11 @@ from fitting.machine_code import _gap, lanes_of, task
 from fitting.residual import LOST, Blocks, Problem, Unknowns, blocks
 from hdjax import Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 from hdjax.effects import CATALOGUE, DryFriction
+from hdjax.effects.effect import MeshTorqueEffect, Motion
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY
 from hdjax.engine import march_lanes
 from hdjax.engine.kernel import march_arrays
+from hdjax.parameters import Scalar, parameter
 from hdjax.signals import HOLDS
 
 COUNT, LENGTH, HALO = 330, 32, 3  # eleven segments: a whole block, and one that is not full; the last is part padding
@@ -114,9 +116,15 @@ TYPICAL = {
 }
 
 
+# A corner that no step resolves: a drive that comes to rest within one.
+SHARP = {"motor_friction.transition": 2e-3, "motor_friction.T_c": 0.1}
+
+
 @pytest.mark.parametrize("name", TYPICAL)
 def test_it_agrees_with_xla(name: str):
-    assert_agreement(*problem_of(models()[name], **TYPICAL[name]))
+    model = models()[name]
+    model = model.replace({path: value for path, value in SHARP.items() if path in model.parameters()})
+    assert_agreement(*problem_of(model, **TYPICAL[name]))
 
 
 @pytest.mark.slow
@@ -141,6 +149,27 @@ def test_every_hold_agrees_with_xla(name: str, hold: Hold, jitter: float):
 def test_all_forms_are_compared():
     named = set(models())
     assert {form.name for form in (*CATALOGUE, *LEARNED_WITH_MEMORY)} <= named and len(LARGE) > 3
+
+
+@pytest.mark.parametrize("name", ["dahl_motor_friction", "lugre_load_friction"])
+def test_rows_of_the_prior_are_differentiated(name: str):
+    """Where hidden states are expected may depend on parameters, which move by their logarithm."""
+    problem, unknowns = problem_of(models()[name])
+    ready = with_engine(problem)
+    index = problem.free.paths.index(f"{name}.bend")
+    step = 1e-6
+
+    def rows(by: float) -> np.ndarray:
+        moved = eqx.tree_at(lambda u: u.parameters, unknowns, unknowns.parameters.at[index].add(by))
+        effect = problem.free.unpack(problem.model, moved.parameters).effects[-1]
+        return np.asarray(linearise(ready, moved).residual)[:, 2 * LENGTH :] * np.asarray(effect.state_scale())
+
+    # The prior's width is taken as fixed.
+    wanted = (rows(step) - rows(-step)) / (2 * step) / np.asarray(problem.model.effects[-1].state_scale())
+    found = np.asarray(linearise(ready, unknowns).by_parameter)[:, 2 * LENGTH :, index]
+    # Rows of order one, rounded to 1e-16, over the step; and what differences err by.
+    np.testing.assert_allclose(found, wanted, atol=1e-8)
+    assert np.abs(found).max() > 0
 
 
 # -- how it is called --------------------------------------------------------------------------------------------------
@@ -316,6 +345,34 @@ def test_one_that_runs_away_in_the_middle_is_sound_until_then():
     assert (slopes[lost] == 0).all() and np.isfinite(slopes).all()
     # Up to where it is far away; beyond, errors grow as the motion does.
     assert all(np.delete(d, 4, axis=0).max(initial=0.0) < 1e-12 for d in (found["residual"], found["by_state"]))
+
+
+class SteepTorque(MeshTorqueEffect):
+    """A torque whose slope is infinite at no twist."""
+
+    family = "unknown"
+    name = "steep_torque"
+
+    k: Scalar = parameter(0.1, unit="N m", doc="size", role="strength")
+
+    @classmethod
+    def proposals(cls, scales):
+        return (cls(),)
+
+    def torque(self, motion: Motion, drive, state):
+        return self.k * jnp.sqrt(jnp.abs(motion.x))
+
+
+def test_a_slope_that_is_no_number_is_none():
+    """The motion is sound, and its derivative is infinite: no infinity gets out."""
+    problem, unknowns = problem_of(rig.drive_model().with_effects(SteepTorque()))
+    still = eqx.tree_at(lambda u: u.states, unknowns, jnp.zeros_like(unknowns.states))
+    found = linearise(with_engine(problem), still)
+    assert np.abs(np.asarray(found.residual)).max() < LOST
+    for leaf in jax.tree.leaves(found):
+        assert np.isfinite(leaf).all()
+    # By the torque's size, and by all that comes after the first sample.
+    assert (np.asarray(found.by_state)[:, 2 * LENGTH - 2 : 2 * LENGTH] == 0).all()
 
 
 def test_a_reduced_drive_agrees_with_xla():
