@@ -18,7 +18,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.residual import Blocks, LinearisedResidual, Unknowns, blocks_of_columns, seeds
-from hdjax.compilation import jit_small
 from hdjax.where import where
 
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
@@ -167,10 +166,6 @@ def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "se
     path = system.chains
     moved = path.by_parameter - jnp.einsum("sqk,skp->sqp", path.by_first, response[path.index])
     return found.by_parameter + jnp.einsum("srq,sqp->srp", found.by_state, moved)
-
-
-projected = jit_small(project)
-"""[`project`][], compiled."""
 
 
 def _diagonal(matrix: Array) -> Array:

@@ -1,16 +1,13 @@
 """How long the dynamic error that a fit leaves over remembers itself, freed of what the fitting has put into it."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 from scipy.special import chdtrc
 
-from fitting.arrow import chains
 from fitting.engines import linearise
 from fitting.estimate import Fit
-from fitting.residual import Blocks
-from hdjax.compilation import jit_small
+from fitting.explained import FirstStates
 
 # Directions of a chain's first state that its samples hardly see.
 _BLIND = 1e-12
@@ -80,15 +77,9 @@ def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directio
     The columns of each chain are orthonormal over its rows and those of the prior of its hidden states.
     """
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
-    slopes = np.asarray(_by_first_state(linearise(problem, fit.unknowns), problem.segments.joined))
+    slopes = FirstStates.of(linearise(problem, fit.unknowns), problem.segments.joined).by_first
     chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
     return _orthonormal(slopes, chain)[:, : problem.segments.measured[0].size], chain
-
-
-@jit_small
-def _by_first_state(found: Blocks, joined: Array) -> Array:
-    """Derivative of each segment's rows by its chain's first state."""
-    return jnp.einsum("srq,sqk->srk", found.by_state, chains(found, joined).by_first)
 
 
 def _orthonormal(slopes: np.ndarray, chain: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 
 from fitting.compare import Account
 from hdjax import Drive, Model
-from hdjax.compilation import jit_small
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
 
 Quantities = Mapping[str, tuple[Array, str]]
 """Value and unit by name."""
@@ -51,11 +51,10 @@ def derived(account: Account, quantities: Callable[..., Quantities], *given: flo
     """
     estimates = account.uncertainty.estimates
     numbers = tuple(jnp.asarray(np.asarray(g)) if isinstance(g, float) else g for g in given)
-    values = jnp.asarray(np.array([e.value for e in estimates.values()]))
+    values = np.array([e.value for e in estimates.values()])
     known, slopes = _values_and_slopes(account.model, tuple(estimates), values, quantities, numbers)
     if not known:
         return {}
-    slopes = np.asarray(slopes)
     spread = np.array([e.std for e in estimates.values()])
     with np.errstate(all="ignore"):
         scaled = slopes * spread
@@ -68,18 +67,30 @@ def derived(account: Account, quantities: Callable[..., Quantities], *given: flo
     }
 
 
-@jit_small
 def _values_and_slopes(
-    model: Model, paths: tuple[str, ...], values: Array, quantities: Callable[..., Quantities], given: tuple[Any, ...]
-) -> tuple[tuple[tuple[str, Array, str], ...], Array]:
+    model: Model,
+    paths: tuple[str, ...],
+    values: np.ndarray,
+    quantities: Callable[..., Quantities],
+    given: tuple[Any, ...],
+) -> tuple[list[tuple[str, float, str]], np.ndarray]:
     """Name, value and unit of each quantity, and derivatives of the values by the parameters at `paths`."""
+    units: dict[str, str] = {}
 
-    def at(vector: Array) -> Array:
-        moved = model.replace({p: vector[i] for i, p in enumerate(paths)})
-        return jnp.stack([value for value, _ in quantities(moved, *given).values()])
+    def look_up(model: Model) -> None:
+        units.update({name: unit for name, (_, unit) in quantities(model, *given).items()})
 
-    known = tuple((name, value, unit) for name, (value, unit) in quantities(model, *given).items())
-    return known, jax.jacfwd(at)(values) if known else jnp.zeros((0, len(paths)))
+    jax.eval_shape(look_up, model)
+    posed = (values, 0), ((model, paths, quantities, given), 0)
+    found, slopes = at_instants(_values, *posed), slopes_at_instants(_values, *posed)
+    return [(name, float(value), unit) for value, (name, unit) in zip(found, units.items(), strict=True)], slopes
+
+
+def _values(vector: Array, posed: tuple[Model, tuple[str, ...], Callable[..., Quantities], tuple[Any, ...]]) -> Array:
+    model, paths, quantities, given = posed
+    moved = model.replace({p: vector[i] for i, p in enumerate(paths)})
+    values = [value for value, _ in quantities(moved, *given).values()]
+    return jnp.stack(values) if values else jnp.zeros(0)
 
 
 def _degrees_of_freedom(

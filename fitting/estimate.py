@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.arrow import projected
 from fitting.engines import linearise
 from fitting.experiment import Stretch, scales
+from fitting.explained import FirstStates
 from fitting.free import FreeParameters
 from fitting.posing import initial_states, pose
 from fitting.residual import RUNAWAY, Problem, Unknowns
@@ -293,7 +293,8 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     substeps = found.substeps
     columns = None
     if np.isfinite(shift):
-        columns = np.asarray(projected(linearise(problem, found.unknowns), problem.segments.joined))
+        slopes = linearise(problem, found.unknowns)
+        columns = FirstStates.of(slopes, problem.segments.joined).parameters_without(slopes)
     error, white_by_error = np.asarray(evaluate(problem, found.unknowns).error), np.asarray(problem.whitening)
     count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:

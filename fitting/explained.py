@@ -5,7 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitting.experiment import Segments
 from fitting.followed import Followed, respond
@@ -16,6 +16,53 @@ from fitting.residual import Blocks
 _NOTHING = 1e-200
 
 
+class FirstStates(eqx.Module):
+    """What the state that each simulation starts from, a chain of joined segments, does to a residual.
+
+    Attributes:
+        joined: whether a segment starts where the one before it ends.
+        by_state: the residual's derivative by each segment's own first state.
+        before_by_state: derivative of the end of the segment before by its first state.
+        by_first: the residual's derivative by the first state of the simulation that a segment belongs to.
+    """
+
+    joined: Bool[np.ndarray, " segments"]
+    by_state: Float[np.ndarray, "segments rows states"]
+    before_by_state: Float[np.ndarray, "segments states states"]
+    by_first: Float[np.ndarray, "segments rows states"]
+
+    @classmethod
+    def of(cls, found: Blocks, joined: Bool[Array | np.ndarray, " segments"]) -> "FirstStates":
+        """Of a residual's derivatives."""
+        joined, by_state, before = np.asarray(joined), np.asarray(found.by_state), np.asarray(found.before_by_state)
+        first = np.where(joined[:, None, None], 0.0, np.eye(before.shape[-1]))
+        return cls(joined, by_state, before, by_state @ through_segments(joined, before, first))
+
+    def without(
+        self,
+        columns: Float[Array | np.ndarray, "segments rows columns"],
+        before: Float[Array | np.ndarray, "segments states columns"],
+    ) -> Float[np.ndarray, "segments rows columns"]:
+        """Columns of the residual without what the first states could do as well.
+
+        Args:
+            columns: by segment.
+            before: what goes with each at the end of the segment before, where segments are joined.
+        """
+        with np.errstate(all="ignore"):
+            moved = np.asarray(columns) + self.by_state @ through_segments(
+                self.joined, self.before_by_state, np.asarray(before)
+            )
+            starts = np.flatnonzero(~self.joined)
+            transposed = np.swapaxes(self.by_first, 1, 2)
+            own, coupling = (np.add.reduceat(transposed @ part, starts, axis=0) for part in (self.by_first, moved))
+            return moved - self.by_first @ _solved_each(own, coupling)[np.cumsum(~self.joined) - 1]
+
+    def parameters_without(self, found: Blocks) -> Float[np.ndarray, "segments rows parameters"]:
+        """The parameters' columns alike."""
+        return self.without(found.by_parameter, found.before_by_parameter)
+
+
 class Answers(eqx.Module):
     """How whitened outputs answer what acts along a motion, without what the first state of each simulation could do as
     well.
@@ -24,29 +71,19 @@ class Answers(eqx.Module):
         followed: the motion.
         weight: of the samples.
         whitening: of the outputs.
-        joined: whether a segment starts where the one before it ends.
-        by_state: the residual's derivative by each segment's own first state.
-        before_by_state: derivative of the end of the segment before by its first state.
-        by_first: the residual's derivative by the first state of the simulation that a segment belongs to.
+        states: what the first states do.
         parameters: the answer to a unit of each parameter that is free already.
     """
 
     followed: Followed
     weight: Float[np.ndarray, "segments samples"]
     whitening: Float[np.ndarray, "outputs outputs"]
-    joined: np.ndarray
-    by_state: Float[np.ndarray, "segments rows states"]
-    before_by_state: Float[np.ndarray, "segments states states"]
-    by_first: Float[np.ndarray, "segments rows states"]
+    states: FirstStates
     parameters: Float[np.ndarray, "segments samples outputs parameters"]
 
     @classmethod
     def of(
-        cls,
-        found: Blocks,
-        followed: Followed,
-        segments: Segments,
-        whitening: Float[Array | np.ndarray, "outputs outputs"],
+        cls, found: Blocks, followed: Followed, segments: Segments, whitening: Float[np.ndarray, "outputs outputs"]
     ) -> "Answers":
         """The answers of a motion.
 
@@ -56,15 +93,10 @@ class Answers(eqx.Module):
             segments: the data.
             whitening: of the outputs.
         """
-        weight, joined = np.asarray(segments.weight), np.asarray(segments.joined)
-        by_state, before = np.asarray(found.by_state), np.asarray(found.before_by_state)
-        first = np.where(joined[:, None, None], 0.0, np.eye(before.shape[-1]))
-        by_first = by_state @ through_segments(joined, before, first)
-        parts = followed, weight, np.asarray(whitening), joined, by_state, before, by_first
-        outputs = by_state.shape[1] // weight.shape[1]
-        answers = cls(*parts, parameters=np.zeros((*weight.shape, outputs, 0)))
-        known = answers._projected(np.asarray(found.by_parameter), np.asarray(found.before_by_parameter))
-        return replace(answers, parameters=known)
+        weight, states = np.asarray(segments.weight), FirstStates.of(found, segments.joined)
+        # Residuals are measured minus simulated.
+        known = -states.parameters_without(found)[:, : weight.shape[1] * len(whitening)]
+        return cls(followed, weight, whitening, states, known.reshape(*weight.shape, len(whitening), -1))
 
     def to(
         self,
@@ -78,24 +110,13 @@ class Answers(eqx.Module):
             reading: what goes with each and is no motion, a change of what the encoders read.
         """
         outputs, end = respond(self.followed, pushed)
-        outputs = (outputs + reading) * self.weight[:, :, None, None]
-        columns = -(self.whitening @ outputs).reshape(len(end), -1, end.shape[-1])
-        # Residuals are measured minus simulated. What follows a segment's rows of outputs is its states' prior.
-        columns = np.pad(columns, ((0, 0), (0, self.by_state.shape[1] - columns.shape[1]), (0, 0)))
-        return self._projected(columns, np.where(self.joined[:, None, None], np.roll(end, 1, axis=0), 0.0))
-
-    def _projected(self, columns: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """Columns of the residual without what each simulation's first state could do as well, once each segment starts
-        where the one before it ends, whose end they move."""
-        moved = columns + self.by_state @ through_segments(self.joined, self.before_by_state, before)
-        starts = np.flatnonzero(~self.joined)
-        chain = np.cumsum(~self.joined) - 1
-        transposed = np.swapaxes(self.by_first, 1, 2)
-        own, coupling = (np.add.reduceat(transposed @ part, starts, axis=0) for part in (self.by_first, moved))
-        left = moved - self.by_first @ _solved_each(own, coupling)[chain]
-        segments, samples = self.weight.shape
-        outputs = len(self.whitening)
-        return -left[:, : samples * outputs].reshape(segments, samples, outputs, -1)
+        outputs = self.whitening @ (outputs + reading) * self.weight[:, :, None, None]
+        columns = outputs.reshape(len(end), -1, end.shape[-1])
+        rows, further = columns.shape[1], self.states.by_state.shape[1] - columns.shape[1]
+        # What follows a segment's rows of outputs is its states' prior.
+        columns = np.pad(columns, ((0, 0), (0, further), (0, 0)))
+        before = np.where(self.states.joined[:, None, None], np.roll(end, 1, axis=0), 0.0)
+        return self.states.without(columns, -before)[:, :rows].reshape(outputs.shape)
 
 
 def through_segments(joined: np.ndarray, before_by_state: np.ndarray, own: np.ndarray) -> np.ndarray:

@@ -3,21 +3,19 @@
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import stdtrit
 
-from fitting.arrow import project
 from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.experiment import scales
+from fitting.explained import FirstStates
 from fitting.formatting import words
-from fitting.residual import Blocks, Problem
+from fitting.residual import Problem
 from fitting.sandwich import directions
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import TwoInertiaModel
-from hdjax.compilation import jit_small
 from hdjax.parameters import ParameterInfo
 
 # Two standard errors along a direction that are more than 40 % leave it open.
@@ -304,7 +302,7 @@ def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[
     return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)
 
 
-def _products(fit: Fit, held: tuple[str, ...]) -> Float[Array, "all all"]:
+def _products(fit: Fit, held: tuple[str, ...]) -> Float[np.ndarray, "all all"]:
     """J^T J of the free parameters and the logarithms of what is held, without the initial states.
 
     By central differences through the program that the fit runs anyway.
@@ -319,23 +317,12 @@ def _products(fit: Fit, held: tuple[str, ...]) -> Float[Array, "all all"]:
         )
         rows.append((up.residual - down.residual) / (2 * _STEP))
         gaps.append((up.gap - down.gap) / (2 * _STEP))
-    return _wider(problem.segments.joined, found, jnp.stack(rows, axis=-1), jnp.stack(gaps, axis=-1))
+    states = FirstStates.of(found, problem.segments.joined)
+    columns, before = np.stack(rows, axis=-1), -np.stack(gaps, axis=-1)
+    both = np.concatenate([states.parameters_without(found), states.without(columns, before)], axis=2)
+    flat = both.reshape(-1, both.shape[-1])
+    return flat.T @ flat
 
 
 def _with_held(problem: Problem, path: str, value: float) -> Problem:
     return eqx.tree_at(lambda p: p.model, problem, problem.model.replace({path: value}))
-
-
-@jit_small
-def _wider(joined: Array, found: Blocks, rows: Array, gaps: Array) -> Array:
-    """The products of the parameters' columns with further ones beside them."""
-    wider = eqx.tree_at(
-        lambda b: (b.by_parameter, b.before_by_parameter),
-        found,
-        (
-            jnp.concatenate([found.by_parameter, rows], axis=2),
-            jnp.concatenate([found.before_by_parameter, -gaps], axis=2),
-        ),
-    )
-    projected = project(wider, joined)
-    return jnp.einsum("srp,srq->pq", projected, projected)

@@ -12,18 +12,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import fdtri
 
-from fitting.arrow import chains, project
 from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.experiment import Segments
+from fitting.explained import FirstStates
 from fitting.posing import natural_frequency
-from fitting.residual import Blocks, Problem
-from hdjax.compilation import jit_small
 
 # Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.
 _MANY_CHAINS = 20
@@ -102,7 +99,9 @@ class Covariance(eqx.Module):
 def linearised(fit: Fit) -> Linearised:
     """The regression that a fit is at its solution."""
     problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
-    residual, projected, by_state = (np.asarray(a) for a in _columns(problem, linearise(problem, fit.unknowns)))
+    found = linearise(problem, fit.unknowns)
+    states = FirstStates.of(found, problem.segments.joined)
+    residual, projected = np.asarray(found.residual), states.parameters_without(found)
     with np.errstate(over="ignore", invalid="ignore"):
         # Derivatives that leave the numbers, as over corners that the solver's steps do not resolve, tell nothing.
         projected = np.where(np.isfinite(np.sum(projected**2, axis=(0, 1))), projected, 0.0)
@@ -111,7 +110,7 @@ def linearised(fit: Fit) -> Linearised:
     period = 2 * np.pi / natural_frequency(fit.model, fit.stretches) / fit.stretches[0].experiment.time_step
     total = sum(len(s) for s in fit.stretches)
     return Linearised(
-        records=_records([len(s) for s in fit.stretches], problem.segments, residual, projected, by_state),
+        records=_records([len(s) for s in fit.stretches], problem.segments, residual, projected, states.by_first),
         information=np.einsum("srp,srq->pq", projected, projected),
         prior=np.einsum("srp,srq->pq", prior, prior),
         chunk=max(1, round(max(_CHUNK_PERIODS * period, total / _CHUNKS))),
@@ -265,14 +264,6 @@ def _power(columns: np.ndarray) -> np.ndarray:
 
 def _spectrum(series: np.ndarray) -> np.ndarray:
     return np.fft.rfft(series, axis=0) / np.sqrt(series.shape[0])
-
-
-@jit_small
-def _columns(problem: Problem, found: Blocks) -> tuple[Array, Array, Array]:
-    """Residual by row, projected slopes, and the derivative with respect to the state that each chain starts from."""
-    joined = problem.segments.joined
-    by_first = jnp.einsum("srq,sqk->srk", found.by_state, chains(found, joined).by_first)
-    return found.residual, project(found, joined), by_first
 
 
 def _records(
