@@ -96,16 +96,22 @@ def apart(problem: Problem, unknowns: Unknowns) -> dict[str, np.ndarray]:
     return result
 
 
+def is_steep(model: Model) -> bool:
+    """Whether slopes change so fast that the rounding of a state shows in them: where a drive comes to rest within a
+    step, at the edge of a gap, and in a learned function that is dense near standstill."""
+    axes = (axis for effect in model.effects for axis in getattr(effect, "axes", ()))
+    dense = any(getattr(axis, "bend", None) is not None for axis in axes)
+    return dense or any(isinstance(e, DryFriction) or e.family == "backlash" for e in model.effects)
+
+
 def assert_agreement(problem: Problem, unknowns: Unknowns):
     """All samples but those that rounding may put on the other side of a corner, of which there are few."""
     found = apart(problem, unknowns)
-    # How a drive that comes to rest within a step depends on its parameters is a small difference over another.
-    dry = any(isinstance(e, DryFriction) for e in problem.model.effects)
-    bounds = {name: 1e-9 if dry and "by" in name else 1e-12 for name in FIELDS}
+    bounds = {name: 1e-9 if "by" in name and is_steep(problem.model) else 1e-12 for name in FIELDS}
     off = {name: int(np.sum(d > bounds[name])) for name, d in found.items()}
     total = {name: max(d.size, 1) for name, d in found.items()}
     worst = {name: float(d.max(initial=0.0)) for name, d in found.items()}
-    assert all(off[n] <= 1e-3 * total[n] for n in FIELDS), f"{off} of {total}, worst {worst}"
+    assert all(off[n] <= max(5, 1e-3 * total[n]) for n in FIELDS), f"{off} of {total}, worst {worst}"
 
 
 TYPICAL = {
