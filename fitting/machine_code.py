@@ -17,6 +17,7 @@ from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
+from hdjax.engine.kernel import Mode, march_arrays
 from hdjax.parameters import as_scalar
 from hdjax.where import where
 
@@ -116,13 +117,13 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
     kernel = problem.kernel
     assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel, width)
-    return _blocks(kernel.jacobian, lanes, kernel.hidden)
-
-
-@eqx.filter_jit
-def _blocks(address: Array | np.ndarray, lanes: Lanes, hidden: int) -> Blocks:
-    found = march_lanes(address, lanes, hidden, "jacobian")
+    found = _marched(kernel.jacobian, lanes, kernel.hidden, "jacobian")
     return _blocks_of(lanes, found, found.rows)
+
+
+def _marched(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode) -> Marched:
+    """Outside a program of JAX none is compiled."""
+    return (march_lanes if _is_traced((address, lanes)) else march_arrays)(address, lanes, hidden, mode)
 
 
 class Task(eqx.Module):
@@ -183,26 +184,21 @@ def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
     )
 
 
-def _blocks_of(lanes: Lanes, found: Marched, residual: Array) -> Blocks:
+def _blocks_of(lanes: Lanes, found: Marched, residual: Array | np.ndarray) -> Blocks:
     """The blocks behind the results of a march."""
-    joined, gap = lanes.joined[:, None] > 0, _gap(lanes, found)
-    near = jnp.abs(gap) < LOST
+    library: Any = jnp if _is_traced((lanes, found)) else np
+    joined, gap = library.asarray(lanes.joined)[:, None] > 0, _gap(lanes, found)
+    near = library.abs(gap) < LOST
 
-    def before(slope: Array | None) -> Array:
-        assert slope is not None
-        moved = jnp.roll(slope, 1, axis=0)
-        return where((joined & near)[:, :, None] & jnp.isfinite(moved), moved, 0.0)
+    def before(slope: Any) -> Any:
+        moved = library.roll(slope, 1, axis=0)
+        return library.where((joined & near)[:, :, None] & library.isfinite(moved), moved, 0.0)
 
     # A state that has run away stands for itself: nothing before it moves the gap.
-    own = where((joined & ~near)[:, :, None], jnp.eye(gap.shape[1]), 0.0)
-    return Blocks(
-        residual=residual,
-        by_parameter=jnp.asarray(found.by_parameter),
-        by_state=jnp.asarray(found.by_state),
-        gap=gap,
-        before_by_parameter=before(found.end_by_parameter),
-        before_by_state=before(found.end_by_state) + own,
-    )
+    own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
+    parts = residual, found.by_parameter, found.by_state, gap
+    ends = before(found.end_by_parameter), before(found.end_by_state) + own
+    return Blocks(*(jnp.asarray(part) for part in (*parts, *ends)))
 
 
 def residual_by_machine_code(
@@ -212,14 +208,17 @@ def residual_by_machine_code(
     kernel = problem.kernel
     assert kernel is not None and kernel.values is not None
     lanes = lanes_of(problem, unknowns, kernel)
-    found = march_lanes(kernel.values, lanes, kernel.hidden, "values")
-    return found.rows, _gap(lanes, found)
+    found = _marched(kernel.values, lanes, kernel.hidden, "values")
+    return jnp.asarray(found.rows), _gap(lanes, found)
 
 
 def _gap(lanes: Lanes, found: Marched) -> Array:
     """How far each joined segment starts from where the one before it ends."""
-    gap = lanes.states - jnp.roll(found.end, 1, axis=0)
-    return where(lanes.joined[:, None] > 0, where(jnp.abs(gap) < LOST, gap, LOST), 0.0)
+    library: Any = jnp if _is_traced((lanes, found)) else np
+    with np.errstate(invalid="ignore"):
+        gap = library.asarray(lanes.states) - library.roll(found.end, 1, axis=0)
+    joined = library.asarray(lanes.joined)[:, None] > 0
+    return jnp.asarray(library.where(joined, library.where(library.abs(gap) < LOST, gap, LOST), 0.0))
 
 
 def simulated(
@@ -228,22 +227,12 @@ def simulated(
     """[`fitting.residual.simulate_segments`][] by machine code that has no derivatives."""
     kernel = problem.kernel
     assert kernel is not None and kernel.values is not None
-    return _simulated(kernel.values, lanes_of(problem, unknowns, kernel), kernel.hidden)
-
-
-@eqx.filter_jit
-def _simulated(address: Array | np.ndarray, lanes: Lanes, hidden: int) -> tuple[Array, Array]:
+    lanes = lanes_of(problem, unknowns, kernel)
+    library: Any = jnp if _is_traced(lanes) else np
     segments, samples, outputs = lanes.measured.shape
-    plain = eqx.tree_at(
-        lambda s: (s.measured, s.weight, s.whitening, s.settings),
-        lanes,
-        (
-            jnp.zeros_like(lanes.measured),
-            jnp.ones_like(lanes.weight),
-            -jnp.eye(outputs),
-            jnp.asarray(lanes.settings).at[1].set(1),
-        ),
-    )
-    found = march_lanes(address, plain, hidden, "values")
+    settings = library.asarray(lanes.settings) * np.array([1, 0, 1, 1]) + np.array([0, 1, 0, 0])
+    plain = np.zeros(lanes.measured.shape), np.ones(lanes.weight.shape), -np.eye(outputs), settings
+    lanes = eqx.tree_at(lambda s: (s.measured, s.weight, s.whitening, s.settings), lanes, plain)
+    found = _marched(kernel.values, lanes, kernel.hidden, "values")
     rows = found.rows[:, : samples * outputs].reshape(segments, samples, outputs)
-    return where(jnp.abs(rows) < LOST, rows, jnp.inf), found.end
+    return jnp.asarray(library.where(library.abs(rows) < LOST, rows, np.inf)), jnp.asarray(found.end)
