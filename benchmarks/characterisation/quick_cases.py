@@ -69,7 +69,7 @@ def _loops() -> list[Case]:
         _loop("no-effects", "kinematic_1.csv", more="--max-effects 0"),
         _loop("reduced", "reduced_bent.csv", "reduced"),
         _loop("quasi-static", "cycles.csv", "static", "--max-effects 2"),
-        _loop("next-experiment", "kinematic_1.csv", more="--next-experiment --largest-speed 400 --duration 0.5"),
+        _loop("next-experiment", "reduced_bent.csv", "reduced", "--next-experiment --duration 0.5"),
         _quick("demo", "demo --out {out}"),
     ]
 
@@ -139,11 +139,13 @@ _BAD_LOGS = (
     "milliseconds.csv constant.csv short.csv cut.h5 text.csv format.xyz mdf.mf4"
 )
 
+_HYPHENS = str.maketrans("._", "--")
+
 
 def _bad() -> list[Case]:
-    logs = [_fit(f"bad-{log.replace('.', '-')}", f"bad_{log}") for log in _BAD_LOGS.split()]
+    logs = [_fit(f"bad-{log.translate(_HYPHENS)}", f"bad_{log}") for log in _BAD_LOGS.split()]
     drives = [
-        _fit(f"bad-drive-{name.replace('_', '-')}", "base.csv", f"drive_{name}")
+        _fit(f"bad-drive-{name.translate(_HYPHENS)}", "base.csv", f"drive_{name}")
         for name in ("wrong_ratio", "no_inertia", "unknown_key", "not_toml", "absent")
     ]
     return [

@@ -67,7 +67,9 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _add_document(record: Record, name: str, content: Any) -> None:
-    figures, words = flattened(content)
+    # A model's numbers stand in the report with their standard errors, and predictions are made of them.
+    stored = isinstance(content, dict) and "torque_hold" in content
+    figures, words = flattened({"hold": content["torque_hold"], "kind": content["kind"]} if stored else content)
     record["figures"] |= {f"{name}:{path}": figure for path, figure in figures.items()}
     record["words"] |= {f"{name}:{path}": word for path, word in words.items()}
     record["schema"] += [f"{name}:{key}" for key in keys(content)]
