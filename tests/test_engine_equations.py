@@ -140,8 +140,6 @@ def models() -> dict[str, Model]:
 
 
 NAMES = tuple(models())
-# Products of splines are many nodes.
-LARGE = tuple(n for n in NAMES if " x " in n)
 POINTS = 16
 
 
@@ -268,7 +266,7 @@ def differentiated(function, free, points: Sequence[np.ndarray]) -> list[np.ndar
     return found
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_equations_and_their_derivatives_are_those_of_jax(name: str):
     """Everywhere: how far a number is off, relative to the largest of its column."""
     model = models()[name]

@@ -11,6 +11,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from hdjax.elementary import cosine_and_sine
+from hdjax.engine.derivatives import Tangent, derivatives
 from hdjax.engine.graph import Graph, Node
 from hdjax.where import where
 
@@ -105,7 +106,7 @@ def _each(rule: Callable[..., Node], *arguments: Nodes) -> Nodes:
 def _with_own_derivative(
     graph: Graph, parameters: dict[str, Any], arguments: list[Nodes], values_only: bool
 ) -> list[Nodes]:
-    """A function that brings its own rule of differentiation, entry by entry."""
+    """A function that brings its own rule of differentiation."""
     values = translated(graph, parameters["call_jaxpr"], arguments, values_only=values_only)
     if values_only:
         return values
@@ -114,24 +115,25 @@ def _with_own_derivative(
     if not moving:
         return values
     rule, constants, zeros = parameters["jvp_jaxpr_fun"].call_wrapped(*(False for _ in arguments))
-    slopes: list[list[Nodes | None]] = []
+    # The rule is linear in the tangents: of what it makes of them the derivatives by each are the partial ones.
+    tangents = [np.full(a.shape, graph.constant(0.0), dtype=object) for a in arguments]
+    seeds: dict[Node, Tangent] = {}
     for k, index in moving:
-        seeds = [np.full(a.shape, graph.constant(0.0), dtype=object) for a in arguments]
-        seeds[k][index] = graph.constant(1.0)
-        # The rule may call the function itself.
-        found = translated(graph, ClosedJaxpr(rule, constants), [*arguments, *seeds], values_only=True)[len(values) :]
-        along = iter(found)
-        slopes.append([None if zero else next(along) for zero in zeros])
+        tangents[k][index] = leaf = graph.leaf(("tangent", k, index))
+        seeds[leaf] = {(k, index): graph.constant(1.0)}
+    # The rule may call the function itself.
+    found = translated(graph, ClosedJaxpr(rule, constants), [*arguments, *tangents], values_only=True)[len(values) :]
+    along = iter(found)
+    moved = [None if zero else next(along) for zero in zeros]
+    wanted: list[Node] = [m.item(*i) for m in moved if m is not None for i in np.ndindex(m.shape)]
+    partials = derivatives(graph, wanted, seeds)
     results = []
-    for o, value in enumerate(values):
+    for value, change in zip(values, moved, strict=True):
         result = np.empty(value.shape, dtype=object)
         for place in np.ndindex(value.shape):
-            given: list[Node] = []
-            for (k, index), slope in zip(moving, slopes, strict=True):
-                partial = slope[o]
-                if partial is not None and graph.known(partial.item(*place)) != 0.0:
-                    given += [arguments[k].item(*index), partial.item(*place)]
-            result[place] = graph.apply("given", value.item(*place), *given) if given else value.item(*place)
+            own = {} if change is None else partials[change.item(*place)]
+            given = [n for (k, index), slope in own.items() for n in (arguments[k].item(*index), slope)]
+            result[place] = graph.apply("given", value.item(*place), *given) if given else value[place]
         results.append(result)
     return results
 
