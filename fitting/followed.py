@@ -5,6 +5,8 @@ model answers a force is the same for all of them, so that it is computed once: 
 the deviation on, two more add what a force that runs in a straight line through the interval does.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,10 +15,11 @@ from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
 from fitting.experiment import Segments
-from fitting.machine_code import actuated, lanes_of
+from fitting.machine_code import actuated
 from fitting.residual import Problem, Unknowns
 from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect, Conditions
+from hdjax.engine.equations import LOAD, TEMPERATURE
 from hdjax.engine.pointwise import at_instants, slopes_at_instants
 from hdjax.engine.response import Pushed, Response, response
 from hdjax.lanes import jit_small_lanes
@@ -24,6 +27,9 @@ from hdjax.simulate import march
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
 """Where a sample interval, from -1 to 1, is looked into; exact for a sextic's mean and a quintic's first moment."""
+
+# Segments that a program of JAX takes at a time.
+_SEGMENTS = 32
 
 
 class Followed(eqx.Module):
@@ -49,14 +55,22 @@ class Followed(eqx.Module):
 def follow(problem: Problem, unknowns: Unknowns) -> Followed:
     """Simulate the segments and linearise every sample interval along the way."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
-    kernel = problem.kernel
-    if kernel is None:
+    if problem.kernel is None:
         found = _response_by_xla(problem, unknowns)
     else:
-        found = response(model, lanes_of(problem, unknowns, kernel), kernel.signals, problem.solver)
+        found = _response(model, problem, np.asarray(unknowns.states))
     states, transition, from_start, from_end = (np.asarray(a) for a in vars(found).values())
     readout = slopes_at_instants(_outputs, (states[:, :-1], 2), (model, 0))
     return Followed(states, _between(model, states, problem.segments), transition, from_start, from_end, readout)
+
+
+def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segments states"]) -> Response:
+    segments = problem.segments
+    knots, torque = np.asarray(segments.torque.knots), acting(model, segments)
+    beside = {LOAD: segments.load_torque, TEMPERATURE: segments.temperature}
+    found = {name: np.asarray(signal.coefficients) for name, signal in beside.items() if signal is not None}
+    own = knots[:, segments.halo :], torque[:, segments.halo :], found
+    return response(model, states, *own, int(problem.substeps), problem.solver)
 
 
 def _outputs(state: Array, model: Model) -> Array:
@@ -98,7 +112,23 @@ def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments inte
     effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
     if not effects:
         return np.asarray(segments.torque.coefficients)
-    return np.asarray(actuated(effects, (), jnp.zeros(0), segments.torque)[0])
+    knots, logged = segments.torque.knots, segments.torque.coefficients
+    return some_at_a_time(
+        lambda *torque: actuated(effects, (), jnp.zeros(0), PiecewisePolynomial(*torque))[0], knots, logged
+    )
+
+
+def some_at_a_time(program: Callable[..., Array], *arrays: Array | np.ndarray) -> np.ndarray:
+    """What a program of JAX makes of segments, so many at a time that logs of all lengths share it.
+
+    Args:
+        program: from arrays whose first axis is one of segments to such an array.
+        arrays: of all segments.
+    """
+    count = len(arrays[0])
+    places = (np.minimum(np.arange(start, start + _SEGMENTS), count - 1) for start in range(0, count, _SEGMENTS))
+    found = [np.asarray(program(*(jnp.asarray(np.asarray(a)[own]) for a in arrays))) for own in places]
+    return np.concatenate(found)[:count]
 
 
 def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """What an effect of little strength would do along a motion: a force, or a change of what the encoders read."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.along import ERROR, INPUT, PART, SLOPE, Along, carried, place_of
-from fitting.followed import acting, polynomial, signals_at
+from fitting.followed import acting, polynomial, signals_at, some_at_a_time
 from fitting.free import strength_paths
 from fitting.memory import Memory, memory_of, own_between, own_states
 from hdjax import Drive, Model, PiecewisePolynomial
@@ -147,14 +148,15 @@ def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: A
 def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples nodes columns"]:
     """Derivatives of the torque that acts, at the nodes."""
     segments = seen.segments
-    logged = jnp.asarray(acting(seen.model, segments))
-    found = np.asarray(_actuated(stacked, segments.torque.knots, logged))[:, :, segments.halo :, None]
-    width = np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
-    return np.moveaxis(polynomial(found, PART * width[..., None]), 0, -1)
+    knots, logged = np.asarray(segments.torque.knots), acting(seen.model, segments)
+    found = some_at_a_time(functools.partial(_actuated, stacked), knots, logged)[:, segments.halo :]
+    width = np.diff(knots[:, segments.halo :])
+    # By columns, and then by powers.
+    return polynomial(found[:, :, None], (PART * width[..., None])[..., None])
 
 
 @jit_small
-def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array, "columns segments samples powers"]:
+def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array, "segments intervals columns powers"]:
     """Derivatives of a torque that effects have changed by the strengths of each proposal: what happens to a torque
     looks back in time, which the graph of an instant has no words for."""
 
@@ -164,10 +166,10 @@ def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array
             assert isinstance(whole, ActuatorEffect)
             return jax.vmap(lambda *own: whole.actuate(PiecewisePolynomial(*own)).coefficients)(knots, coefficients)
 
-        return jnp.moveaxis(jax.jacfwd(changed)(jnp.stack(_strengths(effect))), -1, 0)
+        return jax.jacfwd(changed)(jnp.stack(_strengths(effect)))
 
-    found = jax.vmap(of)(stacked)
-    return found.reshape(-1, *found.shape[2:])
+    found = jnp.moveaxis(jax.vmap(of)(stacked), (0, -1), (2, 3))
+    return found.reshape(*found.shape[:2], -1, found.shape[-1])
 
 
 def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:

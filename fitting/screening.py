@@ -98,7 +98,7 @@ def screen(
             strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
             filled = model.with_effects(effect).replace(strengths).effect(effect.name)
             changes = {p: step[i] for i, p in enumerate(free_now)}
-            leads[effect.name] = Lead(filled, changes, gain, states)
+            leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), null_gains)
 
@@ -107,6 +107,11 @@ def _applicable(
     catalogue: Sequence[type[Effect]], scales: Scales, model: Model
 ) -> dict[type[Effect], tuple[Effect, ...]]:
     return applicable(catalogue, scales, has_motor=isinstance(model, TwoInertiaModel))
+
+
+def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:
+    """One row for each of a fit's segments; those without data are like the last one that has some."""
+    return np.pad(states, ((0, len(fit.unknowns.states) - len(states)), (0, 0)), mode="edge")
 
 
 class _Score(eqx.Module):
@@ -136,7 +141,7 @@ def _score(sight: Sight, forces: Regressors) -> _Score:
     rows = max(float(np.sum(answers.weight)) * sight.residual.shape[-1], 1.0)
     explained = np.concatenate([answers.parameters, answers.to(forces.pushed, forces.reading)], axis=-1)
     flat = explained.reshape(-1, explained.shape[-1])
-    against = flat.T @ sight.surrogates.reshape(len(sight.surrogates), -1).T
+    against = (sight.surrogates.reshape(len(sight.surrogates), -1) @ flat).T
     return _Score(flat.T @ flat, flat.T @ sight.residual.reshape(-1), against, rows)
 
 

@@ -17,12 +17,12 @@ from fitting.followed import Followed, follow
 from fitting.free import strength_paths
 from fitting.posing import STEP_ANGLE, suggested_substeps
 from fitting.regressors import Regressors, regressors
-from fitting.residual import Problem
+from fitting.residual import Problem, Unknowns
 from fitting.surrogates import surrogates
 from hdjax.effects import Effect
 
 # Numbers that the columns of a batch have for the state alone: what a computer has room for.
-_NUMBERS = 1 << 23
+_NUMBERS = 1 << 22
 
 
 class Sight(eqx.Module):
@@ -48,38 +48,38 @@ def sight(fit: Fit, seed: int) -> Sight:
         fit: of the model without what is looked for.
         seed: of the surrogates.
     """
-    problem = _looked_at(fit)
-    found = without_untold(linearise(problem, fit.unknowns), problem.free)
+    problem, unknowns = _looked_at(fit)
+    found = without_untold(linearise(problem, unknowns), problem.free)
     slopes = np.asarray(fit.free.slopes(fit.model))
     found = replace(
         found,
         by_parameter=jnp.asarray(np.asarray(found.by_parameter) / slopes),
         before_by_parameter=jnp.asarray(np.asarray(found.before_by_parameter) / slopes),
     )
-    kept, followed = where_it_goes(fit, follow(problem, fit.unknowns))
+    kept, followed = where_it_goes(fit, follow(problem, unknowns))
     segments = problem.segments
     segments = replace(segments, weight=jnp.asarray(np.where(kept[:, None], np.asarray(segments.weight), 0.0)))
-    residual = np.asarray(fit.error) @ np.asarray(problem.whitening).T
+    residual = np.asarray(fit.error)[: len(kept)] @ np.asarray(problem.whitening).T
     return Sight(
         seen=along(fit.model, followed, segments, fit.stretches),
         answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
         residual=np.where(kept[:, None, None], residual, 0.0),
-        surrogates=surrogates(fit, seed),
+        surrogates=surrogates(fit, seed)[:, : len(kept)],
     )
 
 
 def where_it_goes(fit: Fit, followed: Followed) -> tuple[Bool[np.ndarray, " segments"], Followed]:
     """The segments in which a model does not run away, and its motion with zeros in the others: there is none to look
     along."""
-    kept = ~lost(fit) & np.isfinite(followed.transition).all(axis=(1, 2, 3))
+    kept = ~lost(fit)[: len(followed.states)] & np.isfinite(followed.transition).all(axis=(1, 2, 3))
     if kept.all():
         return kept, followed
     return kept, jax.tree.map(lambda a: np.where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
 
 
 def motion_states(fit: Fit) -> Float[np.ndarray, "segments knots states"]:
-    """The states that a fitted model goes through; zero where it runs away."""
-    return np.nan_to_num(follow(_looked_at(fit), fit.unknowns).states, posinf=0.0, neginf=0.0)
+    """The states that a fitted model goes through, in its segments with data; zero where it runs away."""
+    return np.nan_to_num(follow(*_looked_at(fit)).states, posinf=0.0, neginf=0.0)
 
 
 def follow_on(training: Fit, held_out: Fit) -> bool:
@@ -139,13 +139,20 @@ def _together(parts: Sequence[Batch]) -> Batch:
     return Batch(proposals, columns, forces, own)
 
 
-def _looked_at(fit: Fit) -> Problem:
-    """What a fit has solved, at its solution."""
+def _looked_at(fit: Fit) -> tuple[Problem, Unknowns]:
+    """What a fit has solved, and where, at its solution; without segments that only fill up."""
+    length = fit.problem.segments.weight.shape[1]
+    count = sum(-(-len(s) // length) for s in fit.stretches)
+    segments, states = jax.tree.map(
+        lambda a: jnp.asarray(np.asarray(a)[:count]), (fit.problem.segments, fit.unknowns.states)
+    )
     # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
     # than this; the residual is the fit's own.
-    return replace(
+    problem = replace(
         fit.problem,
         model=fit.model,
-        active=jnp.ones_like(fit.problem.active),
+        segments=segments,
+        active=jnp.asarray(np.ones(len(fit.free.paths))),
         substeps=suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE),
     )
+    return problem, replace(fit.unknowns, states=states)

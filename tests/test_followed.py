@@ -129,3 +129,10 @@ def test_own_states_follow_the_motion_and_go_on():
     np.testing.assert_array_equal(later.at_starts[0], memory.at_ends[0])
     np.testing.assert_allclose(later.at_starts[1, 0], z[border + 64], atol=0.02 * size)
     assert abs(afresh.at_starts[0, 0, 0] - z[border]) > 0.1 * size
+
+
+def test_xla_follows_where_there_is_no_machine_code(found: Fit, followed: Followed):
+    again = follow(replace(found.problem, model=found.model, kernel=None), found.unknowns)
+    for name, values in vars(followed).items():
+        size = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-12)
+        np.testing.assert_allclose(getattr(again, name) / size, values / size, atol=1e-9, err_msg=name)

@@ -1,6 +1,6 @@
 """How a motion answers small forces: what each sample interval makes of a deviation, and of a force through it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -13,7 +13,7 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.dynamics import Model, State
 from hdjax.effects import Conditions, Effect, Motion
 from hdjax.engine.equations import LOAD, TEMPERATURE, split_model
-from hdjax.engine.kernel import Lanes, Marched, Mode, kernel, march_arrays
+from hdjax.engine.kernel import Lanes, Marched, Mode, kernel, march_arrays, threads
 
 
 class Pushed(Model):
@@ -95,31 +95,36 @@ class Response(eqx.Module):
         return cls(states, transition, steady - from_end, from_end)
 
 
-def response(model: Model, lanes: Lanes, signals: Sequence[str], solver: dfx.AbstractERK) -> Response:
+def response(
+    model: Model,
+    states: Float[np.ndarray, "segments states"],
+    knots: Float[np.ndarray, "segments knots"],
+    torque: Float[np.ndarray, "segments samples powers"],
+    beside: Mapping[str, Float[np.ndarray, "segments samples powers"]],
+    substeps: int,
+    solver: dfx.AbstractERK,
+) -> Response:
     """Simulate segments and linearise every sample interval along the way.
 
     Args:
         model: the equations.
-        lanes: the data; of its numbers those of the model, the parameters and the measurements don't matter.
-        signals: what comes in along time beside the torque.
+        states: where each segment starts.
+        knots: of its sample intervals.
+        torque: coefficients of the torque that acts, or of the forcing.
+        beside: of what else comes in along time, by the names in `Kernel.signals`.
+        substeps: solver steps in each interval.
         solver: explicit Runge-Kutta solver of diffrax.
     """
     # What stands on llvmlite is loaded where it is there.
     from hdjax.engine.march import LOST
 
-    segments, samples = np.shape(lanes.weight)
-    count = np.shape(lanes.states)[1]
+    (segments, count), samples = states.shape, knots.shape[1] - 1
     zeros = (jnp.asarray(np.zeros(())),) * count
     pushed = Pushed.of(model, zeros, zeros)
-    around = {"loaded": LOAD in signals, "warm": TEMPERATURE in signals}
+    around = {"loaded": LOAD in beside, "warm": TEMPERATURE in beside}
     made = kernel(pushed, pushed.forces, **around, solver=solver, values=True)
     _, others, _ = split_model(pushed, pushed.forces)
-    halo = np.shape(lanes.knots)[1] - samples - 1
-    knots = np.asarray(lanes.knots)[:, halo:]
-    found = [np.asarray(s) for s in lanes.signals[: 1 + len(signals)]]
-    found = [s[:, s.shape[1] - samples :] for s in found]
-    settings = np.array(lanes.settings)
-    settings[1], settings[3] = 1, 0
+    signals = [torque, *(beside[name] for name in made.signals)]
 
     def marched(states: np.ndarray, knots: np.ndarray, signals: list[np.ndarray], mode: Mode) -> Marched:
         many, length = knots.shape[0], knots.shape[1] - 1
@@ -133,17 +138,17 @@ def response(model: Model, lanes: Lanes, signals: Sequence[str], solver: dfx.Abs
             weight=np.ones((many, length)),
             joined=np.zeros(many),
             whitening=-np.eye(count),
-            settings=settings,
+            settings=np.array([substeps, 1, threads(), 0]),
             signals=tuple(signals),
         )
         assert made.values is not None
         return march_arrays(made.jacobian if mode == "jacobian" else made.values, data, made.hidden, mode)
 
-    values = marched(np.asarray(lanes.states), knots, found, "values")
+    values = marched(states, knots, signals, "values")
     states = np.concatenate([values.rows.reshape(segments, samples, count), values.end[:, None, :-1]], axis=1)
     states = np.where(np.abs(states) < LOST, states, np.nan)
     pairs = np.stack([knots[:, :-1], knots[:, 1:]], axis=-1).reshape(-1, 2)
-    pieces = [s.reshape(-1, 1, s.shape[-1]) for s in found]
+    pieces = [s.reshape(-1, 1, s.shape[-1]) for s in signals]
     slopes = marched(states[:, :-1].reshape(-1, count), pairs, pieces, "jacobian")
     shape = (segments, samples, count, count)
     assert slopes.end_by_state is not None and slopes.end_by_parameter is not None
