@@ -160,16 +160,19 @@ def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array
     """Derivatives of a torque that effects have changed by the strengths of each proposal: what happens to a torque
     looks back in time, which the graph of an instant has no words for."""
 
-    def of(effect: Effect) -> Array:
-        def changed(strengths: Array) -> Array:
-            whole = _with(effect, strengths)
-            assert isinstance(whole, ActuatorEffect)
-            return jax.vmap(lambda *own: whole.actuate(PiecewisePolynomial(*own)).coefficients)(knots, coefficients)
+    def changed(effect: Effect, strengths: Array) -> Array:
+        whole = _with(effect, strengths)
+        assert isinstance(whole, ActuatorEffect)
+        return jax.vmap(lambda *own: whole.actuate(PiecewisePolynomial(*own)).coefficients)(knots, coefficients)
 
-        return jax.jacfwd(changed)(jnp.stack(_strengths(effect)))
-
-    found = jnp.moveaxis(jax.vmap(of)(stacked), (0, -1), (2, 3))
-    return found.reshape(*found.shape[:2], -1, found.shape[-1])
+    columns = []
+    # Written out: there are few, and lanes of lanes take long to compile.
+    for i in range(len(jax.tree.leaves(stacked)[0])):
+        effect = jax.tree.map(lambda a, i=i: a[i], stacked)
+        strengths = jnp.stack(_strengths(effect))
+        along = functools.partial(changed, effect)
+        columns += [jax.jvp(along, (strengths,), (unit,))[1] for unit in np.eye(strengths.size)]
+    return jnp.stack(columns, axis=2)
 
 
 def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:
