@@ -100,7 +100,7 @@ def response(
     states: Float[np.ndarray, "segments states"],
     knots: Float[np.ndarray, "segments knots"],
     torque: Float[np.ndarray, "segments samples powers"],
-    beside: Mapping[str, Float[np.ndarray, "segments samples powers"]],
+    beside: Mapping[str, Float[np.ndarray, "segments samples _"]],
     substeps: int,
     solver: dfx.AbstractERK,
 ) -> Response:
