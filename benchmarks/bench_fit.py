@@ -316,7 +316,7 @@ def show_profile(row: Row, repeats: int) -> None:
 
 
 _linearise = jit_lanes(blocks)
-_system = eqx.filter_jit(normal_equations)
+_system = eqx.filter_jit(lambda found, joined: normal_equations(Products.of(found), joined))
 _step = eqx.filter_jit(lambda system: system.step(jnp.zeros(())))
 _simulated = jit_lanes(residual)
 

@@ -14,15 +14,23 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.residual import Blocks, LinearisedResidual, Unknowns, blocks_of_columns, seeds
+from fitting.residual import Blocks, Products, Unknowns, moved_gap
 from hdjax.where import where
 
+# Shares of what a step promises: one that keeps less is not taken, one that keeps more is followed by a bolder one.
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
 # across it, so it must go quickly where the model predicts well.
-_REGION = optx.ClassicalTrustRegion(high_cutoff=0.75, high_constant=30.0, low_constant=0.1)
+_KEPT, _WELL = 0.01, 0.75
+_LONGER, _SHORTER = 30.0, 0.1
+# Relative changes of the sum of squares that are none; shares of the gaps that are left by a step that closes them, and
+# of the residual that it may cost.
+_SLIGHT, _CLOSED, _DEAREST = 1e-4, 0.25, 1.5
+# With less damping than this, relative to the diagonal, rounding decides whether the normal equations are definite.
+_LEAST_DAMPING = 1e-12
 # Points between which an iteration must make progress.
 _LATEST = 6
 
@@ -48,9 +56,9 @@ class Chains(eqx.Module):
         return jax.ops.segment_sum(each, self.index, num_segments=each.shape[0])
 
 
-def chains(found: Blocks, joined: Bool[Array, " segments"]) -> Chains:
+def chains(found: Blocks | Products, joined: Bool[Array, " segments"]) -> Chains:
     """Follow the linearised motion from segment to segment."""
-    parameters, states = found.by_parameter.shape[2], found.by_state.shape[2]
+    states, parameters = found.before_by_parameter.shape[1:]
     first = jnp.concatenate([jnp.zeros((states, parameters)), jnp.eye(states), jnp.zeros((states, 1))], axis=1)
     added = jnp.concatenate(
         [found.before_by_parameter, jnp.zeros_like(found.before_by_state), -found.gap[:, :, None]], axis=2
@@ -131,13 +139,10 @@ class ArrowSystem(eqx.Module):
         return Unknowns(shared, states)
 
 
-def normal_equations(found: Blocks, joined: Bool[Array, " segments"]) -> ArrowSystem:
+def normal_equations(found: Products, joined: Bool[Array, " segments"]) -> ArrowSystem:
     """The normal equations of a linearised residual, with the gaps closed."""
-    p, s, r = found.by_parameter, found.by_state, found.residual
     path = chains(found, joined)
-    parameters, states = p.shape[2], s.shape[2]
-    columns = jnp.concatenate([p, s, r[:, :, None]], axis=2)
-    products = jnp.einsum("sri,srj->sij", columns, columns)
+    states, parameters = found.before_by_parameter.shape[1:]
     # From (parameters, first state, residual, closing) to (parameters, own state, residual), segment by segment.
     through = jnp.concatenate(
         [path.by_parameter, path.by_first, jnp.zeros_like(path.closing)[..., None], path.closing[..., None]], axis=2
@@ -145,7 +150,7 @@ def normal_equations(found: Blocks, joined: Bool[Array, " segments"]) -> ArrowSy
     above = jnp.broadcast_to(jnp.eye(parameters, through.shape[2]), (through.shape[0], parameters, through.shape[2]))
     below = jnp.broadcast_to(jnp.eye(1, through.shape[2], parameters + states), (through.shape[0], 1, through.shape[2]))
     change = jnp.concatenate([above, through, below], axis=1)
-    total = jnp.einsum("sia,sij,sjb->sab", change, products, change)
+    total = jnp.einsum("sia,sij,sjb->sab", change, found.products, change)
     mine = slice(parameters, parameters + states)
     shared = jnp.sum(total[:, :parameters, :parameters], axis=0)
     return ArrowSystem(
@@ -161,7 +166,7 @@ def normal_equations(found: Blocks, joined: Bool[Array, " segments"]) -> ArrowSy
 
 def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "segments rows parameters"]:
     """The parameters' columns without what each chain's own first state could do as well."""
-    system = normal_equations(found, joined)
+    system = normal_equations(Products.of(found), joined)
     _, _, response, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
     path = system.chains
     moved = path.by_parameter - jnp.einsum("sqk,skp->sqp", path.by_first, response[path.index])
@@ -175,144 +180,162 @@ def _diagonal(matrix: Array) -> Array:
 
 
 def _solve_scaled(matrix: Array, right: Array) -> Array:
-    """Solve a symmetric system after scaling its diagonal to one; a direction without information does not move."""
+    """Solve a symmetric positive system after scaling its diagonal to one; a direction without information does not
+    move."""
     d = jnp.diagonal(matrix)
     scale = where(d > 0, 1.0 / jnp.sqrt(where(d > 0, d, 1.0)), 0.0)
     empty = where(d > 0, 0.0, 1.0)
     scaled = matrix * scale[:, None] * scale[None, :] + jnp.diag(empty + 1e-13)
-    return scale[:, None] * jnp.linalg.solve(scaled, scale[:, None] * right)
+    lower = jax.lax.linalg.cholesky(scaled, symmetrize_input=False)
+    half = jax.lax.linalg.triangular_solve(lower, scale[:, None] * right, left_side=True, lower=True)
+    whole = jax.lax.linalg.triangular_solve(lower, half, left_side=True, lower=True, transpose_a=True)
+    return scale[:, None] * whole
 
 
-def blocks_seen(
-    f_info: Any,
-    unknowns: Unknowns,
-    gap_weight: Float[Array, " states"],
-    joined: Bool[Array, " segments"],
-) -> Blocks:
-    """The blocks behind what optimistix knows of [`fitting.residual.residual_with_blocks`][] at the unknowns, its
-    `FunctionInfo.ResidualJac`."""
-    moved: LinearisedResidual = jax.vmap(f_info.jac.mv, out_axes=-1)(seeds(unknowns))
-    value, weight = f_info.residual, gap_weight[None]
-    return blocks_of_columns(value.rows, value.gap / weight, moved.rows, moved.gap / weight[:, :, None], joined)
-
-
-class ArrowDescent(optx.AbstractDescent):
-    """Damped Gauss-Newton steps by elimination of the segments' states; damping is relative to diag(J^T J), for the
-    shared parameters to the largest that it has been.
+class Iteration(eqx.Module):
+    """What [`ArrowLevenbergMarquardt`][] carries from step to step.
 
     Attributes:
-        joined: whether a segment starts where the one before it ends.
-        gap_weight: of each state, as in the problem.
-        damping: at the start.
-        longest: how far a step may carry each shared parameter.
+        ahead: where to look next.
+        found: the normal equations at the best point.
+        costs: half the sums of squares at the latest best points, newest first; infinite where there were none.
+        rows: sum of squares of the residual at the best point.
+        gap: of the weighted gaps.
+        promised: by how much the next step is to lower half the sum of squares, negative.
+        size: inverse of the damping in units of the first one.
+        yardstick: the largest diagonal of J^T J so far, of the shared parameters.
+        count: how many steps were taken.
+        accepted: whether the point that was seen last is the best.
     """
 
-    joined: Bool[Array, " segments"]
-    gap_weight: Float[Array, " states"]
-    damping: Float[Array, ""]
-    longest: Float[Array, " parameters"] | float = jnp.inf
-
-    def init(self, y: Unknowns, f_info_struct) -> ArrowSystem:
-        parameters = y.parameters.shape[0]
-        segments, states = y.states.shape
-        zeros = jnp.zeros((segments, states, states))
-        return ArrowSystem(
-            shared=jnp.eye(parameters),
-            own=zeros,
-            coupling=zeros[:, :, :1] * jnp.zeros(parameters)[None, None, :],
-            shared_gradient=jnp.zeros((parameters, 2)),
-            own_gradient=jnp.zeros((segments, states, 2)),
-            chains=Chains(
-                by_parameter=zeros[:, :, :1] * jnp.zeros(parameters)[None, None, :],
-                by_first=zeros,
-                closing=zeros[:, :, 0],
-                index=jnp.zeros(segments, dtype=int),
-            ),
-            yardstick=jnp.zeros(parameters),
-        )
-
-    def query(self, y: Unknowns, f_info, state: ArrowSystem) -> ArrowSystem:
-        system = normal_equations(blocks_seen(f_info, y, self.gap_weight, self.joined), self.joined)
-        # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
-        # most that it has ever shown (Moré 1978).
-        return eqx.tree_at(lambda s: s.yardstick, system, jnp.maximum(system.yardstick, state.yardstick))
-
-    def step(self, step_size: Array, state: ArrowSystem) -> tuple[Unknowns, optx.RESULTS]:
-        damping = self.damping / jnp.maximum(step_size, 1e-30)
-        return state.step(damping, self.longest), optx.RESULTS.successful
+    ahead: Unknowns
+    found: Products
+    costs: Float[Array | np.ndarray, " latest"]
+    rows: Float[Array | np.ndarray, ""]
+    gap: Float[Array | np.ndarray, ""]
+    promised: Float[Array | np.ndarray, ""]
+    size: Float[Array | np.ndarray, ""]
+    yardstick: Float[Array | np.ndarray, " parameters"]
+    count: Int[Array | np.ndarray, ""]
+    accepted: Bool[Array | np.ndarray, ""]
 
 
-class Progress(eqx.Module):
-    """How far an iteration has come.
+class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt of optimistix for arrow-shaped problems: damped Gauss-Newton steps by elimination of the
+    segments' states. All that it uses of its function are the [`Products`][fitting.residual.Products] that this returns
+    as a second result.
 
-    Attributes:
-        region: state of the trust region.
-        costs: half the sums of squares at the latest points, newest first; infinite where there were none.
-    """
-
-    region: Any
-    costs: Float[Array, " latest"]
-
-
-class GapTrustRegion(optx.AbstractSearch):
-    """optimistix' trust region, but two kinds of step are taken in any case: one that hardly changes the sum of
-    squares, and one that closes most of the gaps for a little more residual. No finite weight of the gaps repays what
-    closing the last of them costs.
-    """
-
-    region: optx.ClassicalTrustRegion = _REGION
-    slack: float = 1e-4
-    closed: float = 0.25
-    dearest: float = 1.5
-
-    def init(self, y, f_info_struct):
-        return Progress(self.region.init(y, f_info_struct), jnp.full(_LATEST, jnp.inf))
-
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        old = state.region
-        size, accept, result, new = self.region.step(first_step, y, y_eval, f_info, f_eval_info, old)
-        before = f_info.as_min()
-        slight = jnp.abs(f_eval_info.as_min() - before) < self.slack * before
-        rows, gap = (jnp.sum(part**2) for part in (f_info.residual.rows, f_info.residual.gap))
-        new_rows, new_gap = (jnp.sum(part**2) for part in (f_eval_info.residual.rows, f_eval_info.residual.gap))
-        closing = (new_gap < self.closed * gap) & (new_rows < self.dearest * rows)
-        anyway = ~accept & (slight | closing)
-        new = jax.tree.map(lambda before, after: where(anyway, before, after), old, new)
-        accept = accept | anyway
-        costs = jnp.concatenate([f_eval_info.as_min()[None], state.costs[:-1]])
-        return where(anyway, old.step_size, size), accept, result, Progress(new, where(accept, costs, state.costs))
-
-
-class ArrowLevenbergMarquardt(optx.AbstractGaussNewton):
-    """optimistix' Levenberg-Marquardt with [`ArrowDescent`][] for its linear algebra.
+    A step is taken where it lowers the sum of squares by a share of what it promised. Two more kinds are taken in any
+    case: one that hardly changes the sum of squares, and one that closes most of the gaps for a little more residual.
+    No finite weight of the gaps repays what closing the last of them costs.
 
     It ends where a step promises next to nothing: less than `rtol` of what one more degree of freedom explains of
     noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) Corners
     of a nonsmooth model make steps promise what they do not keep: the iteration ends as well where the latest of them
     together have taken off less than a share of the sum of squares, where one is given. How many steps it may take, and
     that share, are data, so that one compiled program serves hasty fits and patient ones.
+
+    Attributes:
+        joined: whether a segment starts where the one before it ends.
+        gap_weight: of each state, as in the problem.
+        damping: of the first step, relative to the diagonal of J^T J; for the shared parameters to the largest that it
+            has been.
+        most_steps: where the iteration ends at the latest.
+        rows: how many rows the residual has.
+        longest: how far a step may carry each shared parameter.
+        least_progress: share of the sum of squares that a few steps must take off it.
     """
 
-    descent: ArrowDescent
-    most_steps: Int[Array, ""]
-    least_progress: Float[Array, ""] = eqx.field(default=0.0, converter=jnp.asarray)
+    joined: Bool[Array | np.ndarray, " segments"]
+    gap_weight: Float[Array | np.ndarray, " states"]
+    damping: Float[Array | np.ndarray, ""]
+    most_steps: Int[Array | np.ndarray, ""]
+    rows: Float[Array | np.ndarray, ""]
+    longest: Float[Array | np.ndarray, " parameters"] | float = jnp.inf
+    least_progress: Float[Array | np.ndarray, ""] | float = 0.0
     rtol: float = 1e-3
     atol: float = 0.0
     norm: Callable[[Any], Array] = optx.max_norm
-    search: GapTrustRegion = GapTrustRegion()
-    verbose: Callable[..., None] = eqx.field(static=True, default=lambda **_: None)
 
-    def terminate(self, fn, y, args, options, state, tags):
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iteration:
+        # By numpy: outside programs of JAX nothing is compiled for it.
+        zero = np.zeros(())
+        return Iteration(
+            ahead=y,
+            found=jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), aux_struct),
+            costs=np.full(_LATEST, np.inf),
+            rows=zero,
+            gap=zero,
+            promised=np.array(-np.inf),
+            size=np.ones(()),
+            yardstick=np.zeros(y.parameters.shape),
+            count=np.zeros((), int),
+            accepted=np.zeros((), bool),
+        )
+
+    def step(self, fn, y, args, options, state: Iteration, tags) -> tuple[Unknowns, Iteration, Products]:
+        _, seen = fn(state.ahead, args)
+        weight = self.gap_weight[None]
+        rows, gap = seen.square, jnp.sum((seen.gap * weight) ** 2)
+        cost, before, first = 0.5 * (rows + gap), state.costs[0], state.count == 0
+        kept = first | (cost - before <= _KEPT * state.promised)
+        well = ~first & (cost - before < _WELL * state.promised)
+        slight = jnp.abs(cost - before) < _SLIGHT * before
+        closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * state.rows)
+        accepted = kept | slight | closing
+        size = state.size * where(kept, where(well, _LONGER, 1.0), where(accepted, 1.0, _SHORTER))
+        costs = jnp.concatenate([cost[None], state.costs[:-1]])
+        new, old = (state.ahead, seen, costs, rows, gap), (y, state.found, state.costs, state.rows, state.gap)
+        best, found, costs, rows, gap = jax.tree.map(lambda a, b: where(accepted, a, b), new, old)
+
+        system = normal_equations(found, self.joined)
+        # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
+        # most that it has ever shown (Moré 1978).
+        yardstick = jnp.maximum(system.yardstick, state.yardstick)
+        system = eqx.tree_at(lambda s: s.yardstick, system, yardstick)
+        step = system.step(jnp.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
+        promised = self._promised(found, step)
+        # Where the system has no solution to working precision, another step from here is more damped.
+        solved = jnp.isfinite(promised)
+        after = Iteration(
+            ahead=jax.tree.map(lambda a, b: where(solved, a + b, a), best, step),
+            found=found,
+            costs=costs,
+            rows=rows,
+            gap=gap,
+            promised=where(solved, promised, -jnp.inf),
+            size=where(solved, size, _SHORTER * size),
+            yardstick=yardstick,
+            count=state.count + 1,
+            accepted=accepted,
+        )
+        return best, after, found
+
+    def _promised(self, found: Products, step: Unknowns) -> Float[Array, ""]:
+        """By how much half the sum of squares changes along a step, to second order."""
+        segments = step.states.shape[0]
+        own = jnp.broadcast_to(step.parameters, (segments, step.parameters.size))
+        column = jnp.concatenate([own, step.states, jnp.zeros((segments, 1))], axis=1)
+        changed = jnp.einsum("sij,sj->si", found.products, column)
+        gap, moved = (g * self.gap_weight[None] for g in (found.gap, moved_gap(found, self.joined, step)))
+        rows = jnp.sum(changed[:, -1]) + 0.5 * jnp.sum(column * changed)
+        return rows + jnp.sum(moved * (gap + 0.5 * moved))
+
+    def terminate(self, fn, y, args, options, state: Iteration, tags):
         """Whether to stop: by the decrease that the next step promises."""
-        step = jax.tree.map(jnp.subtract, state.y_eval, y)
-        promised = self.search.region.predict_reduction(step, state.f_info)
-        residual = state.f_info.residual
-        cost = 0.5 * (jnp.sum(residual.rows**2) + jnp.sum(residual.gap**2))
-        small = jnp.abs(promised) < self.rtol * cost / residual.rows.size
-        done = small & ~state.first_step
-        costs, least = state.search_state.costs, self.least_progress
+        costs = jnp.asarray(state.costs)
+        newest, oldest = costs[0], costs[-1]
+        small = jnp.abs(state.promised) < self.rtol * newest / self.rows
+        # Rounding may leave nothing of a step that still promises something.
+        still = [jnp.all(a == b) for a, b in zip(jax.tree.leaves(state.ahead), jax.tree.leaves(y), strict=True)]
+        small = small | (jnp.isfinite(state.promised) & jnp.all(jnp.stack(still)))
         # To close gaps may cost more than it takes off: without a least progress none is asked for.
-        stalled = (least > 0) & (costs[-1] - costs[0] < least * costs[0])
-        done = done | stalled
-        late = ~done & (state.num_steps >= self.most_steps)
-        return done | late, optx.RESULTS.where(late, optx.RESULTS.nonlinear_max_steps_reached, state.result)
+        least = jnp.asarray(self.least_progress)
+        stalled = (least > 0) & (oldest - newest < least * newest)
+        done = (state.count > 0) & (small | stalled)
+        late = ~done & (state.count >= self.most_steps)
+        successful, most = optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        return done | late, optx.RESULTS.where(late, most, successful)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {}

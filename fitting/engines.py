@@ -15,6 +15,7 @@ from fitting.residual import (
     Blocks,
     LinearisedResidual,
     Problem,
+    Products,
     Unknowns,
     blocks,
     moved_residual,
@@ -122,6 +123,13 @@ def simulate(
 
 
 _simulate_by_xla = jit_lanes(simulate_segments)
+
+
+def residual_and_products(unknowns: Unknowns, problem: Problem) -> tuple[LinearisedResidual, Products]:
+    """What [`fitting.arrow.ArrowLevenbergMarquardt`][] minimises: the residual with weighted gaps; and what it needs
+    of it."""
+    found = blocks_inside(problem, unknowns)
+    return seen_residual(found, problem.gap_weight), Products.of(found)
 
 
 @eqx.filter_custom_jvp

@@ -13,12 +13,11 @@ from fitting.engines import linearise
 from fitting.experiment import Stretch, scales
 from fitting.explained import FirstStates
 from fitting.free import FreeParameters
-from fitting.posing import initial_states, pose
+from fitting.posing import initial_states, on_all_devices, pose
 from fitting.residual import RUNAWAY, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from hdjax import Model
-from hdjax.compilation import jit_small
-from hdjax.lanes import spread
+from hdjax.engine.pointwise import slopes_at_instants
 
 REWEIGHTINGS = 3
 """Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
@@ -52,8 +51,8 @@ class Fit(eqx.Module):
     model: Model
     problem: Problem
     unknowns: Unknowns
-    error: Float[Array, "segments samples outputs"]
-    covariance: Float[Array, "outputs outputs"]
+    error: Float[Array | np.ndarray, "segments samples outputs"]
+    covariance: Float[Array | np.ndarray, "outputs outputs"]
     objective: float = eqx.field(static=True)
     stretches: tuple[Stretch, ...]
     horizon: int = eqx.field(static=True)
@@ -86,7 +85,7 @@ def fit(
     halo: int = 0,
     substeps: int | None = None,
     max_steps: int = 60,
-    covariance: Float[Array, "outputs outputs"] | None = None,
+    covariance: Float[Array | np.ndarray, "outputs outputs"] | None = None,
     reweigh: bool = True,
     hold_parameters: bool = False,
     count: int | None = None,
@@ -141,11 +140,11 @@ def fit(
     )
     length = problem.segments.weight.shape[1]
     outputs = problem.segments.measured.shape[-1]
-    swing = jnp.asarray(np.asarray(scales(stretches).x))
+    swing = float(scales(stretches).x)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = outputs > 1 or unknowns.states.shape[1] > len(model.motion_states)
     if covariance is None:
-        covariance = evaluate(problem, unknowns).covariance if scale_matters else swing[None, None] ** 2
+        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[swing**2]])
     objective, steps = np.inf, 0
     solution = None
 
@@ -158,7 +157,7 @@ def fit(
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
             if begin_anew and not (solution.success or hold_parameters):
                 again = solved(_grown(problem, unknowns, least_progress), NEARBY_DAMPING)
-                solution = min(solution, again, key=lambda s: float(jnp.sum(s.left_over.squares)))
+                solution = min(solution, again, key=lambda s: np.sum(s.left_over.squares))
             mended = _retry_states(problem, solution, least_progress) if retry_states else None
             if mended is not None:
                 solution = solved(mended, NEARBY_DAMPING)
@@ -185,11 +184,11 @@ def fit(
     )
 
 
-@jit_small
-def weighed(problem: Problem, covariance: Array, swing: Array) -> Problem:
+def weighed(problem: Problem, covariance: Array | np.ndarray, swing: float) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
-    return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, (white, _gap_weight(problem, white, swing)))
+    weights = white, _gap_weight(problem, white, swing)
+    return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, tuple(map(jnp.asarray, weights)))
 
 
 def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
@@ -205,8 +204,7 @@ def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unkno
     for samples in _growing(problem, length):
         masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
         part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
-        # The program of the fit, where all is in the same places.
-        part, unknowns = spread((part, unknowns), weight.shape[0])
+        part, unknowns = on_all_devices(part, unknowns)
         unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING, least_progress=least_progress).unknowns
     return unknowns
 
@@ -218,14 +216,14 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
     A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
     segments would dominate the sum of squares.
     """
-    parameters, old = found.unknowns.parameters, np.asarray(found.left_over.squares)
+    parameters, old = found.unknowns.parameters, found.left_over.squares
     suspect = old > _OUTLIER * np.median(old[np.asarray(problem.segments.weight).any(axis=1)])
     if not suspect.any():
         return None
     held = eqx.tree_at(lambda p: p.active, problem, zeros_like(problem.active))
     model = problem.free.unpack(problem.model, parameters)
     fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)), least_progress)
-    new = np.asarray(evaluate(problem, fresh).squares)
+    new = evaluate(problem, fresh).squares
     better = (new < 0.99 * old) & suspect
     if not better.any():
         return None
@@ -245,13 +243,12 @@ def _growing(problem: Problem, length: int) -> list[int]:
     return [first * 4**k for k in range(10) if first * 4**k < length] + [length]
 
 
-@jit_small
-def whitening(covariance: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
+def whitening(covariance: Float[Array | np.ndarray, "outputs outputs"]) -> Float[np.ndarray, "outputs outputs"]:
     """W with `W covariance W^T = 1`."""
-    return jnp.linalg.inv(jnp.linalg.cholesky(covariance))
+    return np.linalg.inv(np.linalg.cholesky(np.asarray(covariance)))
 
 
-def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " states"]:
+def _gap_weight(problem: Problem, white: np.ndarray, swing: float) -> Float[np.ndarray, " states"]:
     """What the states count in a gap: about what the segment behind it would pay for it.
 
     An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
@@ -259,15 +256,20 @@ def _gap_weight(problem: Problem, white: Array, swing: Array) -> Float[Array, " 
     would look too dear.
     """
     model = problem.model
-    motion = len(model.motion_states)
-    angles = jnp.linalg.norm(white @ jax.jacfwd(model.outputs)(model.rest()), axis=0)[: motion // 2]
-    rates = angles / model.drive.omega_0
-    visible = 0.1 * swing * jnp.linalg.norm(white[:, -1])
-    hidden = [visible / e.state_scale() for e in model.effects if e.states]
-    return np.sqrt(problem.segments.weight.shape[1]) * jnp.concatenate([angles, rates, *hidden])
+    angles = len(model.motion_states) // 2
+    seen = slopes_at_instants(_outputs, (np.asarray(model.rest()), 0), (model, 0))
+    shown = np.linalg.norm(white @ seen[:, :angles], axis=0)
+    visible = 0.1 * swing * np.linalg.norm(white[:, -1])
+    hidden = [visible / np.asarray(e.state_scale()) for e in model.effects if e.states]
+    weights = np.concatenate([shown, shown / float(model.drive.omega_0), *hidden])
+    return np.sqrt(problem.segments.weight.shape[1]) * weights
 
 
-def half_log_determinant(covariance: Array) -> float:
+def _outputs(state: Array, model: Model) -> Array:
+    return model.outputs(state)
+
+
+def half_log_determinant(covariance: Array | np.ndarray) -> float:
     """The objective that errors of this covariance make; infinite where it is none."""
     sign, value = np.linalg.slogdet(np.asarray(covariance))
     return float(0.5 * value) if sign > 0 else np.inf
@@ -295,10 +297,10 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     if np.isfinite(shift):
         slopes = linearise(problem, found.unknowns)
         columns = FirstStates.of(slopes, problem.segments.joined).parameters_without(slopes)
-    error, white_by_error = np.asarray(evaluate(problem, found.unknowns).error), np.asarray(problem.whitening)
+    error, white_by_error = evaluate(problem, found.unknowns).error, np.asarray(problem.whitening)
     count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:
-        better = np.asarray(evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error)
+        better = evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error
         white = (better - error) @ white_by_error.T
         mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
         moved = 0.0 if columns is None else _standard_errors_moved(columns, white)

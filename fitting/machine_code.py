@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from fitting.free import LARGEST_LOG
-from fitting.residual import LOST, Blocks, Problem, Unknowns
+from fitting.residual import LOST, Blocks, Problem, Products, Unknowns
 from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
@@ -118,7 +118,8 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
     assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel, width)
     found = _marched(kernel.jacobian, lanes, kernel.hidden, "jacobian")
-    return _blocks_of(lanes, found, found.rows)
+    parts = found.rows, found.by_parameter, found.by_state
+    return Blocks(*map(jnp.asarray, parts), *_ends(lanes, found))
 
 
 def _marched(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode) -> Marched:
@@ -145,16 +146,15 @@ class Task(eqx.Module):
     active: np.ndarray
     hidden: int = eqx.field(static=True)
 
-    def look(self, unknowns: Unknowns) -> tuple[Blocks, Float[Array, "segments rows"]]:
-        """The residual at a point: in place of its rows and their derivatives the triangular factor of these, which has
-        the same normal equations; and the rows."""
+    def look(self, unknowns: Unknowns) -> tuple[Products, Float[Array, "segments rows"]]:
+        """The normal equations of the residual at a point, and its rows."""
         vector = unknowns.parameters
         value = where(self.logarithmic, jnp.exp(jnp.clip(vector, -LARGEST_LOG, LARGEST_LOG)), vector * self.scale)
         slope = where(self.logarithmic, value, self.scale) * self.active
         lanes = eqx.tree_at(lambda s: (s.free, s.slopes, s.states), self.lanes, (value, slope, unknowns.states))
         found = march_lanes(self.address, lanes, self.hidden, "jacobian", reduced=True)
-        assert found.factor is not None
-        return _blocks_of(lanes, found, found.factor), found.rows
+        assert found.products is not None
+        return Products(found.products, *_ends(lanes, found)), found.rows
 
 
 def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
@@ -184,8 +184,8 @@ def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
     )
 
 
-def _blocks_of(lanes: Lanes, found: Marched, residual: Array | np.ndarray) -> Blocks:
-    """The blocks behind the results of a march."""
+def _ends(lanes: Lanes, found: Marched) -> tuple[Array, Array, Array]:
+    """The gap before each segment, and the derivatives of the end of the segment before."""
     library: Any = jnp if _is_traced((lanes, found)) else np
     joined, gap = library.asarray(lanes.joined)[:, None] > 0, _gap(lanes, found)
     near = library.abs(gap) < LOST
@@ -196,9 +196,8 @@ def _blocks_of(lanes: Lanes, found: Marched, residual: Array | np.ndarray) -> Bl
 
     # A state that has run away stands for itself: nothing before it moves the gap.
     own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
-    parts = residual, found.by_parameter, found.by_state, gap
-    ends = before(found.end_by_parameter), before(found.end_by_state) + own
-    return Blocks(*(jnp.asarray(part) for part in (*parts, *ends)))
+    ends = gap, before(found.end_by_parameter), before(found.end_by_state) + own
+    return tuple(map(jnp.asarray, ends))
 
 
 def residual_by_machine_code(

@@ -8,10 +8,9 @@ from jaxtyping import Array, Float
 from fitting.engines import linearise
 from fitting.estimate import REWEIGHTINGS, Fit, weighed, zeros_like
 from fitting.experiment import Stretch, cut, scales
-from fitting.posing import initial_states, natural_frequency
+from fitting.posing import initial_states, natural_frequency, on_all_devices
 from fitting.residual import RUNAWAY, Blocks, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
-from hdjax.lanes import spread
 
 # So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.
 _SAMPLES = 2500
@@ -97,7 +96,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
     piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
     held = eqx.tree_at(lambda p: p.active, found.problem, zeros_like(found.problem.active))
-    swing = jnp.asarray(np.asarray(scales(found.stretches).x))
+    swing = float(scales(found.stretches).x)
     anew = smoothed = _Pieces(np.zeros(found.covariance.shape))
     # A piece is the head of a segment; segments that begin later have other heads.
     for offset in range(0, length - piece + 1, piece):
@@ -109,20 +108,19 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         head = weight * weight[:, piece - 1 : piece] * (np.arange(length) < piece)[None]
         part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
-        # The program of the fit, where all is in the same places.
-        part, unknowns = spread((part, unknowns), count)
+        part, unknowns = on_all_devices(part, unknowns)
         covariance, before = found.covariance, np.full(len(found.covariance), np.inf)
         for turn in range(REWEIGHTINGS):
             part = weighed(part, covariance, swing)
             damping = NEARBY_DAMPING if turn else FIRST_DAMPING
             solution = solve(part, unknowns, _STEPS, damping, least_progress=_LEAST_PROGRESS)
             unknowns, covariance = solution.unknowns, solution.left_over.covariance
-            now = np.sqrt(np.diag(np.asarray(covariance)))
+            now = np.sqrt(np.diag(covariance))
             if np.all(np.abs(now - before) <= _SETTLED * now):
                 break
             before = now
         seen = linearise(part, unknowns)
-        anew = anew.and_more(np.asarray(covariance) * head.sum(), float(head.sum()), _states_freedom(part, seen))
+        anew = anew.and_more(covariance * head.sum(), float(head.sum()), _states_freedom(part, seen))
         smoothed = smoothed.and_more(*_smoothed(part, seen, piece))
     return jnp.asarray(_of_both(anew, smoothed))
 

@@ -48,10 +48,14 @@ def pose(
     outputs = segments.measured.shape[-1]
     unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
     problem = Problem(model, free, segments, *unweighed, substeps=substeps)
-    problem = with_engine(problem)
+    return on_all_devices(with_engine(problem), unknowns)
+
+
+def on_all_devices(problem: Problem, unknowns: Unknowns) -> tuple[Problem, Unknowns]:
+    """The same, its segments shared among the devices where XLA evaluates the residual."""
     if problem.kernel is not None:
         return problem, unknowns
-    return spread((problem, unknowns), states.shape[0])
+    return spread((problem, unknowns), unknowns.states.shape[0])
 
 
 def segment_length(horizon: int) -> int:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from fitting.arrow import normal_equations, project
 from fitting.engines import blocks_inside
 from fitting.estimate import Fit
-from fitting.residual import Problem, Unknowns
+from fitting.residual import Problem, Products, Unknowns
 from fitting.uncertainty import Uncertainty
 from hdjax.where import where
 
@@ -190,7 +190,7 @@ def _density_and_gradient(change: Array, given: tuple[Problem, Unknowns]) -> tup
         value = -0.5 * jnp.sum(found.residual**2)
         gradient = -jnp.einsum("srp,sr->p", project(found, joined), found.residual)
         held = eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), found, replace_fn=jnp.zeros_like)
-        step = normal_equations(held, joined).step(jnp.zeros(()))
+        step = normal_equations(Products.of(held), joined).step(jnp.zeros(()))
         return states + step.states, value, gradient
 
     # The last pass only looks.

@@ -15,8 +15,8 @@ import optimistix as optx
 from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt
-from fitting.engines import residual_with_blocks
+from fitting.arrow import ArrowLevenbergMarquardt
+from fitting.engines import residual_and_products, residual_with_blocks
 from fitting.estimate import Fit
 from fitting.residual import Problem, Unknowns
 from fitting.uncertainty import Uncertainty
@@ -225,17 +225,18 @@ def _solve_lanes(
     """Fit what is active from each start; parameters, states and sums of squares."""
 
     def one(parameters: Array, states: Array) -> tuple[Array, Array, Array]:
-        descent = ArrowDescent(problem.segments.joined, problem.gap_weight, jnp.asarray(_DAMPING))
+        joined, gap_weight = problem.segments.joined, problem.gap_weight
+        rows = jnp.asarray(float(problem.segments.measured.size))
         solution = optx.least_squares(
-            residual_with_blocks,
-            ArrowLevenbergMarquardt(descent=descent, most_steps=jnp.asarray(_STEPS)),
+            residual_and_products,
+            ArrowLevenbergMarquardt(joined, gap_weight, jnp.asarray(_DAMPING), jnp.asarray(_STEPS), rows),
             Unknowns(parameters, states),
             args=problem,
+            has_aux=True,
             max_steps=None,
             throw=False,
         )
-        end = solution.state.f_info.residual
-        square = jnp.sum(end.rows**2) + jnp.sum(end.gap**2)
+        square = 2.0 * solution.state.costs[0]
         return solution.value.parameters, solution.value.states, where(jnp.isfinite(square), square, jnp.inf)
 
     return jax.vmap(one)(parameters, states)

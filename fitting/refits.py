@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from fitting.arrow import normal_equations
 from fitting.engines import linearise, residual_inside, with_engine
 from fitting.estimate import Fit
-from fitting.residual import Blocks, Problem, Unknowns
+from fitting.residual import Blocks, Problem, Products, Unknowns
 from hdjax.lanes import jit_lanes
 
 # Data that run side by side; more would not fit into the processor's cache.
@@ -46,9 +46,8 @@ def _refits(problem: Problem, start: Unknowns, at_start: Blocks, measured: Array
         def improved(_, unknowns_and_moved: tuple[Unknowns, Array]) -> tuple[Unknowns, Array]:
             unknowns, _ = unknowns_and_moved
             rows, gap = residual_inside(own, unknowns)
-            system = normal_equations(
-                eqx.tree_at(lambda b: (b.residual, b.gap), at_start, (rows, gap)), problem.segments.joined
-            )
+            here = eqx.tree_at(lambda b: (b.residual, b.gap), at_start, (rows, gap))
+            system = normal_equations(Products.of(here), problem.segments.joined)
             step = system.step(jnp.zeros(()))
             information, _, _, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
             moved = jnp.sqrt(step.parameters @ information @ step.parameters)

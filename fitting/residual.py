@@ -57,8 +57,8 @@ class Problem(eqx.Module):
 class Unknowns(eqx.Module):
     """What is fitted: the free parameters, and the initial state of each segment."""
 
-    parameters: Float[Array, " parameters"]
-    states: Float[Array, "segments states"]
+    parameters: Float[Array | np.ndarray, " parameters"]
+    states: Float[Array | np.ndarray, "segments states"]
 
 
 class Blocks(eqx.Module):
@@ -80,6 +80,34 @@ class Blocks(eqx.Module):
     gap: Float[Array, "segments states"]
     before_by_parameter: Float[Array, "segments states parameters"]
     before_by_state: Float[Array, "segments states states"]
+
+
+class Products(eqx.Module):
+    """What the normal equations need of residual and Jacobian.
+
+    Attributes:
+        products: of each segment's columns with each other: derivatives by parameters, by states, and the residual.
+        gap: as in [`Blocks`][].
+        before_by_parameter: likewise.
+        before_by_state: likewise.
+    """
+
+    products: Float[Array | np.ndarray, "segments columns columns"]
+    gap: Float[Array | np.ndarray, "segments states"]
+    before_by_parameter: Float[Array | np.ndarray, "segments states parameters"]
+    before_by_state: Float[Array | np.ndarray, "segments states states"]
+
+    @staticmethod
+    def of(found: Blocks) -> "Products":
+        """Those of a residual with its Jacobian."""
+        columns = jnp.concatenate([found.by_parameter, found.by_state, found.residual[:, :, None]], axis=2)
+        ends = found.gap, found.before_by_parameter, found.before_by_state
+        return Products(jnp.einsum("sri,srj->sij", columns, columns), *ends)
+
+    @property
+    def square(self) -> Float[Array, ""]:
+        """Sum of squares of the residual."""
+        return jnp.sum(self.products[:, -1, -1])
 
 
 @eqx.filter_jit
@@ -214,13 +242,23 @@ def moved_residual(
     found: Blocks, gap_weight: Float[Array, " states"], joined: Bool[Array, " segments"], tangent: Unknowns
 ) -> LinearisedResidual:
     """How [`fitting.engines.residual_with_blocks`][] changes there along a tangent, parts of which may be None."""
-    rows, gap = jnp.zeros_like(found.residual), jnp.zeros_like(found.gap)
+    rows = jnp.zeros_like(found.residual)
     if tangent.parameters is not None:
         rows = rows + jnp.einsum("srp,p->sr", found.by_parameter, tangent.parameters)
+    if tangent.states is not None:
+        rows = rows + jnp.einsum("srq,sq->sr", found.by_state, tangent.states)
+    return LinearisedResidual(rows, moved_gap(found, joined, tangent) * gap_weight[None])
+
+
+def moved_gap(
+    found: Blocks | Products, joined: Bool[Array, " segments"], tangent: Unknowns
+) -> Float[Array, "segments states"]:
+    """How the gaps change along a tangent, parts of which may be None."""
+    gap = jnp.zeros_like(found.gap)
+    if tangent.parameters is not None:
         gap = gap - jnp.einsum("sqp,p->sq", found.before_by_parameter, tangent.parameters)
     if tangent.states is not None:
         before = jnp.roll(tangent.states, 1, axis=0)
         own = where(joined[:, None], tangent.states, 0.0)
-        rows = rows + jnp.einsum("srq,sq->sr", found.by_state, tangent.states)
         gap = gap + own - jnp.einsum("sqk,sk->sq", found.before_by_state, before)
-    return LinearisedResidual(rows, gap * gap_weight[None])
+    return gap

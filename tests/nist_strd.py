@@ -14,8 +14,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.arrow import ArrowDescent, ArrowLevenbergMarquardt, normal_equations
-from fitting.residual import Blocks, LinearisedResidual, Unknowns
+from fitting.arrow import ArrowLevenbergMarquardt, normal_equations
+from fitting.residual import Blocks, LinearisedResidual, Products, Unknowns
 
 SAMPLES, PARAMETERS = 250, 9
 # Where a model leaves the numbers, as in `fitting.residual`: a rejected step.
@@ -139,12 +139,18 @@ def physical(vector: Array, data: Regression) -> Array:
     return jnp.where(data.logarithmic, jnp.exp(jnp.where(data.logarithmic, vector, 0.0)), vector)
 
 
-def residual(unknowns: Unknowns, data: Regression) -> LinearisedResidual:
-    """The residual as the core takes it: one segment, whose single state moves nothing."""
-    values = jax.lax.switch(data.number, _FORMS, physical(unknowns.parameters, data), data.x_1, data.x_2)
-    error = (data.y - values) * data.weight
-    error = jnp.where(jnp.abs(error) < LOST, error, LOST)
-    return LinearisedResidual(error[None, :], jnp.zeros((1, 1)))
+def residual(unknowns: Unknowns, data: Regression) -> tuple[LinearisedResidual, Products]:
+    """The residual of one segment, whose single state moves nothing; and what the core needs of it."""
+
+    def error(parameters: Array) -> Array:
+        values = jax.lax.switch(data.number, _FORMS, physical(parameters, data), data.x_1, data.x_2)
+        found = (data.y - values) * data.weight
+        return jnp.where(jnp.abs(found) < LOST, found, LOST)
+
+    rows, slope = error(unknowns.parameters)[None, :], jax.jacfwd(error)(unknowns.parameters)[None]
+    none = jnp.zeros((1, 1))
+    blocks = Blocks(rows, slope, jnp.zeros((*rows.shape, 1)), none, jnp.zeros((1, 1, PARAMETERS)), none[None])
+    return LinearisedResidual(rows, none), Products.of(blocks)
 
 
 @eqx.filter_jit
@@ -154,13 +160,12 @@ def solve(data: Regression, start: Float[Array, " parameters"]) -> Answer:
     state = jnp.zeros((1, 1))
     alone = jnp.zeros(1, dtype=bool)
     # The starts are anywhere, so the first steps are short ones.
-    descent = ArrowDescent(alone, jnp.ones(1), jnp.asarray(30.0))
-    solver = ArrowLevenbergMarquardt(descent, jnp.asarray(2000), rtol=1e-14)
-    solution = optx.least_squares(residual, solver, Unknowns(vector, state), args=data, max_steps=None, throw=False)
+    rows = jnp.asarray(float(data.y.size))
+    solver = ArrowLevenbergMarquardt(alone, jnp.ones(1), jnp.asarray(30.0), jnp.asarray(2000), rows, rtol=1e-14)
+    start = Unknowns(vector, state)
+    solution = optx.least_squares(residual, solver, start, args=data, has_aux=True, max_steps=None, throw=False)
     found = physical(solution.value.parameters, data)
     plain = eqx.tree_at(lambda d: d.logarithmic, data, jnp.zeros_like(data.logarithmic))
-    at = Unknowns(found, state)
-    rows, slope = residual(at, plain).rows, jax.jacfwd(lambda u: residual(u, plain).rows)(at)
-    blocks = Blocks(rows, slope.parameters, slope.states[:, :, 0], state, jnp.zeros((1, 1, PARAMETERS)), state[None])
-    information = normal_equations(blocks, alone).shared
-    return Answer(found, jnp.sum(rows**2), information, solution.result == optx.RESULTS.successful)
+    _, products = residual(Unknowns(found, state), plain)
+    information = normal_equations(products, alone).shared
+    return Answer(found, products.square, information, solution.result == optx.RESULTS.successful)

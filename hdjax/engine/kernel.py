@@ -128,7 +128,7 @@ class Marched(eqx.Module):
     by_state: Float[Array, "segments height states"] | None = None
     end_by_parameter: Float[Array, "segments states width"] | None = None
     end_by_state: Float[Array, "segments states states"] | None = None
-    factor: Float[Array, "segments reduced"] | None = None
+    products: Float[Array, "segments columns columns"] | None = None
 
 
 def march_lanes(
@@ -141,7 +141,7 @@ def march_lanes(
         lanes: the data.
         hidden: how many states are effects' own.
         mode: with derivatives or without.
-        reduced: whether the last of the lanes' settings asks for the triangular factor in place of the Jacobian.
+        reduced: whether the last of the lanes' settings asks for products of the Jacobian in its place.
     """
     from hdjax.engine.handler import register
 
@@ -150,9 +150,9 @@ def march_lanes(
     rows = samples * outputs + hidden
     shapes = [(segments, rows), (segments, states)]
     if mode == "jacobian":
-        height = width + states + 1 if reduced else rows
+        height, columns = (0, width + states + 1) if reduced else (rows, 0)
         shapes += [(segments, height, width), (segments, height, states), (segments, states, width)]
-        shapes += [(segments, states, states), (segments, height if reduced else 0)]
+        shapes += [(segments, states, states), (segments, columns, columns)]
     results = [jax.ShapeDtypeStruct(shape, np.dtype("float64")) for shape in shapes]
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
     call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")

@@ -30,24 +30,22 @@ OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measur
 OPERANDS += ("settings",)
 """What comes in, in order; behind it the signals: torque, those of `Equations.signals`, and derivatives of the torque
 by each of `Equations.acting`. `settings` are solver steps in a sample interval, whether the end of a segment is wanted,
-threads, and whether the Jacobian is to be reduced. There may be more numbers in `free` and `slopes` than the model has
+threads, and whether products of the Jacobian are wanted in its
+place. There may be more numbers in `free` and `slopes` than the model has
 parameters; their columns are zero."""
 
 RESULTS: dict[Mode, tuple[str, ...]] = {
     "values": ("rows", "end"),
-    "jacobian": ("rows", "end", "by_parameter", "by_state", "end_by_parameter", "end_by_state", "factor"),
+    "jacobian": ("rows", "end", "by_parameter", "by_state", "end_by_parameter", "end_by_state", "products"),
 }
-"""What goes out, in order. Where `settings` ask for it, `by_parameter` and `by_state` are not those of the rows but the
-triangular factor of each segment's columns with its residual, and `factor` the factor's last column: sums of squares,
-gradient and normal equations are the same, and the Jacobian is never written."""
+"""What goes out, in order. Where `settings` ask for it, `by_parameter` and `by_state` are not written, but `products`:
+those of each segment's columns with each other, by parameters, states and last the residual itself."""
 
 MARCH = "march"
 """The function's name in its module."""
 
 MOST_THREADS = 64
 
-# Less of a column's square than this is left where it depends on those before it: rounding.
-_DEPENDENT = 1e-13
 _POWERS = 6
 
 
@@ -457,7 +455,7 @@ class _Block:
         if self.jacobian:
             reduced = c.builder.icmp_signed("!=", self._got("reduced", I64), c.i(0))
             with c.builder.if_then(reduced):
-                self._factorise()
+                self._write_products()
 
     def _choose_segments(self) -> None:
         """The lanes' segments; behind the last one it stands again, and what it writes is the same."""
@@ -554,7 +552,7 @@ class _Block:
         return self.code.place(self.collected, row * (self.tangents + 1))
 
     def _put_row(self, row: ir.Value, columns: ir.Value, value: ir.Value) -> None:
-        """Write a row of the Jacobian, or take it into the products of the columns with each other."""
+        """Write a row of the Jacobian, or add it to the products of the columns with each other."""
         c, b = self.code, self.code.builder
         reduced = b.icmp_signed("!=", self._got("reduced", I64), c.i(0))
         c.store(value, columns, self.tangents)
@@ -566,10 +564,10 @@ class _Block:
                     product = c.mul(left, c.load(columns, j))
                     c.store(c.add(c.load(self.products, place), product), self.products, place)
             with written:
-                self._write_row(row, columns, self.rows)
+                self._write_row(row, columns)
 
-    def _write_row(self, row: ir.Value, columns: ir.Value, rows: ir.Value) -> None:
-        """Derivatives of one of so many rows; zero behind the last parameter."""
+    def _write_row(self, row: ir.Value, columns: ir.Value) -> None:
+        """Derivatives of a row; zero behind the last parameter."""
         c, m = self.code, self.march
         width = self._got("width", I64)
         for first, last, count, result in (
@@ -578,44 +576,31 @@ class _Block:
         ):
 
             def put(t: ir.Value, value: ir.Value, count=count, result=result) -> None:
-                self._put(self._got(result), c.times(rows, count), c.plus(c.times(row, count), t), value)
+                self._put(self._got(result), c.times(self.rows, count), c.plus(c.times(row, count), t), value)
 
             with c.loop(last - first) as t:
                 put(t, c.load(columns, c.plus(t, first)))
             with c.loop(count, last - first) as t:
                 put(t, c.number(0.0))
 
-    def _factorise(self) -> None:
-        """The triangular factor of the products (Cholesky); a column that depends on those before it has no row."""
+    def _write_products(self) -> None:
+        """The upper half of the products, mirrored; zero in the columns behind the last parameter."""
         c, b = self.code, self.code.builder
         count = self.tangents + 1
-        rows = c.plus(self._got("width", I64), self.march.states + 1)
-        zero = c.number(0.0)
-        with c.loop(count) as k:
-            c.store(c.load(self.products, c.times(k, count + 1)), self.collected, k)
-        with c.loop(count) as k:
-            pivot = c.load(self.products, c.times(k, count + 1))
-            told = c.smaller(c.mul(c.number(_DEPENDENT), c.load(self.collected, k)), pivot)
-            root = c.called("sqrt", b.select(told, pivot, c.number(1.0)))
-            scale = b.select(told, b.fdiv(c.number(1.0), root), zero)
-            mine = c.place(self.products, c.times(k, count))
-            with c.loop(count) as j:
-                left = b.icmp_signed("<", j, k)
-                value = c.mul(c.load(mine, j), scale)
-                c.store(b.select(left, zero, value), mine, j)
-            with c.loop(count, c.plus(k, 1)) as i:
-                factor = c.load(mine, i)
-                with c.loop(count, i) as j:
-                    place = c.plus(c.times(i, count), j)
-                    less = c.sub(c.load(self.products, place), c.mul(factor, c.load(mine, j)))
-                    c.store(less, self.products, place)
-            self._write_row(k, mine, rows)
-            self._put(self._got("factor"), rows, k, c.load(mine, self.tangents))
-        with c.loop(self.tangents) as t:
-            c.store(zero, self.collected, t)
-        with c.loop(rows, count) as k:
-            self._write_row(k, self.collected, rows)
-            self._put(self._got("factor"), rows, k, zero)
+        padding = b.sub(self._got("width", I64), c.i(self.march.parameters))
+        columns = c.plus(padding, count)
+        size, out = c.times(columns, columns), self._got("products")
+        with c.loop(size) as k:
+            self._put(out, size, k, c.number(0.0))
+
+        def column(i: ir.Value) -> ir.Value:
+            own = b.icmp_signed("<", i, c.i(self.march.parameters))
+            return c.plus(i, b.select(own, c.i(0), padding))
+
+        with c.loop(count) as i, c.loop(count, i) as j:
+            value = c.load(self.products, c.plus(c.times(i, count), j))
+            for row, other in ((i, j), (j, i)):
+                self._put(out, size, c.plus(c.times(column(row), columns), column(other)), value)
 
     def _finite(self, value: ir.Value, as_well: ir.Value) -> ir.Value:
         """A derivative; zero where it is none."""
