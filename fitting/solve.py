@@ -159,7 +159,9 @@ def _begun(unknowns: Unknowns, solver: ArrowLevenbergMarquardt, seen: Any, rows:
 
 
 @jit_small
-def _iterate(point: _Point, solver: ArrowLevenbergMarquardt, looked_at: Task, most: Int[Array | np.ndarray, ""]) -> _Point:
+def _iterate(
+    point: _Point, solver: ArrowLevenbergMarquardt, looked_at: Task, most: Int[Array | np.ndarray, ""]
+) -> _Point:
     """Go on from a point.
 
     Args:

@@ -29,6 +29,12 @@ def cosine_and_sine(angle: Values) -> tuple[Values, Values]:
     Args:
         angle: in radians.
     """
+    return _by_arithmetic(angle)
+
+
+# Traced once for all that call it.
+@jax.jit
+def _by_arithmetic(angle: Values) -> tuple[Values, Values]:
     turns = jnp.round(angle * (2.0 / math.pi))
     rest = angle
     for part in _QUARTER_TURN:

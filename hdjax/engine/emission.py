@@ -1,5 +1,6 @@
 """From a graph of scalars to vector code of LLVM: each node is one number in each lane."""
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -19,6 +20,23 @@ _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
 _LARGEST_EXPONENT, _LEAST_EXPONENT = 709.0, -708.0
 
 
+class _Same(ir.Constant):
+    """A number in each lane, written out once."""
+
+    @functools.cached_property
+    def _reference(self) -> str:
+        return super().get_reference()
+
+    def get_reference(self) -> str:
+        return self._reference
+
+
+@functools.cache
+def _number(value: float, sign: float, lanes: int) -> ir.Constant:
+    """`sign` keeps the two zeros apart."""
+    return ir.Constant(F64, value) if lanes == 1 else _Same(ir.VectorType(F64, lanes), [value] * lanes)
+
+
 class Vectors:
     """Instructions on vectors of so many lanes; on plain numbers where it is one."""
 
@@ -32,7 +50,7 @@ class Vectors:
 
     def number(self, value: float) -> ir.Constant:
         """The same number in each lane."""
-        return ir.Constant(self.numbers, float(value) if self.lanes == 1 else [float(value)] * self.lanes)
+        return _number(float(value), math.copysign(1.0, value), self.lanes)
 
     def integer(self, value: int) -> ir.Constant:
         """The same integer in each lane."""

@@ -19,7 +19,7 @@ def target() -> Any:
     # Vectors of 512 bits, where there are any, are twice as fast here as those that compilers prefer.
     features = llvm.get_host_cpu_features().flatten() + ",-prefer-256-bit"
     triple = llvm.Target.from_default_triple()
-    return triple.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=2, jit=True)
+    return triple.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=1, jit=True)
 
 
 def compiled(module: ir.Module, *names: str) -> list[int]:

@@ -397,11 +397,15 @@ class _Block:
         self.prior_results = code.array(m.expected.size)
         self.moved = code.array(self.tangents * m.states)
         self.rates_by_parameter = m.equations.rates.rows_along("parameter") if self.jacobian else []
-        self.dense = code.array(len(self.rates_by_parameter) * m.parameters * stages)
-        self.held_dense = code.array(m.held * m.parameters)
-        self.read_dense = code.array(m.outputs * m.parameters)
+        # What states do at once is nothing: all tangents go through the same instructions.
+        sizes = len(self.rates_by_parameter) * stages, m.held, m.outputs
+        self.dense, self.held_dense, self.read_dense = (code.array(size * self.tangents) for size in sizes)
+        self.scale = code.array(self.tangents)
         self.collected = code.array((self.tangents + 1) * max(m.outputs, 1))
         self.products = code.array((self.tangents + 1) ** 2 if self.jacobian else 0)
+        tables = self.dense, self.held_dense, self.read_dense
+        self.blank = [(room, size * self.tangents) for room, size in zip(tables, sizes, strict=True)]
+        self.blank.append((self.products, (self.tangents + 1) ** 2))
 
     def _got(self, name: str, kind: Any = F64) -> ir.Value:
         """An entry of the call: an integer, or where numbers stand."""
@@ -443,8 +447,8 @@ class _Block:
         for t in range(self.tangents):
             for i in range(m.states):
                 c.store(c.number(1.0 if t - m.parameters == i else 0.0), self.moved, t * m.states + i)
-        with c.loop((self.tangents + 1) ** 2 if self.jacobian else 0) as k:
-            c.store(c.number(0.0), self.products, k)
+        if self.jacobian:
+            self._begin_tangents()
         self._write_prior()
         with c.loop(self.samples) as i:
             self._record(i)
@@ -488,6 +492,16 @@ class _Block:
                 with b.if_then(there):
                     c.store(power, self.degree, k)
 
+    def _begin_tangents(self) -> None:
+        c, m = self.code, self.march
+        for room, size in self.blank:
+            with c.loop(size) as k:
+                c.store(c.number(0.0), room, k)
+        with c.loop(m.parameters) as t:
+            c.store(c.spread(c.load(self._got("slopes"), t)), self.scale, t)
+        with c.loop(self.tangents, m.parameters) as t:
+            c.store(c.number(1.0), self.scale, t)
+
     # -- what is read ------------------------------------------------------------------------------------------
 
     def _at_state(self) -> None:
@@ -525,25 +539,18 @@ class _Block:
         slopes = m.equations.outputs.slopes
         self._fill(m.read, self.read_results, slopes, range(m.outputs), self.read_dense, 0)
 
-        def columns(count: int, first: int, own: bool) -> None:
-            with c.loop(count) as t:
-                moved = self._tangent(c.plus(t, first))
-                change = [c.total(self._along_states(m.read, self.read_results, s, moved)) for s in slopes]
-                if own:
-                    change = [
-                        c.total([x, c.load(self.read_dense, c.plus(c.times(t, m.outputs), k))])
-                        for k, x in enumerate(change)
-                    ]
-                factor = c.mul(scale, self._slope(t)) if own else scale
-                zero = c.number(0.0)
-                change = [zero if x is None else b.select(counts, c.mul(factor, x), zero) for x in change]
-                for p in range(m.outputs):
-                    white = c.total([c.mul(w, x) for w, x in zip(whitening[p], change, strict=True)])
-                    assert white is not None
-                    c.store(self._finite(white, inside[p]), self._columns_of(p), c.plus(t, first))
-
-        columns(m.parameters, 0, own=True)
-        columns(m.states, m.parameters, own=False)
+        with c.loop(self.tangents) as t:
+            moved = self._tangent(t)
+            factor = c.mul(scale, c.load(self.scale, t))
+            change = []
+            for k, slope in enumerate(slopes):
+                own = c.load(self.read_dense, c.plus(c.times(t, m.outputs), k))
+                total = c.total([*self._along_states(m.read, self.read_results, slope, moved), own])
+                change.append(b.select(counts, c.mul(factor, total), c.number(0.0)))
+            for p in range(m.outputs):
+                white = c.total([c.mul(w, x) for w, x in zip(whitening[p], change, strict=True)])
+                assert white is not None
+                c.store(self._finite(white, inside[p]), self._columns_of(p), t)
         for p in range(m.outputs):
             self._put_row(c.plus(c.times(i, m.outputs), p), self._columns_of(p), values[p])
 
@@ -608,9 +615,6 @@ class _Block:
         fine = c.builder.and_(as_well, c.smaller(c.called("fabs", value), c.number(np.inf)))
         return c.builder.select(fine, value, c.number(0.0))
 
-    def _slope(self, t: ir.Value) -> ir.Value:
-        return self.code.spread(self.code.load(self._got("slopes"), t))
-
     def _tangent(self, t: ir.Value) -> list[ir.Value]:
         c, states = self.code, self.march.states
         return [c.load(self.moved, c.plus(c.times(t, states), i)) for i in range(states)]
@@ -663,8 +667,7 @@ class _Block:
                 for t in range(count):
                     slope = slopes.get((kind, t))
                     change = zero if slope is None else self._node(m.expected, slope, self.prior_results)
-                    if kind == "parameter":
-                        change = c.mul(change, self._slope(c.i(t)))
+                    change = c.mul(change, c.load(self.scale, first + t))
                     c.store(self._finite(change, both), self._columns_of(0), first + t)
             self._put_row(row, self._columns_of(0), value)
 
@@ -685,7 +688,7 @@ class _Block:
 
             with c.loop(count) as t:
                 for i, value in enumerate(self._tangent(c.plus(t, first))):
-                    put(i, t, c.mul(value, self._slope(t)) if own else value)
+                    put(i, t, c.mul(value, c.load(self.scale, c.plus(t, first))))
             with c.loop(width, count) as t:
                 for i in range(m.states):
                     put(i, t, c.number(0.0))
@@ -742,10 +745,8 @@ class _Block:
             assert value is not None
             c.store(value, self.state, i)
         if self.jacobian:
-            with c.loop(m.parameters) as p:
-                self._move_tangent(p, p, step)
-            with c.loop(m.states, 0) as t:
-                self._move_tangent(c.plus(t, m.parameters), None, step)
+            with c.loop(self.tangents) as t:
+                self._move_tangent(t, step)
 
     def _weighted(self, weights: Sequence[float], slope: Callable[[int], ir.Value]) -> ir.Value | None:
         c = self.code
@@ -765,10 +766,10 @@ class _Block:
             c.store(c.mul(step, self._node(m.rates, node, results)), self.slopes, j * m.states + i)
         if self.jacobian:
             rows = self.rates_by_parameter
-            dense = c.place(self.dense, j * len(rows) * m.parameters)
+            dense = c.place(self.dense, j * len(rows) * self.tangents)
             self._fill(m.rates, results, m.equations.rates.slopes, rows, dense, 0)
 
-    def _move_tangent(self, t: ir.Value, parameter: ir.Value | None, step: ir.Value) -> None:
+    def _move_tangent(self, t: ir.Value, step: ir.Value) -> None:
         """Take one tangent through the stages of a step."""
         c, m = self.code, self.march
         rates = m.equations.rates
@@ -776,10 +777,7 @@ class _Block:
         held: list[Any] = []
         for k, slopes in enumerate(m.equations.held.slopes):
             terms = self._along_states(m.before, self.held_results, slopes, old)
-            own = None
-            if parameter is not None:
-                own = c.load(self.held_dense, c.plus(c.times(parameter, m.held), k))
-            held.append(c.total([*terms, own]))
+            held.append(c.total([*terms, c.load(self.held_dense, c.plus(c.times(t, m.held), k))]))
         rows = {row: k for k, row in enumerate(self.rates_by_parameter)}
         found: list[list[ir.Value | None]] = []
         for j in range(len(m.nodes)):
@@ -789,10 +787,10 @@ class _Block:
             for i in range(m.states):
                 terms: list[Any] = [*self._along_states(m.rates, results, rates.slopes[i], now)]
                 for direction, node in rates.slopes[i].items():
-                    if direction[0] == "held" and held[direction[1]] is not None:
+                    if direction[0] == "held":
                         terms.append(c.mul(self._node(m.rates, node, results), held[direction[1]]))
-                if parameter is not None and i in rows:
-                    place = c.plus(c.times(parameter, len(rows)), j * len(rows) * m.parameters + rows[i])
+                if i in rows:
+                    place = c.plus(c.times(t, len(rows)), j * len(rows) * self.tangents + rows[i])
                     terms.append(c.load(self.dense, place))
                 rate = c.total(terms)
                 stage.append(None if rate is None else c.mul(step, rate))
