@@ -87,8 +87,8 @@ def _order_amplitude(residual: np.ndarray, theta_m: np.ndarray) -> np.ndarray:
     """Amplitude of the least-squares harmonic at each order."""
     amplitude = np.empty(_ORDERS.size)
     for i, order in enumerate(_ORDERS):
-        basis = np.stack([np.cos(order * theta_m), np.sin(order * theta_m)], axis=1)
-        amplitude[i] = np.hypot(*np.linalg.lstsq(basis, residual, rcond=None)[0])
+        basis = np.stack([np.cos(order * theta_m), np.sin(order * theta_m)])
+        amplitude[i] = np.hypot(*np.linalg.pinv(basis @ basis.T, hermitian=True) @ (basis @ residual))
     return amplitude
 
 

@@ -90,7 +90,7 @@ def fit(
     hold_parameters: bool = False,
     count: int | None = None,
     states: Float[Array, "segments states"] | None = None,
-    begin_anew: bool = True,
+    begin_anew_above: float = -np.inf,
     retry_states: bool = True,
     give_up_above: float = np.inf,
     least_progress: float = 0.0,
@@ -118,7 +118,8 @@ def fit(
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         count: number of segments, see [`fitting.experiment.cut`][].
         states: initial states of the segments to start from; from their first samples where not given.
-        begin_anew: whether a first pass that does not converge is begun anew, from the first samples of each segment.
+        begin_anew_above: an objective above which a first pass that does not converge is begun anew, from the first
+            samples of each segment: it may have lost its way.
         retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
         least_progress: see [`fitting.solve.solve`][].
@@ -155,7 +156,8 @@ def fit(
         problem = weighed(problem, covariance, swing)
         solution = solved(unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and horizon <= _LONGEST_RETRY * length:
-            if begin_anew and not (solution.success or hold_parameters):
+            reached = half_log_determinant(solution.left_over.covariance)
+            if reached > begin_anew_above and not (solution.success or hold_parameters):
                 again = solved(_grown(problem, unknowns, least_progress), NEARBY_DAMPING)
                 solution = min(solution, again, key=lambda s: np.sum(s.left_over.squares))
             mended = _retry_states(problem, solution, least_progress) if retry_states else None

@@ -128,7 +128,7 @@ def _again(
         covariance=found.covariance,
         count=count,
         states=None if afresh else found.unknowns.states,
-        begin_anew=afresh,
+        begin_anew_above=-np.inf if afresh else np.inf,
         retry_states=afresh,
         max_steps=_STEPS,
         hold_parameters=hold_parameters,

@@ -16,7 +16,7 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave: with a
     phase of its own it would still be explained by that effect.
     """
-    from scipy.fft import prev_fast_len
+    from scipy.fft import irfft, prev_fast_len
 
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0
@@ -32,6 +32,6 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
         # Noise has no mean; what mean there is may be the very thing that is looked for.
         turn[0] = 0.0
-        surrogate = np.fft.irfft(spectrum * turn[None, :], n=length)
-        found[draw][weight] = np.resize(surrogate.T, (samples, series.shape[0]))
+        surrogate = irfft(spectrum * turn[None, :], n=length, overwrite_x=True, workers=-1)
+        found[draw][weight] = np.pad(surrogate, ((0, 0), (0, samples - length)), mode="wrap").T
     return found.reshape(DRAWS, error.shape[0], -1)

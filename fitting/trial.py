@@ -227,7 +227,8 @@ def trained(
         setting: how the data are cut.
         near: the fit near by, if there is one.
         give_up_above: see [`fitting.estimate.fit`][], as for the rest.
-        begin_anew: likewise; so it is in any case where the model has other states.
+        begin_anew: whether a first pass that neither converges nor explains more than the fit near by is begun anew;
+            so it is in any case where the model has other states.
         retry_states: likewise; so they are in any case where a fit may begin anew.
         max_steps: likewise.
         reweigh: likewise.
@@ -249,7 +250,7 @@ def trained(
         reweigh=reweigh,
         hold_parameters=hold_parameters,
         states=states,
-        begin_anew=begin_anew or not same,
+        begin_anew_above=(-np.inf if near is None else near.objective) if begin_anew or not same else np.inf,
         retry_states=retry_states or begin_anew or not same,
         give_up_above=give_up_above,
         least_progress=_LEAST_PROGRESS,

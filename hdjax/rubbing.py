@@ -50,11 +50,13 @@ def over_step(
     moved = [[step * model.mobility(name, other) for other in names] for name in names]
     reaches = [[move * level for move, level in zip(row, levels, strict=True)] for row in moved]
 
-    def rubbing(signs: Sequence[Array]) -> dict[str, Rubbing]:
-        return {n: Rubbing(s, row[i]) for i, (n, s, row) in enumerate(zip(names, signs, reaches, strict=True))}
+    own = [row[i] for i, row in enumerate(reaches)]
+
+    def rubbing(signs: Sequence[Array], turns: Sequence[Array]) -> dict[str, Rubbing]:
+        return {n: Rubbing(sign, turn) for n, sign, turn in zip(names, signs, turns, strict=True)}
 
     # What the rates would do without the friction: what they do with any, and that taken back.
-    some = rubbing([jnp.zeros_like(level) for level in levels])
+    some = rubbing([jnp.zeros_like(level) for level in levels], own)
     slopes = model.component_rates(state, torque, load_torque, dataclasses.replace(conditions, rubbing=some))
     rates, accelerations = jax.jvp(
         lambda *now: [getattr(model.motion(now, conditions), name) for name in names], tuple(state), tuple(slopes)
@@ -65,7 +67,9 @@ def over_step(
         step * acceleration + _total(move * torque for move, torque in zip(row, taken, strict=True))
         for acceleration, row in zip(accelerations, moved, strict=True)
     ]
-    return rubbing(mean_signs(rates, changes, reaches, corners))
+    # A rate that crosses its corner within a part of a step, too fast for the stages to see, takes the mean as well.
+    turns = [jnp.hypot(reach, change) for reach, change in zip(own, changes, strict=True)]
+    return rubbing(mean_signs(rates, changes, reaches, corners), turns)
 
 
 def mean_signs(

@@ -74,7 +74,7 @@ def test_horizons_grow_step_by_step(clean):
     far = rig.reduced_model(omega_0=0.5 * rig.OMEGA_0, gain=0.25 * rig.GAIN, alpha=0.0)
     paths = base_paths(far)
     # At once over six periods, a frequency 50 % off ends in a wrong minimum, from which windows that grow lead out.
-    direct = fit(far, whole(clean), paths, horizon=128, substeps=3, begin_anew=False, retry_states=False)
+    direct = fit(far, whole(clean), paths, horizon=128, substeps=3, begin_anew_above=np.inf, retry_states=False)
     assert abs(float(direct.model.get("omega_0")) / rig.OMEGA_0 - 1) > 0.1
     grown = fit(far, whole(clean), paths, horizon=128, substeps=3)
     assert float(grown.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=1e-3)

@@ -179,7 +179,7 @@ def test_a_segment_that_stands_out_is_begun_anew():
     model = rig.drive_model().with_effects(Backlash(b=jnp.asarray(gap)))
     options = {"horizon": HORIZON, "substeps": 2, "count": 8, "max_steps": 25}
     right = fit(model, logged, (*PATHS, "backlash.b"), **options)
-    options |= {"states": right.unknowns.states.at[3, 2].add(-200.0), "begin_anew": False}
+    options |= {"states": right.unknowns.states.at[3, 2].add(-200.0), "begin_anew_above": np.inf}
     astray = fit(right.model, logged, right.free.paths, **options, retry_states=False)
     mended = fit(right.model, logged, right.free.paths, **options)
     assert astray.objective > right.objective + 1.0
@@ -188,7 +188,7 @@ def test_a_segment_that_stands_out_is_begun_anew():
 
 def test_a_start_that_is_no_number_explains_nothing(found: Fit, stretches):
     nowhere = found.unknowns.states * np.nan
-    got = drive_fit(found.model, stretches, states=nowhere, begin_anew=False, retry_states=False)
+    got = drive_fit(found.model, stretches, states=nowhere, begin_anew_above=np.inf, retry_states=False)
     assert not got.converged and got.objective > found.objective + 3.0
 
 

@@ -16,7 +16,7 @@ class Rubbing(eqx.Module):
 
     Attributes:
         sign: of the rate, averaged over the step [1].
-        reach: by how much the friction can change the rate in the step [rad/s].
+        reach: by how much the friction and all else can change the rate in the step [rad/s].
     """
 
     sign: Array
