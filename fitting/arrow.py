@@ -246,8 +246,8 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         least_progress: share of the sum of squares that a few steps must take off it.
     """
 
-    joined: Bool[Array | np.ndarray, " segments"]
-    gap_weight: Float[Array | np.ndarray, " states"]
+    joined: Bool[Array, " segments"]
+    gap_weight: Float[Array, " states"]
     damping: Float[Array | np.ndarray, ""]
     most_steps: Int[Array | np.ndarray, ""]
     rows: Float[Array | np.ndarray, ""]

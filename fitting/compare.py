@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.engines import why_not
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
 from fitting.free_run import FreeRun, free_run, motor_rms_error, rms_error
@@ -30,6 +31,7 @@ class Account(eqx.Module):
         training: free runs along the training stretches.
         validation: free runs along the held-out stretches.
         identifiability: what the logs can't tell of it.
+        not_machine_code: why XLA evaluates its residual; None where machine code does.
     """
 
     model: Model
@@ -37,6 +39,7 @@ class Account(eqx.Module):
     training: tuple[FreeRun, ...]
     validation: tuple[FreeRun, ...]
     identifiability: Identifiability
+    not_machine_code: str | None = eqx.field(static=True, default=None)
 
     @property
     def training_rmse(self) -> float:
@@ -83,7 +86,8 @@ def account(
     found = uncertainty(fit)
     if profiles:
         found = with_profiles(fit, found)
-    return Account(fit.model, found, seen, unseen, identifiability(fit, found))
+    told = identifiability(fit, found)
+    return Account(fit.model, found, seen, unseen, told, why_not(fit.problem))
 
 
 def validation_rmse(

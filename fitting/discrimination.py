@@ -182,7 +182,7 @@ def respond(
         of.free,
         signals,
         jnp.asarray(rest),
-        whitening(bench.noise),
+        jnp.asarray(whitening(bench.noise)),
         jnp.asarray(np.array([*units, limits.twist])),
         jnp.asarray(np.asarray(bench.temperature if warm and bench.temperature is not None else 0.0)),
         jnp.asarray(np.concatenate([unknowns, command])),

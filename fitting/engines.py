@@ -1,8 +1,10 @@
 """Which engine evaluates a residual: machine code where this processor and the model allow it, XLA otherwise."""
 
+import contextlib
 import dataclasses
 import functools
 import importlib
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -26,6 +28,10 @@ from fitting.residual import (
 from hdjax.engine import UntranslatableError, kernel
 from hdjax.lanes import jit_lanes
 
+Engine = Literal["XLA", "diffrax"]
+"""What evaluates a residual in place of machine code: the same steps as a program of XLA, or `diffrax.diffeqsolve` with
+adaptive steps."""
+
 
 def with_engine(problem: Problem, *, values: bool = False) -> Problem:
     """The problem with machine code for its model, where that can be.
@@ -34,7 +40,11 @@ def with_engine(problem: Problem, *, values: bool = False) -> Problem:
         problem: what is solved.
         values: whether the residual is wanted without derivatives as well.
     """
-    return problem if why_not(problem) else _with_kernel(problem, values)
+    if problem.adaptive or unusable() is not None:
+        return problem
+    with contextlib.suppress(UntranslatableError):
+        return _with_kernel(problem, values)
+    return problem
 
 
 def _with_kernel(problem: Problem, values: bool) -> Problem:
@@ -51,6 +61,8 @@ def _with_kernel(problem: Problem, values: bool) -> Problem:
 
 def why_not(problem: Problem) -> str | None:
     """Why XLA evaluates the residual; None where machine code does."""
+    if problem.adaptive:
+        return "`diffrax.diffeqsolve` was asked for"
     reason = unusable()
     if reason is not None:
         return reason

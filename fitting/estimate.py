@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.engines import linearise
+from fitting.engines import Engine, linearise
 from fitting.experiment import Stretch, scales
 from fitting.explained import FirstStates
 from fitting.free import FreeParameters
@@ -51,8 +51,8 @@ class Fit(eqx.Module):
     model: Model
     problem: Problem
     unknowns: Unknowns
-    error: Float[Array | np.ndarray, "segments samples outputs"]
-    covariance: Float[Array | np.ndarray, "outputs outputs"]
+    error: Float[Array, "segments samples outputs"]
+    covariance: Float[Array, "outputs outputs"]
     objective: float = eqx.field(static=True)
     stretches: tuple[Stretch, ...]
     horizon: int = eqx.field(static=True)
@@ -94,6 +94,7 @@ def fit(
     retry_states: bool = True,
     give_up_above: float = np.inf,
     least_progress: float = 0.0,
+    engine: Engine | None = None,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
@@ -123,6 +124,7 @@ def fit(
         retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
         give_up_above: an objective that the fit must reach in its first pass to be worth another.
         least_progress: see [`fitting.solve.solve`][].
+        engine: what evaluates the residual; machine code where not given, or XLA where there can be none.
 
     Returns:
         The fit.
@@ -138,6 +140,7 @@ def fit(
         hold_parameters=hold_parameters,
         count=count,
         states=states,
+        engine=engine,
     )
     length = problem.segments.weight.shape[1]
     outputs = problem.segments.measured.shape[-1]
@@ -176,8 +179,8 @@ def fit(
         model=problem.free.unpack(model, values),
         problem=weighed(problem, covariance, swing) if reweigh else problem,
         unknowns=unknowns,
-        error=solution.left_over.error,
-        covariance=covariance,
+        error=jnp.asarray(solution.left_over.error),
+        covariance=jnp.asarray(covariance),
         objective=objective,
         stretches=tuple(stretches),
         horizon=horizon,

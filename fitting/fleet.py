@@ -29,6 +29,7 @@ from fitting.log_table import LOG_SUFFIXES
 from fitting.rig import Rig, read_rig
 from hdjax import SimulationError
 from hdjax.cluster import on_cluster
+from hdjax.engine import one_thread
 
 State = Literal["fitted", "refused", "failed"]
 Row = dict[str, Any]
@@ -146,7 +147,7 @@ def _fit_one(log: Path, name: str, drive: Path) -> Row:
     try:
         rig = read_rig([log], drive, other_holds=False)
         # Fits run side by side, so each keeps to one device.
-        with jax.default_device(jax.local_devices()[0]):
+        with jax.default_device(jax.local_devices()[0]), one_thread():
             fitted = fit_only(rig.model, rig.experiments, hold=rig.hold)
     except (InputError, DataError, SimulationError) as error:
         return _row(name, drive, "refused", str(error), seconds=time.perf_counter() - begin)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
+from fitting.engines import unusable
 from fitting.experiment import Segments
 from fitting.machine_code import actuated
 from fitting.residual import Problem, Unknowns
@@ -188,6 +189,10 @@ def respond(
     """
     segments, samples, states, columns = pushed.shape
     deviation = np.broadcast_to(start, (segments, states, columns))
+    if unusable() is None:
+        from hdjax.engine.linear import linear_response
+
+        return linear_response(followed.transition, followed.readout, pushed, deviation)
     outputs = np.empty((segments, samples, followed.readout.shape[2], columns))
     for i in range(samples):
         outputs[:, i] = followed.readout[:, i] @ deviation

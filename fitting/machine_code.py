@@ -118,8 +118,15 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
     assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel, width)
     found = _marched(kernel.jacobian, lanes, kernel.hidden, "jacobian")
-    parts = found.rows, found.by_parameter, found.by_state
-    return Blocks(*map(jnp.asarray, parts), *_ends(lanes, found))
+    gap, before_by_parameter, before_by_state = _ends(lanes, found)
+    return Blocks(
+        residual=jnp.asarray(found.rows),
+        by_parameter=jnp.asarray(found.by_parameter),
+        by_state=jnp.asarray(found.by_state),
+        gap=gap,
+        before_by_parameter=before_by_parameter,
+        before_by_state=before_by_state,
+    )
 
 
 def _marched(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode) -> Marched:
@@ -196,8 +203,8 @@ def _ends(lanes: Lanes, found: Marched) -> tuple[Array, Array, Array]:
 
     # A state that has run away stands for itself: nothing before it moves the gap.
     own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
-    ends = gap, before(found.end_by_parameter), before(found.end_by_state) + own
-    return tuple(map(jnp.asarray, ends))
+    ends = before(found.end_by_parameter), before(found.end_by_state) + own
+    return jnp.asarray(gap), jnp.asarray(ends[0]), jnp.asarray(ends[1])
 
 
 def residual_by_machine_code(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.engines import with_engine
+from fitting.engines import Engine, with_engine
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import free_parameters
 from fitting.residual import Problem, Unknowns
@@ -33,6 +33,7 @@ def pose(
     hold_parameters: bool,
     count: int | None,
     states: Float[Array, "segments states"] | None,
+    engine: Engine | None = None,
 ) -> tuple[Problem, Unknowns]:
     """What is solved, not weighed yet, and where the iteration begins; arguments as in [`fitting.estimate.fit`][]."""
     if length is None:
@@ -47,8 +48,8 @@ def pose(
     active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
     outputs = segments.measured.shape[-1]
     unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
-    problem = Problem(model, free, segments, *unweighed, substeps=substeps)
-    return on_all_devices(with_engine(problem), unknowns)
+    problem = Problem(model, free, segments, *unweighed, substeps=substeps, adaptive=engine == "diffrax")
+    return on_all_devices(with_engine(problem) if engine is None else problem, unknowns)
 
 
 def on_all_devices(problem: Problem, unknowns: Unknowns) -> tuple[Problem, Unknowns]:

@@ -225,11 +225,16 @@ def _solve_lanes(
     """Fit what is active from each start; parameters, states and sums of squares."""
 
     def one(parameters: Array, states: Array) -> tuple[Array, Array, Array]:
-        joined, gap_weight = problem.segments.joined, problem.gap_weight
-        rows = jnp.asarray(float(problem.segments.measured.size))
+        solver = ArrowLevenbergMarquardt(
+            joined=problem.segments.joined,
+            gap_weight=problem.gap_weight,
+            damping=jnp.asarray(_DAMPING),
+            most_steps=jnp.asarray(_STEPS),
+            rows=jnp.asarray(float(problem.segments.measured.size)),
+        )
         solution = optx.least_squares(
             residual_and_products,
-            ArrowLevenbergMarquardt(joined, gap_weight, jnp.asarray(_DAMPING), jnp.asarray(_STEPS), rows),
+            solver,
             Unknowns(parameters, states),
             args=problem,
             has_aux=True,

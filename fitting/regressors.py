@@ -45,7 +45,7 @@ class Regressors(eqx.Module):
     """
 
     pushed: Float[np.ndarray, "segments samples states columns"]
-    reading: Float[np.ndarray, "segments samples outputs columns"]
+    reading: Float[np.ndarray, "segments samples outputs columns"] | float = 0.0
 
 
 def regressors(
@@ -79,12 +79,11 @@ def regressors(
         bare = replace(seen.model, effects=())
         added = _by_strength(_added, stacked, bare, motion, own=own)
     added = {name: _finite(values) for name, values in added.items()}
-    columns = next(iter(added.values())).shape[-1]
-    nothing = np.zeros((*shape[:2], seen.followed.states.shape[-1], columns))
     if _READING in added:
-        return Regressors(nothing, added[_READING]), None
-    pushed = sum((seen.carried[name] @ values for name, values in added.items()), nothing)
-    return Regressors(pushed, np.zeros((*shape, columns))), memory
+        reading = added[_READING]
+        return Regressors(np.zeros((*shape[:2], seen.followed.states.shape[-1], reading.shape[-1])), reading), None
+    first, *others = (seen.carried[name] @ values for name, values in added.items())
+    return Regressors(sum(others, first)), memory
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

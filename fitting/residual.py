@@ -11,7 +11,7 @@ from fitting.experiment import Segments
 from fitting.free import FreeParameters
 from hdjax import Model
 from hdjax.engine import Kernel
-from hdjax.simulate import march
+from hdjax.simulate import march, simulate
 from hdjax.where import where
 
 # A simulation that runs away, or leaves the numbers, is this many standard deviations off: a rejected step. (Its own
@@ -19,6 +19,9 @@ from hdjax.where import where
 LOST = 1e8
 RUNAWAY = 1e-3 * LOST
 """Standard deviations beyond which a simulation has lost its way; the weights may have changed since."""
+
+# Of adaptive steps, in the units of the states.
+_RTOL, _ATOL = 1e-8, 1e-11
 
 
 def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
@@ -40,6 +43,7 @@ class Problem(eqx.Module):
         substeps: its steps in each sample interval; data, so that finer steps need no other program.
         unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
         kernel: machine code that does the same faster, see [`fitting.machine_code`][]; None where XLA does it.
+        adaptive: whether XLA simulates by `diffrax.diffeqsolve` with steps of its own choice, in place of so many.
     """
 
     model: Model
@@ -52,13 +56,14 @@ class Problem(eqx.Module):
     substeps: Int[Array, ""] = eqx.field(converter=_as_integer, default=1)
     unroll: bool = eqx.field(static=True, default=True)
     kernel: Kernel | None = None
+    adaptive: bool = eqx.field(static=True, default=False)
 
 
 class Unknowns(eqx.Module):
     """What is fitted: the free parameters, and the initial state of each segment."""
 
-    parameters: Float[Array | np.ndarray, " parameters"]
-    states: Float[Array | np.ndarray, "segments states"]
+    parameters: Float[Array, " parameters"]
+    states: Float[Array, "segments states"]
 
 
 class Blocks(eqx.Module):
@@ -120,7 +125,14 @@ def simulate_segments(
     segments = problem.segments
     temperature = segments.temperature if any(e.needs_temperature for e in model.effects) else None
 
-    def one(torque, load_torque, temperature, state):
+    def solved(torque, load_torque, temperature, state):
+        times = torque.knots[segments.halo :]
+        beside = {} if load_torque is None else {"load_torque": load_torque}
+        steps = {"solver": problem.solver, "rtol": _RTOL, "atol": _ATOL, "adjoint": dfx.ForwardMode(), "throw": False}
+        found = simulate(model, torque, times, state, temperature=temperature, **beside, **steps)
+        return found.outputs[:-1], found.states[-1]
+
+    def marched(torque, load_torque, temperature, state):
         acting = model.actuate(torque)
         halo = segments.halo
         own = eqx.tree_at(
@@ -141,6 +153,7 @@ def simulate_segments(
         )
         return jax.vmap(model.outputs)(states), end
 
+    one = solved if problem.adaptive else marched
     return jax.vmap(one)(segments.torque, segments.load_torque, temperature, unknowns.states)
 
 

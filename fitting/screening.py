@@ -17,8 +17,7 @@ from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.explained import solved
 from fitting.free import strength_paths
-from fitting.regressors import Regressors
-from fitting.sight import Sight, batches, follow_on, sight
+from fitting.sight import Answered, Sight, batches, follow_on, sight
 from fitting.spectral_lines import spectral_lines
 from fitting.surrogates import DRAWS
 from hdjax import Model, TwoInertiaModel
@@ -84,7 +83,7 @@ def screen(
     sights = sight(training, seed), sight(held_out, seed + 1)
     known = len(free_now)
     for batch in batches(sights, proposals, follow_on(training, held_out)):
-        scores = [_score(*pair) for pair in zip(sights, batch.forces, strict=True)]
+        scores = [_score(*pair) for pair in zip(sights, batch.answers, strict=True)]
         for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
             fitted, unseen = (score.columns([*range(known), *(known + c for c in own)]) for score in scores)
             columns = list(range(known, known + len(own)))
@@ -135,11 +134,11 @@ class _Score(eqx.Module):
         return _Score(*own, self.rows)
 
 
-def _score(sight: Sight, forces: Regressors) -> _Score:
+def _score(sight: Sight, answered: Answered) -> _Score:
     answers = sight.answers
     # Where the model runs away in every segment, nothing is told.
     rows = max(float(np.sum(answers.weight)) * sight.residual.shape[-1], 1.0)
-    explained = np.concatenate([answers.parameters, answers.to(forces.pushed, forces.reading)], axis=-1)
+    explained = np.concatenate([answers.parameters, answered], axis=-1)
     flat = explained.reshape(-1, explained.shape[-1])
     against = (sight.surrogates.reshape(len(sight.surrogates), -1) @ flat).T
     return _Score(flat.T @ flat, flat.T @ sight.residual.reshape(-1), against, rows)

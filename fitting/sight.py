@@ -16,13 +16,15 @@ from fitting.explained import Answers, without_untold
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
 from fitting.posing import STEP_ANGLE, suggested_substeps
-from fitting.regressors import Regressors, regressors
+from fitting.regressors import regressors
 from fitting.residual import Problem, Unknowns
 from fitting.surrogates import surrogates
 from hdjax.effects import Effect
 
-# Numbers that the columns of a batch have for the state alone: what a computer has room for.
+# Numbers that the columns of a batch have: what a computer has room for.
 _NUMBERS = 1 << 22
+
+Answered = Float[np.ndarray, "segments samples outputs columns"]
 
 
 class Sight(eqx.Module):
@@ -94,25 +96,25 @@ class Batch(eqx.Module):
     Attributes:
         proposals: effects at zero strength.
         columns: of each proposal.
-        forces: regressors along the training motion and along the held-out one.
+        answers: of the outputs to a unit of each strength, along the training motion and along the held-out one.
         own_states: where each proposal's own states start in each training segment; None where it has none.
     """
 
     proposals: list[Effect]
     columns: list[list[int]]
-    forces: tuple[Regressors, Regressors]
+    answers: tuple[Answered, Answered]
     own_states: list[np.ndarray | None]
 
 
 def batches(sights: tuple[Sight, Sight], proposals: Sequence[Effect], goes_on: bool) -> Iterator[Batch]:
-    """Regressors of the proposals, form by form, as many forms at a time as there is room for.
+    """What the proposals would do, form by form, as many forms at a time as there is room for.
 
     Args:
         sights: along training stretches, and along held-out ones.
         proposals: effects at zero strength.
         goes_on: whether the held-out stretches begin where the training stretches end, see [`follow_on`][].
     """
-    room = max(1, _NUMBERS // max(s.seen.followed.states.size for s in sights))
+    room = max(1, _NUMBERS // max(s.residual.size for s in sights))
     waiting: list[Batch] = []
     for form in dict.fromkeys(type(p) for p in proposals):
         same = [p for p in proposals if type(p) is form]
@@ -121,8 +123,9 @@ def batches(sights: tuple[Sight, Sight], proposals: Sequence[Effect], goes_on: b
         strengths = len(strength_paths(same[0]))
         columns = [list(range(i * strengths, (i + 1) * strengths)) for i in range(len(same))]
         own = [None if memory is None else memory.at_starts[..., i] for i in range(len(same))]
-        waiting.append(Batch(same, columns, (fitted, unseen), own))
-        if sum(batch.forces[0].reading.shape[-1] for batch in waiting) >= room:
+        first, second = (s.answers.to(f.pushed, f.reading) for s, f in zip(sights, (fitted, unseen), strict=True))
+        waiting.append(Batch(same, columns, (first, second), own))
+        if sum(batch.answers[0].shape[-1] for batch in waiting) >= room:
             yield _together(waiting)
             waiting = []
     if waiting:
@@ -131,12 +134,12 @@ def batches(sights: tuple[Sight, Sight], proposals: Sequence[Effect], goes_on: b
 
 def _together(parts: Sequence[Batch]) -> Batch:
     """Batches side by side."""
-    widths = [part.forces[0].reading.shape[-1] for part in parts]
+    widths = [part.answers[0].shape[-1] for part in parts]
     firsts = np.cumsum(widths) - widths
     columns = [[int(first) + c for c in own] for part, first in zip(parts, firsts, strict=True) for own in part.columns]
-    forces = jax.tree.map(lambda *a: np.concatenate(a, axis=-1), *(part.forces for part in parts))
+    first, second = (np.concatenate(own, axis=-1) for own in zip(*(part.answers for part in parts), strict=True))
     proposals, own = ([one for part in parts for one in getattr(part, name)] for name in ("proposals", "own_states"))
-    return Batch(proposals, columns, forces, own)
+    return Batch(proposals, columns, (first, second), own)
 
 
 def _looked_at(fit: Fit) -> tuple[Problem, Unknowns]:

@@ -84,14 +84,15 @@ def solve(
     segments = problem.segments
     count = start.parameters.shape[0]
     solver = ArrowLevenbergMarquardt(
-        *on_one_device((segments.joined, problem.gap_weight)),
+        joined=on_one_device(segments.joined),
+        gap_weight=on_one_device(problem.gap_weight),
         damping=np.asarray(damping),
         most_steps=np.asarray(max_steps),
         rows=np.asarray(float(segments.weight.size * segments.measured.shape[2])),
         longest=np.where(_widened(problem.free.logarithmic), _LONGEST_LOG, np.inf),
         least_progress=np.asarray(least_progress),
     )
-    unknowns = Unknowns(_widened(start.parameters), on_one_device(start.states))
+    unknowns = Unknowns(jnp.asarray(_widened(start.parameters)), on_one_device(start.states))
     looked_at = task(problem, start, unknowns.parameters.size)
     if looked_at is None:
         point = _by_host(problem, start, unknowns, solver)
@@ -128,7 +129,7 @@ def _in_bursts(problem: Problem, unknowns: Unknowns, solver: ArrowLevenbergMarqu
     while not bool(point.done):
         begun, before = time.perf_counter(), int(point.state.count)
         point = _iterate(point, solver, looked_at, np.asarray(burst))
-        point.done.block_until_ready()
+        jax.block_until_ready(point.done)
         each = (time.perf_counter() - begun) / (int(point.state.count) - before)
         burst = int(np.clip(_BURST / each, 1, 1000))
     return point
@@ -218,12 +219,13 @@ def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
     return _left_over(problem, linearise(problem, unknowns).residual)
 
 
-def _left_over(problem: Problem, rows: Float[Array, "segments rows"]) -> LeftOver:
+def _left_over(problem: Problem, rows: Float[Array | np.ndarray, "segments rows"]) -> LeftOver:
     """What the rows of a residual say."""
-    segments, rows = problem.segments, np.asarray(rows)
+    segments, found = problem.segments, np.asarray(rows)
     measured, weight = np.asarray(segments.measured), np.asarray(segments.weight)[:, :, None]
-    error = rows[:, : measured[0].size].reshape(measured.shape) @ np.linalg.inv(np.asarray(problem.whitening)).T
-    return LeftOver(error, _covariance(error, measured, weight), np.sum(rows**2, axis=1))
+    white = found[:, : measured[0].size].reshape(measured.shape)
+    error = white @ np.linalg.inv(np.asarray(problem.whitening)).T
+    return LeftOver(error, _covariance(error, measured, weight), np.sum(found**2, axis=1))
 
 
 def _covariance(error: np.ndarray, measured: np.ndarray, weight: np.ndarray) -> np.ndarray:

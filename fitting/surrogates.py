@@ -1,5 +1,7 @@
 """What chance might have left over: residuals of the same colour, with random phases."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -32,6 +34,6 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
         # Noise has no mean; what mean there is may be the very thing that is looked for.
         turn[0] = 0.0
-        surrogate = irfft(spectrum * turn[None, :], n=length, overwrite_x=True, workers=-1)
+        surrogate: Any = irfft(spectrum * turn[None, :], n=length, overwrite_x=True, workers=-1)
         found[draw][weight] = np.pad(surrogate, ((0, 0), (0, samples - length)), mode="wrap").T
     return found.reshape(DRAWS, error.shape[0], -1)

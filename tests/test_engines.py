@@ -1,20 +1,23 @@
 """Which engine evaluates a residual, and that all give the same drive."""
 
-import dataclasses
 import sys
+from pathlib import Path
+from typing import Any
 
-import diffrax as dfx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rig
 from fitting import engines
+from fitting.engines import Engine
 from fitting.estimate import fit
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.posing import pose
+from fitting.rig import read_rig
+from fitting.starting_values import starting_models
+from fitting.uncertainty import uncertainty
 from hdjax import TwoInertiaModel
 from hdjax.effects.effect import MeshTorqueEffect, Motion
 from hdjax.parameters import Scalar, parameter
@@ -65,39 +68,19 @@ def test_without_llvmlite_xla_does_it(stretches: tuple[Stretch, ...], monkeypatc
         engines.unusable.cache_clear()
 
 
-def test_three_routes_give_one_drive(stretches: tuple[Stretch, ...]):
-    """Machine code, XLA, and a plain `diffeqsolve` of each segment give the same residual at the fitted parameters."""
-    model = rig.drive_model()
-    found = fit(model, stretches, fitted_paths(model), horizon=128, halo=4, substeps=1)
-    assert found.problem.kernel is not None
-    problem = dataclasses.replace(found.problem, model=found.model)
-    by_code, _ = engines.simulate(problem, found.unknowns)
-    by_xla = engines.linearise(dataclasses.replace(problem, kernel=None), found.unknowns)
-    np.testing.assert_allclose(by_xla.residual, engines.linearise(problem, found.unknowns).residual, rtol=0, atol=1e-9)
-    segments, halo = problem.segments, problem.segments.halo
-    torque = np.asarray(segments.torque.coefficients)[:, halo:, 0]
-    knots = np.asarray(segments.torque.knots)[:, halo:]
-
-    @jax.jit
-    @jax.vmap
-    def solved(values, times, state):
-        def field(t, y, args):
-            return found.model.rates(y, values[jnp.searchsorted(times, t, side="right") - 1], jnp.zeros(()))
-
-        solution = dfx.diffeqsolve(
-            dfx.ODETerm(field),
-            dfx.Tsit5(),
-            times[0],
-            times[-1],
-            None,
-            state,
-            saveat=dfx.SaveAt(ts=times[:-1]),
-            stepsize_controller=dfx.ClipStepSizeController(dfx.PIDController(rtol=1e-10, atol=1e-13), jump_ts=times),
-            max_steps=100_000,
-        )
-        return jax.vmap(found.model.outputs)(solution.ys)
-
-    outputs = np.asarray(solved(jnp.asarray(torque), jnp.asarray(knots), found.unknowns.states))
-    counts = np.asarray(segments.weight) > 0
-    # One step of Tsit5 to a sample errs by some 1e-7 of the motion.
-    np.testing.assert_allclose(np.asarray(by_code)[counts], outputs[counts], rtol=0, atol=1e-5 * np.abs(outputs).max())
+@pytest.mark.parametrize("engine", ["XLA", "diffrax"])
+def test_all_routes_give_one_drive(shared: Path, engine: Engine):
+    """Machine code, the same steps by XLA, and `diffrax.diffeqsolve` with adaptive steps, on a practice log."""
+    folder = shared / "logs" / "clean_multisine-7"
+    logs = read_rig([folder / "train_1.csv"], folder / "drive.toml")
+    experiment = logs.experiments["zero-order"][0]
+    base = [Stretch(experiment, 0, 3000)]
+    start = starting_models(logs.model, base)[0]
+    options: dict[str, Any] = {"horizon": 128, "substeps": 3}
+    found = fit(start, base, fitted_paths(start), **options)
+    assert found.problem.kernel is not None and found.converged
+    other = fit(start, base, fitted_paths(start), engine=engine, **options)
+    assert other.problem.kernel is None and other.converged
+    estimates = uncertainty(found, torque_noise=False).estimates
+    for path in ("K", "alpha", "B_sp"):
+        assert abs(float(other.model.get(path)) - float(found.model.get(path))) < 0.01 * estimates[path].std

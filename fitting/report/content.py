@@ -78,6 +78,7 @@ def report_dict(
         "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
         "hold": outcome.hold,
         "setting": _setting(outcome),
+        "engine": _engine(outcome.after.not_machine_code),
         "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
         "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),
         "seconds": dict(outcome.seconds),
@@ -108,6 +109,11 @@ def _log_dict(training: FreeRun, validation: FreeRun, put_back: float) -> dict[s
         "seconds": float(validation.time[-1] - training.time[0]),
         "clock_put_back": put_back,
     }
+
+
+def _engine(not_machine_code: str | None) -> dict[str, str | None]:
+    """What evaluated the residual, and why it was not machine code."""
+    return {"name": "machine code" if not_machine_code is None else "XLA", "reason": not_machine_code}
 
 
 def _setting(outcome: Outcome) -> dict[str, int] | None:

@@ -121,6 +121,7 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
             f"{g['data']} numbers fitted by "
             f"{g['parameters']} parameters and {g['initial_states']} initial states",
             f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",
+            "residual evaluated by " + ", since ".join(filter(None, report["engine"].values())),
             "time: " + ", ".join(f"{stage} {seconds:.2g} s" for stage, seconds in report["seconds"].items()),
         ]
     )

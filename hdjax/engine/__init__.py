@@ -10,5 +10,6 @@ from hdjax.engine.kernel import Lanes as Lanes
 from hdjax.engine.kernel import Marched as Marched
 from hdjax.engine.kernel import kernel as kernel
 from hdjax.engine.kernel import march_lanes as march_lanes
+from hdjax.engine.kernel import one_thread as one_thread
 from hdjax.engine.kernel import threads as threads
 from hdjax.engine.translate import UntranslatableError as UntranslatableError

@@ -1,10 +1,12 @@
 """A model's machine code, and how programs of JAX call it."""
 
+import contextlib
 import dataclasses
 import functools
 import os
 import threading
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
+from contextvars import ContextVar
 from typing import Literal
 
 import diffrax as dfx
@@ -172,7 +174,24 @@ def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int
     return results
 
 
-@functools.cache
+_ALONE = ContextVar("_ALONE", default=False)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Marches keep to the thread that calls them, for work that is shared among threads already."""
+    token = _ALONE.set(True)
+    try:
+        yield
+    finally:
+        _ALONE.reset(token)
+
+
 def threads() -> int:
-    """How many threads share a march: the processors that this process may use."""
+    """How many threads share a march: the processors that this process may use, or one within [`one_thread`][]."""
+    return 1 if _ALONE.get() else _processors()
+
+
+@functools.cache
+def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
