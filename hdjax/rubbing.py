@@ -68,7 +68,8 @@ def over_step(
         for acceleration, row in zip(accelerations, moved, strict=True)
     ]
     # A rate that crosses its corner within a part of a step, too fast for the stages to see, takes the mean as well.
-    turns = [jnp.hypot(reach, change) for reach, change in zip(own, changes, strict=True)]
+    # Friction that drives has none.
+    turns = [where(r > 0.0, jnp.hypot(r, change), r) for r, change in zip(own, changes, strict=True)]
     return rubbing(mean_signs(rates, changes, reaches, corners), turns)
 
 
