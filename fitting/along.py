@@ -180,14 +180,21 @@ def _rates(strengths: Array, model: Model, state: Array, conditions: Conditions)
 def carried(
     followed: Followed, push: Float[np.ndarray, "segments samples nodes states"]
 ) -> Float[np.ndarray, "segments samples states nodes"]:
-    """What pushes at the nodes of each interval add to the state by its end.
+    """What pushes at the nodes of each interval add to the state by its end."""
+    pushed = np.swapaxes(push, -1, -2)
+    first, second = (ends @ (pushed * by) for ends, by in carriers(followed))
+    return first + second
 
-    Each counts with its part in the straight line that has the pushes' mean and first moment: a system that is slow
-    against the interval sees the same.
+
+def carriers(followed: Followed) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """What the two ends of a push's straight line add to the state by the end of its interval, and the part that each
+    node has in them.
+
+    The line is that which has the pushes' mean and first moment: a system that is slow against the interval sees the
+    same.
     """
     mean, rise = 0.5 * WEIGHTS, 1.5 * WEIGHTS * NODES
-    pushed = np.swapaxes(push, -1, -2)
-    return followed.from_start @ (pushed * (mean - rise)) + followed.from_end @ (pushed * (mean + rise))
+    return (followed.from_start, mean - rise), (followed.from_end, mean + rise)
 
 
 def unit_reading(model: Model, form: type[LearnedReading]) -> Float[np.ndarray, " outputs"]:

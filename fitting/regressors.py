@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.along import ERROR, INPUT, PART, SLOPE, Along, carried, place_of
+from fitting.along import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
 from fitting.followed import acting, polynomial, signals_at, some_at_a_time
 from fitting.free import strength_paths
 from fitting.memory import Memory, memory_of, own_between, own_states
@@ -182,10 +182,8 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
     rates = _by_strength(_rates, stacked, model, followed.between, *around, own=own_between(states))
     own = np.moveaxis(states[:, :-1], 2, 0)
     reading = _by_strength(_outputs, stacked, model, followed.states[:, :-1], own=own)
-    segments, samples, nodes, count, columns = rates.shape
-    flat = rates.transpose(0, 1, 4, 2, 3)
-    pushed = [carried(followed, flat[:, :, i]).sum(axis=-1) for i in range(columns)]
-    return Regressors(_finite(np.stack(pushed, axis=-1)), _finite(reading))
+    first, second = (ends @ np.tensordot(rates, by, axes=(2, 0)) for ends, by in carriers(followed))
+    return Regressors(_finite(first + second), _finite(reading))
 
 
 def _rates(

@@ -24,7 +24,8 @@ from hdjax.effects import Effect
 # Numbers that the columns of a batch have: what a computer has room for.
 _NUMBERS = 1 << 22
 
-Answered = Float[np.ndarray, "segments samples outputs columns"]
+# Of training and of held-out segments, which are not as many.
+Answered = Float[np.ndarray, "_ _ outputs columns"]
 
 
 class Sight(eqx.Module):
