@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from llvmlite import ir
 
+from hdjax.engine.code import LANES, Code
 from hdjax.engine.emission import I64
 from hdjax.engine.handler import ENTRY, called, data
 from hdjax.engine.machine import compiled
-from hdjax.engine.march import LANES, Code
 
 _MOST_STATES = 64
 _NAME = "linear_response"

@@ -4,35 +4,27 @@ A step of an explicit Runge-Kutta method first computes its stages, and at each 
 and parameters. These are the same for all tangents, which then go through the stages one by one.
 """
 
-import contextlib
-import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
 import numpy as np
 from llvmlite import ir
 
-from hdjax.engine.derivatives import Tangent
-from hdjax.engine.emission import F64, I8, I64, Vectors, emitted, is_truth
+from hdjax.engine.block import Block, Emitted
+from hdjax.engine.code import LANES, Code
+from hdjax.engine.emission import F64, I64, Vectors, emitted, is_truth
 from hdjax.engine.equations import Equations, Part
 from hdjax.engine.graph import PARAMETER, VARYING, Node
 from hdjax.engine.handler import ENTRY, POINTER, data, dimension
 from hdjax.engine.kernel import Mode
 
-LANES = 8
-"""Segments in a block: one wide register, or two or four narrow ones that hide each other's latencies."""
-
-LOST = 1e8
-"""A whitened error beyond this many standard deviations, or no number at all, is counted as this many."""
-
 OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measured", "weight", "joined", "whitening")
 OPERANDS += ("settings",)
 """What comes in, in order; behind it the signals: torque, those of `Equations.signals`, and derivatives of the torque
 by each of `Equations.acting`. `settings` are solver steps in a sample interval, whether the end of a segment is wanted,
-threads, and whether products of the Jacobian are wanted in its
-place. There may be more numbers in `free` and `slopes` than the model has
-parameters; their columns are zero."""
+threads, and whether products of the Jacobian are wanted in its place. There may be more numbers in `free` and `slopes`
+than the model has parameters; their columns are zero."""
 
 RESULTS: dict[Mode, tuple[str, ...]] = {
     "values": ("rows", "end"),
@@ -46,8 +38,6 @@ MARCH = "march"
 
 MOST_THREADS = 64
 
-_POWERS = 6
-
 
 def tableau(solver: dfx.AbstractERK) -> tuple[list[list[float]], list[float], list[float]]:
     """Weights within the stages, nodes, and weights of the result; without stages at the end that carry no weight."""
@@ -59,78 +49,6 @@ def tableau(solver: dfx.AbstractERK) -> tuple[list[list[float]], list[float], li
         for row in (weights, nodes, lower):
             row.pop()
     return lower, nodes, weights
-
-
-class Code(Vectors):
-    """Instructions of one function on whole blocks."""
-
-    def __init__(self, builder: ir.IRBuilder):
-        super().__init__(builder, LANES)
-        self.pointers = self.numbers.as_pointer()
-
-    def i(self, value: int | ir.Value) -> ir.Value:
-        """An integer of the program."""
-        return ir.Constant(I64, value) if isinstance(value, int) else value
-
-    def place(self, base: ir.Value, index: int | ir.Value) -> ir.Value:
-        return self.builder.gep(base, [self.i(index)])
-
-    def load(self, base: ir.Value, index: int | ir.Value) -> ir.Value:
-        return self.builder.load(self.place(base, index), align=8)
-
-    def store(self, value: ir.Value, base: ir.Value, index: int | ir.Value) -> None:
-        self.builder.store(value, self.place(base, index), align=8)
-
-    def plus(self, a: int | ir.Value, b: int | ir.Value) -> ir.Value:
-        return self.builder.add(self.i(a), self.i(b))
-
-    def times(self, a: int | ir.Value, b: int | ir.Value) -> ir.Value:
-        return self.builder.mul(self.i(a), self.i(b))
-
-    def array(self, count: int, kind: Any = None) -> ir.Value:
-        """Room on the stack; asked for at the function's beginning."""
-        room = self.builder.alloca(ir.ArrayType(kind or self.numbers, max(count, 1)))
-        return self.builder.gep(room, [ir.Constant(I64, 0)] * 2)
-
-    @contextlib.contextmanager
-    def loop(self, count: int | ir.Value, start: int | ir.Value = 0) -> Iterator[ir.Value]:
-        """The body runs for each index from the start on; its values are its own."""
-        b = self.builder
-        before = b.block
-        head, body, after = (b.function.append_basic_block() for _ in range(3))
-        b.branch(head)
-        b.position_at_end(head)
-        index = b.phi(I64)
-        index.add_incoming(self.i(start), before)
-        b.cbranch(b.icmp_signed("<", index, self.i(count)), body, after)
-        b.position_at_end(body)
-        yield index
-        index.add_incoming(b.add(index, self.i(1)), b.block)
-        b.branch(head)
-        b.position_at_end(after)
-
-    def total(self, terms: Sequence[ir.Value | None]) -> ir.Value | None:
-        """Their sum; None is nothing."""
-        found = None
-        for term in terms:
-            if term is not None:
-                found = term if found is None else self.add(found, term)
-        return found
-
-
-@dataclasses.dataclass(frozen=True)
-class _Emitted:
-    """A part of the equations as a function `name(scalars, inputs, results)`.
-
-    Attributes:
-        function: in the module.
-        slots: where among the results each node is that moves.
-        size: how many results there are.
-    """
-
-    function: ir.Function
-    slots: dict[Node, int]
-    size: int
 
 
 class March:
@@ -177,7 +95,7 @@ class March:
                 asked |= {a for a in graph.arguments(node) if graph.level[a] == PARAMETER}
         return {node: i for i, node in enumerate(sorted(asked))}
 
-    def _part(self, name: str, part: Part) -> _Emitted:
+    def _part(self, name: str, part: Part) -> Emitted:
         graph = self.equations.graph
         moving = list(dict.fromkeys(n for n in self._wanted(part) if graph.level[n] == VARYING))
         kind = ir.VectorType(F64, LANES).as_pointer()
@@ -191,7 +109,7 @@ class March:
         code = Code(ir.IRBuilder(function.append_basic_block()))
         scalars, inputs, results = function.args
         given: dict[Node, Callable[[], ir.Value]] = {
-            node: lambda node=node, i=i: self._scalar(code, scalars, i, node) for node, i in self.scalars.items()
+            node: lambda node=node, i=i: self.scalar(code, scalars, i, node) for node, i in self.scalars.items()
         }
         for node in graph.needed(moving):
             operation, *rest = graph.nodes[node]
@@ -201,9 +119,9 @@ class March:
         for slot, node in enumerate(moving):
             code.store(found[node], results, slot)
         code.builder.ret_void()
-        return _Emitted(function, {node: slot for slot, node in enumerate(moving)}, len(moving))
+        return Emitted(function, {node: slot for slot, node in enumerate(moving)}, len(moving))
 
-    def _scalar(self, code: Vectors, scalars: ir.Value, index: int, node: Node) -> ir.Value:
+    def scalar(self, code: Vectors, scalars: ir.Value, index: int, node: Node) -> ir.Value:
         number = code.spread(code.builder.load(code.builder.gep(scalars, [ir.Constant(I64, index)])))
         if is_truth(self.equations.graph, node):
             return code.builder.fcmp_ordered("!=", number, code.number(0.0))
@@ -252,8 +170,8 @@ class March:
         names += ["substeps", "whole", "segments", "samples", "width", "reduced", "blocks", "next", "scalars"]
         names += [f"first {i}" for i in range(self.signals)] + [f"powers {i}" for i in range(self.signals)]
         self.call = {name: i for i, name in enumerate(names)}
-        self._gather = self._lane_by_lane("gather", reads=True)
-        self._scatter = self._lane_by_lane("scatter", reads=False)
+        self.gather = self._lane_by_lane("gather", reads=True)
+        self.scatter = self._lane_by_lane("scatter", reads=False)
         block = self._block()
         worker = self._worker(block)
         self._entry(prepare, worker)
@@ -371,438 +289,6 @@ class March:
         function.linkage = "internal"
         function.attributes.add("nounwind")
         code = Code(ir.IRBuilder(function.append_basic_block()))
-        _Block(self, code, *function.args).write()
+        Block(self, code, *function.args).write()
         code.builder.ret_void()
         return function
-
-
-class _Block:
-    """What the function of a block is made of: its room on the stack, and its instructions in order."""
-
-    def __init__(self, march: March, code: Code, call: ir.Value, index: ir.Value):
-        self.march, self.code, self.call, self.index = march, code, call, index
-        m = march
-        self.jacobian = m.mode == "jacobian"
-        self.tangents = m.parameters + m.states if self.jacobian else 0
-        stages = len(m.nodes)
-        self.segments = code.array(LANES, I64)
-        self.inputs = code.array(m.inputs)
-        self.state = code.array(m.states)
-        self.slopes = code.array(m.states * stages)
-        self.coefficients = code.array(m.signals * _POWERS)
-        self.degree = code.array(m.signals, I64)
-        self.needed = code.array(1, I64)
-        self.stage_results = code.array(m.rates.size * stages)
-        self.held_results, self.read_results = code.array(m.before.size), code.array(m.read.size)
-        self.prior_results = code.array(m.expected.size)
-        self.moved = code.array(self.tangents * m.states)
-        self.rates_by_parameter = m.equations.rates.rows_along("parameter") if self.jacobian else []
-        # What states do at once is nothing: all tangents go through the same instructions.
-        sizes = len(self.rates_by_parameter) * stages, m.held, m.outputs
-        self.dense, self.held_dense, self.read_dense = (code.array(size * self.tangents) for size in sizes)
-        self.scale = code.array(self.tangents)
-        self.collected = code.array((self.tangents + 1) * max(m.outputs, 1))
-        self.products = code.array((self.tangents + 1) ** 2 if self.jacobian else 0)
-        tables = self.dense, self.held_dense, self.read_dense
-        self.blank = [(room, size * self.tangents) for room, size in zip(tables, sizes, strict=True)]
-        self.blank.append((self.products, (self.tangents + 1) ** 2))
-
-    def _got(self, name: str, kind: Any = F64) -> ir.Value:
-        """An entry of the call: an integer, or where numbers stand."""
-        value = self.code.load(self.call, self.march.call[name])
-        return value if kind is I64 else self.code.builder.inttoptr(value, kind.as_pointer())
-
-    def _lanes(self, base: ir.Value, row: ir.Value | int, offset: ir.Value | int) -> ir.Value:
-        c = self.code
-        return c.builder.call(self.march._gather, [base, self.segments, c.i(row), c.i(offset)])
-
-    def _put(self, base: ir.Value, row: ir.Value | int, offset: ir.Value | int, value: ir.Value) -> None:
-        c = self.code
-        c.builder.call(self.march._scatter, [base, self.segments, c.i(row), c.i(offset), value])
-
-    def _node(self, part: _Emitted, node: Node, results: ir.Value, offset: ir.Value | int = 0) -> ir.Value:
-        """The value of a node: known, the same throughout, or among a part's results."""
-        graph = self.march.equations.graph
-        known = graph.known(node)
-        if known is not None:
-            return self.code.number(float(known))
-        if node in self.march.scalars:
-            return self.march._scalar(self.code, self.scalars, self.march.scalars[node], node)
-        return self.code.load(results, self.code.plus(part.slots[node], offset))
-
-    def _run(self, part: _Emitted, results: ir.Value) -> None:
-        if part.size:
-            self.code.builder.call(part.function, [self.scalars, self.inputs, results])
-
-    def write(self) -> None:
-        m, c = self.march, self.code
-        self.scalars = self._got("scalars")
-        self.samples = self._got("samples", I64)
-        self.rows = c.plus(c.times(self.samples, m.outputs), m.hidden)
-        self.knots = c.plus(c.plus(self.samples, self._got("first 0", I64)), 1)
-        self._choose_segments()
-        self._choose_work()
-        for i in range(m.states):
-            c.store(self._lanes(self._got("states"), m.states, i), self.state, i)
-        for t in range(self.tangents):
-            for i in range(m.states):
-                c.store(c.number(1.0 if t - m.parameters == i else 0.0), self.moved, t * m.states + i)
-        if self.jacobian:
-            self._begin_tangents()
-        self._write_prior()
-        with c.loop(self.samples) as i:
-            self._record(i)
-            go = c.builder.icmp_signed("<", i, c.load(self.needed, 0))
-            with c.builder.if_then(go):
-                self._interval(i)
-        self._write_end()
-        if self.jacobian:
-            reduced = c.builder.icmp_signed("!=", self._got("reduced", I64), c.i(0))
-            with c.builder.if_then(reduced):
-                self._write_products()
-
-    def _choose_segments(self) -> None:
-        """The lanes' segments; behind the last one it stands again, and what it writes is the same."""
-        c, b = self.code, self.code.builder
-        last = c.plus(self._got("segments", I64), -1)
-        for lane in range(LANES):
-            mine = c.plus(c.times(self.index, LANES), lane)
-            c.store(b.select(b.icmp_signed("<", mine, last), mine, last), self.segments, lane)
-
-    def _choose_work(self) -> None:
-        """How many intervals have to be simulated, and how many powers of each signal there are."""
-        c, b, m = self.code, self.code.builder, self.march
-        c.store(c.i(0), self.needed, 0)
-        with c.loop(self.samples) as i:
-            some = self._lanes(self._got("weight"), self.samples, i)
-            counts = b.fcmp_ordered(">", some, c.number(0.0))
-            with b.if_then(b.icmp_unsigned("!=", b.bitcast(counts, I8), ir.Constant(I8, 0))):
-                c.store(i, self.needed, 0)
-        whole = b.icmp_signed("!=", self._got("whole", I64), c.i(0))
-        c.store(b.select(whole, self.samples, c.load(self.needed, 0)), self.needed, 0)
-        for k in range(m.signals):
-            powers = self._got(f"powers {k}", I64)
-            row = c.times(c.plus(self.samples, self._got(f"first {k}", I64)), powers)
-            c.store(c.i(0), self.degree, k)
-            with c.loop(self.samples) as i, c.loop(powers, 1) as power:
-                offset = c.plus(c.times(c.plus(i, self._got(f"first {k}", I64)), powers), power)
-                some = b.fcmp_unordered("!=", self._lanes(self._got(f"signal {k}"), row, offset), c.number(0.0))
-                higher = b.icmp_signed(">", power, c.load(self.degree, k))
-                there = b.and_(higher, b.icmp_unsigned("!=", b.bitcast(some, I8), ir.Constant(I8, 0)))
-                with b.if_then(there):
-                    c.store(power, self.degree, k)
-
-    def _begin_tangents(self) -> None:
-        c, m = self.code, self.march
-        for room, size in self.blank:
-            with c.loop(size) as k:
-                c.store(c.number(0.0), room, k)
-        with c.loop(m.parameters) as t:
-            c.store(c.spread(c.load(self._got("slopes"), t)), self.scale, t)
-        with c.loop(self.tangents, m.parameters) as t:
-            c.store(c.number(1.0), self.scale, t)
-
-    # -- what is read ------------------------------------------------------------------------------------------
-
-    def _at_state(self) -> None:
-        for i in range(self.march.states):
-            self.code.store(self.code.load(self.state, i), self.inputs, i)
-
-    def _record(self, i: ir.Value) -> None:
-        """Rows of the residual at a sample, and their derivatives."""
-        c, b, m = self.code, self.code.builder, self.march
-        self._at_state()
-        self._run(m.read, self.read_results)
-        weight = self._lanes(self._got("weight"), self.samples, i)
-        counts = b.fcmp_ordered(">", weight, c.number(0.0))
-        row = c.times(self.samples, m.outputs)
-        errors = []
-        for k, node in enumerate(m.equations.outputs.values):
-            offset = c.plus(c.times(i, m.outputs), k)
-            error = c.sub(self._lanes(self._got("measured"), row, offset), self._node(m.read, node, self.read_results))
-            errors.append(b.select(counts, c.mul(error, weight), c.number(0.0)))
-        whitening = [
-            [c.spread(c.load(self._got("whitening"), p * m.outputs + q)) for q in range(m.outputs)]
-            for p in range(m.outputs)
-        ]
-        lost = c.number(LOST)
-        inside, values = [], []
-        for p in range(m.outputs):
-            white = c.total([c.mul(w, e) for w, e in zip(whitening[p], errors, strict=True)])
-            assert white is not None
-            inside.append(c.smaller(c.called("fabs", white), lost))
-            values.append(b.select(inside[p], white, lost))
-            self._put(self._got("rows"), self.rows, c.plus(c.times(i, m.outputs), p), values[p])
-        if not self.jacobian:
-            return
-        scale = c.builder.fneg(weight)
-        slopes = m.equations.outputs.slopes
-        self._fill(m.read, self.read_results, slopes, range(m.outputs), self.read_dense, 0)
-
-        with c.loop(self.tangents) as t:
-            moved = self._tangent(t)
-            factor = c.mul(scale, c.load(self.scale, t))
-            change = []
-            for k, slope in enumerate(slopes):
-                own = c.load(self.read_dense, c.plus(c.times(t, m.outputs), k))
-                total = c.total([*self._along_states(m.read, self.read_results, slope, moved), own])
-                change.append(b.select(counts, c.mul(factor, total), c.number(0.0)))
-            for p in range(m.outputs):
-                white = c.total([c.mul(w, x) for w, x in zip(whitening[p], change, strict=True)])
-                assert white is not None
-                c.store(self._finite(white, inside[p]), self._columns_of(p), t)
-        for p in range(m.outputs):
-            self._put_row(c.plus(c.times(i, m.outputs), p), self._columns_of(p), values[p])
-
-    def _columns_of(self, row: int) -> ir.Value:
-        """Where the derivatives of a row, and then its value, are collected."""
-        return self.code.place(self.collected, row * (self.tangents + 1))
-
-    def _put_row(self, row: ir.Value, columns: ir.Value, value: ir.Value) -> None:
-        """Write a row of the Jacobian, or add it to the products of the columns with each other."""
-        c, b = self.code, self.code.builder
-        reduced = b.icmp_signed("!=", self._got("reduced", I64), c.i(0))
-        c.store(value, columns, self.tangents)
-        with b.if_else(reduced) as (taken, written):
-            with taken, c.loop(self.tangents + 1) as i:
-                left = c.load(columns, i)
-                with c.loop(self.tangents + 1, i) as j:
-                    place = c.plus(c.times(i, self.tangents + 1), j)
-                    product = c.mul(left, c.load(columns, j))
-                    c.store(c.add(c.load(self.products, place), product), self.products, place)
-            with written:
-                self._write_row(row, columns)
-
-    def _write_row(self, row: ir.Value, columns: ir.Value) -> None:
-        """Derivatives of a row; zero behind the last parameter."""
-        c, m = self.code, self.march
-        width = self._got("width", I64)
-        for first, last, count, result in (
-            (0, m.parameters, width, "by_parameter"),
-            (m.parameters, self.tangents, c.i(m.states), "by_state"),
-        ):
-
-            def put(t: ir.Value, value: ir.Value, count=count, result=result) -> None:
-                self._put(self._got(result), c.times(self.rows, count), c.plus(c.times(row, count), t), value)
-
-            with c.loop(last - first) as t:
-                put(t, c.load(columns, c.plus(t, first)))
-            with c.loop(count, last - first) as t:
-                put(t, c.number(0.0))
-
-    def _write_products(self) -> None:
-        """The upper half of the products, mirrored; zero in the columns behind the last parameter."""
-        c, b = self.code, self.code.builder
-        count = self.tangents + 1
-        padding = b.sub(self._got("width", I64), c.i(self.march.parameters))
-        columns = c.plus(padding, count)
-        size, out = c.times(columns, columns), self._got("products")
-        with c.loop(size) as k:
-            self._put(out, size, k, c.number(0.0))
-
-        def column(i: ir.Value) -> ir.Value:
-            own = b.icmp_signed("<", i, c.i(self.march.parameters))
-            return c.plus(i, b.select(own, c.i(0), padding))
-
-        with c.loop(count) as i, c.loop(count, i) as j:
-            value = c.load(self.products, c.plus(c.times(i, count), j))
-            for row, other in ((i, j), (j, i)):
-                self._put(out, size, c.plus(c.times(column(row), columns), column(other)), value)
-
-    def _finite(self, value: ir.Value, as_well: ir.Value) -> ir.Value:
-        """A derivative; zero where it is none."""
-        c = self.code
-        fine = c.builder.and_(as_well, c.smaller(c.called("fabs", value), c.number(np.inf)))
-        return c.builder.select(fine, value, c.number(0.0))
-
-    def _tangent(self, t: ir.Value) -> list[ir.Value]:
-        c, states = self.code, self.march.states
-        return [c.load(self.moved, c.plus(c.times(t, states), i)) for i in range(states)]
-
-    def _along_states(
-        self, part: _Emitted, results: ir.Value, slopes: Tangent, moved: Sequence[ir.Value], offset: int = 0
-    ) -> list[ir.Value]:
-        """The terms of a row's change when states change."""
-        graph = self.march.equations.graph
-        terms = []
-        for direction, node in slopes.items():
-            if direction[0] == "state":
-                change = moved[direction[1]]
-                one = graph.known(node) == 1.0
-                terms.append(change if one else self.code.mul(self._node(part, node, results, offset), change))
-        return terms
-
-    def _fill(
-        self, part: _Emitted, results: ir.Value, slopes: Sequence[Tangent], rows: Sequence[int], dense, offset: int
-    ) -> None:
-        """Put derivatives by parameters where a loop over the parameters finds them."""
-        c, m = self.code, self.march
-        for p in range(m.parameters):
-            for k, row in enumerate(rows):
-                node = slopes[row].get(("parameter", p))
-                value = c.number(0.0) if node is None else self._node(part, node, results, offset)
-                c.store(value, dense, p * len(rows) + k)
-
-    def _write_prior(self) -> None:
-        """Rows that say how far hidden states start from where they are expected; none where a segment is joined."""
-        c, b, m = self.code, self.code.builder, self.march
-        if not m.hidden:
-            return
-        self._at_state()
-        self._run(m.expected, self.prior_results)
-        fresh = b.fcmp_ordered("==", self._lanes(self._got("joined"), 1, 0), c.number(0.0))
-        top = c.times(self.samples, m.outputs)
-        zero, lost = c.number(0.0), c.number(LOST)
-        for h, node in enumerate(m.equations.prior.values):
-            value = self._node(m.expected, node, self.prior_results)
-            inside = c.smaller(c.called("fabs", value), lost)
-            value = b.select(fresh, b.select(inside, value, lost), zero)
-            row = c.plus(top, h)
-            self._put(self._got("rows"), self.rows, row, value)
-            if not self.jacobian:
-                continue
-            both = b.and_(fresh, inside)
-            slopes = m.equations.prior.slopes[h]
-            for kind, first, count in (("parameter", 0, m.parameters), ("state", m.parameters, m.states)):
-                for t in range(count):
-                    slope = slopes.get((kind, t))
-                    change = zero if slope is None else self._node(m.expected, slope, self.prior_results)
-                    change = c.mul(change, c.load(self.scale, first + t))
-                    c.store(self._finite(change, both), self._columns_of(0), first + t)
-            self._put_row(row, self._columns_of(0), value)
-
-    def _write_end(self) -> None:
-        c, m = self.code, self.march
-        for i in range(m.states):
-            self._put(self._got("end"), m.states, i, c.load(self.state, i))
-        if not self.jacobian:
-            return
-        for own, first, count, result in (
-            (True, 0, m.parameters, "end_by_parameter"),
-            (False, m.parameters, m.states, "end_by_state"),
-        ):
-            width = self._got("width", I64) if own else c.i(count)
-
-            def put(i: int, t: ir.Value, change: ir.Value, width=width, result=result) -> None:
-                self._put(self._got(result), c.times(width, m.states), c.plus(c.times(width, i), t), change)
-
-            with c.loop(count) as t:
-                for i, value in enumerate(self._tangent(c.plus(t, first))):
-                    put(i, t, c.mul(value, c.load(self.scale, c.plus(t, first))))
-            with c.loop(width, count) as t:
-                for i in range(m.states):
-                    put(i, t, c.number(0.0))
-
-    # -- steps -------------------------------------------------------------------------------------------------
-
-    def _interval(self, i: ir.Value) -> None:
-        c, b, m = self.code, self.code.builder, self.march
-        for k in range(m.signals):
-            powers, first = self._got(f"powers {k}", I64), self._got(f"first {k}", I64)
-            row = c.times(c.plus(self.samples, first), powers)
-            with c.loop(c.plus(c.load(self.degree, k), 1)) as power:
-                offset = c.plus(c.times(c.plus(i, first), powers), power)
-                value = self._lanes(self._got(f"signal {k}"), row, offset)
-                c.store(value, self.coefficients, c.plus(power, k * _POWERS))
-        at = c.plus(i, self._got("first 0", I64))
-        begin, end = (self._lanes(self._got("knots"), self.knots, c.plus(at, late)) for late in (0, 1))
-        substeps = self._got("substeps", I64)
-        step = b.fdiv(c.sub(end, begin), c.spread(b.sitofp(substeps, F64)))
-        with c.loop(substeps) as j:
-            start = c.mul(c.spread(b.sitofp(j, F64)), step)
-            self._step(begin, start, step)
-
-    def _surround(self, begin: ir.Value, late: ir.Value) -> None:
-        """Time and signals, as inputs of the equations."""
-        c, m = self.code, self.march
-        c.store(c.add(begin, late), self.inputs, m.at_time)
-        for k in range(m.signals):
-            degree = c.load(self.degree, k)
-            place = c.place(self.inputs, m.at_signal + k)
-            c.builder.store(c.load(self.coefficients, c.plus(degree, k * _POWERS)), place, align=8)
-            with c.loop(degree) as down:
-                power = c.builder.sub(c.plus(degree, -1), down)
-                value = c.builder.load(place, align=8)
-                lower = c.load(self.coefficients, c.plus(power, k * _POWERS))
-                c.builder.store(c.add(c.mul(value, late), lower), place, align=8)
-
-    def _step(self, begin: ir.Value, start: ir.Value, step: ir.Value) -> None:
-        c, m = self.code, self.march
-        c.store(step, self.inputs, m.at_step)
-        if m.held:
-            self._at_state()
-            self._surround(begin, start)
-            self._run(m.before, self.held_results)
-            for k, node in enumerate(m.equations.held.values):
-                c.store(self._node(m.before, node, self.held_results), self.inputs, m.at_held + k)
-            if self.jacobian:
-                self._fill(m.before, self.held_results, m.equations.held.slopes, range(m.held), self.held_dense, 0)
-        old = [c.load(self.state, i) for i in range(m.states)]
-        for j, node in enumerate(m.nodes):
-            self._stage(j, begin, c.add(start, c.mul(c.number(node), step)), old, step)
-        for i in range(m.states):
-            value = c.total([old[i], self._weighted(m.weights, lambda j, i=i: c.load(self.slopes, j * m.states + i))])
-            assert value is not None
-            c.store(value, self.state, i)
-        if self.jacobian:
-            with c.loop(self.tangents) as t:
-                self._move_tangent(t, step)
-
-    def _weighted(self, weights: Sequence[float], slope: Callable[[int], ir.Value]) -> ir.Value | None:
-        c = self.code
-        return c.total([c.mul(c.number(w), slope(j)) for j, w in enumerate(weights) if w != 0.0])
-
-    def _stage(self, j: int, begin: ir.Value, late: ir.Value, old: list[ir.Value], step: ir.Value) -> None:
-        c, m = self.code, self.march
-        self._surround(begin, late)
-        for i in range(m.states):
-            moved = self._weighted(m.lower[j], lambda k, i=i: c.load(self.slopes, k * m.states + i))
-            value = old[i] if moved is None else c.add(old[i], moved)
-            c.store(value, self.inputs, i)
-        offset = j * m.rates.size
-        results = c.place(self.stage_results, offset)
-        self._run(m.rates, results)
-        for i, node in enumerate(m.equations.rates.values):
-            c.store(c.mul(step, self._node(m.rates, node, results)), self.slopes, j * m.states + i)
-        if self.jacobian:
-            rows = self.rates_by_parameter
-            dense = c.place(self.dense, j * len(rows) * self.tangents)
-            self._fill(m.rates, results, m.equations.rates.slopes, rows, dense, 0)
-
-    def _move_tangent(self, t: ir.Value, step: ir.Value) -> None:
-        """Take one tangent through the stages of a step."""
-        c, m = self.code, self.march
-        rates = m.equations.rates
-        old = self._tangent(t)
-        held: list[Any] = []
-        for k, slopes in enumerate(m.equations.held.slopes):
-            terms = self._along_states(m.before, self.held_results, slopes, old)
-            held.append(c.total([*terms, c.load(self.held_dense, c.plus(c.times(t, m.held), k))]))
-        rows = {row: k for k, row in enumerate(self.rates_by_parameter)}
-        found: list[list[ir.Value | None]] = []
-        for j in range(len(m.nodes)):
-            now: list[Any] = [c.total([old[i], self._weighted_tangents(m.lower[j], found, i)]) for i in range(m.states)]
-            results = c.place(self.stage_results, j * m.rates.size)
-            stage: list[Any] = []
-            for i in range(m.states):
-                terms: list[Any] = [*self._along_states(m.rates, results, rates.slopes[i], now)]
-                for direction, node in rates.slopes[i].items():
-                    if direction[0] == "held":
-                        terms.append(c.mul(self._node(m.rates, node, results), held[direction[1]]))
-                if i in rows:
-                    place = c.plus(c.times(t, len(rows)), j * len(rows) * self.tangents + rows[i])
-                    terms.append(c.load(self.dense, place))
-                rate = c.total(terms)
-                stage.append(None if rate is None else c.mul(step, rate))
-            found.append(stage)
-        for i in range(m.states):
-            value = c.total([old[i], self._weighted_tangents(m.weights, found, i)])
-            assert value is not None
-            c.store(value, self.moved, c.plus(c.times(t, m.states), i))
-
-    def _weighted_tangents(
-        self, weights: Sequence[float], found: Sequence[Sequence[ir.Value | None]], state: int
-    ) -> ir.Value | None:
-        c = self.code
-        pairs = [(w, stage[state]) for w, stage in zip(weights, found, strict=False) if w != 0.0]
-        return c.total([c.mul(c.number(w), s) for w, s in pairs if s is not None])
