@@ -24,7 +24,7 @@ from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
 from fitting.posing import natural_frequency, short_horizon, suggested_substeps
-from fitting.residual import blocks, residual
+from fitting.residual import Products, blocks, residual
 from fitting.starting_values import starting_models
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 from hdjax.lanes import jit_lanes

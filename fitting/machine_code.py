@@ -161,7 +161,20 @@ class Task(eqx.Module):
         lanes = eqx.tree_at(lambda s: (s.free, s.slopes, s.states), self.lanes, (value, slope, unknowns.states))
         found = march_lanes(self.address, lanes, self.hidden, "jacobian", reduced=True)
         assert found.products is not None
-        return Products(found.products, *_ends(lanes, found)), found.rows
+        return Products(found.products, *_ends(lanes, found)), jnp.asarray(found.rows)
+
+    def blank(self, unknowns: Unknowns) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
+        """Zeros like what a look finds."""
+        segments, states = unknowns.states.shape
+        width, (_, samples, outputs) = unknowns.parameters.size, self.lanes.measured.shape
+        columns = width + states + 1
+        found = Products(
+            products=np.zeros((segments, columns, columns)),
+            gap=np.zeros((segments, states)),
+            before_by_parameter=np.zeros((segments, states, width)),
+            before_by_state=np.zeros((segments, states, states)),
+        )
+        return found, np.zeros((segments, samples * outputs + self.hidden))
 
 
 def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:

@@ -124,13 +124,13 @@ class Lanes(eqx.Module):
 class Marched(eqx.Module):
     """Results of a march: whitened rows, the states in which segments end, and where asked for their derivatives."""
 
-    rows: Float[Array, "segments rows"]
-    end: Float[Array, "segments states"]
-    by_parameter: Float[Array, "segments height width"] | None = None
-    by_state: Float[Array, "segments height states"] | None = None
-    end_by_parameter: Float[Array, "segments states width"] | None = None
-    end_by_state: Float[Array, "segments states states"] | None = None
-    products: Float[Array, "segments columns columns"] | None = None
+    rows: Float[Array | np.ndarray, "segments rows"]
+    end: Float[Array | np.ndarray, "segments states"]
+    by_parameter: Float[Array | np.ndarray, "segments height width"] | None = None
+    by_state: Float[Array | np.ndarray, "segments height states"] | None = None
+    end_by_parameter: Float[Array | np.ndarray, "segments states width"] | None = None
+    end_by_state: Float[Array | np.ndarray, "segments states states"] | None = None
+    products: Float[Array | np.ndarray, "segments columns columns"] | None = None
 
 
 def march_lanes(
@@ -147,6 +147,14 @@ def march_lanes(
     """
     from hdjax.engine.handler import register
 
+    results = [jax.ShapeDtypeStruct(s, np.dtype("float64")) for s in _shapes(lanes, hidden, mode, reduced=reduced)]
+    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
+    call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")
+    return Marched(*call(address, *operands, *lanes.signals))
+
+
+def _shapes(lanes: Lanes, hidden: int, mode: Mode, *, reduced: bool) -> list[tuple[int, ...]]:
+    """Of the results of a march."""
     segments, samples, outputs = lanes.measured.shape
     states, width = lanes.states.shape[1], lanes.free.shape[0]
     rows = samples * outputs + hidden
@@ -155,10 +163,7 @@ def march_lanes(
         height, columns = (0, width + states + 1) if reduced else (rows, 0)
         shapes += [(segments, height, width), (segments, height, states), (segments, states, width)]
         shapes += [(segments, states, states), (segments, columns, columns)]
-    results = [jax.ShapeDtypeStruct(shape, np.dtype("float64")) for shape in shapes]
-    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
-    call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")
-    return Marched(*call(address, *operands, *lanes.signals))
+    return shapes
 
 
 def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode) -> Marched:
@@ -166,12 +171,11 @@ def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int
     from hdjax.engine.handler import called
 
     lanes = jax.tree.map(np.ascontiguousarray, lanes)
-    shapes = jax.eval_shape(lambda lanes: march_lanes(address, lanes, hidden, mode), lanes)
-    results = jax.tree.map(lambda s: np.empty(s.shape), shapes)
+    results = [np.empty(shape) for shape in _shapes(lanes, hidden, mode, reduced=False)]
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
     arrays = [np.asarray(a) for a in (address, *operands, *lanes.signals)]
-    called(int(address), arrays, jax.tree.leaves(results))
-    return results
+    called(int(address), arrays, results)
+    return Marched(*results)
 
 
 _ALONE = ContextVar("_ALONE", default=False)
