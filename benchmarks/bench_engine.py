@@ -101,7 +101,7 @@ class Engines:
         lanes: sensitivities, those by parameters and by initial states.
         xla: one linearisation by XLA.
         code: likewise by machine code, with the Jacobian written.
-        needed: what a fit calls: the Jacobian's triangular factor, but all of it where an effect changes the torque.
+        needed: what a fit calls: products of the Jacobian's columns, but all of it where an effect changes the torque.
         xla_ready: from the model to a callable residual and Jacobian.
         code_ready: likewise.
         kernel: of that, for the machine code itself; the rest is a program of JAX that depends on shapes alone.

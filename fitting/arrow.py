@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from fitting.residual import Blocks, Products, Unknowns, moved_gap
 from hdjax.where import where
 
-# Shares of what a step promises: one that keeps less is not taken, one that keeps more is followed by a bolder one.
+# Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
+# keeps more is followed by a bolder one.
 # Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
 # across it, so it must go quickly where the model predicts well.
 _KEPT, _WELL = 0.01, 0.75

@@ -1,10 +1,8 @@
 """Which engine evaluates a residual: machine code where this processor and the model allow it, XLA otherwise."""
 
-import contextlib
 import dataclasses
 import functools
 import importlib
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -28,10 +26,6 @@ from fitting.residual import (
 from hdjax.engine import UntranslatableError, kernel
 from hdjax.lanes import jit_lanes
 
-Engine = Literal["XLA", "diffrax"]
-"""What evaluates a residual in place of machine code: the same steps as a program of XLA, or `diffrax.diffeqsolve` with
-adaptive steps."""
-
 
 def with_engine(problem: Problem, *, values: bool = False) -> Problem:
     """The problem with machine code for its model, where that can be.
@@ -40,37 +34,31 @@ def with_engine(problem: Problem, *, values: bool = False) -> Problem:
         problem: what is solved.
         values: whether the residual is wanted without derivatives as well.
     """
-    if problem.adaptive or unusable() is not None:
-        return problem
-    with contextlib.suppress(UntranslatableError):
-        return _with_kernel(problem, values)
-    return problem
-
-
-def _with_kernel(problem: Problem, values: bool) -> Problem:
-    made = kernel(
-        problem.model,
-        problem.free.paths,
-        loaded=problem.segments.load_torque is not None,
-        warm=problem.segments.temperature is not None,
-        solver=problem.solver,
-        values=values,
-    )
-    return dataclasses.replace(problem, kernel=made)
+    return _ready(problem, values)[0]
 
 
 def why_not(problem: Problem) -> str | None:
     """Why XLA evaluates the residual; None where machine code does."""
-    if problem.adaptive:
-        return "`diffrax.diffeqsolve` was asked for"
-    reason = unusable()
+    return _ready(problem, values=False)[1]
+
+
+def _ready(problem: Problem, values: bool) -> tuple[Problem, str | None]:
+    """The problem with machine code; or as it is, and why."""
+    reason = unusable() if problem.engine is None else f"{problem.engine} was asked for"
     if reason is not None:
-        return reason
+        return problem, reason
     try:
-        _with_kernel(problem, False)
+        made = kernel(
+            problem.model,
+            problem.free.paths,
+            loaded=problem.segments.load_torque is not None,
+            warm=problem.segments.temperature is not None,
+            solver=problem.solver,
+            values=values,
+        )
     except UntranslatableError as error:
-        return f"the model uses {error}, which the engine for machine code does not know"
-    return None
+        return problem, f"the model uses {error}, which the engine for machine code does not know"
+    return dataclasses.replace(problem, kernel=made), None
 
 
 @functools.cache

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.engines import Engine, linearise
+from fitting.engines import linearise
 from fitting.experiment import Stretch, scales
 from fitting.explained import FirstStates
+from fitting.followed import readout
 from fitting.free import FreeParameters
 from fitting.posing import initial_states, on_all_devices, pose
-from fitting.residual import RUNAWAY, Problem, Unknowns
+from fitting.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from hdjax import Model
-from hdjax.engine.pointwise import slopes_at_instants
 
 REWEIGHTINGS = 3
 """Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
@@ -262,16 +262,11 @@ def _gap_weight(problem: Problem, white: np.ndarray, swing: float) -> Float[np.n
     """
     model = problem.model
     angles = len(model.motion_states) // 2
-    seen = slopes_at_instants(_outputs, (np.asarray(model.rest()), 0), (model, 0))
-    shown = np.linalg.norm(white @ seen[:, :angles], axis=0)
+    shown = np.linalg.norm(white @ readout(model, model.rest())[:, :angles], axis=0)
     visible = 0.1 * swing * np.linalg.norm(white[:, -1])
     hidden = [visible / np.asarray(e.state_scale()) for e in model.effects if e.states]
     weights = np.concatenate([shown, shown / float(model.drive.omega_0), *hidden])
     return np.sqrt(problem.segments.weight.shape[1]) * weights
-
-
-def _outputs(state: Array, model: Model) -> Array:
-    return model.outputs(state)
 
 
 def half_log_determinant(covariance: Array | np.ndarray) -> float:

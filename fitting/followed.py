@@ -61,8 +61,8 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
     else:
         found = _response(model, problem, np.asarray(unknowns.states))
     states, transition, from_start, from_end = (np.asarray(a) for a in vars(found).values())
-    readout = slopes_at_instants(_outputs, (states[:, :-1], 2), (model, 0))
-    return Followed(states, _between(model, states, problem.segments), transition, from_start, from_end, readout)
+    between, read = _between(model, states, problem.segments), readout(model, states[:, :-1])
+    return Followed(states, between, transition, from_start, from_end, read)
 
 
 def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segments states"]) -> Response:
@@ -72,6 +72,13 @@ def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segment
     found = {name: np.asarray(signal.coefficients) for name, signal in beside.items() if signal is not None}
     own = knots[:, segments.halo :], torque[:, segments.halo :], found
     return response(model, states, *own, int(problem.substeps), problem.solver)
+
+
+def readout(
+    model: Model, states: Float[Array | np.ndarray, "*many states"]
+) -> Float[np.ndarray, "*many outputs states"]:
+    """Derivatives of the outputs by the state, at each of many states."""
+    return slopes_at_instants(_outputs, (states, states.ndim - 1), (model, 0))
 
 
 def _outputs(state: Array, model: Model) -> Array:

@@ -17,7 +17,7 @@ from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
-from hdjax.engine.kernel import Mode, march_arrays
+from hdjax.engine.kernel import Mode, march_arrays, result_shapes
 from hdjax.parameters import as_scalar
 from hdjax.where import where
 
@@ -163,18 +163,11 @@ class Task(eqx.Module):
         assert found.products is not None
         return Products(found.products, *_ends(lanes, found)), jnp.asarray(found.rows)
 
-    def blank(self, unknowns: Unknowns) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
+    def blank(self) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
         """Zeros like what a look finds."""
-        segments, states = unknowns.states.shape
-        width, (_, samples, outputs) = unknowns.parameters.size, self.lanes.measured.shape
-        columns = width + states + 1
-        found = Products(
-            products=np.zeros((segments, columns, columns)),
-            gap=np.zeros((segments, states)),
-            before_by_parameter=np.zeros((segments, states, width)),
-            before_by_state=np.zeros((segments, states, states)),
-        )
-        return found, np.zeros((segments, samples * outputs + self.hidden))
+        shapes = result_shapes(self.lanes, self.hidden, "jacobian", reduced=True)
+        rows, end, _, _, by_parameter, by_state, products = map(np.zeros, shapes)
+        return Products(products, end, by_parameter, by_state), rows
 
 
 def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
@@ -216,8 +209,8 @@ def _ends(lanes: Lanes, found: Marched) -> tuple[Array, Array, Array]:
 
     # A state that has run away stands for itself: nothing before it moves the gap.
     own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
-    ends = before(found.end_by_parameter), before(found.end_by_state) + own
-    return jnp.asarray(gap), jnp.asarray(ends[0]), jnp.asarray(ends[1])
+    by_parameter, by_state = before(found.end_by_parameter), before(found.end_by_state) + own
+    return jnp.asarray(gap), jnp.asarray(by_parameter), jnp.asarray(by_state)
 
 
 def residual_by_machine_code(

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.engines import Engine, with_engine
+from fitting.engines import with_engine
 from fitting.experiment import Segments, Stretch, cut, scales
 from fitting.free import free_parameters
-from fitting.residual import Problem, Unknowns
+from fitting.residual import Engine, Problem, Unknowns
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import spread
 
@@ -48,8 +48,8 @@ def pose(
     active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
     outputs = segments.measured.shape[-1]
     unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
-    problem = Problem(model, free, segments, *unweighed, substeps=substeps, adaptive=engine == "diffrax")
-    return on_all_devices(with_engine(problem) if engine is None else problem, unknowns)
+    problem = Problem(model, free, segments, *unweighed, substeps=substeps, engine=engine)
+    return on_all_devices(with_engine(problem), unknowns)
 
 
 def on_all_devices(problem: Problem, unknowns: Unknowns) -> tuple[Problem, Unknowns]:

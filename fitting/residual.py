@@ -1,5 +1,7 @@
 """Measured minus simulated on every segment, and its derivatives: the one program that all fits run."""
 
+from typing import Literal
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -20,8 +22,9 @@ LOST = 1e8
 RUNAWAY = 1e-3 * LOST
 """Standard deviations beyond which a simulation has lost its way; the weights may have changed since."""
 
-# Of adaptive steps, in the units of the states.
-_RTOL, _ATOL = 1e-8, 1e-11
+Engine = Literal["XLA", "diffrax"]
+"""What evaluates a residual in place of machine code: the same steps as a program of XLA, or `diffrax.diffeqsolve` with
+adaptive steps."""
 
 
 def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
@@ -43,7 +46,7 @@ class Problem(eqx.Module):
         substeps: its steps in each sample interval; data, so that finer steps need no other program.
         unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
         kernel: machine code that does the same faster, see [`fitting.machine_code`][]; None where XLA does it.
-        adaptive: whether XLA simulates by `diffrax.diffeqsolve` with steps of its own choice, in place of so many.
+        engine: what evaluates the residual, where it is not to be machine code if that can be.
     """
 
     model: Model
@@ -56,7 +59,7 @@ class Problem(eqx.Module):
     substeps: Int[Array, ""] = eqx.field(converter=_as_integer, default=1)
     unroll: bool = eqx.field(static=True, default=True)
     kernel: Kernel | None = None
-    adaptive: bool = eqx.field(static=True, default=False)
+    engine: Engine | None = eqx.field(static=True, default=None)
 
 
 class Unknowns(eqx.Module):
@@ -128,8 +131,8 @@ def simulate_segments(
     def solved(torque, load_torque, temperature, state):
         times = torque.knots[segments.halo :]
         beside = {} if load_torque is None else {"load_torque": load_torque}
-        steps = {"solver": problem.solver, "rtol": _RTOL, "atol": _ATOL, "adjoint": dfx.ForwardMode(), "throw": False}
-        found = simulate(model, torque, times, state, temperature=temperature, **beside, **steps)
+        options = {"temperature": temperature, "solver": problem.solver, "adjoint": dfx.ForwardMode(), "throw": False}
+        found = simulate(model, torque, times, state, **beside, **options)
         return found.outputs[:-1], found.states[-1]
 
     def marched(torque, load_torque, temperature, state):
@@ -153,7 +156,7 @@ def simulate_segments(
         )
         return jax.vmap(model.outputs)(states), end
 
-    one = solved if problem.adaptive else marched
+    one = solved if problem.engine == "diffrax" else marched
     return jax.vmap(one)(segments.torque, segments.load_torque, temperature, unknowns.states)
 
 

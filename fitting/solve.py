@@ -122,7 +122,7 @@ class _Point(eqx.Module):
 
 def _in_bursts(problem: Problem, unknowns: Unknowns, solver: ArrowLevenbergMarquardt, looked_at: Task) -> _Point:
     """The iteration as one program, left now and then so that it can be interrupted."""
-    point = _begun(unknowns, solver, *looked_at.blank(unknowns))
+    point = _begun(unknowns, solver, *looked_at.blank())
     tangents = unknowns.parameters.size + unknowns.states.shape[1]
     guess = _SAMPLE * problem.segments.weight.size * tangents * int(problem.substeps)
     burst = int(np.clip(_BURST / guess, 1, 1000))

@@ -10,11 +10,11 @@ import pytest
 
 import rig
 from fitting import engines
-from fitting.engines import Engine
 from fitting.estimate import fit
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
 from fitting.posing import pose
+from fitting.residual import Engine
 from fitting.rig import read_rig
 from fitting.starting_values import starting_models
 from fitting.uncertainty import uncertainty

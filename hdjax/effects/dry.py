@@ -11,8 +11,8 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect
 from hdjax.parameters import Scalar
 
-# Where the corner is this share of what the friction does to the rate in a step (its reach), half of the sign is the
-# mean. What the stages see of such a damper turns the rate by at most 2.1 times itself in a step; RK4 bears 2.78.
+# Where the corner is this share of how far the rate may turn in a step (its reach), half of the sign is the mean. What
+# the stages see of such a damper turns the rate by at most 2.1 times itself in a step; RK4 bears 2.78.
 _RESOLVED = 1.0 / 3.0
 # No stage of a step sees a corner sharper than this share of the reach.
 _SHARPEST = 1.0 / 16.0

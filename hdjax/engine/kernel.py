@@ -147,14 +147,16 @@ def march_lanes(
     """
     from hdjax.engine.handler import register
 
-    results = [jax.ShapeDtypeStruct(s, np.dtype("float64")) for s in _shapes(lanes, hidden, mode, reduced=reduced)]
+    results = [
+        jax.ShapeDtypeStruct(s, np.dtype("float64")) for s in result_shapes(lanes, hidden, mode, reduced=reduced)
+    ]
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
     call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")
     return Marched(*call(address, *operands, *lanes.signals))
 
 
-def _shapes(lanes: Lanes, hidden: int, mode: Mode, *, reduced: bool) -> list[tuple[int, ...]]:
-    """Of the results of a march."""
+def result_shapes(lanes: Lanes, hidden: int, mode: Mode, *, reduced: bool) -> list[tuple[int, ...]]:
+    """Shapes of the results of a march, in the order of [`Marched`][]; arguments as in [`march_lanes`][]."""
     segments, samples, outputs = lanes.measured.shape
     states, width = lanes.states.shape[1], lanes.free.shape[0]
     rows = samples * outputs + hidden
@@ -171,7 +173,7 @@ def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int
     from hdjax.engine.handler import called
 
     lanes = jax.tree.map(np.ascontiguousarray, lanes)
-    results = [np.empty(shape) for shape in _shapes(lanes, hidden, mode, reduced=False)]
+    results = [np.empty(shape) for shape in result_shapes(lanes, hidden, mode, reduced=False)]
     operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
     arrays = [np.asarray(a) for a in (address, *operands, *lanes.signals)]
     called(int(address), arrays, results)
