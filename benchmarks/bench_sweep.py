@@ -316,7 +316,9 @@ def main() -> None:
     options, _ = arguments.parse_known_args()
     jax.config.update("jax_num_cpu_devices", options.devices)
     jax.config.update("jax_enable_x64", True)
-    print(f"{len(jax.local_devices())} host devices; other work on the machine disturbs times, less so their ratios")
+    kinds = {device.device_kind for device in jax.local_devices()}
+    print(f"{len(jax.local_devices())} devices ({', '.join(kinds)}), {os.cpu_count()} processors for the C programs;")
+    print("other work on the machine disturbs times, less so their ratios")
     with tempfile.TemporaryDirectory() as folder:
         for alpha in (WEAK, ALPHA):
             transient_benchmark(options.drives, alpha, options.repeats, Path(folder))

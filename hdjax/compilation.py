@@ -18,14 +18,15 @@ _SMALL: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusi
 def jit_with(
     function: Callable[_Arguments, _Result], compiler_options: dict[str, Any]
 ) -> Callable[_Arguments, _Result]:
-    """`eqx.filter_jit` with options of the compiler; inside another program, which has options of its own, without."""
+    """`eqx.filter_jit` with options of the compiler for processors; without them inside another program, which has
+    options of its own, and on other devices, whose compiler does not know them."""
     options: Any = {"compiler_options": compiler_options}
     outside, inside = eqx.filter_jit(function, **options), eqx.filter_jit(function)
 
     @functools.wraps(function)
     def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return (inside if traced else outside)(*args, **kwargs)
+        return (inside if traced or jax.default_backend() != "cpu" else outside)(*args, **kwargs)
 
     return called
 

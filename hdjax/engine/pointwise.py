@@ -146,7 +146,7 @@ def _evaluated(formula: _Formula, leaves: Sequence[tuple[np.ndarray, int]], dire
     arrays, start = [], 0
     for shape in formula.shapes:
         rows = math.prod((*shape, *last))
-        own = found[start : start + rows].reshape(*shape, *last, *lead)
+        own = found[start : start + rows].reshape((*shape, *last, *lead))
         many = len(shape) + len(last)
         arrays.append(np.moveaxis(own, range(many), range(-many, 0)))
         start += rows
@@ -169,19 +169,22 @@ def _by_jax(function: Callable[..., Any], arguments: Sequence[Instants], *, slop
     def rows(array: Any, many: int) -> np.ndarray:
         array = np.asarray(array)
         own = array.shape[many:]
-        array = array.reshape(*[1] * (len(lead) - many), *array.shape)
+        array = array.reshape((1,) * (len(lead) - many) + array.shape)
         return np.broadcast_to(array, (*lead, *own)).reshape(math.prod(lead), *own) if many else array.reshape(own)
 
     pairs = zip(parts, axes, strict=True)
     flat = [jax.tree.map(lambda a, many=many: rows(a, many), arrays) for (arrays, _), many in pairs]
-    found = _vmapped(function, flat, [fixed for _, fixed in parts], tuple(many > 0 for many in axes), slopes)
-    return jax.tree.map(lambda a: np.asarray(a).reshape(*lead, *a.shape[1:]), found)
+    moving = tuple(0 if many else None for many in axes)
+    found = _vmapped(function, flat, [fixed for _, fixed in parts], moving, math.prod(lead), slopes)
+    return jax.tree.map(lambda a: np.asarray(a).reshape((*lead, *a.shape[1:])), found)
 
 
 @eqx.filter_jit
-def _vmapped(function: Callable[..., Any], arrays: Any, fixed: Any, moving: tuple[bool, ...], slopes: bool) -> Any:
+def _vmapped(
+    function: Callable[..., Any], arrays: Any, fixed: Any, moving: tuple[int | None, ...], instants: int, slopes: bool
+) -> Any:
     def at(*arrays: Any) -> Any:
         return function(*(eqx.combine(a, f) for a, f in zip(arrays, fixed, strict=True)))
 
-    where = [0 if m else None for m in moving]
-    return jax.vmap(jax.jacfwd(at) if slopes else at, in_axes=where)(*jax.tree.map(jnp.asarray, arrays))
+    each = jax.vmap(jax.jacfwd(at) if slopes else at, in_axes=moving, axis_size=instants)
+    return each(*jax.tree.map(jnp.asarray, arrays))

@@ -22,7 +22,6 @@ _SPLITTINGS = {"strang": STRANG, "aba864": ABA864, "srkn14": SRKN14}
 _BLOCK = 1024
 # Adaptive lanes wait for the slowest of their block.
 _ADAPTIVE_BLOCK = 64
-_TILE = 16384
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +62,7 @@ def transients(
         values: parameters of the points, by path.
     """
     # One shape of program for pilots and chunks: compiling another takes longer than the lanes that fill this one.
-    tile, block = tile_for(request.points.size, _TILE), _BLOCK
+    tile, block = tile_for(request.points.size), _BLOCK
     if adaptive := route.method == "adaptive":
         tile, block = _ADAPTIVE_BLOCK, _ADAPTIVE_BLOCK
     # The looks of adaptive steps shape the program; numbers of steps and tolerances are data.
