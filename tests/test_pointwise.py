@@ -71,6 +71,12 @@ def test_jax_takes_over_where_a_function_is_not_known():
     np.testing.assert_allclose(slopes, ordered[..., None] * np.eye(2))
 
 
+def test_jax_takes_over_at_a_single_instant():
+    looked_at = {"pair": np.array([2.0, 1.0])}
+    found = at_instants(sorted_pair, (np.array([1.0, 3.0]), 0), (looked_at, 0))
+    np.testing.assert_array_equal(found, [1.0, 6.0])
+
+
 def test_a_function_is_translated_once_for_all_numbers(monkeypatch: pytest.MonkeyPatch):
     looked_at, strengths = points((6,)), np.array([0.7, -1.3])
     at_instants(around, (strengths, 0), ((np.array(1.1), "some"), 0), (looked_at, 1))
