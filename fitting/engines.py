@@ -1,11 +1,8 @@
 """Which engine evaluates a residual: machine code where this processor and the model allow it, XLA otherwise."""
 
 import dataclasses
-import functools
-import importlib
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,7 +20,7 @@ from fitting.residual import (
     seen_residual,
     simulate_segments,
 )
-from hdjax.engine import UntranslatableError, kernel
+from hdjax.engine import UntranslatableError, kernel, unusable
 from hdjax.lanes import jit_lanes
 
 
@@ -59,20 +56,6 @@ def _ready(problem: Problem, values: bool) -> tuple[Problem, str | None]:
     except UntranslatableError as error:
         return problem, f"the model uses {error}, which the engine for machine code does not know"
     return dataclasses.replace(problem, kernel=made), None
-
-
-@functools.cache
-def unusable() -> str | None:
-    """Why there is no machine code on this machine; None where there is."""
-    if jax.default_backend() != "cpu":
-        return f"the computation runs on a {jax.default_backend()}"
-    try:
-        importlib.import_module("hdjax.engine.handler").register()
-    except ImportError:
-        return "llvmlite is not installed"
-    except Exception as error:  # whatever stops a compiler on a processor that nobody has tried
-        return f"no machine code can be made on this machine ({type(error).__name__}: {error})"
-    return None
 
 
 def linearise(problem: Problem, unknowns: Unknowns, width: int | None = None) -> Blocks:

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
-from fitting.engines import unusable
 from fitting.experiment import Segments
 from fitting.machine_code import actuated
 from fitting.residual import Problem, Unknowns
 from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect, Conditions
+from hdjax.engine import unusable
 from hdjax.engine.equations import LOAD, TEMPERATURE
 from hdjax.engine.pointwise import at_instants, slopes_at_instants
 from hdjax.engine.response import Pushed, Response, response

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.along import PART, Along
-from fitting.engines import unusable
 from hdjax.effects import Effect, Motion
+from hdjax.engine import unusable
 from hdjax.engine.driven import own_states_along
 from hdjax.engine.pointwise import at_instants
 

@@ -2,7 +2,8 @@
 
 From JAX's language ([`translate`][hdjax.engine.translate]) to a graph of scalars ([`graph`][hdjax.engine.graph]), whose
 [`derivatives`][hdjax.engine.derivatives] are sparse, to vector code ([`emission`][hdjax.engine.emission]) with a
-Runge-Kutta method around it ([`march`][hdjax.engine.march]).
+Runge-Kutta method around it ([`march`][hdjax.engine.march] with derivatives, for fits;
+[`transient`][hdjax.engine.transient] without, for sweeps).
 """
 
 from hdjax.engine.kernel import Kernel as Kernel
@@ -12,4 +13,5 @@ from hdjax.engine.kernel import kernel as kernel
 from hdjax.engine.kernel import march_lanes as march_lanes
 from hdjax.engine.kernel import one_thread as one_thread
 from hdjax.engine.kernel import threads as threads
+from hdjax.engine.kernel import unusable as unusable
 from hdjax.engine.translate import UntranslatableError as UntranslatableError

@@ -66,6 +66,26 @@ class Equations:
     prior: Part
 
 
+class DryStep:
+    """Dry friction over a step: what is computed of it at the step's start, as a list of numbers, and its use."""
+
+    def __init__(self):
+        self._names: list[str] = []
+
+    def before(self, model: Model, state: list[Array], torque: Array, load: Array, conditions: Any, step: Array):
+        """The numbers; arguments as of [`hdjax.rubbing.over_step`][]."""
+        found = over_step(model, state, torque, load, conditions, step) or {}
+        self._names[:] = sorted(found)
+        return [part for name in self._names for part in (found[name].sign, found[name].reach)]
+
+    def within(self, conditions: Conditions, held: Array) -> Conditions:
+        """The conditions within the step; what `before` was traced for."""
+        if not self._names:
+            return conditions
+        rubbing = {n: Rubbing(held[2 * i], held[2 * i + 1]) for i, n in enumerate(self._names)}
+        return dataclasses.replace(conditions, rubbing=rubbing)
+
+
 def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[Array], Callable[..., Model]]:
     """A model as numbers: the parameters at the paths, all other arrays, and what puts them together again."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
@@ -78,8 +98,8 @@ def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[A
     return [model.get(p) for p in paths], leaves, joined
 
 
-def structure(model: Model, paths: Sequence[str], signals: Sequence[str]) -> Hashable:
-    """What two models have in common that the same machine code serves."""
+def structure(model: Any, paths: Sequence[str], signals: Sequence[str]) -> Hashable:
+    """What two models, or two trees that hold one, have in common that the same machine code serves."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
     fixed, fixed_tree = jax.tree.flatten(rest)
@@ -103,8 +123,8 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
     graph = Graph()
     count = len(model.state_names)
     numbers = {
-        "parameter": _leaves(graph, "parameter", (len(free),), PARAMETER),
-        "state": _leaves(graph, "state", (count,), VARYING),
+        "parameter": numbered_leaves(graph, "parameter", (len(free),), PARAMETER),
+        "state": numbered_leaves(graph, "state", (count,), VARYING),
     }
     constants, used = [], 0
     for leaf in others:
@@ -142,24 +162,19 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
         ]
         return translated(graph, program, arguments)
 
-    names: list[str] = []
+    dry = DryStep()
 
     def before_step(model: Model, state: list[Array], surrounding: list[Array]) -> list[Array]:
         torque, time, step, *beside = surrounding
-        found = over_step(model, state, *around(torque, time, beside), step)
-        names[:] = sorted(found or {})
-        return [part for name in names for part in ((found or {})[name].sign, (found or {})[name].reach)]
+        return dry.before(model, state, *around(torque, time, beside), step)
 
     held = translate(before_step)
-    frozen = _leaves(graph, "held", (len(held),), VARYING)
+    frozen = numbered_leaves(graph, "held", (len(held),), VARYING)
 
     def rates(model: Model, state: list[Array], surrounding: list[Array], held: Array) -> list[Array]:
         torque, time, step, *beside = surrounding
         torque, load, conditions = around(torque, time, beside)
-        if names:
-            rubbing = {n: Rubbing(held[2 * i], held[2 * i + 1]) for i, n in enumerate(names)}
-            conditions = dataclasses.replace(conditions, rubbing=rubbing)
-        return model.component_rates(state, torque, load, conditions)
+        return model.component_rates(state, torque, load, dry.within(conditions, held))
 
     moved = translate(rates, frozen)
     outputs = translate(lambda model, state, surrounding: model.outputs(jnp.stack(state)))[0]
@@ -192,7 +207,8 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
     )
 
 
-def _leaves(graph: Graph, name: str, shape: tuple[int], level: int) -> Nodes:
+def numbered_leaves(graph: Graph, name: str, shape: tuple[int], level: int) -> Nodes:
+    """Leaves under numbered names."""
     found = np.empty(shape, dtype=object)
     for (i,) in np.ndindex(shape):
         found[i] = graph.leaf((name, i), level)

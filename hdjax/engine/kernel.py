@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import importlib
 import os
 import threading
 from collections.abc import Hashable, Iterator, Sequence
@@ -42,6 +43,20 @@ class Kernel(eqx.Module):
     hidden: int = eqx.field(static=True)
     jacobian: Int[np.ndarray | Array, ""]
     values: Int[np.ndarray | Array, ""] | None
+
+
+@functools.cache
+def unusable() -> str | None:
+    """Why there is no machine code on this machine; None where there is."""
+    if jax.default_backend() != "cpu":
+        return f"the computation runs on a {jax.default_backend()}"
+    try:
+        importlib.import_module("hdjax.engine.handler").register()
+    except ImportError:
+        return "llvmlite is not installed"
+    except Exception as error:  # whatever stops a compiler on a processor that nobody has tried
+        return f"no machine code can be made on this machine ({type(error).__name__}: {error})"
+    return None
 
 
 @dataclasses.dataclass

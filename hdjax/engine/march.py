@@ -16,8 +16,9 @@ from hdjax.engine.code import LANES, Code
 from hdjax.engine.emission import F64, I64, Vectors, emitted, is_truth
 from hdjax.engine.equations import Equations, Part
 from hdjax.engine.graph import PARAMETER, VARYING, Node
-from hdjax.engine.handler import ENTRY, POINTER, data, dimension
+from hdjax.engine.handler import ENTRY, data, dimension
 from hdjax.engine.kernel import Mode
+from hdjax.engine.sharing import share, worker
 
 OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measured", "weight", "joined", "whitening")
 OPERANDS += ("settings",)
@@ -35,8 +36,6 @@ those of each segment's columns with each other, by parameters, states and last 
 
 MARCH = "march"
 """The function's name in its module."""
-
-MOST_THREADS = 64
 
 
 def tableau(solver: dfx.AbstractERK) -> tuple[list[list[float]], list[float], list[float]]:
@@ -173,8 +172,7 @@ class March:
         self.gather = self._lane_by_lane("gather", reads=True)
         self.scatter = self._lane_by_lane("scatter", reads=False)
         block = self._block()
-        worker = self._worker(block)
-        self._entry(prepare, worker)
+        self._entry(prepare, worker(self.module, block, self.call))
 
     def _lane_by_lane(self, name: str, *, reads: bool) -> ir.Function:
         """Read or write one number of each lane: `row[segment]` of rows so long, at an offset."""
@@ -196,32 +194,12 @@ class March:
         code.builder.ret(found) if reads else code.builder.ret_void()
         return function
 
-    def _worker(self, block: ir.Function) -> ir.Function:
-        """Take one block after the other, as long as there are any."""
-        function = ir.Function(self.module, ir.FunctionType(POINTER, [POINTER]), "worker")
-        function.linkage = "internal"
-        code = Code(ir.IRBuilder(function.append_basic_block()))
-        b = code.builder
-        call = b.bitcast(function.args[0], I64.as_pointer())
-        head, work, done = (function.append_basic_block() for _ in range(3))
-        b.branch(head)
-        b.position_at_end(head)
-        index = b.atomic_rmw("add", code.place(call, self.call["next"]), code.i(1), "monotonic")
-        b.cbranch(b.icmp_signed("<", index, code.load(call, self.call["blocks"])), work, done)
-        b.position_at_end(work)
-        b.call(block, [call, index])
-        b.branch(head)
-        b.position_at_end(done)
-        b.ret(ir.Constant(POINTER, None))
-        return function
-
     def _entry(self, prepare: ir.Function, worker: ir.Function) -> None:
         function = ir.Function(self.module, ENTRY, MARCH)
         code = Code(ir.IRBuilder(function.append_basic_block()))
         b = code.builder
         operands, results = function.args
         call, scalars = code.array(len(self.call), I64), code.array(len(self.scalars), F64)
-        threads = code.array(MOST_THREADS, I64)
 
         def put(name: str, value: Any) -> None:
             whole = value if value.type == I64 else b.ptrtoint(value, I64)
@@ -252,36 +230,8 @@ class March:
         put("next", code.i(0))
         put("scalars", scalars)
         b.call(prepare, [data(b, operands, OPERANDS.index(n)) for n in ("free", "constants")] + [scalars])
-        self._share(code, call, threads, worker, blocks, code.load(settings, 2))
+        share(code, worker, call, blocks, code.load(settings, 2))
         b.ret_void()
-
-    def _share(self, code: Code, call, threads, worker: ir.Function, blocks, wanted) -> None:
-        """Work in this thread, and in as many others as are wanted and of use."""
-        b = code.builder
-        make = ir.Function(
-            self.module,
-            ir.FunctionType(ir.IntType(32), [I64.as_pointer(), POINTER, worker.type, POINTER]),
-            "pthread_create",
-        )
-        join = ir.Function(self.module, ir.FunctionType(ir.IntType(32), [I64, POINTER.as_pointer()]), "pthread_join")
-        none = ir.Constant(POINTER, None)
-        work = b.bitcast(call, POINTER)
-
-        def least(x, y):
-            return b.select(b.icmp_signed("<", x, y), x, y)
-
-        others = code.plus(least(least(wanted, blocks), code.i(MOST_THREADS)), -1)
-        made = code.array(1, I64)
-        code.store(code.i(0), made, 0)
-        with code.loop(others):
-            so_far = code.load(made, 0)
-            failed = b.call(make, [code.place(threads, so_far), none, worker, work])
-            # A thread that could not be made is not missed: the others take its blocks.
-            well = b.zext(b.icmp_signed("==", failed, ir.Constant(failed.type, 0)), I64)
-            code.store(code.plus(so_far, well), made, 0)
-        b.call(worker, [work])
-        with code.loop(code.load(made, 0)) as k:
-            b.call(join, [code.load(threads, k), ir.Constant(POINTER.as_pointer(), None)])
 
     def _block(self) -> ir.Function:
         """March so many segments side by side."""

@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdjax.sweep.check import Check, drawn_points
+from hdjax.sweep.machine_code import address
 from hdjax.sweep.request import Case, Request, duration
 from hdjax.sweep.splitting import splits
 from hdjax.sweep.transients import Method, TransientRoute, transients
 from hdjax.sweep.windows import Windows
 
 _REFERENCE = 1e-11
-# What a step costs beside a Strang step in double precision, measured on a CPU.
-_COST = {"strang": 1.0, "aba864": 3.0, "srkn14": 6.0, "tsit5": 6.0}
+# What a step costs beside a Strang step in double precision, measured on a CPU; Runge-Kutta steps by machine code, with
+# motor friction and beside each other alone.
+_COST = {"strang": 1.0, "aba864": 3.0, "srkn14": 6.0, "tsit5": 1.0, "dopri8": 1.7}
 _LOOKS_PER_TURN = 24
 _MOST_STEPS_PER_TURN = 512
 _FINER = 1.25
@@ -67,11 +69,14 @@ def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, 
     singles = (True, False) if split and request.tolerance >= _SINGLE_FROM else (False,)
     for single in singles:
 
-        def needed(method: Method, most: float, single: bool = single) -> TransientRoute | None:
-            return _fewest_steps(case, request, TransientRoute(method, 1, single), values, truth, turns, most)
+        def needed(method: Method, most: float, single: bool = single, by_code: bool = False) -> TransientRoute | None:
+            route = TransientRoute(method, 1, single, by_code=by_code)
+            return _fewest_steps(case, request, route, values, truth, turns, most)
 
         if not split:
-            found = needed("tsit5", math.inf)
+            found = needed("tsit5", math.inf, by_code=address(case, request, "tsit5") is not None)
+            if found is not None and found.by_code:
+                found = needed("dopri8", found.substeps * _COST["tsit5"] / _COST["dopri8"], by_code=True) or found
         elif (found := needed("aba864", math.inf)) is not None:
             each = found.substeps / turns
             # Each further method is a program to compile: only where it can win.

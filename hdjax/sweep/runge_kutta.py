@@ -1,7 +1,8 @@
 """Runge-Kutta steps for any model under any forcing, as lanes.
 
 Fixed ones are slower than [`hdjax.sweep.splitting`][], whose steps need not resolve the oscillation, but serve every
-model without sharp corners. Adaptive ones serve those too, and are the reference of every sweep of transients.
+model without sharp corners. They are for devices and models without machine code ([`hdjax.sweep.machine_code`][]).
+Adaptive ones serve models with corners too, and are the reference of every sweep of transients.
 """
 
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hdjax.dynamics import Model
+from hdjax.effects import Conditions
 from hdjax.sweep.windows import Windows, largest_between
 
 _TABLEAU = dfx.Tsit5.tableau
@@ -51,11 +53,12 @@ def march_steps(
         slopes: list[list[Array]] = []
         for row, node in zip(((), *_ROWS), _NODES, strict=True):
             now = _advanced(y, h, row, slopes)
-            slopes.append(model.component_rates(now, forcing(t + node * h), none))
+            at = t + node * h
+            slopes.append(model.component_rates(now, forcing(at), none, Conditions(time=at)))
         return _advanced(y, h, _WEIGHTS, slopes)
 
     def at(y: list[Array], t: Array) -> tuple[Array, Array, Array]:
-        return twist(model, jnp.stack(y), forcing(t))
+        return twist(model, jnp.stack(y), forcing(t), t)
 
     def window(carry: list[Array], index: Array) -> tuple[list[Array], tuple[Array, ...]]:
         begin = index * width
@@ -104,7 +107,7 @@ def march_adaptively(
     """
 
     def field(t, y: Array, _: object) -> Array:
-        return model.rates(y, forcing(t), jnp.zeros_like(t))
+        return model.rates(y, forcing(t), jnp.zeros_like(t), Conditions(time=t))
 
     times = jnp.linspace(0.0, 1.0, windows * looks + 1) * duration
     solution = dfx.diffeqsolve(
@@ -120,7 +123,7 @@ def march_adaptively(
         throw=False,
     )
     states = jnp.asarray(solution.ys)
-    x, v, a = jax.vmap(lambda y, t: twist(model, y, forcing(t)))(states, times)
+    x, v, a = jax.vmap(lambda y, t: twist(model, y, forcing(t), t))(states, times)
     starts, ends = ((x[part], v[part], a[part]) for part in (slice(None, -1), slice(1, None)))
     between = largest_between(starts, ends, jnp.full_like(x[1:], 1.0) * (duration / (windows * looks)))
     peak = jnp.max(between.reshape(windows, looks), axis=1)
@@ -128,16 +131,18 @@ def march_adaptively(
     return Windows(x[looks::looks], v[looks::looks], peak), reached
 
 
-def twist(model: Model, state: Float[Array, " states"], torque: Array) -> tuple[Array, Array, Array]:
-    """The measured dynamic error [rad], its rate and its acceleration at a state."""
-    none = jnp.zeros_like(torque)
+def twist(
+    model: Model, state: Float[Array, " states"], torque: Array, time: Float[Array, ""]
+) -> tuple[Array, Array, Array]:
+    """The measured dynamic error [rad], its rate and its acceleration at a state, under a torque that holds."""
+    none, conditions = jnp.zeros_like(torque), Conditions(time=time)
 
     def rate(state: Array) -> tuple[Array, Array]:
-        moving = model.rates(state, torque, none)
+        moving = model.rates(state, torque, none, conditions)
         x, v = jax.jvp(lambda y: model.outputs(y)[-1], (state,), (moving,))
         return v, x
 
-    moving = model.rates(state, torque, none)
+    moving = model.rates(state, torque, none, conditions)
     v, a, x = jax.jvp(rate, (state,), (moving,), has_aux=True)
     return x, v, a
 

@@ -10,14 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hdjax.engine import unusable
+from hdjax.sweep.machine_code import NAMES, address, transients_by_code
 from hdjax.sweep.request import Case, Request, duration
 from hdjax.sweep.runge_kutta import march_adaptively, march_steps
 from hdjax.sweep.splitting import ABA864, SRKN14, STRANG, march_split
 from hdjax.sweep.tiles import in_tiles, tile_for
 from hdjax.sweep.windows import Windows
 
-Method = Literal["strang", "aba864", "srkn14", "tsit5", "adaptive"]
+Method = Literal["strang", "aba864", "srkn14", "tsit5", "dopri8", "adaptive"]
 _SPLITTINGS = {"strang": STRANG, "aba864": ABA864, "srkn14": SRKN14}
+_NAMES = {method: splitting.name for method, splitting in _SPLITTINGS.items()} | NAMES
 # The lanes that are moved together: their states and constants stay in a core's cache.
 _BLOCK = 1024
 # Adaptive lanes wait for the slowest of their block.
@@ -33,12 +36,14 @@ class TransientRoute:
         substeps: steps of each window; for adaptive steps, looks for the largest |x|.
         single: whether in single precision.
         tolerance: of adaptive steps.
+        by_code: whether Runge-Kutta steps are taken by machine code. Without, there is `tsit5` alone.
     """
 
     method: Method
     substeps: int
     single: bool = False
     tolerance: float = 1e-11
+    by_code: bool = False
 
     @property
     def description(self) -> str:
@@ -46,7 +51,8 @@ class TransientRoute:
         precision = "single" if self.single else "double"
         if self.method == "adaptive":
             return f"adaptive Dopri8 of diffrax at rtol {self.tolerance:g}, {precision} precision"
-        name = "Tsit5" if self.method == "tsit5" else _SPLITTINGS[self.method].name
+        name = _NAMES[self.method]
+        name += " by machine code" if self.by_code else ""
         return f"fixed-step lanes, {name}, {self.substeps} steps a window, {precision} precision"
 
 
@@ -60,7 +66,12 @@ def transients(
         request: what is wanted.
         route: how.
         values: parameters of the points, by path.
+
+    Raises:
+        RuntimeError: for a route by machine code where there is none.
     """
+    if route.by_code:
+        return _by_code(case, request, route, values)
     # One shape of program for pilots and chunks: compiling another takes longer than the lanes that fill this one.
     tile, block = tile_for(request.points.size), _BLOCK
     if adaptive := route.method == "adaptive":
@@ -70,6 +81,17 @@ def transients(
     wanted = (request.duration, request.periods, request.windows, request.peaks)
     numbers = jnp.asarray(route.substeps, dtype=int), jnp.asarray(route.tolerance, dtype=float)
     return in_tiles(_Lanes(fixed, *wanted), (case, *numbers), values, tile=tile, block=block, checked=adaptive)
+
+
+def _by_code(
+    case: Case, request: Request, route: TransientRoute, values: Mapping[str, Float[np.ndarray, " points"]]
+) -> tuple[Windows, Bool[np.ndarray, " points"]]:
+    assert route.method == "tsit5" or route.method == "dopri8"
+    code = address(case, request, route.method)
+    if code is None:
+        raise RuntimeError(f"the sweep's route was chosen with machine code, which is missing here: {unusable()}")
+    found = transients_by_code(code, case, request, values, route.substeps)
+    return found, np.all(np.isfinite(np.asarray(found.x)), axis=1)
 
 
 class _Lanes(eqx.Module):
