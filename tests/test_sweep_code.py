@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hdjax import Drive, Harmonic, TwoInertiaModel
-from hdjax.effects import CATALOGUE, ActuatorEffect, Effect, Scales
+from hdjax.effects import BY_NAME, CATALOGUE, ActuatorEffect, Effect, Scales
 from hdjax.engine.kernel import one_thread
 from hdjax.forcing import Chirp
 from hdjax.sweep import machine_code
@@ -97,3 +97,9 @@ def test_without_machine_code_xla_does_it(monkeypatch: pytest.MonkeyPatch):
     assert not route.by_code and route.method == "tsit5" and check.error <= request.tolerance
     with pytest.raises(RuntimeError, match="missing here"):
         transients(case, request, TransientRoute("dopri8", 10, by_code=True), request.points.values(np.arange(2)))
+
+
+def test_an_effect_on_the_logged_torque_is_refused():
+    case = Case(TwoInertiaModel(DRIVE, (BY_NAME["torque_bias"](),)), HARMONIC)
+    with pytest.raises(ValueError, match="torque_bias"):
+        case.require(requested())

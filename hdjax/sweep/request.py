@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hdjax.dynamics import Model
+from hdjax.effects import ActuatorEffect
 from hdjax.sweep.points import Points
 
 Response = Literal["steady", "transient"]
@@ -107,6 +108,9 @@ class Case(eqx.Module):
         Raises:
             ValueError: that names the parameter and what is wrong with it.
         """
+        acting = [effect.name for effect in self.model.effects if isinstance(effect, ActuatorEffect)]
+        if acting:
+            raise ValueError(f"`{acting[0]}` changes a torque that was logged; give a sweep the forcing that acts")
         points, parameters = request.points, self.model.parameters()
         known = [*parameters, *(FORCING + name for name in vars(self.forcing))]
         for path in points.paths:
