@@ -183,6 +183,16 @@ def is_truth(graph: Graph, node: Node) -> bool:
     return operation in COMPARISONS or operation in LOGICAL or operation == "is_finite"
 
 
+def storable(vectors: Vectors, graph: Graph, node: Node, value: ir.Value) -> ir.Value:
+    """The value of a node as a number; [`restored`][] turns it back."""
+    return vectors.builder.uitofp(value, vectors.numbers) if is_truth(graph, node) else value
+
+
+def restored(vectors: Vectors, graph: Graph, node: Node, number: ir.Value) -> ir.Value:
+    """The value of a node from what [`storable`][] made of it."""
+    return vectors.builder.fcmp_ordered("!=", number, vectors.number(0.0)) if is_truth(graph, node) else number
+
+
 def emitted(
     vectors: Vectors, graph: Graph, wanted: Iterable[Node], given: Mapping[Node, Callable[[], ir.Value]]
 ) -> dict[Node, ir.Value]:

@@ -72,7 +72,9 @@ class DryStep:
     def __init__(self):
         self._names: list[str] = []
 
-    def before(self, model: Model, state: list[Array], torque: Array, load: Array, conditions: Any, step: Array):
+    def before(
+        self, model: Model, state: list[Array], torque: Array, load: Array, conditions: Conditions, step: Array
+    ) -> list[Array]:
         """The numbers; arguments as of [`hdjax.rubbing.over_step`][]."""
         found = over_step(model, state, torque, load, conditions, step) or {}
         self._names[:] = sorted(found)
@@ -128,10 +130,7 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
     }
     constants, used = [], 0
     for leaf in others:
-        nodes = np.array(
-            [graph.leaf(("constant", used + i), PARAMETER) for i in range(leaf.size)] + [None], dtype=object
-        )[:-1]
-        constants.append(nodes.reshape(leaf.shape))
+        constants.append(numbered_leaves(graph, "constant", leaf.shape, PARAMETER, used))
         used += leaf.size
     surroundings = [np.array(graph.leaf(name), dtype=object) for name in (("signal", 0), ("time",), ("step",))] + [
         np.array(graph.leaf(("signal", 1 + i)), dtype=object) for i in range(len(signals))
@@ -207,11 +206,11 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
     )
 
 
-def numbered_leaves(graph: Graph, name: str, shape: tuple[int], level: int) -> Nodes:
-    """Leaves under numbered names."""
+def numbered_leaves(graph: Graph, name: str, shape: tuple[int, ...], level: int, first: int = 0) -> Nodes:
+    """Leaves under numbered names, from `first` on, in the shape of an array."""
     found = np.empty(shape, dtype=object)
-    for (i,) in np.ndindex(shape):
-        found[i] = graph.leaf((name, i), level)
+    for i, index in enumerate(np.ndindex(shape), first):
+        found[index] = graph.leaf((name, i), level)
     return found
 
 

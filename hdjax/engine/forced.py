@@ -14,7 +14,7 @@ from hdjax.effects import Conditions
 from hdjax.elementary import cosine_and_sine
 from hdjax.engine.equations import DryStep, numbered_leaves
 from hdjax.engine.graph import PARAMETER, VARYING, Graph, Node
-from hdjax.engine.translate import traced, translated
+from hdjax.engine.translate import Nodes, traced, translated
 from hdjax.forcing import Harmonic
 
 
@@ -42,7 +42,6 @@ class Forced:
 
     Attributes:
         graph: of all nodes here.
-        numbers: how many a lane has.
         length: how long the motion is simulated [s].
         start: the state at t = 0.
         wave: amplitude, frequency, phase and mean of a harmonic forcing; empty for any other.
@@ -55,7 +54,6 @@ class Forced:
     """
 
     graph: Graph
-    numbers: int
     length: Node
     start: tuple[Node, ...]
     wave: tuple[Node, ...]
@@ -85,11 +83,9 @@ def forced(
         UntranslatableError: where the model or the forcing uses a function that the engine does not know.
     """
     graph, half = Graph(), np.float64(0.5)
-    places = iter(range(sum(int(np.prod(shape)) for shape in shapes)))
-    numbers = [np.empty(shape, dtype=object) for shape in shapes]
-    for own in numbers:
-        for index in np.ndindex(own.shape):
-            own[index] = graph.leaf(("number", next(places)), PARAMETER)
+    numbers: list[Nodes] = []
+    for shape in shapes:
+        numbers.append(numbered_leaves(graph, "number", shape, PARAMETER, sum(n.size for n in numbers)))
 
     def translate(function: Callable[..., Any], *extra: Any) -> tuple[Node, ...]:
         nodes = [np.asarray(n, dtype=object) for n in extra]
@@ -99,7 +95,8 @@ def forced(
         )
         return tuple(node for array in translated(graph, program, [*numbers, *nodes]) for node in np.ravel(array))
 
-    torque, time, step, angle = (np.array(graph.leaf((name,)), dtype=object) for name in _MOVING)
+    moving = ("torque", "time", "step", "angle")
+    torque, time, step, angle = (np.array(graph.leaf((name,)), dtype=object) for name in moving)
     start = translate(lambda point: point.model.rest())
     state = numbered_leaves(graph, "state", (len(start),), VARYING)
     dry, none = DryStep(), jnp.asarray(np.zeros(()))
@@ -119,7 +116,6 @@ def forced(
     ends = [numbered_leaves(graph, name, (3,), VARYING) for name in ("before", "after")]
     return Forced(
         graph=graph,
-        numbers=sum(n.size for n in numbers),
         length=translate(lambda point: point.length)[0],
         start=start,
         wave=translate(wave),
@@ -130,6 +126,3 @@ def forced(
         seen=translate(lambda point, *moving: seen(point.model, *moving), state, torque, time),
         largest=translate(lambda point, a, b, step: largest(tuple(a), tuple(b), step), *ends, step)[0],
     )
-
-
-_MOVING = ("torque", "time", "step", "angle")

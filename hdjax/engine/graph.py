@@ -113,6 +113,16 @@ class Graph:
             stack.extend(self.arguments(node))
         return sorted(found)
 
+    def steady(self, wanted: Iterable[Node]) -> dict[Node, int]:
+        """What stays the same during a simulation and is asked for, by the wanted nodes or by what they are made of:
+        each with a place of its own."""
+        wanted = list(wanted)
+        asked = {n for n in wanted if self.level[n] == PARAMETER}
+        for node in self.needed(wanted):
+            if self.level[node] == VARYING:
+                asked |= {a for a in self.arguments(node) if self.level[a] == PARAMETER}
+        return {node: i for i, node in enumerate(sorted(asked))}
+
     def arguments(self, node: Node) -> Sequence[Node]:
         """The nodes that a node's value is computed from."""
         operation, *rest = self.nodes[node]

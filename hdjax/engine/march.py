@@ -13,12 +13,12 @@ from llvmlite import ir
 
 from hdjax.engine.block import Block, Emitted
 from hdjax.engine.code import LANES, Code
-from hdjax.engine.emission import F64, I64, Vectors, emitted, is_truth
+from hdjax.engine.emission import F64, I64, Vectors, emitted, restored, storable
 from hdjax.engine.equations import Equations, Part
-from hdjax.engine.graph import PARAMETER, VARYING, Node
+from hdjax.engine.graph import VARYING, Node
 from hdjax.engine.handler import ENTRY, data, dimension
 from hdjax.engine.kernel import Mode
-from hdjax.engine.sharing import share, worker
+from hdjax.engine.sharing import block_of, share, worker
 
 OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measured", "weight", "joined", "whitening")
 OPERANDS += ("settings",)
@@ -85,14 +85,9 @@ class March:
         return [*part.values, *slopes]
 
     def _scalars(self) -> dict[Node, int]:
-        """What stays the same during a simulation and is asked for: computed once, as plain numbers."""
-        graph, e = self.equations.graph, self.equations
-        wanted = [n for part in (e.rates, e.held, e.outputs, e.prior) for n in self._wanted(part)]
-        asked = {n for n in wanted if graph.level[n] == PARAMETER}
-        for node in graph.needed(wanted):
-            if graph.level[node] == VARYING:
-                asked |= {a for a in graph.arguments(node) if graph.level[a] == PARAMETER}
-        return {node: i for i, node in enumerate(sorted(asked))}
+        """What is computed once, as plain numbers."""
+        e = self.equations
+        return e.graph.steady(n for part in (e.rates, e.held, e.outputs, e.prior) for n in self._wanted(part))
 
     def _part(self, name: str, part: Part) -> Emitted:
         graph = self.equations.graph
@@ -122,9 +117,7 @@ class March:
 
     def scalar(self, code: Vectors, scalars: ir.Value, index: int, node: Node) -> ir.Value:
         number = code.spread(code.builder.load(code.builder.gep(scalars, [ir.Constant(I64, index)])))
-        if is_truth(self.equations.graph, node):
-            return code.builder.fcmp_ordered("!=", number, code.number(0.0))
-        return number
+        return restored(code, self.equations.graph, node, number)
 
     def _input(self, leaf: tuple[Any, ...]) -> int:
         kind = leaf[0]
@@ -153,9 +146,7 @@ class March:
                 given[node] = lambda t=table, i=index: plain.builder.load(plain.builder.gep(t, [ir.Constant(I64, i)]))
         found = emitted(plain, graph, self.scalars, given)
         for node, index in self.scalars.items():
-            value = found[node]
-            if is_truth(self.equations.graph, node):
-                value = plain.builder.uitofp(value, F64)
+            value = storable(plain, graph, node, found[node])
             plain.builder.store(value, plain.builder.gep(results, [ir.Constant(I64, index)]))
         plain.builder.ret_void()
         return function
@@ -171,7 +162,7 @@ class March:
         self.call = {name: i for i, name in enumerate(names)}
         self.gather = self._lane_by_lane("gather", reads=True)
         self.scatter = self._lane_by_lane("scatter", reads=False)
-        block = self._block()
+        block = block_of(self.module, lambda code, call, index: Block(self, code, call, index).write())
         self._entry(prepare, worker(self.module, block, self.call))
 
     def _lane_by_lane(self, name: str, *, reads: bool) -> ir.Function:
@@ -232,13 +223,3 @@ class March:
         b.call(prepare, [data(b, operands, OPERANDS.index(n)) for n in ("free", "constants")] + [scalars])
         share(code, worker, call, blocks, code.load(settings, 2))
         b.ret_void()
-
-    def _block(self) -> ir.Function:
-        """March so many segments side by side."""
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [I64.as_pointer(), I64]), "block")
-        function.linkage = "internal"
-        function.attributes.add("nounwind")
-        code = Code(ir.IRBuilder(function.append_basic_block()))
-        Block(self, code, *function.args).write()
-        code.builder.ret_void()
-        return function

@@ -1,6 +1,6 @@
 """Blocks of lanes, shared among threads that the machine code makes itself."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from llvmlite import ir
 
@@ -11,12 +11,28 @@ from hdjax.engine.handler import POINTER
 MOST_THREADS = 64
 
 
+def block_of(module: ir.Module, write: Callable[[Code, ir.Value, ir.Value], None]) -> ir.Function:
+    """The function `block(call, index)` of a module.
+
+    Args:
+        module: to which it is added.
+        write: its instructions, with the table of the call and the block's index.
+    """
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [I64.as_pointer(), I64]), "block")
+    function.linkage = "internal"
+    function.attributes.add("nounwind")
+    code = Code(ir.IRBuilder(function.append_basic_block()))
+    write(code, *function.args)
+    code.builder.ret_void()
+    return function
+
+
 def worker(module: ir.Module, block: ir.Function, call: Mapping[str, int]) -> ir.Function:
     """A function that takes one block after the other, as long as there are any.
 
     Args:
         module: to which it is added.
-        block: what is done with one, `block(call, index)`.
+        block: what is done with one, see [`block_of`][].
         call: places in the table of a call; at `next` and `blocks` it has the next block and how many there are.
     """
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "worker")

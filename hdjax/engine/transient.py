@@ -13,18 +13,17 @@ from jaxtyping import Float
 from llvmlite import ir
 
 from hdjax.engine.code import LANES, Code
-from hdjax.engine.emission import F64, I64, emitted, is_truth
+from hdjax.engine.emission import F64, I64, emitted, restored, storable
 from hdjax.engine.forced import Forced
-from hdjax.engine.graph import PARAMETER, VARYING, Node
+from hdjax.engine.graph import Node
 from hdjax.engine.handler import ENTRY, called, data, dimension
 from hdjax.engine.machine import compiled
 from hdjax.engine.march import tableau
-from hdjax.engine.sharing import share, worker
+from hdjax.engine.sharing import block_of, share, worker
 
 _NAME = "transients"
 _OPERANDS = ("address", "numbers", "settings")
 _RESULTS = ("x", "v", "peak")
-Given = Mapping[Node, Callable[[], ir.Value]]
 
 
 def made(forced: Forced, solver: dfx.AbstractERK, *, peaks: bool) -> int:
@@ -71,7 +70,7 @@ class _Transients:
         self.module = ir.Module(_NAME)
         names = ("numbers", *_RESULTS, "lanes", "windows", "substeps", "blocks", "next")
         self.call = {name: i for i, name in enumerate(names)}
-        block = self._block()
+        block = block_of(self.module, lambda code, call, index: _Block(self, code, call, index).write())
         self._entry(worker(self.module, block, self.call))
 
     def _entry(self, worker: ir.Function) -> None:
@@ -92,15 +91,6 @@ class _Transients:
         share(code, worker, call, blocks, code.load(settings, 2))
         code.builder.ret_void()
 
-    def _block(self) -> ir.Function:
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [I64.as_pointer(), I64]), "block")
-        function.linkage = "internal"
-        function.attributes.add("nounwind")
-        code = Code(ir.IRBuilder(function.append_basic_block()))
-        _Block(self, code, *function.args).write()
-        code.builder.ret_void()
-        return function
-
 
 class _Block:
     """The function of a block: its room on the stack, and its instructions in order."""
@@ -112,11 +102,7 @@ class _Block:
         self.leaf = functools.cache(lambda *name: graph.leaf(name))
         asked = [f.length, *f.start, *f.wave, *f.held, *f.rates, *f.seen, f.largest, *f.circle]
         asked += [] if f.wave else [f.torque]
-        kept = {n for n in asked if graph.level[n] == PARAMETER}
-        for node in graph.needed(asked):
-            if graph.level[node] == VARYING:
-                kept |= {a for a in graph.arguments(node) if graph.level[a] == PARAMETER}
-        self.kept = {node: i for i, node in enumerate(sorted(kept))}
+        self.kept = graph.steady(asked)
         self.room = code.array(len(self.kept))
         stages = len(module.nodes)
         self.state, self.ends = code.array(len(f.start)), code.array(6)
@@ -143,21 +129,18 @@ class _Block:
 
     def _constant(self, node: Node) -> ir.Value:
         """A node that stays the same throughout a lane."""
-        value = self.code.load(self.room, self.kept[node])
-        truth = is_truth(self.forced.graph, node)
-        return self.code.builder.fcmp_ordered("!=", value, self.code.number(0.0)) if truth else value
+        return restored(self.code, self.forced.graph, node, self.code.load(self.room, self.kept[node]))
 
     def _prepare(self) -> None:
         graph, code = self.forced.graph, self.code
-        leaves: Given = {
+        leaves = {
             node: lambda row=graph.nodes[node][1][1]: code.load(self._vector("numbers", row), 0)
             for node in graph.needed(self.kept)
             if graph.nodes[node][0] == "leaf"
         }
         found = emitted(code, graph, self.kept, leaves)
         for node, i in self.kept.items():
-            value = found[node]
-            code.store(code.builder.uitofp(value, code.numbers) if is_truth(graph, node) else value, self.room, i)
+            code.store(storable(code, graph, node, found[node]), self.room, i)
 
     def write(self) -> None:
         c, f = self.code, self.forced
