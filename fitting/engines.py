@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.machine_code import blocks_by_machine_code, residual_by_machine_code, simulated
+from fitting.machine_code import (
+    blocks_by_machine_code,
+    residual_by_machine_code,
+    rows_by_machine_code,
+    simulated,
+)
 from fitting.residual import (
     Blocks,
     LinearisedResidual,
@@ -73,6 +78,13 @@ def linearise(problem: Problem, unknowns: Unknowns, width: int | None = None) ->
 
 
 _linearise_by_xla = jit_lanes(blocks)
+
+
+def rows_at(problem: Problem, unknowns: Unknowns) -> Float[Array | np.ndarray, "segments rows"]:
+    """The rows of a problem's residual at some point, by its engine and its one program or machine code."""
+    if problem.kernel is not None:
+        return rows_by_machine_code(problem, unknowns)
+    return _linearise_by_xla(problem, unknowns).residual
 
 
 def _widened(found: Blocks, width: int) -> Blocks:

@@ -17,9 +17,8 @@ from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
-from hdjax.engine.kernel import Mode, march_arrays, result_shapes
+from hdjax.engine.kernel import Mode, Wanted, march_arrays, result_shapes
 from hdjax.parameters import as_scalar
-from hdjax.where import where
 
 # The model's constants come in tables of so many, so that few sizes of them make few programs.
 _CONSTANTS = 32
@@ -44,7 +43,7 @@ def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | 
     constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
     more = 0 if width is None else width - len(free.paths)
     whole = library.any(library.asarray(segments.joined))
-    numbers = [library.asarray(problem.substeps), whole, threads(), 0]
+    numbers = [library.asarray(problem.substeps), whole, threads()]
     return Lanes(
         free=library.pad(library.asarray(values, dtype=float).reshape(-1), (0, more)),
         slopes=library.pad(library.asarray(slopes), (0, more)),
@@ -70,12 +69,16 @@ def _signals(problem: Problem, model: Model, kernel: Kernel) -> tuple[Array, ...
     actuators = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
     torque, slopes = segments.torque.coefficients, ()
     if actuators:
-        paths = tuple(kernel.paths[i] for i in kernel.acting)
+        paths = _acting_paths(kernel)
         values = jnp.stack([as_scalar(model.get(p)) for p in paths]) if paths else jnp.zeros(0)
         torque, slopes = actuated(actuators, paths, values, segments.torque)
     beside = {"load torque": segments.load_torque, "temperature": segments.temperature}
     found = [beside[name] for name in kernel.signals]
     return torque, *(s.coefficients for s in found if s is not None), *slopes
+
+
+def _acting_paths(kernel: Kernel) -> tuple[str, ...]:
+    return tuple(kernel.paths[i] for i in kernel.acting)
 
 
 class _Actuators(eqx.Module):
@@ -117,7 +120,7 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
     kernel = problem.kernel
     assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel, width)
-    found = _marched(kernel.jacobian, lanes, kernel.hidden, "jacobian")
+    found = _march(kernel.jacobian, lanes, kernel.hidden, "jacobian")
     gap, before_by_parameter, before_by_state = _ends(lanes, found)
     return Blocks(
         residual=jnp.asarray(found.rows),
@@ -129,17 +132,48 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
     )
 
 
-def _marched(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode) -> Marched:
+def rows_by_machine_code(problem: Problem, unknowns: Unknowns) -> Float[np.ndarray, "segments rows"]:
+    """The rows of [`fitting.residual.residual`][] by the machine code that has derivatives, without computing them."""
+    kernel = problem.kernel
+    assert kernel is not None
+    return np.asarray(
+        _march(kernel.jacobian, lanes_of(problem, unknowns, kernel), kernel.hidden, "jacobian", "rows").rows
+    )
+
+
+def _march(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian") -> Marched:
     """Outside a program of JAX none is compiled."""
-    return (march_lanes if _is_traced((address, lanes)) else march_arrays)(address, lanes, hidden, mode)
+    return (march_lanes if _is_traced((address, lanes)) else march_arrays)(address, lanes, hidden, mode, wanted)
+
+
+class Acting(eqx.Module):
+    """Effects on the logged torque, of a [`Task`][].
+
+    Attributes:
+        effects: in order.
+        paths: their free parameters.
+        places: where these are among all free parameters.
+        torque: what was logged.
+    """
+
+    effects: tuple[ActuatorEffect, ...]
+    paths: tuple[str, ...] = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
+    torque: PiecewisePolynomial
+
+    def signals(self, given: tuple[Any, ...], free: Float[Array | np.ndarray, " width"]) -> tuple[Any, ...]:
+        """The lanes' signals, with what the torque is at other values of the free parameters."""
+        torque, slopes = actuated(self.effects, self.paths, jnp.asarray(free[list(self.places)]), self.torque)
+        return torque, *given[1 : len(given) - len(self.places)], *slopes
 
 
 class Task(eqx.Module):
-    """A problem of which a program of JAX can look at any point.
+    """A problem that can be looked at from any point, by numpy or within a program of JAX.
 
     Attributes:
         address: of the machine code.
-        lanes: the data; what is free and the states are replaced.
+        lanes: the data; what is free, the states and what depends on them are replaced.
+        acting: effects on the logged torque; None where there are none.
         logarithmic: which parameters move by their logarithm.
         scale: unit of each of the others.
         active: 1 for a parameter that may move, 0 for one that is held, or that there is not.
@@ -148,6 +182,7 @@ class Task(eqx.Module):
 
     address: Array | np.ndarray
     lanes: Lanes
+    acting: Acting | None
     logarithmic: np.ndarray
     scale: np.ndarray
     active: np.ndarray
@@ -156,23 +191,28 @@ class Task(eqx.Module):
     def look(self, unknowns: Unknowns) -> tuple[Products, Float[Array, "segments rows"]]:
         """The normal equations of the residual at a point, and its rows."""
         vector = unknowns.parameters
-        value = where(self.logarithmic, jnp.exp(jnp.clip(vector, -LARGEST_LOG, LARGEST_LOG)), vector * self.scale)
-        slope = where(self.logarithmic, value, self.scale) * self.active
+        library: Any = jnp if _is_traced((self, unknowns)) else np
+        if library is np:
+            vector = np.asarray(vector)
+        power = library.exp(library.clip(vector, -LARGEST_LOG, LARGEST_LOG))
+        value = library.where(self.logarithmic, power, vector * self.scale)
+        slope = library.where(self.logarithmic, value, self.scale) * self.active
         lanes = eqx.tree_at(lambda s: (s.free, s.slopes, s.states), self.lanes, (value, slope, unknowns.states))
-        found = march_lanes(self.address, lanes, self.hidden, "jacobian", reduced=True)
+        if self.acting is not None:
+            lanes = eqx.tree_at(lambda s: s.signals, lanes, self.acting.signals(lanes.signals, value))
+        found = _march(self.address, lanes, self.hidden, "jacobian", "products")
         assert found.products is not None
         return Products(found.products, *_ends(lanes, found)), jnp.asarray(found.rows)
 
     def blank(self) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
         """Zeros like what a look finds."""
-        shapes = result_shapes(self.lanes, self.hidden, "jacobian", reduced=True)
+        shapes = result_shapes(self.lanes, self.hidden, "jacobian", "products")
         rows, end, _, _, by_parameter, by_state, products = map(np.zeros, shapes)
         return Products(products, end, by_parameter, by_state), rows
 
 
 def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
-    """A problem for programs of JAX; None where there is no machine code, or where effects change the torque, for which
-    each model needs a program of its own.
+    """A problem ready to be looked at by machine code; None where there is none.
 
     Args:
         problem: what is solved.
@@ -180,16 +220,16 @@ def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
         width: room for the parameters.
     """
     kernel = problem.kernel
-    if kernel is None or any(isinstance(e, ActuatorEffect) for e in problem.model.effects):
+    if kernel is None:
         return None
-    lanes = lanes_of(problem, unknowns, kernel, width)
-    settings = np.array(lanes.settings)
-    settings[-1] = 1
+    effects = tuple(e for e in problem.model.effects if isinstance(e, ActuatorEffect))
+    acting = Acting(effects, _acting_paths(kernel), kernel.acting, problem.segments.torque) if effects else None
     free = problem.free
     more = (0, width - len(free.paths))
     return Task(
         address=kernel.jacobian,
-        lanes=eqx.tree_at(lambda s: s.settings, lanes, settings),
+        lanes=lanes_of(problem, unknowns, kernel, width),
+        acting=acting,
         logarithmic=np.pad(np.array(free.logarithmic, dtype=bool), more),
         scale=np.pad(np.asarray(free.scale), more, constant_values=1.0),
         active=np.pad(np.asarray(problem.active), more),
@@ -220,7 +260,7 @@ def residual_by_machine_code(
     kernel = problem.kernel
     assert kernel is not None and kernel.values is not None
     lanes = lanes_of(problem, unknowns, kernel)
-    found = _marched(kernel.values, lanes, kernel.hidden, "values")
+    found = _march(kernel.values, lanes, kernel.hidden, "values")
     return jnp.asarray(found.rows), _gap(lanes, found)
 
 
@@ -242,9 +282,9 @@ def simulated(
     lanes = lanes_of(problem, unknowns, kernel)
     library: Any = jnp if _is_traced(lanes) else np
     segments, samples, outputs = lanes.measured.shape
-    settings = library.asarray(lanes.settings) * np.array([1, 0, 1, 1]) + np.array([0, 1, 0, 0])
+    settings = library.asarray(lanes.settings) * np.array([1, 0, 1]) + np.array([0, 1, 0])
     plain = np.zeros(lanes.measured.shape), np.ones(lanes.weight.shape), -np.eye(outputs), settings
     lanes = eqx.tree_at(lambda s: (s.measured, s.weight, s.whitening, s.settings), lanes, plain)
-    found = _marched(kernel.values, lanes, kernel.hidden, "values")
+    found = _march(kernel.values, lanes, kernel.hidden, "values")
     rows = found.rows[:, : samples * outputs].reshape(segments, samples, outputs)
     return jnp.asarray(library.where(library.abs(rows) < LOST, rows, np.inf)), jnp.asarray(found.end)

@@ -1,7 +1,7 @@
 """Least squares of one problem: optimistix' loop around the model's machine code, as one program for all models.
 
-That program depends on sizes alone. Where a model has no machine code, or its effects change the torque, its residual
-is a program of its own, and the host takes the steps.
+That program depends on sizes alone. Where a model has no machine code its residual is a program of its own, and where
+effects change the logged torque that is one: there the host takes the steps.
 """
 
 import time
@@ -15,7 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.arrow import ArrowLevenbergMarquardt, Iteration
-from fitting.engines import linearise
+from fitting.engines import linearise, rows_at
 from fitting.machine_code import Task, task
 from fitting.residual import Blocks, Problem, Products, Unknowns
 from hdjax.compilation import jit_small
@@ -94,10 +94,10 @@ def solve(
     )
     unknowns = Unknowns(jnp.asarray(_widened(start.parameters)), on_one_device(start.states))
     looked_at = task(problem, start, unknowns.parameters.size)
-    if looked_at is None:
-        point = _by_host(problem, start, unknowns, solver)
-    else:
+    if looked_at is not None and looked_at.acting is None:
         point = _in_bursts(problem, unknowns, solver, looked_at)
+    else:
+        point = _by_host(problem, start, unknowns, solver, looked_at)
     found = Unknowns(jnp.asarray(np.asarray(point.unknowns.parameters)[:count]), point.unknowns.states)
     return Solution(found, _left_over(problem, point.rows), bool(point.success), int(point.state.count))
 
@@ -135,21 +135,30 @@ def _in_bursts(problem: Problem, unknowns: Unknowns, solver: ArrowLevenbergMarqu
     return point
 
 
-def _by_host(problem: Problem, start: Unknowns, unknowns: Unknowns, solver: ArrowLevenbergMarquardt) -> _Point:
-    """The iteration step by step, where each model's residual is a program of its own."""
+def _by_host(
+    problem: Problem, start: Unknowns, unknowns: Unknowns, solver: ArrowLevenbergMarquardt, looked_at: Task | None
+) -> _Point:
+    """The iteration step by step, where what is looked at is no part of one program for all models."""
     count = start.parameters.shape[0]
 
-    def seen_from(wide: Unknowns) -> Blocks:
+    def seen_from(wide: Unknowns) -> tuple[Products, Array]:
+        if looked_at is not None:
+            return looked_at.look(wide)
         own = placed_like(Unknowns(jnp.asarray(np.asarray(wide.parameters)[:count]), wide.states), start)
-        return on_one_device(linearise(problem, own, unknowns.parameters.size))
+        return _products(on_one_device(linearise(problem, own, unknowns.parameters.size)))
 
     seen = seen_from(unknowns)
-    point = _begun(unknowns, solver, jax.eval_shape(Products.of, seen), seen.residual)
+    point = _begun(unknowns, solver, *seen)
     while True:
-        point = _taken(point, seen, solver)
+        point = _next_by_host(point, *seen, solver)
         if bool(point.done):
             return point
         seen = seen_from(point.state.ahead)
+
+
+@jit_small
+def _products(found: Blocks) -> tuple[Products, Array]:
+    return Products.of(found), found.residual
 
 
 def _begun(unknowns: Unknowns, solver: ArrowLevenbergMarquardt, seen: Any, rows: Any) -> _Point:
@@ -198,9 +207,7 @@ def _next(point: _Point, seen: Products, rows: Array, solver: ArrowLevenbergMarq
     return _Point(best, state, where(state.accepted, rows, point.rows), done | ~good, done & good)
 
 
-@jit_small
-def _taken(point: _Point, seen: Blocks, solver: ArrowLevenbergMarquardt) -> _Point:
-    return _next(point, Products.of(seen), seen.residual, solver)
+_next_by_host = jit_small(_next)
 
 
 def _function(unknowns: Unknowns, seen: Products) -> tuple[None, Products]:
@@ -216,7 +223,7 @@ def _widened(by_parameter: Shaped[Array | np.ndarray, " parameters"] | tuple[boo
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
     """What is left over at the given unknowns."""
-    return _left_over(problem, linearise(problem, unknowns).residual)
+    return _left_over(problem, rows_at(problem, unknowns))
 
 
 def _left_over(problem: Problem, rows: Float[Array | np.ndarray, "segments rows"]) -> LeftOver:

@@ -10,7 +10,7 @@ import pytest
 from test_engine_equations import models
 
 import rig
-from fitting.engines import linearise, residual_with_blocks, simulate, with_engine
+from fitting.engines import linearise, residual_with_blocks, rows_at, simulate, with_engine
 from fitting.experiment import Experiment, Stretch, cut
 from fitting.free import fitted_paths, free_parameters
 from fitting.machine_code import _gap, lanes_of, task
@@ -26,8 +26,8 @@ from hdjax.signals import HOLDS
 
 COUNT, LENGTH, HALO = 330, 32, 3  # eleven segments: a whole block, and one that is not full; the last is part padding
 FIELDS = tuple(f.name for f in dataclasses.fields(Blocks))
-SETTINGS = np.arange(4)
-SUBSTEPS, WHOLE, THREADS, REDUCED = SETTINGS
+SETTINGS = np.arange(3)
+SUBSTEPS, WHOLE, THREADS = SETTINGS
 
 
 def experiment(
@@ -281,19 +281,30 @@ def products(found: Blocks, count: int) -> np.ndarray:
     return np.einsum("srp,srq->spq", columns, columns)
 
 
-@pytest.mark.parametrize("name", ["two inertias", "maxwell_slip", "bouc_wen"])
+def test_held_parameters_have_no_slope_and_change_no_other(several):
+    """Their tangents are left out where all of them are held."""
+    problem, unknowns = several
+    held = dataclasses.replace(problem, active=jnp.zeros_like(problem.active))
+    found, other = linearise(held, unknowns), linearise(problem, unknowns)
+    for name in ("residual", "by_state", "gap", "before_by_state"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
+    assert (np.asarray(found.by_parameter) == 0).all() and (np.asarray(found.before_by_parameter) == 0).all()
+
+
+@pytest.mark.parametrize("name", ["two inertias", "maxwell_slip", "bouc_wen", "input_delay"])
 def test_products_are_those_of_the_jacobian(name: str):
     """What a fit needs of the Jacobian, without ever writing it; and a column that depends on others does no harm."""
     problem, unknowns = problem_of(models()[name], missing=0.1)
-    for held in (False, True):
-        if held:
-            problem = eqx.tree_at(lambda p: p.active, problem, problem.active.at[1].set(0.0))
+    free = np.array(problem.active)
+    for active in (free, np.where(np.arange(free.size) == 1, 0.0, free), np.zeros_like(free)):
+        problem = eqx.tree_at(lambda p: p.active, problem, jnp.asarray(active))
         ready = with_engine(problem)
         full = linearise(ready, unknowns)
         count = full.by_parameter.shape[2]
         padded = eqx.tree_at(lambda u: u.parameters, unknowns, jnp.pad(unknowns.parameters, (0, 3)))
         found, rows = task(ready, unknowns, count + 3).look(padded)
         np.testing.assert_allclose(rows, full.residual, rtol=0, atol=1e-13 * np.abs(full.residual).max())
+        np.testing.assert_array_equal(rows_at(ready, unknowns), full.residual)
         there = np.r_[:count, count + 3 : found.products.shape[1]]
         products, wanted = np.asarray(found.products), np.asarray(Products.of(full).products)
         size = np.sqrt(np.einsum("spp->sp", wanted))

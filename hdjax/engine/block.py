@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from llvmlite import ir
@@ -11,6 +11,7 @@ from hdjax.engine.code import LANES, Code
 from hdjax.engine.derivatives import Tangent
 from hdjax.engine.emission import F64, I8, I64
 from hdjax.engine.graph import Node
+from hdjax.engine.kernel import Wanted
 
 if TYPE_CHECKING:
     from hdjax.engine.march import March
@@ -52,6 +53,7 @@ class Block:
         self.coefficients = code.array(m.signals * _POWERS)
         self.degree = code.array(m.signals, I64)
         self.needed = code.array(1, I64)
+        self.first = code.array(1, I64)
         self.stage_results = code.array(m.rates.size * stages)
         self.held_results, self.read_results = code.array(m.before.size), code.array(m.read.size)
         self.prior_results = code.array(m.expected.size)
@@ -61,11 +63,12 @@ class Block:
         sizes = len(self.rates_by_parameter) * stages, m.held, m.outputs
         self.dense, self.held_dense, self.read_dense = (code.array(size * self.tangents) for size in sizes)
         self.scale = code.array(self.tangents)
-        self.collected = code.array((self.tangents + 1) * max(m.outputs, 1))
-        self.products = code.array((self.tangents + 1) ** 2 if self.jacobian else 0)
+        columns = self.tangents + 1
+        self.collected = code.array(columns * max(m.outputs, 1))
+        self.products = code.array(columns**2 if self.jacobian else 0)
         tables = self.dense, self.held_dense, self.read_dense
         self.blank = [(room, size * self.tangents) for room, size in zip(tables, sizes, strict=True)]
-        self.blank.append((self.products, (self.tangents + 1) ** 2))
+        self.blank += [(self.collected, columns * max(m.outputs, 1)), (self.products, columns**2)]
 
     def _got(self, name: str, kind: Any = F64) -> ir.Value:
         """An entry of the call: an integer, or where numbers stand."""
@@ -117,9 +120,14 @@ class Block:
                 self._interval(i)
         self._write_end()
         if self.jacobian:
-            reduced = c.builder.icmp_signed("!=", self._got("reduced", I64), c.i(0))
-            with c.builder.if_then(reduced):
+            with c.builder.if_then(self._wants("products")):
                 self._write_products()
+
+    def _wants(self, result: Wanted) -> ir.Value:
+        """Whether this is what the march is to give."""
+        return self.code.builder.icmp_signed(
+            "==", self._got("wanted", I64), self.code.i(get_args(Wanted).index(result))
+        )
 
     def _choose_segments(self) -> None:
         """The lanes' segments; behind the last one it stands again, and what it writes is the same."""
@@ -161,6 +169,18 @@ class Block:
             c.store(c.spread(c.load(self._got("slopes"), t)), self.scale, t)
         with c.loop(self.tangents, m.parameters) as t:
             c.store(c.number(1.0), self.scale, t)
+        # Where all parameters are held, the tangents that move are those of the states; none for rows alone.
+        c.store(c.i(m.parameters), self.first, 0)
+        with c.loop(m.parameters) as t:
+            slope = c.load(self._got("slopes"), t)
+            with c.builder.if_then(c.builder.fcmp_unordered("!=", slope, ir.Constant(F64, 0.0))):
+                c.store(c.i(0), self.first, 0)
+        with c.builder.if_then(self._wants("rows")):
+            c.store(c.i(self.tangents), self.first, 0)
+
+    def _first(self) -> ir.Value:
+        """The first tangent that moves."""
+        return self.code.load(self.first, 0)
 
     # -- what is read ------------------------------------------------------------------------------------------
 
@@ -195,11 +215,27 @@ class Block:
             self._put(self._got("rows"), self.rows, c.plus(c.times(i, m.outputs), p), values[p])
         if not self.jacobian:
             return
-        scale = c.builder.fneg(weight)
+        # What counts in no lane adds nothing to products.
+        there = b.icmp_unsigned("!=", b.bitcast(counts, I8), ir.Constant(I8, 0))
+        with b.if_then(b.or_(b.and_(there, self._wants("products")), self._wants("jacobian"))):
+            self._record_tangents(i, weight, counts, whitening, inside, values)
+
+    def _record_tangents(
+        self,
+        i: ir.Value,
+        weight: ir.Value,
+        counts: ir.Value,
+        whitening: Sequence[Sequence[ir.Value]],
+        inside: Sequence[ir.Value],
+        values: Sequence[ir.Value],
+    ) -> None:
+        """Derivatives of the rows at a sample."""
+        c, b, m = self.code, self.code.builder, self.march
+        scale = b.fneg(weight)
         slopes = m.equations.outputs.slopes
         self._fill(m.read, self.read_results, slopes, range(m.outputs), self.read_dense, 0)
 
-        with c.loop(self.tangents) as t:
+        with c.loop(self.tangents, self._first()) as t:
             moved = self._tangent(t)
             factor = c.mul(scale, c.load(self.scale, t))
             change = []
@@ -221,10 +257,9 @@ class Block:
     def _put_row(self, row: ir.Value, columns: ir.Value, value: ir.Value) -> None:
         """Write a row of the Jacobian, or add it to the products of the columns with each other."""
         c, b = self.code, self.code.builder
-        reduced = b.icmp_signed("!=", self._got("reduced", I64), c.i(0))
         c.store(value, columns, self.tangents)
-        with b.if_else(reduced) as (taken, written):
-            with taken, c.loop(self.tangents + 1) as i:
+        with b.if_else(self._wants("jacobian")) as (written, taken):
+            with taken, c.loop(self.tangents + 1, self._first()) as i:
                 left = c.load(columns, i)
                 with c.loop(self.tangents + 1, i) as j:
                     place = c.plus(c.times(i, self.tangents + 1), j)
@@ -297,11 +332,12 @@ class Block:
     ) -> None:
         """Put derivatives by parameters where a loop over the parameters finds them."""
         c, m = self.code, self.march
-        for p in range(m.parameters):
-            for k, row in enumerate(rows):
-                node = slopes[row].get(("parameter", p))
-                value = c.number(0.0) if node is None else self._node(part, node, results, offset)
-                c.store(value, dense, p * len(rows) + k)
+        with c.builder.if_then(c.builder.icmp_signed("==", self._first(), c.i(0))):
+            for p in range(m.parameters):
+                for k, row in enumerate(rows):
+                    node = slopes[row].get(("parameter", p))
+                    value = c.number(0.0) if node is None else self._node(part, node, results, offset)
+                    c.store(value, dense, p * len(rows) + k)
 
     def _write_prior(self) -> None:
         """Rows that say how far hidden states start from where they are expected; none where a segment is joined."""
@@ -335,8 +371,12 @@ class Block:
         c, m = self.code, self.march
         for i in range(m.states):
             self._put(self._got("end"), m.states, i, c.load(self.state, i))
-        if not self.jacobian:
-            return
+        if self.jacobian:
+            with c.builder.if_then(c.builder.not_(self._wants("rows"))):
+                self._write_end_tangents()
+
+    def _write_end_tangents(self) -> None:
+        c, m = self.code, self.march
         for own, first, count, result in (
             (True, 0, m.parameters, "end_by_parameter"),
             (False, m.parameters, m.states, "end_by_state"),
@@ -405,7 +445,7 @@ class Block:
             assert value is not None
             c.store(value, self.state, i)
         if self.jacobian:
-            with c.loop(self.tangents) as t:
+            with c.loop(self.tangents, self._first()) as t:
                 self._move_tangent(t, step)
 
     def _weighted(self, weights: Sequence[float], slope: Callable[[int], ir.Value]) -> ir.Value | None:

@@ -106,7 +106,7 @@ def own_states_along(
             weight=np.ones((lanes, intervals)),
             joined=np.zeros(lanes),
             whitening=-np.eye(own),
-            settings=np.array([_STEPS, 1, threads(), 0]),
+            settings=np.array([_STEPS, 1, threads()]),
             signals=tuple(np.repeat(line, proposals, axis=0) for line in lines),
         ),
         0,

@@ -8,12 +8,14 @@ import os
 import threading
 from collections.abc import Hashable, Iterator, Sequence
 from contextvars import ContextVar
-from typing import Literal
+from typing import Literal, get_args
 
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from hdjax.dynamics import Model
@@ -21,6 +23,8 @@ from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, equations, stru
 
 # What stands on llvmlite is loaded where machine code is made or called: without it XLA does all.
 Mode = Literal["values", "jacobian"]
+Wanted = Literal["jacobian", "products", "rows"]
+"""What a march with derivatives gives: the Jacobian, products of its columns in its place, or the rows alone."""
 
 _LOCK = threading.Lock()
 
@@ -132,7 +136,7 @@ class Lanes(eqx.Module):
     weight: Float[Array | np.ndarray, "segments samples"]
     joined: Float[Array | np.ndarray, " segments"]
     whitening: Float[Array | np.ndarray, "outputs outputs"]
-    settings: Int[Array | np.ndarray, "4"]
+    settings: Int[Array | np.ndarray, "3"]
     signals: tuple[Float[Array | np.ndarray, "segments _ _"], ...]
 
 
@@ -143,13 +147,13 @@ class Marched(eqx.Module):
     end: Float[Array | np.ndarray, "segments states"]
     by_parameter: Float[Array | np.ndarray, "segments height width"] | None = None
     by_state: Float[Array | np.ndarray, "segments height states"] | None = None
-    end_by_parameter: Float[Array | np.ndarray, "segments states width"] | None = None
-    end_by_state: Float[Array | np.ndarray, "segments states states"] | None = None
+    end_by_parameter: Float[Array | np.ndarray, "segments ends width"] | None = None
+    end_by_state: Float[Array | np.ndarray, "segments ends states"] | None = None
     products: Float[Array | np.ndarray, "segments columns columns"] | None = None
 
 
 def march_lanes(
-    address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode, *, reduced: bool = False
+    address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian"
 ) -> Marched:
     """March all segments by machine code; inside programs of JAX or outside.
 
@@ -158,40 +162,49 @@ def march_lanes(
         lanes: the data.
         hidden: how many states are effects' own.
         mode: with derivatives or without.
-        reduced: whether the last of the lanes' settings asks for products of the Jacobian in its place.
+        wanted: of a march with derivatives.
     """
     from hdjax.engine.handler import register
 
-    results = [
-        jax.ShapeDtypeStruct(s, np.dtype("float64")) for s in result_shapes(lanes, hidden, mode, reduced=reduced)
-    ]
-    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
+    shapes = result_shapes(lanes, hidden, mode, wanted)
+    results = [jax.ShapeDtypeStruct(shape, np.dtype("float64")) for shape in shapes]
     call = jax.ffi.ffi_call(register(), results, vmap_method="sequential")
-    return Marched(*call(address, *operands, *lanes.signals))
+    return Marched(*call(*_operands(address, lanes, wanted)))
 
 
-def result_shapes(lanes: Lanes, hidden: int, mode: Mode, *, reduced: bool) -> list[tuple[int, ...]]:
+def _operands(address: Int[Array | np.ndarray, ""], lanes: Lanes, wanted: Wanted) -> list[Array | np.ndarray]:
+    """What comes in, in the order of [`hdjax.engine.march.OPERANDS`][] and behind it the signals."""
+    asked = np.array([get_args(Wanted).index(wanted)])
+    # Outside a program of JAX none is compiled for it.
+    library = jnp if isinstance(lanes.settings, Tracer) else np
+    lanes = eqx.tree_at(lambda given: given.settings, lanes, library.concatenate([lanes.settings, asked]))
+    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
+    return [address, *operands, *lanes.signals]
+
+
+def result_shapes(lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted) -> list[tuple[int, ...]]:
     """Shapes of the results of a march, in the order of [`Marched`][]; arguments as in [`march_lanes`][]."""
     segments, samples, outputs = lanes.measured.shape
     states, width = lanes.states.shape[1], lanes.free.shape[0]
     rows = samples * outputs + hidden
     shapes = [(segments, rows), (segments, states)]
     if mode == "jacobian":
-        height, columns = (0, width + states + 1) if reduced else (rows, 0)
-        shapes += [(segments, height, width), (segments, height, states), (segments, states, width)]
-        shapes += [(segments, states, states), (segments, columns, columns)]
+        height = rows if wanted == "jacobian" else 0
+        ends = 0 if wanted == "rows" else states
+        columns = width + states + 1 if wanted == "products" else 0
+        shapes += [(segments, height, width), (segments, height, states), (segments, ends, width)]
+        shapes += [(segments, ends, states), (segments, columns, columns)]
     return shapes
 
 
-def march_arrays(address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode) -> Marched:
+def march_arrays(
+    address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian"
+) -> Marched:
     """[`march_lanes`][] outside programs of JAX, of numpy's arrays to such: none is compiled for their shapes."""
     from hdjax.engine.handler import called
 
-    lanes = jax.tree.map(np.ascontiguousarray, lanes)
-    results = [np.empty(shape) for shape in result_shapes(lanes, hidden, mode, reduced=False)]
-    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
-    arrays = [np.asarray(a) for a in (address, *operands, *lanes.signals)]
-    called(int(address), arrays, results)
+    results = [np.empty(shape) for shape in result_shapes(lanes, hidden, mode, wanted)]
+    called(int(address), [np.ascontiguousarray(a) for a in _operands(address, lanes, wanted)], results)
     return Marched(*results)
 
 

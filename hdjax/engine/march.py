@@ -24,15 +24,15 @@ OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measur
 OPERANDS += ("settings",)
 """What comes in, in order; behind it the signals: torque, those of `Equations.signals`, and derivatives of the torque
 by each of `Equations.acting`. `settings` are solver steps in a sample interval, whether the end of a segment is wanted,
-threads, and whether products of the Jacobian are wanted in its place. There may be more numbers in `free` and `slopes`
+threads, and which of `kernel.Wanted` a march with derivatives gives. There may be more numbers in `free` and `slopes`
 than the model has parameters; their columns are zero."""
 
 RESULTS: dict[Mode, tuple[str, ...]] = {
     "values": ("rows", "end"),
     "jacobian": ("rows", "end", "by_parameter", "by_state", "end_by_parameter", "end_by_state", "products"),
 }
-"""What goes out, in order. Where `settings` ask for it, `by_parameter` and `by_state` are not written, but `products`:
-those of each segment's columns with each other, by parameters, states and last the residual itself."""
+"""What goes out, in order; `by_parameter` and `by_state`, or in their place `products`: those of each segment's columns
+with each other, by parameters, states and last the residual itself."""
 
 MARCH = "march"
 """The function's name in its module."""
@@ -157,7 +157,7 @@ class March:
         prepare = self._prepare()
         names = [n for n in OPERANDS if n not in ("address", "settings")]
         names += [f"signal {i}" for i in range(self.signals)] + list(RESULTS[self.mode])
-        names += ["substeps", "whole", "segments", "samples", "width", "reduced", "blocks", "next", "scalars"]
+        names += ["substeps", "whole", "segments", "samples", "width", "wanted", "blocks", "next", "scalars"]
         names += [f"first {i}" for i in range(self.signals)] + [f"powers {i}" for i in range(self.signals)]
         self.call = {name: i for i, name in enumerate(names)}
         self.gather = self._lane_by_lane("gather", reads=True)
@@ -211,7 +211,7 @@ class March:
         settings = data(b, operands, OPERANDS.index("settings"), I64)
         put("substeps", code.load(settings, 0))
         put("whole", code.load(settings, 1))
-        put("reduced", code.load(settings, 3))
+        put("wanted", code.load(settings, 3))
         put("width", dimension(b, operands, OPERANDS.index("free"), 0))
         segments = dimension(b, operands, OPERANDS.index("weight"), 0)
         put("segments", segments)

@@ -138,7 +138,7 @@ def response(
             weight=np.ones((many, length)),
             joined=np.zeros(many),
             whitening=-np.eye(count),
-            settings=np.array([substeps, 1, threads(), 0]),
+            settings=np.array([substeps, 1, threads()]),
             signals=tuple(signals),
         )
         assert made.values is not None
