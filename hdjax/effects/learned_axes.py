@@ -292,14 +292,13 @@ def _sum_jvp(primals, tangents):
     (moved, c_moved), *_ = tangents
     both = [jax.jvp(axis.functions, (v,), (jnp.ones_like(v),)) for axis, v in zip(axes, values, strict=True)]
     found, weights = [f for f, _ in both], mixing @ c
-    by_coefficient = _products(found) @ mixing
     tangent = jnp.zeros_like(weights[0])
     if c_moved is not None:
-        tangent = tangent + by_coefficient @ c_moved
+        tangent = tangent + _products(found) @ mixing @ c_moved
     for i, ((_, slopes), moves) in enumerate(zip(both, moved, strict=True)):
         if moves is not None:
             tangent = tangent + _products([*found[:i], slopes, *found[i + 1 :]]) @ weights * moves
-    return by_coefficient @ c, tangent
+    return _products(found) @ weights, tangent
 
 
 def _products(found: Sequence[Array]) -> Float[Array, " functions"]:

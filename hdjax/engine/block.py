@@ -24,17 +24,24 @@ _POWERS = 6
 
 @dataclasses.dataclass(frozen=True)
 class Emitted:
-    """A part of the equations as a function `name(scalars, inputs, results)`.
+    """A part of the equations as a function `name(scalars, inputs, passed, results)`.
 
     Attributes:
         function: in the module.
         slots: where among the results each node is that moves.
-        size: how many results there are.
+        passed: how many numbers it passes on to the function of the derivatives by parameters.
+        by_parameter: that function; None of itself.
     """
 
     function: ir.Function
     slots: dict[Node, int]
-    size: int
+    passed: int = 0
+    by_parameter: "Emitted | None" = None
+
+    @property
+    def size(self) -> int:
+        """How many results there are."""
+        return len(self.slots)
 
 
 class Block:
@@ -57,6 +64,9 @@ class Block:
         self.stage_results = code.array(m.rates.size * stages)
         self.held_results, self.read_results = code.array(m.before.size), code.array(m.read.size)
         self.prior_results = code.array(m.expected.size)
+        parts = (m.rates, m.before, m.read, m.expected)
+        self.passed = code.array(max(part.passed for part in parts))
+        self.further_results = code.array(max(part.by_parameter.size if part.by_parameter else 0 for part in parts))
         self.moved = code.array(self.tangents * m.states)
         self.rates_by_parameter = m.equations.rates.rows_along("parameter") if self.jacobian else []
         # What states do at once is nothing: all tangents go through the same instructions.
@@ -95,7 +105,15 @@ class Block:
 
     def _run(self, part: Emitted, results: ir.Value) -> None:
         if part.size:
-            self.code.builder.call(part.function, [self.scalars, self.inputs, results])
+            self.code.builder.call(part.function, [self.scalars, self.inputs, self.passed, results])
+
+    def _by_parameter(self, part: Emitted, slope: Tangent, parameter: int) -> ir.Value:
+        """The derivative of a row by a parameter, behind a call of [`_run`][] for those of a part."""
+        node = slope.get(("parameter", parameter))
+        if node is None:
+            return self.code.number(0.0)
+        assert part.by_parameter is not None
+        return self._node(part.by_parameter, node, self.further_results)
 
     def write(self) -> None:
         m, c = self.march, self.code
@@ -233,7 +251,7 @@ class Block:
         c, b, m = self.code, self.code.builder, self.march
         scale = b.fneg(weight)
         slopes = m.equations.outputs.slopes
-        self._fill(m.read, self.read_results, slopes, range(m.outputs), self.read_dense, 0)
+        self._fill(m.read, slopes, range(m.outputs), self.read_dense)
 
         with c.loop(self.tangents, self._first()) as t:
             moved = self._tangent(t)
@@ -327,17 +345,16 @@ class Block:
                 terms.append(change if one else self.code.mul(self._node(part, node, results, offset), change))
         return terms
 
-    def _fill(
-        self, part: Emitted, results: ir.Value, slopes: Sequence[Tangent], rows: Sequence[int], dense, offset: int
-    ) -> None:
-        """Put derivatives by parameters where a loop over the parameters finds them."""
+    def _fill(self, part: Emitted, slopes: Sequence[Tangent], rows: Sequence[int], dense: ir.Value) -> None:
+        """Put derivatives by parameters, where any of these moves, where a loop over them finds them."""
         c, m = self.code, self.march
+        if part.by_parameter is None:
+            return
         with c.builder.if_then(c.builder.icmp_signed("==", self._first(), c.i(0))):
+            self._run(part.by_parameter, self.further_results)
             for p in range(m.parameters):
                 for k, row in enumerate(rows):
-                    node = slopes[row].get(("parameter", p))
-                    value = c.number(0.0) if node is None else self._node(part, node, results, offset)
-                    c.store(value, dense, p * len(rows) + k)
+                    c.store(self._by_parameter(part, slopes[row], p), dense, p * len(rows) + k)
 
     def _write_prior(self) -> None:
         """Rows that say how far hidden states start from where they are expected; none where a segment is joined."""
@@ -346,6 +363,8 @@ class Block:
             return
         self._at_state()
         self._run(m.expected, self.prior_results)
+        if m.expected.by_parameter is not None:
+            self._run(m.expected.by_parameter, self.further_results)
         fresh = b.fcmp_ordered("==", self._lanes(self._got("joined"), 1, 0), c.number(0.0))
         top = c.times(self.samples, m.outputs)
         zero, lost = c.number(0.0), c.number(LOST)
@@ -359,12 +378,14 @@ class Block:
                 continue
             both = b.and_(fresh, inside)
             slopes = m.equations.prior.slopes[h]
-            for kind, first, count in (("parameter", 0, m.parameters), ("state", m.parameters, m.states)):
-                for t in range(count):
-                    slope = slopes.get((kind, t))
-                    change = zero if slope is None else self._node(m.expected, slope, self.prior_results)
-                    change = c.mul(change, c.load(self.scale, first + t))
-                    c.store(self._finite(change, both), self._columns_of(0), first + t)
+            for t in range(self.tangents):
+                change = zero
+                if t < m.parameters:
+                    change = self._by_parameter(m.expected, slopes, t)
+                elif ("state", t - m.parameters) in slopes:
+                    change = self._node(m.expected, slopes["state", t - m.parameters], self.prior_results)
+                change = c.mul(change, c.load(self.scale, t))
+                c.store(self._finite(change, both), self._columns_of(0), t)
             self._put_row(row, self._columns_of(0), value)
 
     def _write_end(self) -> None:
@@ -436,7 +457,7 @@ class Block:
             for k, node in enumerate(m.equations.held.values):
                 c.store(self._node(m.before, node, self.held_results), self.inputs, m.at_held + k)
             if self.jacobian:
-                self._fill(m.before, self.held_results, m.equations.held.slopes, range(m.held), self.held_dense, 0)
+                self._fill(m.before, m.equations.held.slopes, range(m.held), self.held_dense)
         old = [c.load(self.state, i) for i in range(m.states)]
         for j, node in enumerate(m.nodes):
             self._stage(j, begin, c.add(start, c.mul(c.number(node), step)), old, step)
@@ -467,7 +488,7 @@ class Block:
         if self.jacobian:
             rows = self.rates_by_parameter
             dense = c.place(self.dense, j * len(rows) * self.tangents)
-            self._fill(m.rates, results, m.equations.rates.slopes, rows, dense, 0)
+            self._fill(m.rates, m.equations.rates.slopes, rows, dense)
 
     def _move_tangent(self, t: ir.Value, step: ir.Value) -> None:
         """Take one tangent through the stages of a step."""

@@ -4,7 +4,7 @@ A step of an explicit Runge-Kutta method first computes its stages, and at each 
 and parameters. These are the same for all tangents, which then go through the stages one by one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import diffrax as dfx
@@ -80,20 +80,44 @@ class March:
 
     # -- the equations -------------------------------------------------------------------------------------------
 
-    def _wanted(self, part: Part) -> list[Node]:
-        slopes = [n for t in part.slopes for n in t.values()] if self.mode == "jacobian" else []
-        return [*part.values, *slopes]
+    def _wanted(self, part: Part) -> tuple[list[Node], list[Node]]:
+        """Values and their derivatives by states and by what is held; and those by parameters."""
+        own, by_parameter = [*part.values], []
+        for direction, node in (item for t in part.slopes for item in t.items() if self.mode == "jacobian"):
+            (by_parameter if direction[0] == "parameter" else own).append(node)
+        return own, by_parameter
 
     def _scalars(self) -> dict[Node, int]:
         """What is computed once, as plain numbers."""
         e = self.equations
-        return e.graph.steady(n for part in (e.rates, e.held, e.outputs, e.prior) for n in self._wanted(part))
+        parts = (e.rates, e.held, e.outputs, e.prior)
+        return e.graph.steady(n for part in parts for nodes in self._wanted(part) for n in nodes)
 
     def _part(self, name: str, part: Part) -> Emitted:
+        """Two functions, for where all parameters are held those by them are not wanted; what both need the first one
+        passes on."""
         graph = self.equations.graph
-        moving = list(dict.fromkeys(n for n in self._wanted(part) if graph.level[n] == VARYING))
+
+        def moving(nodes: Iterable[Node]) -> list[Node]:
+            return list(dict.fromkeys(n for n in nodes if graph.level[n] == VARYING))
+
+        own, by_parameter = map(moving, self._wanted(part))
+        found = set(graph.needed(own))
+        asked = {a for n in graph.needed(by_parameter) if n not in found for a in graph.arguments(n)}
+        both = moving(sorted(found & (asked | set(by_parameter))))
+        passed = {n: i for i, n in enumerate(n for n in both if graph.nodes[n][0] != "leaf")}
+        further = None
+        if self.mode == "jacobian":
+            further = Emitted(*self._function(name + "_by_parameter", by_parameter, passed, passes=False))
+        return Emitted(*self._function(name, own, passed, passes=True), len(passed), further)
+
+    def _function(
+        self, name: str, wanted: list[Node], passed: dict[Node, int], *, passes: bool
+    ) -> tuple[ir.Function, dict[Node, int]]:
+        """A function of nodes, which passes others on or is passed them; and where its results are."""
+        graph = self.equations.graph
         kind = ir.VectorType(F64, LANES).as_pointer()
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [F64.as_pointer(), kind, kind]), name)
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [F64.as_pointer(), kind, kind, kind]), name)
         function.linkage = "internal"
         function.attributes.add("nounwind")
         # Copies of it at each stage would multiply what there is to compile.
@@ -101,19 +125,25 @@ class March:
         for argument in function.args:
             argument.add_attribute("noalias")
         code = Code(ir.IRBuilder(function.append_basic_block()))
-        scalars, inputs, results = function.args
+        scalars, inputs, between, results = function.args
         given: dict[Node, Callable[[], ir.Value]] = {
             node: lambda node=node, i=i: self.scalar(code, scalars, i, node) for node, i in self.scalars.items()
         }
-        for node in graph.needed(moving):
+        for node in graph.needed(wanted):
             operation, *rest = graph.nodes[node]
             if operation == "leaf" and graph.level[node] == VARYING:
                 given[node] = lambda place=self._input(rest[0]): code.load(inputs, place)
-        found = emitted(code, graph, moving, given)
-        for slot, node in enumerate(moving):
+        if not passes:
+            for node, i in passed.items():
+                given[node] = lambda node=node, i=i: restored(code, graph, node, code.load(between, i))
+        found = emitted(code, graph, wanted, given)
+        slots = {node: slot for slot, node in enumerate(wanted)}
+        for node, slot in slots.items():
             code.store(found[node], results, slot)
+        for node, i in passed.items() if passes else ():
+            code.store(storable(code, graph, node, found[node]), between, i)
         code.builder.ret_void()
-        return Emitted(function, {node: slot for slot, node in enumerate(moving)}, len(moving))
+        return function, slots
 
     def scalar(self, code: Vectors, scalars: ir.Value, index: int, node: Node) -> ir.Value:
         number = code.spread(code.builder.load(code.builder.gep(scalars, [ir.Constant(I64, index)])))
