@@ -24,7 +24,7 @@ _POWERS = 6
 
 @dataclasses.dataclass(frozen=True)
 class Emitted:
-    """A part of the equations as a function `name(scalars, inputs, passed, results)`.
+    """A part of the equations as a function `name(scalars, constants, inputs, passed, results)`.
 
     Attributes:
         function: in the module.
@@ -105,7 +105,8 @@ class Block:
 
     def _run(self, part: Emitted, results: ir.Value) -> None:
         if part.size:
-            self.code.builder.call(part.function, [self.scalars, self.inputs, self.passed, results])
+            arguments = [self.scalars, self.constants, self.inputs, self.passed, results]
+            self.code.builder.call(part.function, arguments)
 
     def _by_parameter(self, part: Emitted, slope: Tangent, parameter: int) -> ir.Value:
         """The derivative of a row by a parameter, behind a call of [`_run`][] for those of a part."""
@@ -117,7 +118,7 @@ class Block:
 
     def write(self) -> None:
         m, c = self.march, self.code
-        self.scalars = self._got("scalars")
+        self.scalars, self.constants = self._got("scalars"), self._got("constants")
         self.samples = self._got("samples", I64)
         self.rows = c.plus(c.times(self.samples, m.outputs), m.hidden)
         self.knots = c.plus(c.plus(self.samples, self._got("first 0", I64)), 1)

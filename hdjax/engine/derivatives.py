@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from hdjax.engine.graph import Graph, Node
+from hdjax.engine.graph import PARAMETER, Graph, Node
 
 Tangent = dict[Any, Node]
 """Derivatives that are not zero, by direction: whatever name stands for it."""
@@ -44,7 +44,7 @@ def _in_order(graph: Graph, wanted: list[Node]) -> list[Node]:
             found.add(node)
             operation, *rest = graph.nodes[node]
             if operation not in ("constant", "leaf"):
-                stack.extend(rest[1::2] if operation == "given" else rest)
+                stack.extend(rest[1::2] if operation == "given" else graph.arguments(node))
     return sorted(found)
 
 
@@ -76,6 +76,9 @@ def _partials(graph: Graph, node: Node, found: Mapping[Node, Tangent]) -> list[t
     operation, *rest = graph.nodes[node]
     if operation == "given":
         return [(a, p) for a, p in zip(rest[1::2], rest[2::2], strict=True) if found[a]]
+    if operation == "dot":
+        pairs = zip(rest[1:], graph.line(node), strict=True)
+        return [(a, graph.leaf(name, PARAMETER)) for a, name in pairs if found[a]]
     rule = _RULES.get(operation)
     if rule is None:
         return []

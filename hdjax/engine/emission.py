@@ -11,6 +11,8 @@ from hdjax.engine.graph import COMPARISONS, LOGICAL, Graph, Node
 
 F64, I64, I32, I8, BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(32), ir.IntType(8), ir.IntType(1)
 
+# Inner products that go through a table side by side.
+_COLUMNS = 8
 # Fused multiply-adds, and nothing that changes results by more than rounding.
 _FUSED = ("contract",)
 _SIGNS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
@@ -194,7 +196,11 @@ def restored(vectors: Vectors, graph: Graph, node: Node, number: ir.Value) -> ir
 
 
 def emitted(
-    vectors: Vectors, graph: Graph, wanted: Iterable[Node], given: Mapping[Node, Callable[[], ir.Value]]
+    vectors: Vectors,
+    graph: Graph,
+    wanted: Iterable[Node],
+    given: Mapping[Node, Callable[[], ir.Value]],
+    tables: Mapping[str, ir.Value] | None = None,
 ) -> dict[Node, ir.Value]:
     """Write the instructions for nodes at the builder's place.
 
@@ -203,6 +209,7 @@ def emitted(
         graph: of the nodes.
         wanted: what is computed.
         given: how to come by the nodes that are known already, leaves included.
+        tables: where the numbers of the graph's tables stand.
 
     Returns:
         The value of every node that was needed.
@@ -216,11 +223,57 @@ def emitted(
         if node not in needed:
             needed.add(node)
             stack.extend(() if node in given else graph.arguments(node))
+    alike: dict[Any, list[Node]] = {}
+    for node in sorted(needed - given.keys()):
+        if graph.nodes[node][0] == "dot":
+            (table, _, stride), *factors = graph.nodes[node][1:]
+            alike.setdefault((table, stride, *factors), []).append(node)
     for node in sorted(needed):
+        if node in found:
+            continue
         if node in given:
             found[node] = given[node]()
+        elif graph.nodes[node][0] == "dot":
+            (table, _, stride), *factors = graph.nodes[node][1:]
+            assert tables is not None
+            same = alike[table, stride, *factors]
+            firsts = [graph.nodes[n][1][1] for n in same]
+            sums = _inner_products(vectors, [found[f] for f in factors], tables[table], firsts, stride)
+            found.update(zip(same, sums, strict=True))
         else:
             found[node] = _instruction(vectors, graph, node, [found[a] for a in graph.arguments(node)])
+    return found
+
+
+def _inner_products(
+    v: Vectors, factors: Sequence[ir.Value], table: ir.Value, firsts: Sequence[int], stride: int
+) -> list[ir.Value]:
+    """Sums of products of the same factors with numbers at even distances of a table, from each of the first places on:
+    as a loop, since what is written out takes long to compile, and to read."""
+    b = v.builder
+    with b.goto_entry_block():
+        room = b.alloca(ir.ArrayType(v.numbers, len(factors)))
+    for i, factor in enumerate(factors):
+        b.store(factor, b.gep(room, [ir.Constant(I64, 0), ir.Constant(I64, i)]), align=8)
+    found = []
+    for start in range(0, len(firsts), _COLUMNS):
+        before, loop, after = b.block, b.function.append_basic_block(), b.function.append_basic_block()
+        b.branch(loop)
+        b.position_at_end(loop)
+        index = b.phi(I64)
+        totals = [b.phi(v.numbers) for _ in firsts[start : start + _COLUMNS]]
+        index.add_incoming(ir.Constant(I64, 0), before)
+        factor = b.load(b.gep(room, [ir.Constant(I64, 0), index]), align=8)
+        row = b.mul(index, ir.Constant(I64, stride))
+        for first, total in zip(firsts[start:], totals, strict=False):
+            number = b.load(b.gep(table, [b.add(row, ir.Constant(I64, first))]), align=8)
+            total.add_incoming(v.number(0.0), before)
+            found.append(v.add(total, v.mul(v.spread(number), factor)))
+            total.add_incoming(found[-1], loop)
+        following = b.add(index, ir.Constant(I64, 1))
+        index.add_incoming(following, loop)
+        b.cbranch(b.icmp_signed("<", following, ir.Constant(I64, len(factors))), loop, after)
+        b.position_at_end(after)
     return found
 
 

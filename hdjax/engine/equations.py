@@ -122,7 +122,7 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
         UntranslatableError: where the model uses a function that is not known here.
     """
     free, others, joined = split_model(model, paths)
-    graph = Graph()
+    graph = Graph(tables=("constant",))
     count = len(model.state_names)
     numbers = {
         "parameter": numbered_leaves(graph, "parameter", (len(free),), PARAMETER),

@@ -1,7 +1,7 @@
 """A graph of scalar expressions, in which equal expressions are one node."""
 
 import math
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,11 +52,17 @@ class Graph:
 
     Attributes:
         nodes: each as its operation and what that is applied to: `("constant", value)`, `("leaf", name)`, or an
-            operation and nodes. `("given", value, argument, partial, ...)` is the value, with its partial derivatives.
+            operation and nodes. `("given", value, argument, partial, ...)` is the value, with its partial derivatives;
+            `("dot", (name, first, stride), *factors)` see [`Graph.dot`][].
         level: what each depends on, see [`CONSTANT`][].
     """
 
-    def __init__(self):
+    def __init__(self, tables: Collection[str] = ()):
+        """
+        Args:
+            tables: leaves `(name, place)` of these names stand in tables, by their places.
+        """
+        self.tables = tables
         self.nodes: list[tuple[Any, ...]] = []
         self.level: list[int] = []
         self._found: dict[tuple[Hashable, ...], Node] = {}
@@ -101,6 +107,26 @@ class Graph:
         square = self.apply("mul", half, half)
         return self.apply("mul", square, base) if exponent % 2 else square
 
+    def dot(self, numbers: Sequence[Node], factors: Sequence[Node]) -> Node | None:
+        """The sum of products of numbers and factors as one node: large matrices would make thousands. None where the
+        numbers are no leaves at even distances of a table."""
+        names = [self.nodes[n][1] for n in numbers if self.nodes[n][0] == "leaf"]
+        if not self.tables or len(numbers) < 2 or len(names) < len(numbers):
+            return None
+        if len({name for name, *_ in names}) > 1 or names[0][0] not in self.tables:
+            return None
+        places = [place for _, place in names]
+        stride = places[1] - places[0]
+        if any(place != places[0] + i * stride for i, place in enumerate(places)):
+            return None
+        node = "dot", (names[0][0], places[0], stride), *factors
+        return self._make(node, node, max(PARAMETER, *(self.level[f] for f in factors)))
+
+    def line(self, node: Node) -> list[Hashable]:
+        """The names of the leaves that a `dot` node multiplies."""
+        (name, first, stride), *factors = self.nodes[node][1:]
+        return [(name, first + i * stride) for i in range(len(factors))]
+
     def needed(self, wanted: Iterable[Node]) -> list[Node]:
         """The nodes that the wanted ones are made of, themselves included, in order."""
         found: set[Node] = set()
@@ -128,6 +154,8 @@ class Graph:
         operation, *rest = self.nodes[node]
         if operation in ("constant", "leaf"):
             return ()
+        if operation == "dot":
+            return rest[1:]
         return rest[:1] if operation == "given" else rest
 
     def evaluate(self, wanted: Sequence[Node], leaves: Mapping[Hashable, Any]) -> list[Any]:
@@ -140,6 +168,9 @@ class Graph:
                     value[node] = rest[0]
                 elif operation == "leaf":
                     value[node] = leaves[rest[0]]
+                elif operation == "dot":
+                    pairs = zip(self.line(node), rest[1:], strict=True)
+                    value[node] = sum(leaves[name] * value[factor] for name, factor in pairs)
                 else:
                     value[node] = _OPERATIONS[operation](*(value[a] for a in self.arguments(node)))
         return [value[node] for node in wanted]

@@ -117,7 +117,8 @@ class March:
         """A function of nodes, which passes others on or is passed them; and where its results are."""
         graph = self.equations.graph
         kind = ir.VectorType(F64, LANES).as_pointer()
-        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), [F64.as_pointer(), kind, kind, kind]), name)
+        arguments = [*[F64.as_pointer()] * 2, kind, kind, kind]
+        function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), arguments), name)
         function.linkage = "internal"
         function.attributes.add("nounwind")
         # Copies of it at each stage would multiply what there is to compile.
@@ -125,7 +126,7 @@ class March:
         for argument in function.args:
             argument.add_attribute("noalias")
         code = Code(ir.IRBuilder(function.append_basic_block()))
-        scalars, inputs, between, results = function.args
+        scalars, constants, inputs, between, results = function.args
         given: dict[Node, Callable[[], ir.Value]] = {
             node: lambda node=node, i=i: self.scalar(code, scalars, i, node) for node, i in self.scalars.items()
         }
@@ -136,7 +137,7 @@ class March:
         if not passes:
             for node, i in passed.items():
                 given[node] = lambda node=node, i=i: restored(code, graph, node, code.load(between, i))
-        found = emitted(code, graph, wanted, given)
+        found = emitted(code, graph, wanted, given, {"constant": constants})
         slots = {node: slot for slot, node in enumerate(wanted)}
         for node, slot in slots.items():
             code.store(found[node], results, slot)
@@ -174,7 +175,7 @@ class March:
                 name, index = rest[0]
                 table = free if name == "parameter" else constants
                 given[node] = lambda t=table, i=index: plain.builder.load(plain.builder.gep(t, [ir.Constant(I64, i)]))
-        found = emitted(plain, graph, self.scalars, given)
+        found = emitted(plain, graph, self.scalars, given, {"constant": constants})
         for node, index in self.scalars.items():
             value = storable(plain, graph, node, found[node])
             plain.builder.store(value, plain.builder.gep(results, [ir.Constant(I64, index)]))

@@ -18,6 +18,8 @@ from hdjax.where import where
 Nodes = np.ndarray[Any, np.dtype[np.object_]]
 """Nodes in the shape of an array."""
 
+# Multiplications of a matrix that are not written out one by one.
+_LARGE = 64
 _LONGEST_LOOP = 64
 
 
@@ -413,7 +415,13 @@ def _dot(graph: Graph, equation: Any, a: Nodes, b: Nodes) -> Nodes:
     right = b.transpose(*over_b, *rest_b).reshape(-1, math.prod(b.shape[i] for i in rest_b))
     found = np.empty((left.shape[0], right.shape[1]), dtype=object)
     for i, j in np.ndindex(found.shape):
-        found[i, j] = _sum(graph, [graph.apply("mul", x, y) for x, y in zip(left[i], right[:, j], strict=True)])
+        row, column = list(left[i]), list(right[:, j])
+        whole = None
+        if left.size * right.shape[1] >= _LARGE:
+            whole = graph.dot(row, column) or graph.dot(column, row)
+        if whole is None:
+            whole = _sum(graph, [graph.apply("mul", x, y) for x, y in zip(row, column, strict=True)])
+        found[i, j] = whole
     return found.reshape([a.shape[i] for i in rest_a] + [b.shape[i] for i in rest_b])
 
 
