@@ -18,6 +18,7 @@ from fitting.posing import initial_states, on_all_devices, pose
 from fitting.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from hdjax import Model
+from hdjax.effects.learned import FAMILY
 
 REWEIGHTINGS = 3
 """Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
@@ -169,7 +170,7 @@ def fit(
         unknowns, covariance = solution.unknowns, solution.left_over.covariance
         before, objective = objective, half_log_determinant(covariance)
         steps += solution.steps
-        settled = not np.isfinite(objective) or abs(before - objective) < 1e-4
+        settled = not np.isfinite(objective) or abs(before - objective) < max(1e-4, 0.5 * least_progress)
         if settled or objective > give_up_above or steps >= 2 * max_steps:
             break
     assert solution is not None
@@ -287,8 +288,8 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     Args:
         found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
         tolerance: largest rms difference in units of the residual's standard deviation.
-        shift: by how many standard errors the difference may move the parameters. An error too small to be seen in a
-            sample adds up over all of them.
+        shift: by how many standard errors the difference may move the parameters, coefficients of learned functions
+            aside. An error too small to be seen in a sample adds up over all of them.
         most: where to stop.
     """
     problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
@@ -303,18 +304,25 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
         better = evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error
         white = (better - error) @ white_by_error.T
         mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
-        moved = 0.0 if columns is None else _standard_errors_moved(columns, white)
+        moved = 0.0 if columns is None else _standard_errors_moved(columns, white, _named(found))
         if np.sqrt(mean_square) < tolerance and moved < shift:
             break
         substeps, error = 2 * substeps, better
     return substeps
 
 
-def _standard_errors_moved(columns: np.ndarray, white: np.ndarray) -> float:
-    """How far a whitened output error would move the parameters, in standard errors of their joint estimate."""
+def _named(found: Fit) -> Bool[np.ndarray, " parameters"]:
+    """Which parameters are no coefficients of something learned."""
+    learned = {e.name for e in found.model.effects if e.family == FAMILY}
+    return np.array([path.partition(".")[0] not in learned for path in found.free.paths], dtype=bool)
+
+
+def _standard_errors_moved(columns: np.ndarray, white: np.ndarray, which: Bool[np.ndarray, " parameters"]) -> float:
+    """How far a whitened output error would move some of the parameters, in standard errors of their joint estimate."""
     rows = white.reshape(white.shape[0], -1)
     slopes = columns[:, : rows.shape[1]].reshape(rows.size, -1)
     gradient, information = slopes.T @ rows.ravel(), slopes.T @ slopes
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    return float(np.sqrt(max(0.0, (scale * gradient) @ inverse @ (scale * gradient))))
+    moved, covariance = (inverse @ (scale * gradient))[which], inverse[np.ix_(which, which)]
+    return float(np.sqrt(max(0.0, moved @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ moved)))

@@ -55,7 +55,7 @@ _FOLDS = 4
 # How many coefficients a function of one variable may have, and of two.
 _SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (1, 2, 3, 5, 7, 9, 12, 16, 20, 24)}
 # A poorer error by this share (in the objective) is no reason for more coefficients.
-_WORTH_A_COEFFICIENT = 0.005
+WORTH_A_COEFFICIENT = 0.005
 # What explains this share of what the best one does, to first order, may be the better one after all.
 NEARLY = 0.8
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
@@ -78,7 +78,6 @@ class Candidate(eqx.Module):
         variables: what the function depends on.
         gain: decrease of the objective on parts of the training data that were left out, to first order.
         effect: the learned function, at the coefficients that suit best to first order.
-        drive_step: change of the free vector that goes with it.
         known: functions of the variables that the free parameters stand for already, at the instants that are kept.
     """
 
@@ -86,7 +85,6 @@ class Candidate(eqx.Module):
     variables: tuple[str, ...] = eqx.field(static=True)
     gain: float
     effect: Learned
-    drive_step: Float[np.ndarray, " parameters"]
     known: Float[np.ndarray, "instants known"]
 
     @property
@@ -153,7 +151,7 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
 
     alone = {form: look_at(form, [(name,) for name in may[form]]) for form in forms}
     found = [candidate for those in alone.values() for candidate in those]
-    any_two = all(candidate.gain < _WORTH_A_COEFFICIENT for candidate in found)
+    any_two = all(candidate.gain < WORTH_A_COEFFICIENT for candidate in found)
     for form, those in alone.items():
         best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
         pairs = (p for p in combinations(may[form], 2) if any_two or best & set(p))
@@ -241,7 +239,7 @@ def _simplest(
     """One place and choice of variables, by the simplest function that explains as much as any."""
     best: Candidate | None = None
     for candidate in _functions_of(seen, form, variables, own):
-        if best is None or candidate.gain > best.gain + _WORTH_A_COEFFICIENT:
+        if best is None or candidate.gain > best.gain + WORTH_A_COEFFICIENT:
             best = candidate
     return best
 
@@ -289,14 +287,14 @@ def _candidate(
     base = _left_out(found, parameters)
     for size in (s for s in sizes if s <= mixing.shape[1]):
         gain = base - _left_out(found, parameters + size)
-        if best is None or gain > best[0] + _WORTH_A_COEFFICIENT:
+        if best is None or gain > best[0] + WORTH_A_COEFFICIENT:
             best = gain, size
     if best is None or not best[0] > 0:
         return None
     gain, size = best
     (step,) = best_steps(found.first(parameters + size).in_parts(1))
     effect = form.made_of(axes, mixing[:, :size], step[parameters:])
-    return Candidate(form, tuple(axis.variable for axis in axes), gain, effect, step[:parameters], known)
+    return Candidate(form, tuple(axis.variable for axis in axes), gain, effect, known)
 
 
 def _of_its_own(model: Model, form: type[Learned]) -> int:

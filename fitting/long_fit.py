@@ -1,5 +1,7 @@
 """The last fit, over simulations as long as the logs, where small errors of a parameter add up and show."""
 
+from typing import Any
+
 import numpy as np
 
 from fitting.engines import linearise
@@ -44,17 +46,19 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     return long if check.objective < start.objective + _LOSS else start
 
 
-def over_whole_stretches(found: Fit, *, hold_parameters: bool = True) -> Fit:
+def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_progress: float = 0.0) -> Fit:
     """The same model over horizons as long as the stretches.
 
     Args:
         found: a fit over short horizons.
         hold_parameters: whether only initial states are fitted.
+        least_progress: see [`fitting.solve.solve`][].
     """
-    return _again(found, found.model, horizon=_longest(found), substeps=found.substeps, hold_parameters=hold_parameters)
+    how = {"substeps": found.substeps, "hold_parameters": hold_parameters, "least_progress": least_progress}
+    return _again(found, found.model, horizon=_longest(found), **how)
 
 
-def with_memory_carried(found: Fit, *, hold_parameters: bool = False) -> Fit:
+def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_progress: float = 0.0) -> Fit:
     """A fit over short horizons that has gone by way of horizons as long as the stretches, where that leaves less.
 
     What an effect remembers is not seen, and where it slips it forgets its start: on a short segment a start that is
@@ -63,13 +67,13 @@ def with_memory_carried(found: Fit, *, hold_parameters: bool = False) -> Fit:
     Args:
         found: a fit over short horizons.
         hold_parameters: whether only initial states are fitted.
+        least_progress: see [`fitting.solve.solve`][].
     """
-    carried = over_whole_stretches(found, hold_parameters=hold_parameters)
+    how: dict[str, Any] = {"hold_parameters": hold_parameters, "least_progress": least_progress}
+    carried = over_whole_stretches(found, **how)
     if not follows(carried):
         return found
-    back = _again(
-        carried, carried.model, horizon=found.horizon, substeps=found.substeps, hold_parameters=hold_parameters
-    )
+    back = _again(carried, carried.model, horizon=found.horizon, substeps=found.substeps, **how)
     return min(found, back, key=lambda fit: fit.objective)
 
 
@@ -111,7 +115,14 @@ def _fine_enough(found: Fit) -> int:
 
 
 def _again(
-    found: Fit, model: Model, *, horizon: int, substeps: int, hold_parameters: bool = False, afresh: bool = False
+    found: Fit,
+    model: Model,
+    *,
+    horizon: int,
+    substeps: int,
+    hold_parameters: bool = False,
+    afresh: bool = False,
+    least_progress: float = 0.0,
 ) -> Fit:
     """A fit of the same data on segments of the same length, which share its compiled program; from its states or, for
     a model that these don't suit, afresh."""
@@ -132,4 +143,5 @@ def _again(
         retry_states=afresh,
         max_steps=_STEPS,
         hold_parameters=hold_parameters,
+        least_progress=least_progress,
     )

@@ -39,17 +39,20 @@ class Setting(eqx.Module):
         halo: intervals of torque before a segment.
         substeps: solver steps in a sample interval.
         count: segments in each program.
+        least_progress: share of the sum of squares that a few steps of a fit must take off it.
     """
 
     horizon: int = eqx.field(static=True)
     halo: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
+    least_progress: float = eqx.field(static=True, default=_LEAST_PROGRESS)
 
     @property
     def options(self) -> dict[str, Any]:
         """The same as options of [`fitting.estimate.fit`][]."""
-        return {"horizon": self.horizon, "halo": self.halo, "substeps": self.substeps, "count": self.count}
+        names = ("horizon", "halo", "substeps", "count", "least_progress")
+        return {name: getattr(self, name) for name in names}
 
     def with_steps_of(self, found: Fit) -> "Setting":
         """The same, with the solver steps of a fit."""
@@ -187,8 +190,9 @@ def to_the_end(
     [`challenge`][]."""
     before = champion.training.objective
     limit = min(give_up_above, before + LEAST_GAIN)
-    if first.objective <= before - _MOST_OF_THE_WAY * (before - limit) and _may_remember_better(first):
-        first = with_memory_carried(first)
+    remembers_more = first.model.state_names != champion.model.state_names and _may_remember_better(first)
+    if remembers_more and first.objective <= before - _MOST_OF_THE_WAY * (before - limit):
+        first = with_memory_carried(first, least_progress=setting.least_progress)
     if first.objective > limit:
         return None
     setting = setting.fine_enough(first)
@@ -253,7 +257,6 @@ def trained(
         begin_anew_above=(-np.inf if near is None else near.objective) if begin_anew or not same else np.inf,
         retry_states=retry_states or begin_anew or not same,
         give_up_above=give_up_above,
-        least_progress=_LEAST_PROGRESS,
     )
 
 
@@ -266,10 +269,9 @@ def _judged(training: Fit, data: Data, hold: Hold, setting: Setting) -> Trial:
         covariance=training.covariance,
         max_steps=_TRIAL_STEPS,
         hold_parameters=True,
-        least_progress=_LEAST_PROGRESS,
     )
     if _may_remember_better(held_out):
-        held_out = with_memory_carried(held_out, hold_parameters=True)
+        held_out = with_memory_carried(held_out, hold_parameters=True, least_progress=setting.least_progress)
     return Trial(training.model, training, held_out, hold)
 
 
@@ -288,7 +290,9 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
     short = before.held_out.objective - trial.held_out.objective
     if not effect.states or short <= 0.0:
         return 1.0
-    long_before, long_after = (over_whole_stretches(t.held_out) for t in (before, trial))
+    long_before, long_after = (
+        over_whole_stretches(t.held_out, least_progress=_LEAST_PROGRESS) for t in (before, trial)
+    )
     if not (follows(long_before) or follows(long_after)):
         return 1.0
     return float(np.clip((with_gaps_closed(long_before) - with_gaps_closed(long_after)) / short, 0.0, 1.0))

@@ -6,6 +6,7 @@ memory ([`fitting.remembering`][]).
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.learned_look import (
     NEARLY,
+    WORTH_A_COEFFICIENT,
     Candidate,
     LearnedLook,
     candidates,
@@ -33,15 +35,16 @@ from fitting.surrogates import surrogates
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, sampled
 from hdjax.effects import Conditions, Motion
-from hdjax.effects.learned import LearnedReading
+from hdjax.effects.learned import Learned, LearnedReading
+from hdjax.parameters import as_scalar
 
 # A poorer error by this share (in the objective) is no reason for a second variable.
 _WORTH_A_VARIABLE = 0.03
 # What explains less than this share of the error, to first order, is not refitted: of what the base model leaves,
 # and beside effects that have a name already.
 _LEAST_SHARE, _LEAST_SHARE_BESIDE = 0.005, 0.02
-# First-order changes of a logarithm are taken no larger than this.
-_LARGEST_CHANGE = 1.0
+# Steps that together take less than this share off the sum of squares are no better than one more coefficient.
+_LEAST_PROGRESS = 2.0 * WORTH_A_COEFFICIENT
 
 
 class Unknown(eqx.Module):
@@ -151,7 +154,8 @@ def _likeliest(
     """The best of the likeliest candidates and of what was the best so far, inside the equations."""
     for candidate in _rivals(found):
         progress(f"learning a function of {' and '.join(candidate.variables)}")
-        trial = _refitted(before, candidate, data, setting)
+        # A whole step to what the first look found may leave the present model, where it is nothing, far behind.
+        trial = _refitted(before, candidate, data, setting, np.zeros(len(candidate.effect.c)))
         if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
             best = candidate, trial
     return best
@@ -173,9 +177,10 @@ def _refined(
     """The same variables with those functions of them, and as many, that a second look calls for, along the motion that
     the first fit found: the first look is but first order."""
     first, trial = best
-    for candidate in looked_again(first, learned_look(trial.training)):
+    seen = learned_look(trial.training)
+    for candidate in looked_again(first, seen):
         progress("learning its shape more closely")
-        finer = _refitted(trial, candidate, data, setting)
+        finer = _refitted(trial, candidate, data, setting, _as_before(first, trial, candidate, seen))
         if finer is not None and _penalised(finer) < _penalised(best[1]):
             best = eqx.tree_at(lambda c: c.gain, candidate, first.gain), finer
     return best
@@ -261,15 +266,21 @@ def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
     return [c for c in found[:2] if c.gain > NEARLY * found[0].gain]
 
 
-def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting) -> Trial | None:
-    free, step = before.training.free, candidate.drive_step
-    # The coefficients of a learned torque that is there already come last.
-    change = np.pad(step, (0, len(free.paths) - step.size))
-    change = np.where(free.logarithmic, np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE), change)
-    moved = free.unpack(before.model, free.pack(before.model) + change)
-    # First-order changes may overshoot: a spring may soften until it is none.
-    starts = (m.without_effect(candidate.form.name).with_effects(candidate.effect) for m in (moved, before.model))
-    return challenge(list(starts), data, before.hold, setting, champion=before)
+def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting, c: np.ndarray) -> Trial | None:
+    """The model with a candidate inside, from given coefficients."""
+    name = candidate.effect.name
+    effect = eqx.tree_at(lambda e: e.c, candidate.effect, tuple(map(as_scalar, c)))
+    bare = before.model.without_effect(name) if name in {e.name for e in before.model.effects} else before.model
+    setting = replace(setting, least_progress=_LEAST_PROGRESS)
+    return challenge([bare.with_effects(effect)], data, before.hold, setting, champion=before)
+
+
+def _as_before(old: Candidate, trial: Trial, new: Candidate, seen: LearnedLook) -> np.ndarray:
+    """The coefficients at which one candidate comes closest to what another one has come to in a trial."""
+    fitted = trial.model.effect(old.effect.name)
+    assert isinstance(fitted, Learned)
+    ours, theirs = (sizes_along(c, seen)[0].reshape(-1, len(c.effect.c))[seen.instants] for c in (new, old))
+    return np.linalg.lstsq(ours, theirs @ np.array([float(c) for c in fitted.c]), rcond=1e-10)[0]
 
 
 def _penalised(trial: Trial) -> float:

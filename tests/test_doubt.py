@@ -110,7 +110,7 @@ def test_where_what_stands_in_their_place_leaves_noise_nothing_is_learned_beside
 
     def learn(before, *args, **options):
         asked.append("instead" if before is base else "beside")
-        chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros(4), np.zeros((2, 1)))
+        chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
         found = Unknown(
             base, base, (), chosen, np.arange(2), np.zeros((2, 2)), Conditions(), np.ones((2, 2)), 2.0, 0.005
         )
@@ -187,7 +187,7 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
     monkeypatch.setattr(doubt, "told_from_zero", lambda fit, names: told)
     monkeypatch.setattr(doubt, "_refitted_without", refitted_without)
     names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
-    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros(4), np.zeros((2, 1)))
+    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
     named, trial = with_effects(*names, objective=-5.0), with_effects(*names, LEARNED, objective=-7.0)
     motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
     instants = np.arange(2)
