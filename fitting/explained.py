@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.experiment import Segments
-from fitting.followed import Followed, respond
+from fitting.followed import Followed, Forces, respond
 from fitting.free import FreeParameters
 from fitting.residual import Blocks
 
@@ -50,9 +50,10 @@ class FirstStates(eqx.Module):
             before: what goes with each at the end of the segment before, where segments are joined.
         """
         with np.errstate(all="ignore"):
-            moved = np.asarray(columns) + self.by_state @ through_segments(
-                self.joined, self.before_by_state, np.asarray(before)
-            )
+            moved = np.asarray(columns)
+            if self.joined.any():
+                through = through_segments(self.joined, self.before_by_state, np.asarray(before))
+                moved = moved + self.by_state @ through
             starts = np.flatnonzero(~self.joined)
             transposed = np.swapaxes(self.by_first, 1, 2)
             own, coupling = (np.add.reduceat(transposed @ part, starts, axis=0) for part in (self.by_first, moved))
@@ -71,6 +72,7 @@ class Answers(eqx.Module):
         followed: the motion.
         weight: of the samples.
         whitening: of the outputs.
+        readout: of the weighted and whitened outputs from the state.
         states: what the first states do.
         parameters: the answer to a unit of each parameter that is free already.
     """
@@ -78,6 +80,7 @@ class Answers(eqx.Module):
     followed: Followed
     weight: Float[np.ndarray, "segments samples"]
     whitening: Float[np.ndarray, "outputs outputs"]
+    readout: Float[np.ndarray, "segments samples outputs states"]
     states: FirstStates
     parameters: Float[np.ndarray, "segments samples outputs parameters"]
 
@@ -96,25 +99,28 @@ class Answers(eqx.Module):
         weight, states = np.asarray(segments.weight), FirstStates.of(found, segments.joined)
         # Residuals are measured minus simulated.
         known = -states.parameters_without(found)[:, : weight.shape[1] * len(whitening)]
-        return cls(followed, weight, whitening, states, known.reshape(*weight.shape, len(whitening), -1))
+        readout = whitening @ followed.readout * weight[:, :, None, None]
+        return cls(followed, weight, whitening, readout, states, known.reshape(*weight.shape, len(whitening), -1))
 
     def to(
         self,
-        pushed: Float[np.ndarray, "segments samples states columns"],
-        reading: Float[np.ndarray, "#segments #samples #outputs columns"] | float = 0.0,
+        forces: Forces,
+        reading: Float[np.ndarray, "#segments #samples #outputs columns"] | None = None,
     ) -> Float[np.ndarray, "segments samples outputs columns"]:
         """The answers to forces.
 
         Args:
-            pushed: what each adds to the state by the end of each sample interval.
+            forces: along the motion.
             reading: what goes with each and is no motion, a change of what the encoders read.
         """
-        outputs, end = respond(self.followed, pushed)
-        outputs = self.whitening @ (outputs + reading) * self.weight[:, :, None, None]
+        outputs, end = respond(self.followed, forces, readout=self.readout)
+        if reading is not None:
+            outputs += self.whitening @ reading * self.weight[:, :, None, None]
         columns = outputs.reshape(len(end), -1, end.shape[-1])
         rows, further = columns.shape[1], self.states.by_state.shape[1] - columns.shape[1]
-        # What follows a segment's rows of outputs is its states' prior.
-        columns = np.pad(columns, ((0, 0), (0, further), (0, 0)))
+        if further:
+            # What follows a segment's rows of outputs is its states' prior.
+            columns = np.pad(columns, ((0, 0), (0, further), (0, 0)))
         before = np.where(self.states.joined[:, None, None], np.roll(end, 1, axis=0), 0.0)
         return self.states.without(columns, -before)[:, :rows].reshape(outputs.shape)
 

@@ -182,26 +182,41 @@ def _between(
     return y0 + s * rise + s * (1.0 - s) * ((1.0 - s) * (r0 - rise) - s * (r1 - rise))
 
 
+class Forces(eqx.Module):
+    """What acts along a motion: in each sample interval a sum of parts.
+
+    Attributes:
+        lands: what a unit of each part adds to the state by the end of the interval.
+        sizes: how much of each part each force has.
+    """
+
+    lands: Float[np.ndarray, "segments samples states parts"]
+    sizes: Float[np.ndarray, "segments samples parts columns"]
+
+
 def respond(
     followed: Followed,
-    pushed: Float[np.ndarray, "segments samples states columns"],
+    forces: Forces,
     start: Float[np.ndarray, "#segments states columns"] | float = 0.0,
+    readout: Float[np.ndarray, "segments samples outputs states"] | None = None,
 ) -> tuple[Float[np.ndarray, "segments samples outputs columns"], Float[np.ndarray, "segments states columns"]]:
     """What forces along the motion do to the outputs and to each segment's end.
 
     Args:
         followed: the motion.
-        pushed: what each force adds to the state by the end of each sample interval.
+        forces: along it.
         start: where each segment starts.
+        readout: derivative of what is wanted by the state; that of the outputs where not given.
     """
-    segments, samples, states, columns = pushed.shape
-    deviation = np.broadcast_to(start, (segments, states, columns))
+    segments, samples, states, _ = forces.lands.shape
+    deviation = np.broadcast_to(start, (segments, states, forces.sizes.shape[-1]))
+    readout = followed.readout if readout is None else readout
     if unusable() is None:
         from hdjax.engine.linear import linear_response
 
-        return linear_response(followed.transition, followed.readout, pushed, deviation)
-    outputs = np.empty((segments, samples, followed.readout.shape[2], columns))
+        return linear_response(followed.transition, readout, forces.lands, forces.sizes, deviation)
+    outputs = np.empty((segments, samples, readout.shape[2], forces.sizes.shape[-1]))
     for i in range(samples):
-        outputs[:, i] = followed.readout[:, i] @ deviation
-        deviation = followed.transition[:, i] @ deviation + pushed[:, i]
+        outputs[:, i] = readout[:, i] @ deviation
+        deviation = followed.transition[:, i] @ deviation + forces.lands[:, i] @ forces.sizes[:, i]
     return outputs, deviation

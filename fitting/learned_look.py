@@ -284,9 +284,10 @@ def _candidate(
     found = products(seen.look, seen.acting(form), tuple(part @ mixing for part in raw)).in_parts(_FOLDS)
     found = _instead_of_own(found, seen.look, parameters, own.shape[2])
     best: tuple[float, int] | None = None
-    base = _left_out(found, parameters)
+    others = found.others()
+    base = _left_out(found, others, parameters)
     for size in (s for s in sizes if s <= mixing.shape[1]):
-        gain = base - _left_out(found, parameters + size)
+        gain = base - _left_out(found, others, parameters + size)
         if best is None or gain > best[0] + WORTH_A_COEFFICIENT:
             best = gain, size
     if best is None or not best[0] > 0:
@@ -386,8 +387,7 @@ def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> 
     return free @ vectors
 
 
-def _left_out(found: Products, columns: int) -> float:
+def _left_out(found: Products, others: Products, columns: int) -> float:
     """The objective on each part of the data after least squares on the others, with the first columns free."""
-    first = found.first(columns)
-    left = np.sum(left_after(first, best_steps(first.others())), axis=0)
+    left = np.sum(left_after(found.first(columns), best_steps(others.first(columns))), axis=0)
     return 0.5 * float(np.linalg.slogdet(left / found.samples.sum())[1])

@@ -12,7 +12,7 @@ from fitting.along import acting_at_knots, acting_slopes_at_knots, conditions_at
 from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.explained import Answers, solved, without_untold
-from fitting.followed import Followed, follow
+from fitting.followed import Followed, Forces, follow
 from fitting.residual import Problem
 from fitting.sight import where_it_goes
 from hdjax import Model, TwoInertiaModel
@@ -185,14 +185,17 @@ def products(look: Look, acting: Acting, sizes: Sizes) -> Products:
 def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[np.ndarray, "segments samples outputs columns"]:
     """The whitened outputs' derivative by the free parameters and by each force."""
     followed = look.followed
-    reading: np.ndarray | float = 0.0
-    pushed = np.zeros((*followed.transition.shape[:3], sizes[0].shape[-1]))
     if acting.reading is not None:
         reading = acting.reading[:, None] * sizes[0][:, :-1, None, :]
-    for push, size in zip(acting.pushes, sizes, strict=acting.reading is None):
-        starts, ends = followed.from_start @ push[:, :-1, :, None], followed.from_end @ push[:, 1:, :, None]
-        pushed += starts * size[:, :-1, None, :] + ends * size[:, 1:, None, :]
-    return np.concatenate([look.answers.parameters, look.answers.to(pushed, reading)], axis=-1)
+        none = Forces(np.zeros((*followed.transition.shape[:3], 1)), np.zeros_like(reading[:, :, :1]))
+        return np.concatenate([look.answers.parameters, look.answers.to(none, reading)], axis=-1)
+    lands: list[np.ndarray] = []
+    parts: list[np.ndarray] = []
+    for push, size in zip(acting.pushes, sizes, strict=True):
+        lands += [followed.from_start @ push[:, :-1, :, None], followed.from_end @ push[:, 1:, :, None]]
+        parts += [size[:, :-1], size[:, 1:]]
+    forces = Forces(np.concatenate(lands, axis=-1), np.stack(parts, axis=2))
+    return np.concatenate([look.answers.parameters, look.answers.to(forces)], axis=-1)
 
 
 def surrogate_gains(

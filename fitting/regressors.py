@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.along import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
-from fitting.followed import acting, polynomial, signals_at, some_at_a_time
+from fitting.followed import Forces, acting, polynomial, signals_at, some_at_a_time
 from fitting.free import strength_paths
 from fitting.memory import Memory, memory_of, own_between, own_states
 from hdjax import Drive, Model, PiecewisePolynomial
@@ -40,12 +40,12 @@ class Regressors(eqx.Module):
     """Derivatives by the strengths of an effect, one column for each strength of each proposal.
 
     Attributes:
-        pushed: of the state, what is added to it by the end of each sample interval.
+        forces: of what acts along the motion.
         reading: of the outputs at the samples.
     """
 
-    pushed: Float[np.ndarray, "segments samples states columns"]
-    reading: Float[np.ndarray, "segments samples outputs columns"] | float = 0.0
+    forces: Forces
+    reading: Float[np.ndarray, "segments samples outputs columns"] | None = None
 
 
 def regressors(
@@ -81,9 +81,10 @@ def regressors(
     added = {name: _finite(values) for name, values in added.items()}
     if _READING in added:
         reading = added[_READING]
-        return Regressors(np.zeros((*shape[:2], seen.followed.states.shape[-1], reading.shape[-1])), reading), None
-    first, *others = (seen.carried[name] @ values for name, values in added.items())
-    return Regressors(sum(others, first)), memory
+        none = np.zeros((*shape[:2], 1, reading.shape[-1]))
+        return Regressors(Forces(np.zeros((*shape[:2], seen.followed.states.shape[-1], 1)), none), reading), None
+    lands, sizes = [seen.carried[name] for name in added], list(added.values())
+    return Regressors(Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))), memory
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
@@ -182,8 +183,11 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
     rates = _by_strength(_rates, stacked, model, followed.between, *around, own=own_between(states))
     own = np.moveaxis(states[:, :-1], 2, 0)
     reading = _by_strength(_outputs, stacked, model, followed.states[:, :-1], own=own)
-    first, second = (ends @ np.tensordot(rates, by, axes=(2, 0)) for ends, by in carriers(followed))
-    return Regressors(_finite(first + second), _finite(reading))
+    # A rate of each state at each node is a part.
+    parts = [[ends * weight for weight in by] for ends, by in carriers(followed)]
+    lands = np.concatenate([first + second for first, second in zip(*parts, strict=True)], axis=-1)
+    sizes = rates.reshape(*rates.shape[:2], -1, rates.shape[-1])
+    return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
 
 
 def _rates(

@@ -124,7 +124,7 @@ def batches(sights: tuple[Sight, Sight], proposals: Sequence[Effect], goes_on: b
         strengths = len(strength_paths(same[0]))
         columns = [list(range(i * strengths, (i + 1) * strengths)) for i in range(len(same))]
         own = [None if memory is None else memory.at_starts[..., i] for i in range(len(same))]
-        first, second = (s.answers.to(f.pushed, f.reading) for s, f in zip(sights, (fitted, unseen), strict=True))
+        first, second = (s.answers.to(f.forces, f.reading) for s, f in zip(sights, (fitted, unseen), strict=True))
         waiting.append(Batch(same, columns, (first, second), own))
         if sum(batch.answers[0].shape[-1] for batch in waiting) >= room:
             yield _together(waiting)

@@ -18,7 +18,7 @@ from scipy.special import kolmogorov
 
 from fitting.estimate import Fit
 from fitting.explained import through_segments
-from fitting.followed import Followed, follow, respond
+from fitting.followed import Followed, Forces, follow, respond
 from fitting.residual import Problem
 from fitting.sandwich import Linearised, Record
 from hdjax import Model
@@ -202,11 +202,11 @@ def _answers(
     problem: Problem, followed: Followed, noise: Float[np.ndarray, "segments samples draws"]
 ) -> Float[np.ndarray, "segments samples outputs draws"]:
     """Whitened residual that torque noise leaves; it does not stop where a segment goes on where another one ends."""
-    pushed = _pushes(problem.model, followed)[..., None] * noise[:, :, None, :]
+    forces = Forces(_pushes(problem.model, followed)[..., None], noise[:, :, None, :])
     joined = np.asarray(problem.segments.joined)
-    before = np.roll(respond(followed, pushed)[1], 1, axis=0), np.roll(_across(followed), 1, axis=0)
+    before = np.roll(respond(followed, forces)[1], 1, axis=0), np.roll(_across(followed), 1, axis=0)
     own, across = (np.where(joined[:, None, None], a, 0.0) for a in before)
-    outputs, _ = respond(followed, pushed, through_segments(joined, across, own))
+    outputs, _ = respond(followed, forces, through_segments(joined, across, own))
     return -(np.asarray(problem.whitening) @ outputs) * np.asarray(problem.segments.weight)[:, :, None, None]
 
 
