@@ -26,7 +26,7 @@ from bench_fit import RATE, TRUTH, C, Record, _growth, experiment, record, verdi
 from fitting.engines import linearise, with_engine
 from fitting.experiment import Stretch, scales
 from fitting.free import base_paths, fitted_paths
-from fitting.machine_code import Task, task
+from fitting.machine_code import task
 from fitting.posing import pose, short_horizon
 from fitting.residual import Problem, Unknowns, blocks
 from fitting.solve import _WIDTH as WIDTH
@@ -101,7 +101,7 @@ class Engines:
         lanes: sensitivities, those by parameters and by initial states.
         xla: one linearisation by XLA.
         code: likewise by machine code, with the Jacobian written.
-        needed: what a fit calls: products of the Jacobian's columns, but all of it where an effect changes the torque.
+        needed: what a fit calls: products of the Jacobian's columns.
         xla_ready: from the model to a callable residual and Jacobian.
         code_ready: likewise.
         kernel: of that, for the machine code itself; the rest is a program of JAX that depends on shapes alone.
@@ -135,13 +135,15 @@ def least(call: Callable[[], Any], repeats: int) -> float:
 _look = eqx.filter_jit(lambda own, unknowns: own.look(unknowns))
 
 
-def as_fitted(ready: Problem, unknowns: Unknowns) -> tuple[Task | None, Unknowns]:
-    """What a fit's program is called with; no task where an effect changes the torque. There is room for more
-    parameters, so that models share a program."""
+def as_fitted(ready: Problem, unknowns: Unknowns) -> Callable[[], Any]:
+    """What a fit calls: a program with room for more parameters, which models share; where an effect changes the
+    torque, no program."""
     count = len(ready.free.paths)
     more = -count % WIDTH
     padded = np.pad(np.asarray(unknowns.parameters), (0, more))
-    return task(ready, unknowns, count + more), dataclasses.replace(unknowns, parameters=jnp.asarray(padded))
+    own, wide = task(ready, unknowns, count + more), dataclasses.replace(unknowns, parameters=jnp.asarray(padded))
+    assert own is not None
+    return (lambda: _look(own, wide)) if own.acting is None else lambda: own.look(wide)
 
 
 def both(name: str, problem: Problem, unknowns: Unknowns, repeats: int) -> Engines:
@@ -149,8 +151,7 @@ def both(name: str, problem: Problem, unknowns: Unknowns, repeats: int) -> Engin
     ready, kernel = waited(lambda: with_engine(problem))
     if ready.kernel is None:
         raise SystemExit(f"{name}: there is no machine code for it here")
-    own, padded = as_fitted(ready, unknowns)
-    needed = (lambda: linearise(ready, unknowns)) if own is None else lambda: _look(own, padded)
+    needed = as_fitted(ready, unknowns)
     first = waited(needed)[1]
     reduced = least(needed, repeats)
     found, _ = waited(lambda: linearise(ready, unknowns))
@@ -408,14 +409,13 @@ def show_goals(base: Engines, effects: Sequence[Engines]) -> None:
 def show_memory(problem: Problem, unknowns: Unknowns) -> None:
     """Peak memory of one linearisation, over that before it."""
     ready = with_engine(problem)
-    own, padded = as_fitted(ready, unknowns)
     by_xla = jit_lanes(blocks)
     samples = problem.segments.weight.size
     lanes = len(problem.free.paths) + unknowns.states.shape[1]
     print(f"\nmemory of one linearisation, {lanes} lanes{'[B/sample]':>40}{'[B/sample/lane]':>18}")
     kept = 0.0
     for name, call in (
-        ("machine code, what a fit needs", lambda: _look(own, padded)),
+        ("machine code, what a fit needs", as_fitted(ready, unknowns)),
         ("machine code, the Jacobian written", lambda: linearise(ready, unknowns)),
         ("XLA", lambda: by_xla(problem, unknowns)),
     ):
