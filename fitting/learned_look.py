@@ -283,16 +283,14 @@ def _candidate(
         return None
     found = products(seen.look, seen.acting(form), tuple(part @ mixing for part in raw)).in_parts(_FOLDS)
     found = _instead_of_own(found, seen.look, parameters, own.shape[2])
-    best: tuple[float, int] | None = None
-    others = found.others()
-    base = _left_out(found, others, parameters)
-    for size in (s for s in sizes if s <= mixing.shape[1]):
-        gain = base - _left_out(found, others, parameters + size)
-        if best is None or gain > best[0] + WORTH_A_COEFFICIENT:
-            best = gain, size
-    if best is None or not best[0] > 0:
+    sizes = [s for s in sizes if s <= mixing.shape[1]]
+    base, *left = _left_out(found, [parameters, *(parameters + s for s in sizes)])
+    gain, size = 0.0, 0
+    for more, after in zip(sizes, left, strict=True):
+        if size == 0 or base - after > gain + WORTH_A_COEFFICIENT:
+            gain, size = float(base - after), more
+    if not gain > 0:
         return None
-    gain, size = best
     (step,) = best_steps(found.first(parameters + size).in_parts(1))
     effect = form.made_of(axes, mixing[:, :size], step[parameters:])
     return Candidate(form, tuple(axis.variable for axis in axes), gain, effect, known)
@@ -387,7 +385,20 @@ def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> 
     return free @ vectors
 
 
-def _left_out(found: Products, others: Products, columns: int) -> float:
-    """The objective on each part of the data after least squares on the others, with the first columns free."""
-    left = np.sum(left_after(found.first(columns), best_steps(others.first(columns))), axis=0)
-    return 0.5 * float(np.linalg.slogdet(left / found.samples.sum())[1])
+def _left_out(found: Products, counts: Sequence[int]) -> Float[np.ndarray, " counts"]:
+    """The objective over the parts of the data, each after least squares on the others, with so many of the first
+    columns free."""
+    most = max(counts)
+    free = np.arange(most) < np.asarray(counts)[:, None]
+
+    def for_each(products: Products) -> Products:
+        """Once for each count; columns that are not free explain nothing."""
+        first = products.first(most)
+        gradient = first.gradient * free[:, None, None, None, :]
+        gram = first.gram * free[:, None, None, None, :, None] * free[:, None, None, None, None, :]
+        square, samples = (np.broadcast_to(a, (len(counts), *a.shape)) for a in (first.square, first.samples))
+        return Products(*(a.reshape(-1, *a.shape[2:]) for a in (gram, gradient, square, samples)))
+
+    left = left_after(for_each(found), best_steps(for_each(found.others())))
+    left = np.sum(left.reshape(len(counts), -1, *left.shape[1:]), axis=1)
+    return 0.5 * np.linalg.slogdet(left / found.samples.sum())[1]
