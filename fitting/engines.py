@@ -81,7 +81,8 @@ _linearise_by_xla = jit_lanes(blocks)
 
 
 def rows_at(problem: Problem, unknowns: Unknowns) -> Float[Array | np.ndarray, "segments rows"]:
-    """The rows of a problem's residual at some point, by its engine and its one program or machine code."""
+    """The rows of a problem's residual at some point: by machine code without derivatives, or by the program of XLA
+    that computes these too, so that no other is compiled."""
     if problem.kernel is not None:
         return rows_by_machine_code(problem, unknowns)
     return _linearise_by_xla(problem, unknowns).residual

@@ -104,18 +104,23 @@ class Answers(eqx.Module):
 
     def to(
         self,
-        forces: Forces,
-        reading: Float[np.ndarray, "#segments #samples #outputs columns"] | None = None,
+        forces: Forces | None,
+        reading: Float[np.ndarray, "segments samples outputs columns"] | None = None,
     ) -> Float[np.ndarray, "segments samples outputs columns"]:
         """The answers to forces.
 
         Args:
-            forces: along the motion.
-            reading: what goes with each and is no motion, a change of what the encoders read.
+            forces: along the motion; None where nothing acts.
+            reading: what goes with each and is no motion, a change of what the encoders read; None where there is none.
         """
-        outputs, end = respond(self.followed, forces, readout=self.readout)
+        if forces is not None:
+            outputs, end = respond(self.followed, forces, readout=self.readout)
+        else:
+            assert reading is not None
+            outputs = np.zeros(reading.shape)
+            end = np.zeros((*self.states.before_by_state.shape[:2], reading.shape[-1]))
         if reading is not None:
-            outputs += self.whitening @ reading * self.weight[:, :, None, None]
+            outputs = outputs + self.whitening @ reading * self.weight[:, :, None, None]
         columns = outputs.reshape(len(end), -1, end.shape[-1])
         rows, further = columns.shape[1], self.states.by_state.shape[1] - columns.shape[1]
         if further:

@@ -187,8 +187,7 @@ def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[np.ndarray, "seg
     followed = look.followed
     if acting.reading is not None:
         reading = acting.reading[:, None] * sizes[0][:, :-1, None, :]
-        none = Forces(np.zeros((*followed.transition.shape[:3], 1)), np.zeros_like(reading[:, :, :1]))
-        return np.concatenate([look.answers.parameters, look.answers.to(none, reading)], axis=-1)
+        return np.concatenate([look.answers.parameters, look.answers.to(None, reading)], axis=-1)
     lands: list[np.ndarray] = []
     parts: list[np.ndarray] = []
     for push, size in zip(acting.pushes, sizes, strict=True):

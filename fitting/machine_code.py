@@ -13,19 +13,25 @@ from jaxtyping import Array, Float
 
 from fitting.free import LARGEST_LOG
 from fitting.residual import LOST, Blocks, Problem, Products, Unknowns
-from hdjax import Model, PiecewisePolynomial
+from hdjax import PiecewisePolynomial
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
 from hdjax.engine.kernel import Mode, Wanted, march_arrays, result_shapes
-from hdjax.parameters import as_scalar
 
 # The model's constants come in tables of so many, so that few sizes of them make few programs.
 _CONSTANTS = 32
 
 
 def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | None = None) -> Lanes:
-    """What the machine code needs of a problem.
+    """What the machine code needs of a problem; arguments as in [`_as_logged`][]."""
+    acting = _acting(problem, kernel)
+    lanes = _as_logged(problem, unknowns, kernel, width)
+    return lanes if acting is None else acting.on(lanes)
+
+
+def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | None) -> Lanes:
+    """What the machine code needs of a problem, with the torque as it was logged.
 
     Args:
         problem: what is solved.
@@ -44,6 +50,8 @@ def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | 
     more = 0 if width is None else width - len(free.paths)
     whole = library.any(library.asarray(segments.joined))
     numbers = [library.asarray(problem.substeps), whole, threads()]
+    named = {"load torque": segments.load_torque, "temperature": segments.temperature}
+    beside = [named[name] for name in kernel.signals]
     return Lanes(
         free=library.pad(library.asarray(values, dtype=float).reshape(-1), (0, more)),
         slopes=library.pad(library.asarray(slopes), (0, more)),
@@ -55,7 +63,7 @@ def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | 
         joined=library.asarray(segments.joined, dtype=float),
         whitening=problem.whitening,
         settings=library.stack([library.asarray(n, dtype=np.int64) for n in numbers]),
-        signals=_signals(problem, model, kernel),
+        signals=(segments.torque.coefficients, *(s.coefficients for s in beside if s is not None)),
     )
 
 
@@ -63,22 +71,34 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def _signals(problem: Problem, model: Model, kernel: Kernel) -> tuple[Array, ...]:
-    """The torque that acts, what else comes in, and how the torque depends on parameters."""
-    segments = problem.segments
-    actuators = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
-    torque, slopes = segments.torque.coefficients, ()
-    if actuators:
-        paths = _acting_paths(kernel)
-        values = jnp.stack([as_scalar(model.get(p)) for p in paths]) if paths else jnp.zeros(0)
-        torque, slopes = actuated(actuators, paths, values, segments.torque)
-    beside = {"load torque": segments.load_torque, "temperature": segments.temperature}
-    found = [beside[name] for name in kernel.signals]
-    return torque, *(s.coefficients for s in found if s is not None), *slopes
+class Acting(eqx.Module):
+    """Effects on the logged torque.
+
+    Attributes:
+        effects: in order.
+        paths: their free parameters.
+        places: where these are among all free parameters.
+        torque: what was logged.
+    """
+
+    effects: tuple[ActuatorEffect, ...]
+    paths: tuple[str, ...] = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
+    torque: PiecewisePolynomial
+
+    def on(self, lanes: Lanes) -> Lanes:
+        """Lanes with the torque that acts, and its derivatives by the parameters at the paths, in the place of what was
+        logged."""
+        values = jnp.asarray(lanes.free[np.array(self.places, dtype=int)])
+        torque, slopes = actuated(self.effects, self.paths, values, self.torque)
+        return eqx.tree_at(lambda s: s.signals, lanes, (torque, *lanes.signals[1:], *slopes))
 
 
-def _acting_paths(kernel: Kernel) -> tuple[str, ...]:
-    return tuple(kernel.paths[i] for i in kernel.acting)
+def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
+    """The effects on a problem's logged torque; None where there are none."""
+    effects = tuple(e for e in problem.model.effects if isinstance(e, ActuatorEffect))
+    paths = tuple(kernel.paths[i] for i in kernel.acting)
+    return Acting(effects, paths, kernel.acting, problem.segments.torque) if effects else None
 
 
 class _Actuators(eqx.Module):
@@ -146,33 +166,12 @@ def _march(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode, w
     return (march_lanes if _is_traced((address, lanes)) else march_arrays)(address, lanes, hidden, mode, wanted)
 
 
-class Acting(eqx.Module):
-    """Effects on the logged torque, of a [`Task`][].
-
-    Attributes:
-        effects: in order.
-        paths: their free parameters.
-        places: where these are among all free parameters.
-        torque: what was logged.
-    """
-
-    effects: tuple[ActuatorEffect, ...]
-    paths: tuple[str, ...] = eqx.field(static=True)
-    places: tuple[int, ...] = eqx.field(static=True)
-    torque: PiecewisePolynomial
-
-    def signals(self, given: tuple[Any, ...], free: Float[Array | np.ndarray, " width"]) -> tuple[Any, ...]:
-        """The lanes' signals, with what the torque is at other values of the free parameters."""
-        torque, slopes = actuated(self.effects, self.paths, jnp.asarray(free[list(self.places)]), self.torque)
-        return torque, *given[1 : len(given) - len(self.places)], *slopes
-
-
 class Task(eqx.Module):
     """A problem that can be looked at from any point, by numpy or within a program of JAX.
 
     Attributes:
         address: of the machine code.
-        lanes: the data; what is free, the states and what depends on them are replaced.
+        lanes: the data as logged; what is free and the states are replaced.
         acting: effects on the logged torque; None where there are none.
         logarithmic: which parameters move by their logarithm.
         scale: unit of each of the others.
@@ -199,7 +198,7 @@ class Task(eqx.Module):
         slope = library.where(self.logarithmic, value, self.scale) * self.active
         lanes = eqx.tree_at(lambda s: (s.free, s.slopes, s.states), self.lanes, (value, slope, unknowns.states))
         if self.acting is not None:
-            lanes = eqx.tree_at(lambda s: s.signals, lanes, self.acting.signals(lanes.signals, value))
+            lanes = self.acting.on(lanes)
         found = _march(self.address, lanes, self.hidden, "jacobian", "products")
         assert found.products is not None
         return Products(found.products, *_ends(lanes, found)), jnp.asarray(found.rows)
@@ -222,14 +221,12 @@ def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
     kernel = problem.kernel
     if kernel is None:
         return None
-    effects = tuple(e for e in problem.model.effects if isinstance(e, ActuatorEffect))
-    acting = Acting(effects, _acting_paths(kernel), kernel.acting, problem.segments.torque) if effects else None
     free = problem.free
     more = (0, width - len(free.paths))
     return Task(
         address=kernel.jacobian,
-        lanes=lanes_of(problem, unknowns, kernel, width),
-        acting=acting,
+        lanes=_as_logged(problem, unknowns, kernel, width),
+        acting=_acting(problem, kernel),
         logarithmic=np.pad(np.array(free.logarithmic, dtype=bool), more),
         scale=np.pad(np.asarray(free.scale), more, constant_values=1.0),
         active=np.pad(np.asarray(problem.active), more),

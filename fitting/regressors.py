@@ -40,11 +40,11 @@ class Regressors(eqx.Module):
     """Derivatives by the strengths of an effect, one column for each strength of each proposal.
 
     Attributes:
-        forces: of what acts along the motion.
-        reading: of the outputs at the samples.
+        forces: of what acts along the motion; None where nothing does.
+        reading: of the outputs at the samples; None where nothing changes there.
     """
 
-    forces: Forces
+    forces: Forces | None
     reading: Float[np.ndarray, "segments samples outputs columns"] | None = None
 
 
@@ -80,9 +80,7 @@ def regressors(
         added = _by_strength(_added, stacked, bare, motion, own=own)
     added = {name: _finite(values) for name, values in added.items()}
     if _READING in added:
-        reading = added[_READING]
-        none = np.zeros((*shape[:2], 1, reading.shape[-1]))
-        return Regressors(Forces(np.zeros((*shape[:2], seen.followed.states.shape[-1], 1)), none), reading), None
+        return Regressors(None, added[_READING]), None
     lands, sizes = [seen.carried[name] for name in added], list(added.values())
     return Regressors(Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))), memory
 

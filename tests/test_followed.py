@@ -74,6 +74,7 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     seen = along(found.model, followed, found.problem.segments, found.stretches)
     forces, _ = regressors(seen, [effect])
     column = [p.split(".")[1] for p in strength_paths(effect)].index(name)
+    assert forces.forces is not None
     outputs, _ = respond(followed, forces.forces)
     answer = np.asarray(outputs if forces.reading is None else outputs + forces.reading)[..., column]
     real = np.asarray(found.problem.segments.weight)[:, :, None] > 0

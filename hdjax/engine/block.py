@@ -148,6 +148,11 @@ class Block:
             "==", self._got("wanted", I64), self.code.i(get_args(Wanted).index(result))
         )
 
+    def _in_any(self, lanes: ir.Value) -> ir.Value:
+        """Whether something holds in any lane."""
+        b = self.code.builder
+        return b.icmp_unsigned("!=", b.bitcast(lanes, I8), ir.Constant(I8, 0))
+
     def _choose_segments(self) -> None:
         """The lanes' segments; behind the last one it stands again, and what it writes is the same."""
         c, b = self.code, self.code.builder
@@ -163,7 +168,7 @@ class Block:
         with c.loop(self.samples) as i:
             some = self._lanes(self._got("weight"), self.samples, i)
             counts = b.fcmp_ordered(">", some, c.number(0.0))
-            with b.if_then(b.icmp_unsigned("!=", b.bitcast(counts, I8), ir.Constant(I8, 0))):
+            with b.if_then(self._in_any(counts)):
                 c.store(i, self.needed, 0)
         whole = b.icmp_signed("!=", self._got("whole", I64), c.i(0))
         c.store(b.select(whole, self.samples, c.load(self.needed, 0)), self.needed, 0)
@@ -175,7 +180,7 @@ class Block:
                 offset = c.plus(c.times(c.plus(i, self._got(f"first {k}", I64)), powers), power)
                 some = b.fcmp_unordered("!=", self._lanes(self._got(f"signal {k}"), row, offset), c.number(0.0))
                 higher = b.icmp_signed(">", power, c.load(self.degree, k))
-                there = b.and_(higher, b.icmp_unsigned("!=", b.bitcast(some, I8), ir.Constant(I8, 0)))
+                there = b.and_(higher, self._in_any(some))
                 with b.if_then(there):
                     c.store(power, self.degree, k)
 
@@ -235,8 +240,8 @@ class Block:
         if not self.jacobian:
             return
         # What counts in no lane adds nothing to products.
-        there = b.icmp_unsigned("!=", b.bitcast(counts, I8), ir.Constant(I8, 0))
-        with b.if_then(b.or_(b.and_(there, self._wants("products")), self._wants("jacobian"))):
+        useful = b.and_(self._in_any(counts), self._wants("products"))
+        with b.if_then(b.or_(useful, self._wants("jacobian"))):
             self._record_tangents(i, weight, counts, whitening, inside, values)
 
     def _record_tangents(
@@ -349,8 +354,7 @@ class Block:
     def _fill(self, part: Emitted, slopes: Sequence[Tangent], rows: Sequence[int], dense: ir.Value) -> None:
         """Put derivatives by parameters, where any of these moves, where a loop over them finds them."""
         c, m = self.code, self.march
-        if part.by_parameter is None:
-            return
+        assert part.by_parameter is not None
         with c.builder.if_then(c.builder.icmp_signed("==", self._first(), c.i(0))):
             self._run(part.by_parameter, self.further_results)
             for p in range(m.parameters):

@@ -223,26 +223,32 @@ def emitted(
         if node not in needed:
             needed.add(node)
             stack.extend(() if node in given else graph.arguments(node))
-    alike: dict[Any, list[Node]] = {}
+    alike: dict[tuple[Any, ...], list[Node]] = {}
     for node in sorted(needed - given.keys()):
         if graph.nodes[node][0] == "dot":
-            (table, _, stride), *factors = graph.nodes[node][1:]
-            alike.setdefault((table, stride, *factors), []).append(node)
+            alike.setdefault(_alike(graph, node), []).append(node)
     for node in sorted(needed):
         if node in found:
             continue
         if node in given:
             found[node] = given[node]()
         elif graph.nodes[node][0] == "dot":
-            (table, _, stride), *factors = graph.nodes[node][1:]
+            key = table, stride, *factors = _alike(graph, node)
             assert tables is not None
-            same = alike[table, stride, *factors]
+            same = alike[key]
             firsts = [graph.nodes[n][1][1] for n in same]
             sums = _inner_products(vectors, [found[f] for f in factors], tables[table], firsts, stride)
             found.update(zip(same, sums, strict=True))
         else:
             found[node] = _instruction(vectors, graph, node, [found[a] for a in graph.arguments(node)])
     return found
+
+
+def _alike(graph: Graph, node: Node) -> tuple[Any, ...]:
+    """What inner products have in common that go through a table side by side: its name, the distance of its numbers,
+    and the factors."""
+    (table, _, stride), *factors = graph.nodes[node][1:]
+    return table, stride, *factors
 
 
 def _inner_products(

@@ -18,7 +18,7 @@ from hdjax.where import where
 Nodes = np.ndarray[Any, np.dtype[np.object_]]
 """Nodes in the shape of an array."""
 
-# Multiplications of a matrix that are not written out one by one.
+# A product of matrices with so many multiplications is no longer written out one by one.
 _LARGE = 64
 _LONGEST_LOOP = 64
 
