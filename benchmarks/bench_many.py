@@ -18,7 +18,7 @@ import bench_fit
 import jax
 import jax.numpy as jnp
 import numpy as np
-from bench_fit import NOISE, RATE, Ours, Record, at, experiment, fit_peer, peer_start, record, start_ours
+from bench_fit import NOISE, RATE, Ours, Record, at, experiment, fit_peer, peer_start, record
 
 from fitting.estimate import Fit
 from fitting.refits import refits
@@ -42,8 +42,7 @@ def peer_refit(argument: tuple[Record, np.ndarray]) -> np.ndarray:
 def our_fit(log: Record, *, reweigh: bool = True) -> Fit:
     """Ours from the peer's start, on the dynamic error alone."""
     case = Ours(*experiment(log, reduced=True))
-    away = at(start_ours(case.model, case.stretches), peer_start(log, 1e-3)[0][:3])
-    return case.whole_from(away, reweigh=reweigh)
+    return case.whole_from(at(case.model, peer_start(log, 1e-3)[0][:3]), reweigh=reweigh)
 
 
 def with_noise(log: Record, seed: int) -> Record:

@@ -47,7 +47,7 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
 
 
 def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_progress: float = 0.0) -> Fit:
-    """The same model over horizons as long as the stretches.
+    """The same model over horizons as long as the stretches, its outputs weighed as over short ones.
 
     Args:
         found: a fit over short horizons.
@@ -55,7 +55,7 @@ def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_prog
         least_progress: see [`fitting.solve.solve`][].
     """
     how = {"substeps": found.substeps, "hold_parameters": hold_parameters, "least_progress": least_progress}
-    return _again(found, found.model, horizon=_longest(found), **how)
+    return _again(found, found.model, horizon=_longest(found), reweigh=False, **how)
 
 
 def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_progress: float = 0.0) -> Fit:
@@ -123,6 +123,7 @@ def _again(
     hold_parameters: bool = False,
     afresh: bool = False,
     least_progress: float = 0.0,
+    reweigh: bool = True,
 ) -> Fit:
     """A fit of the same data on segments of the same length, which share its compiled program; from its states or, for
     a model that these don't suit, afresh."""
@@ -144,4 +145,5 @@ def _again(
         max_steps=_STEPS,
         hold_parameters=hold_parameters,
         least_progress=least_progress,
+        reweigh=reweigh,
     )

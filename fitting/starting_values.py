@@ -41,31 +41,36 @@ def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, 
             f"{names}: the dynamic error does not follow from the torque by any positive stiffness; check the signs "
             "and units of motor_torque, motor_angle and load_angle in the drive file"
         )
-    return _distinct([*found, *_estimates(model, stretches, blind=True)])
+    return _distinct(model, [*found, *_estimates(model, stretches, blind=True)])
 
 
 def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
     """Those of the weak forms that see no steady load; there may be none. Arguments as in [`starting_models`][]."""
-    return _distinct(_estimates(model, stretches, blind=True))
+    return _distinct(model, _estimates(model, stretches, blind=True))
 
 
-def _estimates(model: Model, stretches: Sequence[Stretch], *, blind: bool) -> list[Model]:
+def _estimates(model: Model, stretches: Sequence[Stretch], *, blind: bool) -> list[dict[str, float]]:
     forms = itertools.product(_WIDTHS, _equations(model))
     estimates = (_weak_form(model, stretches, width, equation, blind=blind) for width, equation in forms)
     return [estimate for estimate in estimates if estimate is not None]
 
 
-def _distinct(models: Sequence[Model]) -> tuple[Model, ...]:
+def _distinct(model: Model, estimates: Sequence[dict[str, float]]) -> tuple[Model, ...]:
     found: list[Model] = []
-    for model in models:
-        if all(apart(model, other) > _DISTINCT for other in found):
-            found.append(model)
+    for values in estimates:
+        stiffness = values["omega_0"] ** 2 if "omega_0" in values else values["K"]
+        if all(_apart(stiffness, float(other.drive.stiffness)) > _DISTINCT for other in found):
+            found.append(model.replace(values))
     return tuple(found)
 
 
 def apart(model: Model, other: Model) -> float:
     """By how much the stiffness of two models differs, in its logarithm."""
-    return float(abs(np.log(float(model.drive.stiffness) / float(other.drive.stiffness))))
+    return _apart(float(model.drive.stiffness), float(other.drive.stiffness))
+
+
+def _apart(stiffness: float, other: float) -> float:
+    return float(abs(np.log(stiffness / other)))
 
 
 def _equations(model: Model) -> tuple[str, ...]:
@@ -75,7 +80,8 @@ def _equations(model: Model) -> tuple[str, ...]:
 
 def _weak_form(
     model: Model, stretches: Sequence[Stretch], width: int, equation: str, *, blind: bool = False
-) -> Model | None:
+) -> dict[str, float] | None:
+    """Starting values of the base parameters; None where the stiffness is not positive."""
     rows, right = [], []
     for stretch in stretches:
         if len(stretch) < 3 * width:
@@ -89,10 +95,12 @@ def _weak_form(
     norm = np.linalg.norm(a, axis=0)
     norm[norm == 0] = 1.0
     solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0] / norm
-    return _model(model, solution, stretches, equation)
+    return _values(model, solution, stretches, equation)
 
 
-def _model(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str) -> Model | None:
+def _values(
+    model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str
+) -> dict[str, float] | None:
     stiffness, cubic, damping = solution[:3]
     if not np.isfinite(solution).all() or stiffness <= 0:
         return None
@@ -102,13 +110,13 @@ def _model(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equ
     if isinstance(model, ReducedModel):
         omega_0 = np.sqrt(stiffness)
         mu = max(damping, 1e-3 * omega_0)
-        return model.replace({"omega_0": omega_0, "alpha": alpha, "mu": mu, "gain": solution[3]})
+        return {"omega_0": omega_0, "alpha": alpha, "mu": mu, "gain": solution[3]}
     drive = model.drive
     assert isinstance(drive, Drive)
     inertia = 1.0 if equation == "load" else float(drive.c)
     K = stiffness / inertia
     least = 2e-3 * np.sqrt(K / float(drive.c))
-    return model.replace({"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)})
+    return {"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)}
 
 
 def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,8 @@ LEAST_GAIN = 1e-3
 
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
+# Those that tell a good start from a poor one.
+_FIRST_STEPS = 12
 # A few steps that together lower the objective by less than half of this are not worth another.
 _LEAST_PROGRESS = 0.1 * LEAST_GAIN
 # What a first pass may fall short of because of what effects remember: it must have come so far towards what it is to
@@ -166,21 +168,40 @@ def first_pass(
     champion: Trial,
     own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Fit:
-    """The best start of a challenger, as one pass from each tells it; arguments as in [`challenge`][]."""
-
-    def begun(model: Model) -> Fit:
-        return trained(
-            model,
-            data,
-            hold,
-            setting,
-            champion.training,
-            give_up_above=-np.inf,
-            begin_anew=True,
-            own_states=own_states if model is models[0] else None,
-        )
-
-    return min(map(begun, models), key=lambda found: found.objective)
+    """The first pass of a challenger, from the best of its starts as a few iterations from each tell it; arguments as
+    in [`challenge`][]."""
+    near, how = champion.training, {"give_up_above": -np.inf}
+    if len(models) == 1:
+        (best,) = models
+    else:
+        begun = [
+            trained(
+                model,
+                data,
+                hold,
+                setting,
+                near,
+                begin_anew_above=np.inf,
+                retry_states=False,
+                max_steps=_FIRST_STEPS,
+                own_states=own_states if model is models[0] else None,
+                **how,
+            )
+            for model in models
+        ]
+        near = min(begun, key=lambda found: found.objective)
+        best, own_states = near.model, None
+    return trained(
+        best,
+        data,
+        hold,
+        setting,
+        near,
+        begin_anew_above=champion.training.objective,
+        retry_states=True,
+        own_states=own_states,
+        **how,
+    )
 
 
 def to_the_end(
@@ -215,8 +236,8 @@ def trained(
     near: Fit | None,
     *,
     give_up_above: float = np.inf,
-    begin_anew: bool = False,
-    retry_states: bool = False,
+    begin_anew_above: float | None = None,
+    retry_states: bool | None = None,
     max_steps: int = _TRIAL_STEPS,
     reweigh: bool = True,
     hold_parameters: bool = False,
@@ -231,9 +252,9 @@ def trained(
         setting: how the data are cut.
         near: the fit near by, if there is one.
         give_up_above: see [`fitting.estimate.fit`][], as for the rest.
-        begin_anew: whether a first pass that neither converges nor explains more than the fit near by is begun anew;
-            so it is in any case where the model has other states.
-        retry_states: likewise; so they are in any case where a fit may begin anew.
+        begin_anew_above: likewise; where not given, a fit begins anew in any case where the model has other states than
+            the one near by, and in none where it has the same.
+        retry_states: likewise; where not given, as it may begin anew.
         max_steps: likewise.
         reweigh: likewise.
         hold_parameters: likewise.
@@ -241,6 +262,8 @@ def trained(
             not given.
     """
     same = near is not None and near.model.state_names == model.state_names
+    if begin_anew_above is None:
+        begin_anew_above = np.inf if same else -np.inf if near is None else near.objective
     states = None if near is None else states_from(model, near.model, near.unknowns.states)
     if states is not None and own_states is not None:
         states = jnp.concatenate([states[:, : -own_states.shape[1]], jnp.asarray(own_states)], axis=1)
@@ -254,8 +277,8 @@ def trained(
         reweigh=reweigh,
         hold_parameters=hold_parameters,
         states=states,
-        begin_anew_above=(-np.inf if near is None else near.objective) if begin_anew or not same else np.inf,
-        retry_states=retry_states or begin_anew or not same,
+        begin_anew_above=begin_anew_above,
+        retry_states=not same if retry_states is None else retry_states,
         give_up_above=give_up_above,
     )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import hypothesis
 import jax
 import pytest
+from jaxtyping import install_import_hook
 from jax.experimental.compilation_cache import compilation_cache
 
 # Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
@@ -28,7 +29,13 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("gate")
 
-SHARED = Path(__file__).parents[2] / "shared"
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared"
+
+# The modules that annotate shapes are checked at run time. A check takes longer than most functions of the others do,
+# and their types are checked statically.
+_SHAPED = [f for package in ("hdjax", "fitting") for f in (ROOT / package).rglob("*.py") if "jaxtyping" in f.read_text()]
+install_import_hook([".".join(f.relative_to(ROOT).with_suffix("").parts) for f in _SHAPED], "beartype.beartype")
 
 
 @pytest.fixture(scope="session")
