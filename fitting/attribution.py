@@ -11,7 +11,6 @@ from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
 from fitting.lead_refit import begin, go_on, try_hold
-from fitting.long_fit import freedom_of_states
 from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
 from fitting.screening import Lead, Screen, screen
@@ -34,6 +33,9 @@ _NEAR_TIE = 0.1
 _MAY_DO_BETTER = 0.75
 # Gains that differ by less than this share are the same.
 _SAME_GAIN = 0.02
+# What gains this share of what a form with memory does over short segments, where that may begin as it likes, is
+# compared with it over whole stretches.
+_RIVAL_OF_MEMORY = 0.5
 # A rival that explains less than this share of what the best one so far does, in its first pass, is given up.
 _HOPELESS = 0.3
 
@@ -324,7 +326,7 @@ def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting:
     it gains nearly as much in free runs along whole held-out stretches: short segments hide what adds up slowly, and
     let what an effect remembers start where it suits them."""
     best = verdicts[0].gain
-    freely = best - _freedom_of_memory(verdicts[0], before)
+    freely = _RIVAL_OF_MEMORY * best if _remembers_more(verdicts[0], before) else best
     least = (1.0 - _NEAR_TIE) * best - LEAST_GAIN
     near = [v for v in verdicts if v.trial is not None and (v.gain > freely or (not v.separable and v.gain > least))]
     if len(near) < 2:
@@ -342,11 +344,10 @@ def _simplest_first(verdicts: list[Verdict], before: Trial, data: Data, setting:
     return sorted(verdicts, key=lambda v: v.name != leader.name)
 
 
-def _freedom_of_memory(verdict: Verdict, before: Trial) -> float:
-    """What of a gain the starts of hidden states may make, which are fitted to each short segment."""
+def _remembers_more(verdict: Verdict, before: Trial) -> bool:
+    """Whether a competitor has hidden states of its own."""
     assert verdict.trial is not None
-    own = len(verdict.trial.model.state_names) - len(before.model.state_names)
-    return freedom_of_states(verdict.trial.held_out, own)
+    return len(verdict.trial.model.state_names) > len(before.model.state_names)
 
 
 def _beyond_real_drives(verdict: Verdict) -> bool:

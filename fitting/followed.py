@@ -89,7 +89,7 @@ def _outputs(state: Array, model: Model) -> Array:
 def _response_by_xla(problem: Problem, unknowns: Unknowns) -> Response:
     model = problem.free.unpack(problem.model, unknowns.parameters)
     segments = problem.segments
-    options = {"solver": problem.solver, "substeps": problem.substeps, "unroll": problem.unroll}
+    options = {"solver": problem.solver, "substeps": problem.substeps}
 
     def one(torque, load_torque, temperature, state):
         acting = model.actuate(torque)

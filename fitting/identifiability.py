@@ -1,6 +1,7 @@
 """What a log can't tell, and why: directions it does not see, parameters too small for it, values taken for granted."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -15,7 +16,7 @@ from fitting.formatting import words
 from fitting.residual import Problem
 from fitting.sandwich import directions
 from fitting.uncertainty import Estimate, Uncertainty
-from hdjax import TwoInertiaModel
+from hdjax import Model, TwoInertiaModel
 from hdjax.parameters import ParameterInfo
 
 # Two standard errors along a direction that are more than 40 % leave it open.
@@ -104,7 +105,10 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     x_max = scales(fit.stretches).x_max
     x_unit = "rad" if isinstance(fit.model, TwoInertiaModel) else "[x]"
     known, first = fit.model.parameters(), fit.problem.model
-    bounds = {p: at_bound(p, float(known[p][0]), known[p][1], start=float(first.get(p))) for p in estimates}
+    bounds = {
+        p: at_bound(p, float(known[p][0]), _in_units_of(fit.model, known[p][1]), start=float(first.get(p)))
+        for p in estimates
+    }
     return Identifiability(
         reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in estimates.items() if not e.identifiable},
         directions=_directions(fit, found),
@@ -225,6 +229,15 @@ def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, flo
 
 def _power(path: str, exponent: float) -> str:
     return path if np.isclose(exponent, 1.0) else f"{path}^{exponent:.2g}"
+
+
+def _in_units_of(model: Model, info: ParameterInfo) -> ParameterInfo:
+    """What is known of a parameter of a model. The units of a reduced log are its own, so that of bounds in SI units no
+    more is left than a sign."""
+    if isinstance(model, TwoInertiaModel) or info.unit == "1":
+        return info
+    low, high = info.bounds
+    return replace(info, bounds=(low if low == 0.0 else -np.inf, high if high == 0.0 else np.inf))
 
 
 def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> str | None:

@@ -44,7 +44,6 @@ class Problem(eqx.Module):
             it ends.
         solver: explicit Runge-Kutta solver of diffrax.
         substeps: its steps in each sample interval; data, so that finer steps need no other program.
-        unroll: whether a step's stages are written out, see [`hdjax.simulate.march`][].
         kernel: machine code that does the same faster, see [`fitting.machine_code`][]; None where XLA does it.
         engine: what evaluates the residual, where it is not to be machine code if that can be.
     """
@@ -57,7 +56,6 @@ class Problem(eqx.Module):
     gap_weight: Float[Array, " states"]
     solver: dfx.AbstractERK = dfx.Tsit5()
     substeps: Int[Array, ""] = eqx.field(converter=_as_integer, default=1)
-    unroll: bool = eqx.field(static=True, default=True)
     kernel: Kernel | None = None
     engine: Engine | None = eqx.field(static=True, default=None)
 
@@ -151,7 +149,6 @@ def simulate_segments(
             solver=problem.solver,
             substeps=problem.substeps,
             intervals=intervals,
-            unroll=problem.unroll,
             temperature=temperature,
         )
         return jax.vmap(model.outputs)(states), end

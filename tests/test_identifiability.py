@@ -11,6 +11,7 @@ from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
 from fitting.identifiability import _held_one, at_bound, identifiability, needed_samples, needed_twist, reason
 from fitting.uncertainty import Estimate, uncertainty
+from hdjax.effects.hysteresis import BoucWen
 from hdjax.parameters import ParameterInfo
 
 COUNT, HORIZON, NOISE = 1000, 128, 2e-3
@@ -132,6 +133,14 @@ def test_a_parameter_that_ran_to_zero(drive: Fit):
     assert result.bounds["K"].startswith("K ran from") and "towards its bound at zero" in result.bounds["K"]
     assert result.note("K") == result.bounds["K"]
     assert identifiability(drive, uncertainty(drive)).bounds == {}
+
+
+def test_bounds_in_si_units_say_nothing_of_a_reduced_log():
+    stretches = [Stretch(rig.reduced_experiment(COUNT, noise=NOISE), 0, COUNT)]
+    model = rig.reduced_model().with_effects(BoucWen(k=0.01, memory_twist=0.2))
+    found = fit(model, stretches, ["bouc_wen.k", "bouc_wen.memory_twist"], horizon=HORIZON, hold_parameters=True)
+    assert float(found.model.get("bouc_wen.memory_twist")) > found.model.parameters()["bouc_wen.memory_twist"][1].bounds[1]
+    assert "bouc_wen.memory_twist" not in identifiability(found, uncertainty(found)).bounds
 
 
 @pytest.mark.parametrize(
