@@ -98,9 +98,7 @@ def _weak_form(
     return _values(model, solution, stretches, equation)
 
 
-def _values(
-    model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str
-) -> dict[str, float] | None:
+def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str) -> dict[str, float] | None:
     stiffness, cubic, damping = solution[:3]
     if not np.isfinite(solution).all() or stiffness <= 0:
         return None

@@ -26,8 +26,9 @@ LEAST_GAIN = 1e-3
 _TRIAL_STEPS = 25
 # Those that tell a good start from a poor one.
 _FIRST_STEPS = 12
-# A few steps that together lower the objective by less than half of this are not worth another.
-_LEAST_PROGRESS = 0.1 * LEAST_GAIN
+# A few steps that together lower the objective by less than half of this are not worth another; nor by less than half
+# of the latter while a model is but one of several.
+_LEAST_PROGRESS, _LEAST_OF_A_RIVAL = 0.1 * LEAST_GAIN, LEAST_GAIN
 # What a first pass may fall short of because of what effects remember: it must have come so far towards what it is to
 # reach.
 _MOST_OF_THE_WAY = 2.0 / 3.0
@@ -59,6 +60,10 @@ class Setting(eqx.Module):
     def with_steps_of(self, found: Fit) -> "Setting":
         """The same, with the solver steps of a fit."""
         return replace(self, substeps=found.substeps)
+
+    def for_rivals(self) -> "Setting":
+        """The same, with no more patience than one of several models needs."""
+        return replace(self, least_progress=max(self.least_progress, _LEAST_OF_A_RIVAL))
 
     def fine_enough(self, found: Fit) -> "Setting":
         """The same, with as many solver steps as the fitted motion needs; itself where these are enough."""
@@ -170,6 +175,7 @@ def first_pass(
 ) -> Fit:
     """The first pass of a challenger, from the best of its starts as a few iterations from each tell it; arguments as
     in [`challenge`][]."""
+    setting = setting.for_rivals()
     near, how = champion.training, {"give_up_above": -np.inf}
     if len(models) == 1:
         (best,) = models
@@ -209,6 +215,7 @@ def to_the_end(
 ) -> Trial | None:
     """A challenger followed from its first pass to the end, as far as it is worth it; arguments as in
     [`challenge`][]."""
+    to_judge, setting = setting, setting.for_rivals()
     before = champion.training.objective
     limit = min(give_up_above, before + LEAST_GAIN)
     remembers_more = first.model.state_names != champion.model.state_names and _may_remember_better(first)
@@ -225,7 +232,7 @@ def to_the_end(
     finer = setting.fine_enough(best)
     if finer is not setting:
         best = trained(best.model, data, hold, finer, best, give_up_above=limit, retry_states=True)
-    return _judged(best, data, hold, finer) if best.objective <= limit else None
+    return _judged(best, data, hold, to_judge.with_steps_of(best)) if best.objective <= limit else None
 
 
 def trained(
