@@ -176,24 +176,13 @@ def first_pass(
     """The first pass of a challenger, from the best of its starts as a few iterations from each tell it; arguments as
     in [`challenge`][]."""
     setting = setting.for_rivals()
-    near, how = champion.training, {"give_up_above": -np.inf}
-    if len(models) == 1:
-        (best,) = models
-    else:
+    best, near = models[0], champion.training
+    if len(models) > 1:
+        once: dict[str, Any] = {"give_up_above": -np.inf, "begin_anew_above": np.inf, "retry_states": False}
+        own = [own_states if model is best else None for model in models]
         begun = [
-            trained(
-                model,
-                data,
-                hold,
-                setting,
-                near,
-                begin_anew_above=np.inf,
-                retry_states=False,
-                max_steps=_FIRST_STEPS,
-                own_states=own_states if model is models[0] else None,
-                **how,
-            )
-            for model in models
+            trained(model, data, hold, setting, near, max_steps=_FIRST_STEPS, own_states=states, **once)
+            for model, states in zip(models, own, strict=True)
         ]
         near = min(begun, key=lambda found: found.objective)
         best, own_states = near.model, None
@@ -203,10 +192,10 @@ def first_pass(
         hold,
         setting,
         near,
+        give_up_above=-np.inf,
         begin_anew_above=champion.training.objective,
         retry_states=True,
         own_states=own_states,
-        **how,
     )
 
 

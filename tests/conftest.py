@@ -34,7 +34,9 @@ SHARED = ROOT.parent / "shared"
 
 # The modules that annotate shapes are checked at run time. A check takes longer than most functions of the others do,
 # and their types are checked statically.
-_SHAPED = [f for package in ("hdjax", "fitting") for f in (ROOT / package).rglob("*.py") if "jaxtyping" in f.read_text()]
+_SHAPED = [
+    f for package in ("hdjax", "fitting") for f in (ROOT / package).rglob("*.py") if "jaxtyping" in f.read_text()
+]
 install_import_hook([".".join(f.relative_to(ROOT).with_suffix("").parts) for f in _SHAPED], "beartype.beartype")
 
 

@@ -139,7 +139,9 @@ def test_bounds_in_si_units_say_nothing_of_a_reduced_log():
     stretches = [Stretch(rig.reduced_experiment(COUNT, noise=NOISE), 0, COUNT)]
     model = rig.reduced_model().with_effects(BoucWen(k=0.01, memory_twist=0.2))
     found = fit(model, stretches, ["bouc_wen.k", "bouc_wen.memory_twist"], horizon=HORIZON, hold_parameters=True)
-    assert float(found.model.get("bouc_wen.memory_twist")) > found.model.parameters()["bouc_wen.memory_twist"][1].bounds[1]
+    assert (
+        float(found.model.get("bouc_wen.memory_twist")) > found.model.parameters()["bouc_wen.memory_twist"][1].bounds[1]
+    )
     assert "bouc_wen.memory_twist" not in identifiability(found, uncertainty(found)).bounds
 
 
