@@ -8,8 +8,8 @@ from pathlib import Path
 import hypothesis
 import jax
 import pytest
-from jaxtyping import install_import_hook
 from jax.experimental.compilation_cache import compilation_cache
+from jaxtyping import install_import_hook
 
 # Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
 # by tests. What a user's command compiles is made well, as `jit_small` says.
