@@ -13,7 +13,10 @@ from jaxtyping import install_import_hook
 
 # Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
 # by tests. What a user's command compiles is made well, as `jit_small` says.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false")
+_QUICK = (
+    "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+os.environ.setdefault("XLA_FLAGS", _QUICK)
 
 # As the command line does, for the same reason.
 gc.set_threshold(200_000)

@@ -12,6 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from fitting.engines import linearise, with_engine
+from fitting.experiment import Experiment, Stretch, cut
+from fitting.free import FreeParameters
+from fitting.residual import Problem, Unknowns
 from hdjax import Drive, Harmonic, ReducedDrive, ReducedModel, TwoInertiaModel, sampled, simulate
 from hdjax.effects import CATALOGUE, Motion, Scales
 from hdjax.effects.actuation import InputDelay
@@ -42,38 +46,39 @@ TEMPERATURE = sampled(TIME, 300.0 + 50.0 * TIME, hold="linear")
 START = jnp.asarray([0.3, 0.007, 5.0, 0.2])
 
 
-@eqx.filter_jit
-def outputs(model, torque, start, substeps=1):
-    """What the encoders read. The drive's own states start at `start`, an effect's at rest."""
-    state = model.settled(start)
-    warmth = eqx.tree_at(lambda s: s.coefficients, torque, jnp.zeros((torque.knots.size - 1, 1)) + 300.0)
+def marched(model, torque, start, substeps=1, settled=None):
+    """What the encoders read, and its derivatives by each parameter of the last effect, by dotted path. The drive's own
+    states start at `start`, an effect's where those of `settled` are, of the model itself where not given.
+
+    By machine code, which agrees with XLA for every form (`test_engine_march.py`) and compiles sooner.
+    """
+    count = torque.knots.size - 1
+    warmth = eqx.tree_at(lambda s: s.coefficients, torque, jnp.zeros((count, 1)) + 300.0)
     if torque.knots.size == TEMPERATURE.knots.size:
         warmth = TEMPERATURE
-    states, _ = march(
-        model,
-        model.actuate(torque),
-        None,
-        state,
-        solver=dfx.Tsit5(),
-        substeps=substeps,
-        unroll=False,
-        temperature=warmth,
+    knots = np.asarray(torque.knots)
+    log = Experiment("rig", knots[:-1], torque, None, np.zeros((count, 2)), None, temperature=warmth)
+    paths = tuple(f"{e.name}.{name}" for e in model.effects[-1:] for name, _ in own_parameters(e))
+    free = FreeParameters(paths, (False,) * len(paths), jnp.ones(len(paths)))
+    states = (model if settled is None else settled).settled(start)[None]
+    weights = jnp.eye(2), jnp.ones(len(paths)), jnp.ones(states.shape[1])
+    problem = Problem(model, free, cut([Stretch(log, 0, count)], count), *weights, substeps=substeps)
+    found = linearise(with_engine(problem), Unknowns(free.pack(model), states))
+    rows = slice(2 * count)
+    slopes = -np.asarray(found.by_parameter)[0, rows].reshape(count, 2, len(paths))
+    return -np.asarray(found.residual)[0, rows].reshape(count, 2), dict(
+        zip(paths, np.moveaxis(slopes, 2, 0), strict=True)
     )
-    return jax.vmap(model.outputs)(states)
 
 
-@eqx.filter_jit
+def outputs(model, torque, start, substeps=1, settled=None):
+    """What the encoders read, as in [`marched`][]."""
+    return marched(model, torque, start, substeps, settled)[0]
+
+
 def slopes(model, torque, start):
-    """Derivative of the outputs with respect to each parameter of the last effect, forward mode, by dotted path."""
-    effect = model.effects[-1]
-    paths = [f"{effect.name}.{name}" for name, _ in own_parameters(effect)]
-    values = jnp.stack([model.get(path) for path in paths])
-
-    def along(seed):
-        changed = lambda v: outputs(model.replace(dict(zip(paths, v, strict=True))), torque, start)  # noqa: E731
-        return jax.jvp(changed, (values,), (seed,))[1]
-
-    return dict(zip(paths, jax.vmap(along)(jnp.eye(len(paths))), strict=True))
+    """Derivative of the outputs with respect to each parameter of the last effect, by dotted path."""
+    return marched(model, torque, start)[1]
 
 
 BASE = TwoInertiaModel(DRIVE)
@@ -161,7 +166,8 @@ def test_gradients_with_respect_to_every_strength_and_shape(form):
         path = f"{form.name}.{name}"
         value = float(model.get(path))
         h = 1e-6 * value
-        after, before = (np.asarray(outputs(model.replace({path: value + s * h}), TORQUE, START)) for s in (1, -1))
+        near = (model.replace({path: value + sign * h}) for sign in (1, -1))
+        after, before = (outputs(changed, TORQUE, START, settled=model) for changed in near)
         differences = (after - before) / (2 * h) * value
         found = np.asarray(gradients[path]) * value
         # Differences err by rounding, 1e-14 / 1e-6 of the angles, and where a kink lies between the two motions.
