@@ -22,6 +22,7 @@ from bench_fit import NOISE, RATE, Ours, Record, at, experiment, fit_peer, peer_
 
 from fitting.estimate import Fit
 from fitting.refits import refits
+from hdjax.engine import one_thread
 
 PEER_SUBSTEPS = 2
 
@@ -70,9 +71,14 @@ def many_logs(count: int, samples: int, pool: ProcessPoolExecutor) -> None:
     logs = [record(samples, seed=seed) for seed in range(count)]
     our_fit(logs[0])
     peer, theirs = timed(lambda: list(pool.map(peer_fit, logs)))
-    # One log a thread keeps both cores busy; each fit stays on one device.
+
+    def alone(log: Record) -> Fit:
+        """One log a thread keeps all cores busy, as in a fleet."""
+        with one_thread():
+            return our_fit(log)
+
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        ours, found = timed(lambda: list(threads.map(our_fit, logs)))
+        ours, found = timed(lambda: list(threads.map(alone, logs)))
     tell(f"{count} logs of {samples} samples", peer, ours, 20.0)
     apart = [np.max(np.abs(bench_fit.physical(f.model) / t[:3] - 1)) for f, t in zip(found, theirs, strict=True)]
     print(f"  answers apart by {max(apart):.1e} at most (RK4 x {PEER_SUBSTEPS} is itself 1e-5 off)")

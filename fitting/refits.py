@@ -13,6 +13,8 @@ from hdjax.lanes import jit_lanes
 
 # Data that run side by side; more would not fit into the processor's cache.
 _BATCH = 8
+# Standard errors by which the last step moves the parameters at most.
+_CLOSE = 1e-3
 
 
 def refits(
@@ -27,8 +29,9 @@ def refits(
     Args:
         found: the fit, with its segments and weights.
         measured: the outputs in place of those of `found.problem.segments`.
-        steps: Gauss-Newton steps. Each removes all but a share of the error that is about as small as the parameters'
-            relative change.
+        steps: Gauss-Newton steps at most. Each removes all but a share of the error that is about as small as the
+            parameters' relative change, so that after one that moved them by a thousandth of a standard error nothing
+            is left to do.
 
     Returns:
         The free vector (see [`fitting.free.FreeParameters`][]) by draw, and how far the last step still moved it, in
@@ -43,17 +46,22 @@ def _refits(problem: Problem, start: Unknowns, at_start: Blocks, measured: Array
     def refit(data: Array) -> tuple[Array, Array]:
         own = eqx.tree_at(lambda p: p.segments.measured, problem, data)
 
-        def improved(_, unknowns_and_moved: tuple[Unknowns, Array]) -> tuple[Unknowns, Array]:
-            unknowns, _ = unknowns_and_moved
+        def improved(at: tuple[Unknowns, Array, Array]) -> tuple[Unknowns, Array, Array]:
+            unknowns, _, count = at
             rows, gap = residual_inside(own, unknowns)
             here = eqx.tree_at(lambda b: (b.residual, b.gap), at_start, (rows, gap))
             system = normal_equations(Products.of(here), problem.segments.joined)
             step = system.step(jnp.zeros(()))
             information, _, _, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
             moved = jnp.sqrt(step.parameters @ information @ step.parameters)
-            return jax.tree.map(jnp.add, unknowns, step), moved
+            return jax.tree.map(jnp.add, unknowns, step), moved, count + 1
 
-        unknowns, moved = jax.lax.fori_loop(0, steps, improved, (start, jnp.zeros(())))
+        def goes_on(at: tuple[Unknowns, Array, Array]) -> Array:
+            _, moved, count = at
+            return (count < steps) & ~(moved < _CLOSE)
+
+        begin = start, jnp.full((), jnp.inf), jnp.zeros((), int)
+        unknowns, moved, _ = jax.lax.while_loop(goes_on, improved, begin)
         return unknowns.parameters, moved
 
     return jax.lax.map(refit, measured, batch_size=_BATCH)
