@@ -39,7 +39,7 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     if substeps > long.substeps:
         long = _again(long, long.model, horizon=_longest(start), substeps=substeps)
     motion = len(start.model.motion_states)
-    explains = with_gaps_closed(long) <= start.objective + freedom_of_states(start, motion) + _LOSS
+    explains = with_gaps_closed(long) <= start.objective + _freedom_of_states(start, motion) + _LOSS
     if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
@@ -96,7 +96,7 @@ def _longest(found: Fit) -> int:
     return max(len(s) for s in found.stretches)
 
 
-def freedom_of_states(found: Fit, states: int) -> float:
+def _freedom_of_states(found: Fit, states: int) -> float:
     """By how much fitting so many initial states of each short segment lowers the objective over nothing but noise.
 
     Args:

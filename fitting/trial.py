@@ -179,7 +179,7 @@ def first_pass(
     best, near = models[0], champion.training
     if len(models) > 1:
         once: dict[str, Any] = {"give_up_above": -np.inf, "begin_anew_above": np.inf, "retry_states": False}
-        own = [own_states if model is best else None for model in models]
+        own = own_states, *[None] * (len(models) - 1)
         begun = [
             trained(model, data, hold, setting, near, max_steps=_FIRST_STEPS, own_states=states, **once)
             for model, states in zip(models, own, strict=True)

@@ -205,7 +205,6 @@ def march(
     solver: dfx.AbstractERK,
     substeps: int | Int[Array, ""],
     intervals: Int[Array, ""] | None = None,
-    unroll: bool = True,
     temperature: PiecewisePolynomial | None = None,
 ) -> tuple[Float[Array, "n states"], State]:
     """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
@@ -224,8 +223,6 @@ def march(
         substeps: steps in each sample interval. An array is data, so that one compiled program serves any number.
         intervals: in how many of the intervals, from the first on, the drive moves; in the others it stays where it is,
             at next to no cost. Data, as `substeps`; all of them where None.
-        unroll: whether a step's stages are written out. A loop over them compiles several times faster for a large
-            model, and runs slower for a small one.
         temperature: of the drive [K] on the same knots; None where no effect depends on it.
 
     Returns:
@@ -237,7 +234,6 @@ def march(
     lower = [np.asarray(row) for row in tableau.a_lower]
     nodes = np.concatenate([[0.0], np.asarray(tableau.c)])
     weights = np.asarray(tableau.b_sol)
-    table = np.stack([np.pad(row, (0, len(nodes) - len(row))) for row in [np.zeros(0), *lower]])
 
     def interval(state, inputs):
         index, coefficients, load_coefficients, warmth, knot, width = inputs
@@ -253,22 +249,8 @@ def march(
         def rates_within(y, s, rubbing):
             return model.component_rates(y, *around(s, rubbing))
 
-        def step_in_a_loop(y, start, rates):
-            def stage(slopes, inputs):
-                i, row, node = inputs
-                now = tuple(c + h * jnp.dot(row, k) for c, k in zip(y, slopes, strict=True))
-                found = rates(now, start + node * h)
-                return tuple(k.at[i].set(r) for k, r in zip(slopes, found, strict=True)), None
-
-            none = tuple(jnp.zeros(len(nodes)) for _ in y)
-            stages = (jnp.arange(len(nodes)), jnp.asarray(table), jnp.asarray(nodes))
-            slopes, _ = jax.lax.scan(stage, none, stages)
-            return tuple(c + h * jnp.dot(jnp.asarray(weights), k) for c, k in zip(y, slopes, strict=True))
-
         def step(y, start):
             rates = functools.partial(rates_within, rubbing=over_step(model, y, *around(start), h))
-            if not unroll:
-                return step_in_a_loop(y, start, rates)
             slopes = [rates(y, start)]
             for row, node in zip(lower, nodes[1:], strict=True):
                 slopes.append(rates(_advanced(y, h, row, slopes), start + float(node) * h))

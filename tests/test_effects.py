@@ -189,7 +189,7 @@ SPRUNG = jnp.asarray([0.2, 0.7, 3.0, 0.1]).at[0].add(50 * 0.7)  # twisted by 4 m
 def released(model):
     """States of a drive let go from a twist, without torque."""
     state = model.rest().at[:4].set(SPRUNG)
-    return march(model, NO_TORQUE, None, state, solver=dfx.Tsit5(), substeps=1, unroll=False)[0]
+    return march(model, NO_TORQUE, None, state, solver=dfx.Tsit5(), substeps=1)[0]
 
 
 def spring(x, alpha):
