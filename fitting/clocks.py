@@ -16,6 +16,7 @@ from fitting.free import effect_paths
 from fitting.linear_look import Acting, Look, best_steps, left_after, look_along, products
 from fitting.spectral_lines import spectral_lines
 from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
+from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, Learned, LearnedPeriodic, LearnedTorque
 from hdjax.effects.learned_axes import PeriodicAxis
 
@@ -122,6 +123,19 @@ def put_back(before: Sequence[Stretch], after: Sequence[Stretch]) -> tuple[float
     return tuple(a.experiment.origin - b.experiment.origin for b, a in zip(before, after, strict=True))
 
 
+def put_back_as(
+    late: Sequence[float], tests: dict[Hold, tuple[Stretch, ...]], fitted: Sequence[Stretch]
+) -> dict[Hold, tuple[Stretch, ...]]:
+    """Test stretches with their clocks put back as those of the logs that they are the end of."""
+    by_log = {s.experiment.log: by for s, by in zip(fitted, late, strict=True)}
+    return {h: tuple(_put_back(s, by_log.get(s.experiment.log, 0.0)) for s in some) for h, some in tests.items()}
+
+
+def _put_back(stretch: Stretch, by: float) -> Stretch:
+    experiment = stretch.experiment
+    return replace(stretch, experiment=replace(experiment, origin=experiment.origin + float(by)))
+
+
 def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | None:
     """The data with their clocks set by a line, refined by refits with it; None where these do not explain more."""
     near = base
@@ -137,14 +151,10 @@ def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | 
 
 
 def _with_clocks_put_back(data: Data, late: Float[np.ndarray, " logs"]) -> Data:
-    def one(stretch: Stretch, by: float) -> Stretch:
-        experiment = stretch.experiment
-        return replace(stretch, experiment=replace(experiment, origin=experiment.origin + float(by)))
-
     def each(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-        return tuple(one(s, by) for s, by in zip(stretches, late, strict=True))
+        return tuple(_put_back(s, by) for s, by in zip(stretches, late, strict=True))
 
-    return {hold: (each(training), each(validation)) for hold, (training, validation) in data.items()}
+    return {hold: (each(training), each(selection)) for hold, (training, selection) in data.items()}
 
 
 def _lines(found: Fit) -> list[Phasors]:

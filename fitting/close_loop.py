@@ -11,15 +11,16 @@ from jaxtyping import Array, Float
 from fitting.attribution import Round, leaves_imperfection, look
 from fitting.base_fit import base_fit, is_held
 from fitting.clock import Clock
-from fitting.clocks import put_back, with_clocks_set
-from fitting.compare import EXCESS, EXPLAINED, Account, account, excess, validation_rmse
+from fitting.clocks import put_back, put_back_as, with_clocks_set
+from fitting.compare import EXCESS, EXPLAINED, Account, account, excess, free_runs
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.doubt import what_is_unknown
 from fitting.errors import DataError
-from fitting.estimate import lost
+from fitting.estimate import Fit, lost
 from fitting.evidence import Evidence, evidence
-from fitting.experiment import Experiment, Stretch, segment_count, split
-from fitting.long_fit import long_fit
+from fitting.experiment import Experiment, Stretch, segment_count, split, whole
+from fitting.free_run import FreeRun, rms_error
+from fitting.long_fit import long_fit, refitted_on_all
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.noise_memory import noise_with_memory
 from fitting.outliers import with_weights
@@ -43,15 +44,15 @@ class Finding(eqx.Module):
         effect: with fitted values; None where the finding is another hold of the torque.
         name: its form.
         family: its family.
-        validation_gain: share of the held-out free-run error that it removes, against the same model without it; of
-            what has a name, in the model before anything is learned beside it.
+        gain: share of the free-run error on selection data that it removes, against the same model without it; of what
+            has a name, in the model before anything is learned beside it.
         p_value: chance that the best of the catalogue would gain as much on noise.
     """
 
     effect: Effect | None
     name: str = eqx.field(static=True)
     family: str = eqx.field(static=True)
-    validation_gain: float
+    gain: float
     p_value: float
 
 
@@ -76,8 +77,8 @@ class Loop(eqx.Module):
         hold: what the torque does between samples, as used.
         setting: how the logs were cut.
         after_substeps: solver steps in a sample interval of the final model.
-        stretches: training and held-out stretches.
-        surprise: how much farther off than they promised free runs of held-out stretches are where effects were found
+        stretches: training and selection stretches.
+        surprise: how much farther off than they promised free runs of selection stretches are where effects were found
             that do not explain them, and nothing was learned that does better; None elsewhere.
         put_back: by how much the clock of each log was put back [s], so that a line is in phase.
         seconds: where the time went.
@@ -113,6 +114,7 @@ def close_loop(
     model: Model,
     experiments: dict[Hold, tuple[Experiment, ...]],
     *,
+    test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
     max_effects: int = 3,
     catalogue: Sequence[type[Effect]] = CATALOGUE,
@@ -123,7 +125,9 @@ def close_loop(
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
-        experiments: the same logs under each assumption about the torque between samples.
+        experiments: the same logs under each assumption about the torque between samples. The end of each selects the
+            model.
+        test: likewise of data that only the final figures look at; where there are none, no figures are claimed.
         hold: the assumption that the user states; where None, the one that suits the base model best.
         max_effects: effects to add at most.
         catalogue: forms to look for.
@@ -168,37 +172,44 @@ def close_loop(
         unknown = None
     current = trusted if unknown is None else unknown.trial
     progress("final fit over long horizons")
-    training, validation = data[current.hold]
-    final = long_fit(current.training)
+    long = long_fit(current.training)
     clock.lap("final fit")
-    progress("free runs on held-out data")
-    after = account(final, training, validation, noise=noise, halo=setting.halo)
-    before = after
-    if current is not base:
-        before = account(base.training, *data[base.hold], noise=noise, halo=setting.halo)
+    progress("free runs")
 
+    def selection_runs(fitted: Fit, hold: Hold) -> tuple[FreeRun, ...]:
+        return free_runs(fitted, data[hold][1], noise=noise, halo=setting.halo)
+
+    then, now = selection_runs(base.training, base.hold), selection_runs(long, current.hold)
     surprised = None
     if decision == "effect_found":
-        surprised = surprise(final, before, after, current.held_out, noise=noise, halo=setting.halo)
+        surprised = surprise(long, then, now, current.held_out, noise=noise, halo=setting.halo)
         if surprised is not None and surprised > SURPRISED:
             decision = "unexplained"
             # What follows over long times may be learned in the place of names that do not.
             instead = learn_supported(base, data, setting, seed=seed, progress=progress)
             if instead is not None:
                 other = long_fit(instead.trial.training)
-                then = account(other, *data[base.hold], noise=noise, halo=setting.halo)
-                if then.validation_rmse < after.validation_rmse:
+                runs = selection_runs(other, instead.trial.hold)
+                if rms_error(runs) < rms_error(now):
                     trusted, unknown, current = base, instead, instead.trial
-                    training, validation = data[current.hold]
-                    final, after, surprised = other, then, None
+                    long, now, surprised = other, runs, None
+
+    final = refitted_on_all(long, current.held_out)
+    tests = put_back_as(late, {h: whole(e) for h, e in (test or {}).items()}, data[current.hold][0])
+
+    def accounted(fitted: Fit, hold: Hold, runs: tuple[FreeRun, ...]) -> Account:
+        return account(fitted, data[hold][0], tests.get(hold, ()), selection=runs, noise=noise, halo=setting.halo)
+
+    after = accounted(final, current.hold, now)
+    before = after
+    if current is not base:
+        before = accounted(refitted_on_all(base.training, base.held_out), base.hold, then)
 
     def rmse_of(trial: Trial) -> float:
-        if trial is base:
-            return before.validation_rmse
-        return validation_rmse(trial.training, *data[trial.hold], noise=noise, halo=setting.halo)
+        return rms_error(then if trial is base else selection_runs(trial.training, trial.hold))
 
     fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
-    by_name = after.validation_rmse if unknown is None else rmse_of(trusted)
+    by_name = rms_error(now) if unknown is None else rmse_of(trusted)
     if trusted is not named:
         kept = [] if trusted is base else [n for n in without if n not in fallen]
         finer = setting.with_steps_of(trusted.training)
@@ -222,13 +233,13 @@ def close_loop(
         unknown=unknown,
         evidence=seen,
         noise=noise,
-        noise_memory=None if slow is None else slow.memory(training[0].experiment.time_step),
+        noise_memory=None if slow is None else slow.memory(data[base.hold][0][0].experiment.time_step),
         residual_before=diagnose(base.training),
         residual_after=diagnose(current.training),
         hold=current.hold,
         setting=setting,
         after_substeps=final.substeps,
-        stretches=(training, validation),
+        stretches=data[current.hold],
         surprise=surprised,
         put_back=late,
         seconds=clock.laps,
@@ -350,18 +361,24 @@ def _decide(base: Trial, trusted: Trial, unknown: Unknown | None, noise: Float[A
 def _findings(
     rounds: Sequence[Round], final: Model, rmse: float, rmse_without: Mapping[str, float]
 ) -> tuple[Finding, ...]:
-    """The accepted effects with their final values, each with what the held-out error would be without it in place of
-    `rmse`; those that were not kept are not in `rmse_without`."""
+    """The accepted effects with their final values.
+
+    Args:
+        rounds: every look at the catalogue.
+        final: the final model.
+        rmse: error of its free runs on selection data.
+        rmse_without: likewise without each effect; those that were not kept are not in it.
+    """
     effects = {e.name: e for e in final.effects}
     found = [
         Finding(effects.get(w.name), w.name, w.family, 1.0 - rmse / rmse_without[w.name], w.p_value)
         for w in (this.winner for this in rounds if this.accepted)
         if w.name in rmse_without
     ]
-    return tuple(sorted(found, key=lambda f: -f.validation_gain))
+    return tuple(sorted(found, key=lambda f: -f.gain))
 
 
 def _unknown_finding(unknown: Unknown, after: Account, by_name: float) -> Finding:
-    """The learned function, with what the held-out error is without it."""
+    """The learned function, with what the error on selection data is without it."""
     effect = after.model.effect(unknown.chosen.form.name)
-    return Finding(effect, effect.name, effect.family, 1.0 - after.validation_rmse / by_name, unknown.p_value)
+    return Finding(effect, effect.name, effect.family, 1.0 - rms_error(after.selection) / by_name, unknown.p_value)

@@ -1,4 +1,4 @@
-"""Before against after: the same logs, free-running, on what the fits have seen and on what they have not."""
+"""Before against after: free runs along the same logs, on each part of the data."""
 
 from collections.abc import Sequence
 
@@ -28,8 +28,10 @@ class Account(eqx.Module):
     Attributes:
         model: with fitted values.
         uncertainty: of what was fitted.
-        training: free runs along the training stretches.
-        validation: free runs along the held-out stretches.
+        training: free runs along the stretches that candidates are fitted to.
+        selection: free runs along the stretches by which one of them was selected, by the model as it was fitted
+            without them; none where nothing was to be selected.
+        test: free runs along data that nothing has looked at; none where there are too few.
         identifiability: what the logs can't tell of it.
         not_machine_code: why XLA evaluates its residual; None where machine code does.
     """
@@ -37,84 +39,71 @@ class Account(eqx.Module):
     model: Model
     uncertainty: Uncertainty
     training: tuple[FreeRun, ...]
-    validation: tuple[FreeRun, ...]
+    selection: tuple[FreeRun, ...]
+    test: tuple[FreeRun, ...]
     identifiability: Identifiability
     not_machine_code: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def training_rmse(self) -> float:
-        """Rms error of the dynamic error on training stretches."""
-        return rms_error(self.training)
+    def parts(self) -> dict[str, tuple[FreeRun, ...]]:
+        """The free runs of each part of the data that there is, by its name."""
+        named = {"training": self.training, "selection": self.selection, "test": self.test}
+        return {name: runs for name, runs in named.items() if runs}
 
     @property
-    def validation_rmse(self) -> float:
-        """Rms error of the dynamic error on held-out stretches."""
-        return rms_error(self.validation)
+    def rmse(self) -> dict[str, float]:
+        """Rms error of the dynamic error on each part of the data [rad]."""
+        return {name: rms_error(runs) for name, runs in self.parts().items()}
 
     @property
-    def training_motor_rmse(self) -> float | None:
-        """Rms error of the motor's angle on training stretches; None for a reduced model."""
-        return motor_rms_error(self.training)
+    def motor_rmse(self) -> dict[str, float]:
+        """Likewise of the motor's angle; nothing for a reduced model."""
+        found = {name: motor_rms_error(runs) for name, runs in self.parts().items()}
+        return {name: value for name, value in found.items() if value is not None}
 
     @property
-    def validation_motor_rmse(self) -> float | None:
-        """Likewise on held-out stretches."""
-        return motor_rms_error(self.validation)
+    def judged(self) -> tuple[FreeRun, ...]:
+        """The free runs that tell best how good the model is: of test data, or else of what selected it."""
+        return self.test or self.selection or self.training
 
 
 def account(
     fit: Fit,
     training: Sequence[Stretch],
-    validation: Sequence[Stretch],
+    test: Sequence[Stretch],
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int,
+    selection: tuple[FreeRun, ...] = (),
     profiles: bool = False,
 ) -> Account:
     """Free runs and standard errors of a fit, and what it can't tell.
 
     Args:
         fit: the fitted model.
-        training: stretches that were fitted.
-        validation: stretches that were not.
+        training: stretches along which it runs.
+        test: likewise, that it has not seen.
         noise: covariance of the measurement noise.
         halo: intervals of torque before a stretch.
+        selection: free runs along the stretches by which it was selected.
         profiles: whether doubtful intervals are taken from the likelihood's profile, which compiles a program of its
             own.
     """
-    seen, unseen = _runs(fit, training, validation, noise, halo)
+    # Apart, so that test data do not even share the scale of a window.
+    seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
     found = uncertainty(fit)
     if profiles:
         found = with_profiles(fit, found)
     told = identifiability(fit, found)
-    return Account(fit.model, found, seen, unseen, told, why_not(fit.problem))
+    return Account(fit.model, found, seen, selection, unseen, told, why_not(fit.problem))
 
 
-def validation_rmse(
-    fit: Fit,
-    training: Sequence[Stretch],
-    validation: Sequence[Stretch],
-    *,
-    noise: Float[Array, "outputs outputs"],
-    halo: int,
-) -> float:
-    """Rms error of a fit's free runs on held-out stretches; arguments as in [`account`][]."""
-    return rms_error(_runs(fit, training, validation, noise, halo)[1])
-
-
-def _runs(
-    fit: Fit, training: Sequence[Stretch], validation: Sequence[Stretch], noise: Array, halo: int
-) -> tuple[tuple[FreeRun, ...], tuple[FreeRun, ...]]:
-    """Free runs on training and held-out stretches, in one program."""
-    together = free_run(
-        fit.model,
-        [*training, *validation],
-        covariance=noise,
-        halo=halo,
-        substeps=fit.substeps,
-        like=fit,
-    )
-    return together[: len(training)], together[len(training) :]
+def free_runs(
+    fit: Fit, stretches: Sequence[Stretch], *, noise: Float[Array, "outputs outputs"], halo: int
+) -> tuple[FreeRun, ...]:
+    """Free runs of a fitted model; arguments as in [`account`][]."""
+    if not stretches:
+        return ()
+    return free_run(fit.model, stretches, covariance=noise, halo=halo, substeps=fit.substeps, like=fit)
 
 
 def excess(fit: Fit, noise: Float[Array, "outputs outputs"]) -> Float[np.ndarray, " outputs"]:

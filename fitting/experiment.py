@@ -35,6 +35,7 @@ class Experiment(eqx.Module):
         rows: which samples are rows of the log, the others having been put in; None where all are.
         temperature: of the drive [K], or None.
         origin: when the log starts, on the clock of `time` [s].
+        log: the name of the log that it is a part of.
     """
 
     name: str = eqx.field(static=True)
@@ -47,6 +48,7 @@ class Experiment(eqx.Module):
     rows: Bool[np.ndarray, " n"] | None = None
     temperature: PiecewisePolynomial | None = None
     origin: float = eqx.field(static=True, default=0.0)
+    log: str = eqx.field(static=True, default="")
 
     def __len__(self) -> int:
         return self.time.size
@@ -125,17 +127,13 @@ def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tup
     several = len(log.pieces) > 1
     parts = (
         experiment_from_log(
-            _piece(log, start, stop, f"{log.name}, part {i + 1}" if several else log.name), hold=hold, N=N
+            replace(log.rows(start, stop), pieces=None, name=f"{log.name}, part {i + 1}" if several else log.name),
+            hold=hold,
+            N=N,
         )
         for i, (start, stop) in enumerate(log.pieces)
     )
-    return tuple(replace(part, origin=float(log.time[0])) for part in parts)
-
-
-def _piece(log: Log, start: int, stop: int, name: str) -> Log:
-    """Rows `start` to `stop` of a log."""
-    columns = {key: value[start:stop] for key, value in vars(log).items() if isinstance(value, np.ndarray)}
-    return replace(log, name=name, pieces=None, **columns)
+    return tuple(replace(part, origin=float(log.time[0]), log=log.name) for part in parts)
 
 
 def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Experiment:
@@ -190,6 +188,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         rows=None if rows.all() else rows,
         temperature=_channel(log, log.temperature, time, "linear"),
         origin=float(log.time[0]),
+        log=log.name,
     )
 
 
@@ -239,16 +238,26 @@ def _filled(log: Log, values: np.ndarray, time: np.ndarray, rows: np.ndarray) ->
     return np.interp(time, log.time[known], values[known])
 
 
+def whole(experiments: Sequence[Experiment]) -> tuple[Stretch, ...]:
+    """Each experiment as one stretch."""
+    return tuple(Stretch(e, 0, len(e)) for e in experiments)
+
+
 def split(
     experiments: Sequence[Experiment], *, held_out: float = 0.2
 ) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]]:
-    """The training part of each log and the stretch at its end that the fit never sees."""
-    training, validation = [], []
+    """The part of each experiment that candidates are fitted to, and the stretch at its end by which one is selected.
+
+    Args:
+        experiments: without the test data.
+        held_out: share that serves selection.
+    """
+    training, selection = [], []
     for experiment in experiments:
         border = _border(experiment, held_out)
         training.append(Stretch(experiment, 0, border))
-        validation.append(Stretch(experiment, border, len(experiment)))
-    return tuple(training), tuple(validation)
+        selection.append(Stretch(experiment, border, len(experiment)))
+    return tuple(training), tuple(selection)
 
 
 def _border(experiment: Experiment, held_out: float) -> int:

@@ -1,6 +1,6 @@
 """A fit without a search for effects, with all that can be said of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from fitting.clock import Clock
 from fitting.close_loop import Finding
 from fitting.compare import Account, account
 from fitting.diagnostics import ResidualDiagnostics, diagnose
-from fitting.experiment import Experiment, split
+from fitting.experiment import Experiment, whole
 from fitting.frequency_response import FrequencyResponse, frequency_response
 from fitting.goodness import Goodness, goodness
 from fitting.long_fit import long_fit
@@ -36,7 +36,7 @@ class FitOnly(eqx.Module):
         tests: of the same.
         goodness: figures of merit.
         frequency_response: of the logs and of the model; None where the logs are too short for it.
-        bands: how well the free runs along held-out data are known.
+        bands: how well the free runs are known, along test data where there are any.
         posterior: draws, where they were asked for.
         seconds: where the time went.
     """
@@ -76,6 +76,7 @@ def fit_only(
     model: Model,
     experiments: dict[Hold, tuple[Experiment, ...]],
     *,
+    test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
     seed: int | None = None,
     progress: Callable[[str], None] = _silent,
@@ -85,6 +86,7 @@ def fit_only(
     Args:
         model: the base model; its stiffness and damping are only placeholders.
         experiments: the same logs under each assumption about the torque between samples.
+        test: likewise of data that only the final figures look at.
         hold: the assumption that the user states; where None, the one that suits the model best.
         seed: of draws from the posterior; where None, none are made.
         progress: told what is being done.
@@ -96,18 +98,19 @@ def fit_only(
     clock = Clock()
     progress("fitting the base model")
     holds: list[Hold] = list(experiments) if hold is None else [hold]
-    fits = {h: base_fit(model, split(experiments[h])[0]) for h in holds}
+    fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
-    base, (_, validation) = fits[hold], split(experiments[hold])
+    base, tests = fits[hold], whole((test or {}).get(hold, ()))
     clock.lap("base fit")
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
     found = long_fit(base, must_explain=True)
     clock.lap("final fit")
-    progress("free runs on held-out data")
-    result = account(found, found.stretches, validation, noise=noise, halo=0, profiles=True)
-    bands = prediction_bands(found, result.uncertainty, validation, noise=noise, runs=result.validation)
+    progress("free runs")
+    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True)
+    seen = found.stretches if not tests else tests
+    bands = prediction_bands(found, result.uncertainty, seen, noise=noise, runs=result.judged)
     clock.lap("free runs and standard errors")
     residual = diagnose(found)
     tests = residual_tests(found, residual)

@@ -148,7 +148,7 @@ def _fit_one(log: Path, name: str, drive: Path) -> Row:
         rig = read_rig([log], drive, other_holds=False)
         # Fits run side by side, so each keeps to one device.
         with jax.default_device(jax.local_devices()[0]), one_thread():
-            fitted = fit_only(rig.model, rig.experiments, hold=rig.hold)
+            fitted = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold)
     except (InputError, DataError, SimulationError) as error:
         return _row(name, drive, "refused", str(error), seconds=time.perf_counter() - begin)
     except Exception as error:  # one bad log never stops the others
@@ -168,15 +168,15 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
     log, account, goodness = rig.logs[0], fitted.account, fitted.goodness
     found: Row = {
         "kind": log.kind,
-        "samples": len(log),
+        "samples": sum(run.time.size for runs in account.parts().values() for run in runs),
         "findings": len(rig.findings[log.name]),
         "torque_hold": fitted.hold,
         "converged": goodness.converged,
-        "rmse_training": account.training_rmse,
-        "rmse_validation": account.validation_rmse,
+        "rmse_training": account.rmse["training"],
+        "rmse_test": account.rmse.get("test"),
         "noise": float(fitted.noise[-1, -1]) ** 0.5,
         "error_over_noise": goodness.error_over_noise["dynamic error"],
-        "fit_percent_validation": goodness.fit_percent["validation"],
+        "fit_percent_test": goodness.fit_percent.get("test"),
     }
     return found | parameter_columns(account, log.units)
 

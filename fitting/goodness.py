@@ -17,7 +17,7 @@ class Goodness(eqx.Module):
     """Figures of merit.
 
     Attributes:
-        fit_percent: `100 (1 - |y - yhat| / |y - mean(y)|)` of the free runs on training and on held-out stretches.
+        fit_percent: `100 (1 - |y - yhat| / |y - mean(y)|)` of the free runs on each part of the data.
         data: measured numbers that were fitted (samples times outputs).
         left_out: samples without weight: put in, not believed by the health gate, or wrong on their own.
         parameters: free parameters.
@@ -70,7 +70,7 @@ def goodness(fit: Fit, account: Account, noise: Float[Array, "outputs outputs"])
     freedom = samples * outputs - parameters - states
     names = ("motor angle", "dynamic error")[-outputs:]
     return Goodness(
-        fit_percent={"training": fit_percent(account.training), "validation": fit_percent(account.validation)},
+        fit_percent={name: fit_percent(runs) for name, runs in account.parts().items()},
         data=samples * outputs,
         left_out=left_out(fit.stretches),
         parameters=parameters,

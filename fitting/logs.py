@@ -97,6 +97,13 @@ class Log:
     def __len__(self) -> int:
         return len(self.time)
 
+    def rows(self, start: int, stop: int) -> "Log":
+        """Rows `start` to `stop` (exclusive) as a log of their own, with the stretches between gaps that lie there."""
+        columns = {key: value[start:stop] for key, value in vars(self).items() if isinstance(value, np.ndarray)}
+        inside = [(max(a, start) - start, min(b, stop) - start) for a, b in self.pieces or ()]
+        kept = tuple((a, b) for a, b in inside if b - a >= SHORTEST)
+        return replace(self, pieces=None if self.pieces is None else kept, **columns)
+
 
 def read_log(path: str | PathLike[str], drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
     """The log that a file holds, in SI units.

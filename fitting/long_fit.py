@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from fitting.engines import linearise
@@ -44,6 +45,49 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
         return start
     check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
     return long if check.objective < start.objective + _LOSS else start
+
+
+def refitted_on_all(found: Fit, selection: Fit) -> Fit:
+    """The same parameters fitted to the data that selected the model as well.
+
+    Args:
+        found: the fit to training data, over horizons of any length.
+        selection: the same model on the data that selected it, over short horizons.
+
+    Returns:
+        The fit to both; over short horizons where longer ones do not follow the logs any more.
+    """
+    horizons = dict.fromkeys((found.horizon, selection.horizon))
+    for fitted in (_on_both(found, selection, horizon) for horizon in horizons):
+        if np.isfinite(fitted.objective) and (follows(fitted) or not follows(found)):
+            return fitted
+    return found
+
+
+def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
+    segments = found.problem.segments
+    states = np.concatenate([np.asarray(f.unknowns.states)[: _with_data(f)] for f in (found, selection)])
+    return fit(
+        found.model,
+        (*found.stretches, *selection.stretches),
+        found.free.paths,
+        horizon=horizon,
+        length=segments.weight.shape[1],
+        halo=segments.halo,
+        substeps=found.substeps,
+        covariance=found.covariance,
+        count=len(states),
+        states=jnp.asarray(states),
+        begin_anew_above=np.inf,
+        retry_states=False,
+        max_steps=_STEPS,
+    )
+
+
+def _with_data(found: Fit) -> int:
+    """Segments that hold data; those that only fill up a program come last."""
+    length = found.problem.segments.weight.shape[1]
+    return sum(-(-len(s) // length) for s in found.stretches)
 
 
 def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_progress: float = 0.0) -> Fit:

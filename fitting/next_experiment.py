@@ -118,7 +118,7 @@ def _silent(message: str) -> None:
 
 
 def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
-    """What explains held-out data about as well as what was found: pairs of found and rival, the closest first."""
+    """What explains selection data about as well as what was found: pairs of found and rival, the closest first."""
     names = {f.name for f in loop.findings}
     pairs = [
         (this.winner, verdict)

@@ -13,6 +13,7 @@ from fitting.findings import Finding
 from fitting.health import examine, refuse_unfit
 from fitting.logs import Log, read_log
 from fitting.masks import masked
+from fitting.test_part import TEST_SHARE, parted, whole_test_log
 from fitting.zero import zeroed
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 
@@ -29,8 +30,10 @@ class Rig(eqx.Module):
         name: of the drive.
         model: base model; its stiffness and damping are placeholders until they are fitted.
         hold: what the drive file says of the torque between samples, or None.
-        experiments: the logs' stretches between gaps, under each hold, or under the one stated alone.
-        logs: as read.
+        experiments: the logs' stretches between gaps, without test data, under each hold, or under the one stated
+            alone.
+        test: likewise of the test data.
+        logs: as fitted, without test data.
         findings: what the health gate saw, by log.
         error_unit: unit of the dynamic error.
     """
@@ -39,17 +42,21 @@ class Rig(eqx.Module):
     model: Model
     hold: Hold | None = eqx.field(static=True)
     experiments: dict[Hold, tuple[Experiment, ...]]
+    test: dict[Hold, tuple[Experiment, ...]]
     logs: tuple[Log, ...] = eqx.field(static=True)
     findings: dict[str, tuple[Finding, ...]] = eqx.field(static=True)
     error_unit: str = eqx.field(static=True)
 
 
-def read_rig(log_paths: Sequence[Path], drive_path: Path, *, other_holds: bool = True) -> Rig:
+def read_rig(
+    log_paths: Sequence[Path], drive_path: Path, *, test: Sequence[Path] = (), other_holds: bool = True
+) -> Rig:
     """Read a drive file and logs, and refuse what can't be fitted.
 
     Args:
         log_paths: of one drive.
         drive_path: its drive file.
+        test: logs of the same drive that are test data; where none is given, the end of each log is.
         other_holds: whether the torque is wanted under other holds as well, where the drive file states one.
 
     Raises:
@@ -57,43 +64,62 @@ def read_rig(log_paths: Sequence[Path], drive_path: Path, *, other_holds: bool =
         DataError: for logs that can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
-    return rig_of(ready_logs(log_paths, drive_file), drive_file, other_holds=other_holds)
+    fitted, tested = read_logs(log_paths, drive_file, test=test)
+    return rig_of(fitted, drive_file, test=tested, other_holds=other_holds)
 
 
-def rig_of(logs: tuple[Log, ...], drive_file: DriveFile, *, other_holds: bool = True) -> Rig:
+def rig_of(
+    logs: tuple[Log, ...], drive_file: DriveFile, *, test: tuple[Log, ...] = (), other_holds: bool = True
+) -> Rig:
     """[`read_rig`][] for logs that have been read."""
     if logs[0].kind == "quasi-static":
         raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
     stated = drive_file.torque_hold
     holds = HOLDS if stated is None or other_holds else (stated,)
+    parts = [parted(log, drive_file, share=0.0 if test else TEST_SHARE) for log in logs]
     findings = {}
-    for log in logs:
+    for known, _ in parts:
+        findings[known.name] = examine(known, drive_file)
+        refuse_unfit(findings[known.name], known)
+    for log in test:
         findings[log.name] = examine(log, drive_file)
-        refuse_unfit(findings[log.name], log)
+    fitted = tuple(known for known, _ in parts)
+    tests = [whole_test_log(log, drive_file) for log in test] or [end for _, end in parts if end is not None]
+    # The end of a log goes on by its clock.
+    starts = {log.name: float(log.time[0]) for log in (*fitted, *test)}
     return Rig(
         name=drive_file.name,
-        model=base_model(drive_file, logs[0]),
+        model=base_model(drive_file, fitted[0]),
         hold=stated,
-        experiments={h: tuple(e for log in logs for e in experiments(log, drive_file, h)) for h in holds},
-        logs=logs,
+        experiments={h: tuple(e for log in fitted for e in experiments(log, drive_file, h)) for h in holds},
+        test={
+            h: tuple(replace(e, origin=starts[e.log]) for log in tests for e in experiments(log, drive_file, h))
+            for h in holds
+        },
+        logs=fitted,
         findings=findings,
-        error_unit=logs[0].units.get("dynamic_error", "rad"),
+        error_unit=fitted[0].units.get("dynamic_error", "rad"),
     )
 
 
-def ready_logs(paths: Sequence[Path], drive_file: DriveFile) -> tuple[Log, ...]:
-    """Logs of one kind, each with a name of its own.
+def read_logs(
+    paths: Sequence[Path], drive_file: DriveFile, *, test: Sequence[Path] = ()
+) -> tuple[tuple[Log, ...], tuple[Log, ...]]:
+    """Logs as they are in their files, and those that are test data; all of one kind, each with a name of its own.
 
     Raises:
-        InputError: They are of several kinds.
+        InputError: They are of several kinds, or a log is to be fitted and to be test data.
     """
-    logs = _with_own_names([ready_log(path, drive_file) for path in paths])
+    both = {path.resolve() for path in paths} & {path.resolve() for path in test}
+    if both:
+        raise InputError(f"{min(both)}: the log is both fitted and test data; name it once")
+    logs = _with_own_names([read_log(path, drive_file) for path in (*paths, *test)])
     kinds = sorted({log.kind for log in logs})
     if len(kinds) > 1:
         raise InputError(
             f"{paths[0]} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
         )
-    return logs
+    return logs[: len(paths)], logs[len(paths) :]
 
 
 def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.compare import EXPLAINED, Account
+from fitting.compare import EXPLAINED
 from fitting.estimate import Fit
+from fitting.free_run import FreeRun, rms_error
 from fitting.prediction_band import PredictionBand, prediction_bands
+from fitting.uncertainty import uncertainty
 
 SURPRISED = 1.25
 """Free runs that are farther off than this, in units of what their bands allow, are not what the model promised."""
@@ -16,8 +18,8 @@ SURPRISED = 1.25
 
 def surprise(
     final: Fit,
-    before: Account,
-    after: Account,
+    before: Sequence[FreeRun],
+    after: Sequence[FreeRun],
     held_out: Fit,
     *,
     noise: Float[Array, "outputs outputs"],
@@ -32,20 +34,18 @@ def surprise(
 
     Args:
         final: the model with its effects.
-        before: the base model's account.
-        after: the final model's.
+        before: free runs of the base model along the held-out stretches.
+        after: likewise of the final model.
         held_out: the final model on short segments of the held-out stretches, which show noise with a memory whole.
         noise: covariance of the measurement noise, as shorter pieces tell it.
         halo: intervals of torque before a stretch.
     """
     short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
     variance = float(short[-1, -1])
-    at_first = before.validation_rmse**2 - variance
-    if after.validation_rmse**2 - variance <= (1.0 - EXPLAINED) * at_first:
+    at_first = rms_error(before) ** 2 - variance
+    if rms_error(after) ** 2 - variance <= (1.0 - EXPLAINED) * at_first:
         return None
-    bands = prediction_bands(
-        final, after.uncertainty, held_out.stretches, noise=short, halo=halo, runs=after.validation
-    )
+    bands = prediction_bands(final, uncertainty(final), held_out.stretches, noise=short, halo=halo, runs=after)
     return over_bands(bands)
 
 

@@ -45,20 +45,22 @@ axes[2].set_ylabel("dynamic error [mrad]")
 axes[2].set_xlabel("time [s]")
 # %% [markdown]
 # ## The loop
-# No starting values: they come from the weak form of the equation of motion. The last 20 % of each log is held out.
+# No starting values: they come from the weak form of the equation of motion. The last 20 % of each log is test data, at
+# which only the figures at the end look.
 
 # %%
-loop = close_loop(rig.model, {rig.hold: rig.experiments[rig.hold]}, hold=rig.hold)
+hold = rig.hold
+loop = close_loop(rig.model, {hold: rig.experiments[hold]}, test={hold: rig.test[hold]}, hold=hold)
 print(loop.decision)
 for finding in loop.findings:
-    print(f"{finding.family}: removes {finding.validation_gain:.1%} of the held-out error, p = {finding.p_value:.3f}")
+    print(f"{finding.family}: removes {finding.gain:.1%} of the error on selection data, p = {finding.p_value:.3f}")
 
 # %% [markdown]
 # ## Before and after
 # The initial state comes from 50 samples; from there on the models run alone.
 
 # %%
-before, after = loop.before.validation[0], loop.after.validation[0]
+before, after = loop.before.test[0], loop.after.test[0]
 figure, axes = plt.subplots(2, 1, sharex=True, figsize=(9, 5), layout="constrained")
 axes[0].plot(before.time, 1e6 * before.measured, color="0.6", lw=0.8, label="measured")
 axes[0].plot(after.time, 1e6 * after.predicted, color="#0072B2", lw=0.8, label="predicted, after")

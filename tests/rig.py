@@ -132,9 +132,19 @@ def drive_experiment(
     count: int, *, noise: float = 1.0, seed: int = 0, rms: float = 0.3, name: str = "log", **physics
 ) -> Experiment:
     """The rig's experiment; `physics` goes to [`drive_motion`][]."""
-    torque = drive_torque(count, rms=rms, seed=seed)
+    (experiment,) = drive_parts(count, noise=noise, seed=seed, rms=rms, name=name, **physics)
+    return experiment
+
+
+def drive_parts(
+    *counts: int, noise: float = 1.0, seed: int = 0, rms: float = 0.3, name: str = "log", **physics
+) -> tuple[Experiment, ...]:
+    """The rig's experiment in parts of so many samples, one after the other."""
+    torque = drive_torque(sum(counts), rms=rms, seed=seed)
     log = drive_log(drive_motion(torque, **physics), torque, noise=noise, seed=seed, name=name)
-    return experiment_from_log(log, hold="zero-order", N=N)
+    ends = np.cumsum(counts)
+    parts = (log.rows(end - count, end) for end, count in zip(ends, counts, strict=True))
+    return tuple(experiment_from_log(part, hold="zero-order", N=N) for part in parts)
 
 
 def drive_model(*, K: float = K, alpha: float = ALPHA, B_sp: float = B_SP) -> TwoInertiaModel:

@@ -86,7 +86,7 @@ def test_logs_that_begin_in_other_phases(begun):
 def test_clocks_that_are_right_stay(begun, phases: tuple[float | None, ...], logs: int):
     """In phase already, without a line, with one in a single log, and a log by itself."""
     base, data, setting = begun(*phases)
-    data = {hold: (training[:logs], validation[:logs]) for hold, (training, validation) in data.items()}
+    data = {hold: (training[:logs], selection[:logs]) for hold, (training, selection) in data.items()}
     after, clocked = with_clocks_set(base, data, setting, progress=silent)
     assert after is base and clocked is data
 

@@ -54,7 +54,7 @@ def test_friction_is_found(rubbing):
     (finding,) = found.findings
     assert (finding.family, finding.name) == ("coulomb_friction", "coulomb_friction")
     assert finding.p_value <= 0.01
-    assert finding.validation_gain > 0.2
+    assert finding.gain > 0.2
     assert found.dropped == ()
     assert found.hold == "zero-order"
     assert any("found coulomb_friction" in message for message in told)
@@ -78,15 +78,15 @@ def test_the_drive_is_right_once_the_effect_is_inside(rubbing):
     assert before.value - rig.MU > 5 * before.std
 
 
-def test_held_out_data_say_so(rubbing):
+def test_selection_data_say_so(rubbing):
     found, _ = rubbing
-    assert found.after.validation_rmse < found.before.validation_rmse
-    assert found.after.validation_rmse < 1.3 * REDUCED_NOISE
+    assert found.after.rmse["selection"] < found.before.rmse["selection"]
+    assert found.after.rmse["selection"] < 1.3 * REDUCED_NOISE
     assert np.sqrt(float(found.noise[0, 0])) == pytest.approx(REDUCED_NOISE, rel=0.1)
-    training, validation = found.stretches
-    assert [len(s) for s in training + validation] == [960, 240]
-    assert found.after.validation[0].time.size == 240
-    assert not np.any(np.isin(found.after.validation[0].time, found.after.training[0].time))
+    training, selection = found.stretches
+    assert [len(s) for s in training + selection] == [960, 240]
+    assert found.after.selection[0].time.size == 240
+    assert not np.any(np.isin(found.after.selection[0].time, found.after.training[0].time))
 
 
 def test_nothing_is_found_where_nothing_is():
@@ -96,7 +96,7 @@ def test_nothing_is_found_where_nothing_is():
     assert clean.after is clean.before
     assert not clean.rounds[0].accepted
     assert float(clean.before.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=1e-3)
-    assert clean.before.validation_rmse < 1.3 * REDUCED_NOISE
+    assert clean.before.rmse["selection"] < 1.3 * REDUCED_NOISE
 
 
 @pytest.mark.slow
@@ -106,12 +106,12 @@ def test_a_torque_bias_of_a_drive_is_found():
     (finding,) = found.findings
     assert (finding.family, finding.name) == ("torque_sensor", "torque_bias")
     assert finding.p_value <= 0.01
-    assert finding.validation_gain > 0.3
+    assert finding.gain > 0.3
     assert float(finding.effect.bias) == pytest.approx(BIAS, rel=0.05)
     # The placeholder was wrong by a factor of thousands.
     assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=2e-3)
     assert float(found.after.model.get("alpha")) == pytest.approx(rig.ALPHA, rel=0.1)
-    assert found.after.validation_rmse < 2 * X_NOISE
+    assert found.after.rmse["selection"] < 2 * X_NOISE
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_a_spring_to_the_ground_is_no_weight(stiffness: float):
     chosen = found.unknown.chosen
     assert (chosen.form.name, chosen.variables) == ("learned_load_torque", ("theta_l",))
     assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=1e-3)
-    assert found.after.validation_rmse < 0.01 * found.before.validation_rmse
+    assert found.after.rmse["selection"] < 0.01 * found.before.rmse["selection"]
 
 
 @pytest.mark.parametrize(
@@ -206,4 +206,4 @@ def test_what_explains_whole_stretches_is_learned_in_place_of_names_that_do_not(
     assert [f.name for f in loop.findings] == ["learned_mesh_torque"]
     assert loop.doubted == ("quadratic_damping",)
     assert (loop.decision, loop.surprise) == ("unexplained", None)
-    assert loop.after.validation_rmse < 1.2 * REDUCED_NOISE
+    assert loop.after.rmse["selection"] < 1.2 * REDUCED_NOISE

@@ -23,7 +23,7 @@ def account_of(model: Model, std: dict[str, float], correlation: np.ndarray) -> 
     spread = np.array(list(std.values()))
     covariance = correlation * np.outer(spread, spread)
     found = Uncertainty(estimates, correlation, covariance, covariance)
-    return Account(model, found, (), (), Identifiability({}, (), (), {}))
+    return Account(model, found, (), (), (), Identifiability({}, (), (), {}))
 
 
 def test_drive_by_draws():

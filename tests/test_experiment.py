@@ -147,11 +147,11 @@ def test_segment_count_is_exact_up_to_eight_and_then_a_multiple_of_sixteen(lengt
 
 def test_split_holds_out_the_end_of_each_log():
     experiments = [experiment(), experiment(count=30)]
-    training, validation = split(experiments, held_out=0.2)
+    training, selection = split(experiments, held_out=0.2)
     assert [(s.start, s.stop) for s in training] == [(0, 38), (0, 24)]
-    assert [(s.start, s.stop) for s in validation] == [(38, 47), (24, 30)]
+    assert [(s.start, s.stop) for s in selection] == [(38, 47), (24, 30)]
     assert [s.name for s in training] == ["log", "log"]
-    assert len(training[0]) + len(validation[0]) == COUNT
+    assert len(training[0]) + len(selection[0]) == COUNT
 
 
 def test_scales_of_a_sine():
@@ -227,8 +227,8 @@ def test_samples_that_are_not_believed_have_no_weight_and_no_say():
     found = experiment_from_log(replace(logged, dynamic_error=wild), hold="zero-order", N=rig.N)
     np.testing.assert_array_equal(np.flatnonzero(found.weight == 0), [5, 6, 990])
     assert np.max(np.abs(found.measured[:, 1])) <= np.max(np.abs(whole.dynamic_error))
-    training, validation = split([found])
-    assert training[0].weight.sum() + validation[0].weight.sum() == 997
+    training, selection = split([found])
+    assert training[0].weight.sum() + selection[0].weight.sum() == 997
     assert training[0].weight.sum() == pytest.approx(0.8 * 997, abs=1)
     assert len(training[0].beginning(10)) == 12
     assert len(Stretch(found, 0, 8).beginning(10)) == 8

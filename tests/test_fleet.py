@@ -170,7 +170,7 @@ def test_why_a_parameter_is_not_told():
     }
     nothing = np.zeros((0, 0))
     found = Identifiability({"alpha": "alpha is at most 5 1/[x]^2"}, (), (), {})
-    account = Account(rig.reduced_model(), Uncertainty(estimates, nothing, nothing, nothing), (), (), found)
+    account = Account(rig.reduced_model(), Uncertainty(estimates, nothing, nothing, nothing), (), (), (), found)
     columns = parameter_columns(account, {"dynamic_error": "V", "forcing": "A"})
     assert columns["alpha_note"] == "alpha is at most 5 1/V^2" and columns["mu_note"] == ""
     assert (columns["alpha_low"], columns["alpha_identifiable"]) == (-3.0, False)

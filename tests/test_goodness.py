@@ -38,7 +38,7 @@ def found(fitted: Fit) -> Goodness:
     runs = (run(np.arange(5.0), np.arange(5.0)),)
     nothing = np.zeros((0, 0))
     unknown = Identifiability({}, (), (), {})
-    result = Account(fitted.model, Uncertainty({}, nothing, nothing, nothing), runs, runs, unknown)
+    result = Account(fitted.model, Uncertainty({}, nothing, nothing, nothing), runs, (), runs, unknown)
     return goodness(fitted, result, jnp.asarray(NOISE))
 
 

@@ -209,7 +209,7 @@ def yielded() -> Loop:
 def test_hysteresis_without_a_name_is_learned_with_its_memory(yielded: Loop):
     assert yielded.decision == "unexplained" and yielded.unknown is not None
     assert [f.name for f in yielded.findings] == [YieldingMeshTorque.name]
-    assert yielded.after.validation_rmse < 1.2 * NOISE < 0.2 * yielded.before.validation_rmse
+    assert yielded.after.rmse["selection"] < 1.2 * NOISE < 0.2 * yielded.before.rmse["selection"]
     assert yielded.findings[0].p_value <= 0.01
     assert float(yielded.after.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=5e-3)
 

@@ -24,7 +24,7 @@ from fitting.attribution import Verdict
 from fitting.close_loop import Loop, close_loop
 from fitting.diagnostics import Dependence
 from fitting.estimate import Fit
-from fitting.experiment import Experiment, split
+from fitting.experiment import Experiment, whole
 from fitting.findings import Finding
 from fitting.fit_only import FitOnly, fit_only
 from fitting.plots import decimated, fit_plots, plots
@@ -60,17 +60,18 @@ ESTIMATE_KEYS = {"value", "std", "ci95", "unit", "identifiable"}
 @pytest.fixture(scope="module")
 def loop() -> Loop:
     """The loop closed on one log of a drive with motor friction, with two forms to choose from."""
-    log = rig.drive_experiment(3000, motor_friction=(T_C, 0.05), name=HOSTILE)
-    data: dict[Hold, tuple[Experiment, ...]] = {HOLD: (log,)}
+    known, test = rig.drive_parts(2400, 600, motor_friction=(T_C, 0.05), name=HOSTILE)
+    data: dict[Hold, tuple[Experiment, ...]] = {HOLD: (known,)}
     start = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
-    return close_loop(start, data, hold=HOLD, max_effects=1, catalogue=(MotorFriction, TorqueBias))
+    forms = (MotorFriction, TorqueBias)
+    return close_loop(start, data, test={HOLD: (test,)}, hold=HOLD, max_effects=1, catalogue=forms)
 
 
 @pytest.fixture(scope="module")
 def fitted() -> FitOnly:
     """A fit of the same log, which has a hostile name."""
-    log = rig.drive_experiment(3000, motor_friction=(T_C, 0.05), name=HOSTILE)
-    return fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (log,)}, hold=HOLD)
+    known, test = rig.drive_parts(2400, 600, motor_friction=(T_C, 0.05), name=HOSTILE)
+    return fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (known,)}, test={HOLD: (test,)}, hold=HOLD)
 
 
 @pytest.fixture
@@ -117,17 +118,18 @@ def leaves(value: object) -> Iterator[object]:
 def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
     paths = write_report(tmp_path, loop, model_json=MODEL_JSON, health=HEALTH, name="rig")
     found = json.loads(paths["report.json"].read_text(encoding="utf-8"))
-    assert found["schema"] == "hdjax-report/1"
+    assert found["schema"] == "hdjax-report/2"
     assert found["decision"] == "effect_found"
     assert found["noise"]["dynamic_error"] > 0
     for side in ("before", "after"):
-        assert set(found[side]["rmse"]) == {"training", "validation"}
+        assert found[side]["rmse"]["test"] == found[side]["rmse"]["validation"]
+        assert set(found[side]["rmse"]) == {"training", "selection", "test", "validation"}
         assert set(found[side]["parameters"]) == {"K", "alpha", "B_sp"}
         assert all(set(e) >= ESTIMATE_KEYS for e in found[side]["parameters"].values())
     assert found["before"]["effects"] == []
     (effect,) = found["after"]["effects"]
     assert effect["family"] in FAMILIES
-    assert 0.5 < effect["validation_gain"] < 1.0 and 0.0 < effect["p_value"] <= 0.01
+    assert 0.5 < effect["gain"] < 1.0 and 0.0 < effect["p_value"] <= 0.01
     assert all(set(e) >= ESTIMATE_KEYS for e in effect["parameters"].values())
     T_c = effect["parameters"]["motor_friction.T_c"]
     # The report's own number, not the loop's precision: that is tested with the loop.
@@ -145,41 +147,44 @@ def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
     assert log == {
         "name": HOSTILE,
         "samples": 3000,
+        "training": 1920,
+        "selection": 480,
+        "test": 600,
         "held_out": 600,
-        "seconds": 2999 * rig.STEP,
+        "seconds": pytest.approx(2997 * rig.STEP),
         "clock_put_back": 0.0,
     }
     assert found["hold"] == HOLD and found["dropped"] == [] and found["unexplained"] is None
 
 
-def test_each_step_with_its_held_out_error(loop: Loop):
+def test_each_step_with_its_error_on_selection_data(loop: Loop):
     base, last = report_dict(loop)["steps"]
     assert base["added"] is None and last["added"] == loop.findings[0].name
-    assert last["held_out_rmse"] < 0.5 * base["held_out_rmse"]
+    assert last["selection_segments_rmse"] < 0.5 * base["selection_segments_rmse"]
     assert base["segment_seconds"] == pytest.approx(loop.setting.horizon * rig.STEP)
 
 
 def test_free_runs_that_leave_a_right_model_are_told(loop: Loop):
     """As behind a dead zone: short simulations stay at the noise, long ones can't."""
     assert not any("grow" in note for note in report_dict(loop)["cannot_tell"])
-    lost = eqx.tree_at(lambda x: x.after.validation[0].predicted, loop, replace_fn=lambda p: p + 1e-3)
+    lost = eqx.tree_at(lambda x: x.after.test[0].predicted, loop, replace_fn=lambda p: p + 1e-3)
     (note,) = (n for n in report_dict(lost)["cannot_tell"] if "grow" in n)
     assert "times the noise" in note
 
 
 def test_every_number_is_finite(loop: Loop):
-    broken = eqx.tree_at(lambda x: x.before.validation[0].predicted, loop, replace_fn=lambda p: p * np.inf)
+    broken = eqx.tree_at(lambda x: x.before.test[0].predicted, loop, replace_fn=lambda p: p * np.inf)
     found = report_dict(broken)
-    assert found["before"]["rmse"]["validation"] is None
+    assert found["before"]["rmse"]["test"] is None
     assert all(math.isfinite(v) for v in leaves(found) if isinstance(v, float))
     assert "diverged" in report_text(found) or "much of" in report_text(found)
 
 
 def test_effects_are_ordered_by_gain(loop: Loop):
     (finding,) = loop.findings
-    second = eqx.tree_at(lambda f: f.validation_gain, finding, 0.1)
+    second = eqx.tree_at(lambda f: f.gain, finding, 0.1)
     both = eqx.tree_at(lambda x: x.findings, loop, (finding, second))
-    gains = [e["validation_gain"] for e in report_dict(both)["after"]["effects"]]
+    gains = [e["gain"] for e in report_dict(both)["after"]["effects"]]
     assert gains == sorted(gains, reverse=True) and len(gains) == 2
 
 
@@ -193,7 +198,7 @@ def test_a_tie_is_told_with_the_experiment_that_separates(loop: Loop):
     (other,) = found["alternatives"]
     assert (other["family"], other["separable"]) == ("torque_sensor", False)
     assert "both directions" in other["separating_experiment"]
-    assert other["validation_rmse"] == other["validation_rmse_of_found"] > 0
+    assert other["selection_rmse"] == other["selection_rmse_of_found"] > 0
     assert any("tie" in note for note in found["cannot_tell"])
 
 
@@ -339,7 +344,7 @@ def test_a_fit_alone_has_a_report_too(fitted: FitOnly, tmp_path: Path):
     assert "What was found" not in page and "The base model was fitted" in page
     found = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert found["decision"] == "fit_only"
-    assert found["after"]["parameters"] == {} and found["after"]["rmse"] == {"training": None, "validation": None}
+    assert found["after"]["parameters"] == {} and not any(found["after"]["rmse"].values())
     assert found["before"]["parameters"]["K"]["value"] == pytest.approx(rig.K, rel=0.05)
     heads = re.findall(r"<h2>(.*?)</h2>", page)
     assert heads[:4] == ["Parameters", "Goodness", "What was left over", "Frequency response"]
@@ -355,15 +360,15 @@ def test_a_fit_tells_all_that_fitters_expect(fitted: FitOnly):
         # A start is from the weak form, and no answer.
         assert entry["start"] != entry["value"], path
         assert not entry["at_bound"]
-    experiment = rig.drive_experiment(3000, motor_friction=(T_C, 0.05), name=HOSTILE)
-    starts = starting_models(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), split([experiment])[0])
+    known, _ = rig.drive_parts(2400, 600, motor_friction=(T_C, 0.05), name=HOSTILE)
+    starts = starting_models(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), whole([known]))
     assert before["parameters"]["K"]["start"] in [float(s.drive.K) for s in starts]
-    (run,) = fitted.account.validation
+    (run,) = fitted.account.test
     error = run.measured - run.predicted
-    assert good["fit_percent"]["validation"] == pytest.approx(
+    assert good["fit_percent"]["test"] == pytest.approx(
         100 * (1 - np.linalg.norm(error) / np.linalg.norm(run.measured - run.measured.mean()))
     )
-    assert good["rmse_over_noise"]["validation"] == pytest.approx(
+    assert good["rmse_over_noise"]["test"] == pytest.approx(
         np.sqrt(np.mean(error**2)) / found["noise"]["dynamic_error"]
     )
     assert good["data"] == 2 * 2400 and good["parameters"] == 3 and good["converged"]
@@ -385,8 +390,9 @@ def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
         return dataclasses.replace(known, estimates=known.estimates | {"alpha": alpha})
 
     monkeypatch.setattr("fitting.compare.with_profiles", doubt)
-    log = rig.drive_experiment(3000)
-    good = report_dict(fit_only(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), {HOLD: (log,)}, hold=HOLD))
+    known, test = rig.drive_parts(2400, 600)
+    start = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
+    good = report_dict(fit_only(start, {HOLD: (known,)}, test={HOLD: (test,)}, hold=HOLD))
     # What a profile says of an interval goes before the parabola, in the reason as well.
     alpha = good["before"]["parameters"]["alpha"]
     assert (alpha["interval"], alpha["ci95"]) == ("profile", [-900.0, None])
@@ -398,15 +404,15 @@ def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
     assert {t["verdict"] for t in good["residual_tests"]} == {"passed"}
     assert good["meaning"] == ["The model explains these logs down to the measurement noise."]
     assert good["goodness"]["reduced_chi_square"] == pytest.approx(1.0, abs=0.1)
-    assert good["before"]["rmse"]["validation"] < 1.2 * good["noise"]["dynamic_error"]
+    assert good["before"]["rmse"]["test"] < 1.2 * good["noise"]["dynamic_error"]
 
 
 def test_a_diverged_fit_has_a_report_too(fitted: FitOnly, tmp_path: Path):
-    broken = eqx.tree_at(lambda f: f.account.validation[0].predicted, fitted, replace_fn=lambda p: p * np.inf)
+    broken = eqx.tree_at(lambda f: f.account.test[0].predicted, fitted, replace_fn=lambda p: p * np.inf)
     broken = eqx.tree_at(lambda f: f.bands[0].std_parameters, broken, replace_fn=lambda s: s * np.nan)
-    broken = eqx.tree_at(lambda f: f.goodness.fit_percent["validation"], broken, -math.inf)
+    broken = eqx.tree_at(lambda f: f.goodness.fit_percent["test"], broken, -math.inf)
     found = report_dict(broken)
-    assert found["goodness"]["fit_percent"]["validation"] is None
+    assert found["goodness"]["fit_percent"]["test"] is None
     assert found["goodness"]["band_coverage"] is None
     assert any("diverges" in sentence for sentence in found["meaning"])
     assert "n/a" in report_text(found)
@@ -502,9 +508,9 @@ def test_sentences_have_the_units_of_a_reduced_log():
     assert formatting.superscripts("K^-2 and omega_0^-2.1") == "K⁻² and omega_0^-2.1"
 
 
-def test_share_of_held_out_samples_in_the_band(fitted: FitOnly, tmp_path: Path):
+def test_share_of_test_samples_in_the_band(fitted: FitOnly, tmp_path: Path):
     (band,) = fitted.bands
-    (run,) = fitted.account.validation
+    (run,) = fitted.account.test
     assert band.run is run
     spread = np.sqrt(band.std_predicted**2 + float(fitted.noise[-1, -1]))
     share = float(np.mean(np.abs(run.measured - run.predicted) <= stats.norm.ppf(0.975) * spread))
@@ -667,8 +673,8 @@ def test_what_is_no_number_leaves_a_gap_in_a_figure():
 @pytest.mark.parametrize(
     ("after", "said"),
     [
-        (2e-6, "It removes 80 % of the held-out error, which falls from 10"),
-        (3e-5, "It explains short segments alone; over whole held-out stretches the error rises from 10"),
+        (2e-6, "It removes 80 % of the error on test data, which falls from 10"),
+        (3e-5, "It explains short segments alone; over whole stretches of test data the error rises from 10"),
         (None, "to a simulation that diverged."),
     ],
 )
@@ -682,12 +688,12 @@ def test_the_summary_claims_no_gain_where_the_error_rises(after: float | None, s
         (
             8.7e-7,
             (0.2, 1e-4),
-            "It shows in the motor's angle, whose held-out error falls by 99.95 %, from 200 mrad to 0.1",
+            "It shows in the motor's angle, whose error on test data falls by 99.95 %, from 200 mrad to 0.1",
         ),
         (8.8e-7, (0.2, 1e-4), "It shows in the motor's angle"),
         (8.7e-7, (None, 1e-4), "from a simulation that diverged to 100 µrad"),
-        (8.7e-7, (0.2, 0.2), "It removes 0 % of the held-out error"),
-        (1e-7, (0.2, 1e-4), "It removes 89 % of the held-out error"),
+        (8.7e-7, (0.2, 0.2), "It removes 0 % of the error on test data"),
+        (1e-7, (0.2, 1e-4), "It removes 89 % of the error on test data"),
     ],
 )
 def test_the_summary_tells_of_the_motor_what_the_dynamic_error_does_not_show(
@@ -704,5 +710,5 @@ def test_the_summary_tells_where_the_noise_was_told_from_what_is_missing_by_its_
 
 def _changed(before: float, after: float | None, *, motor: tuple[float | None, float | None]) -> dict[str, Any]:
     stages = zip(("before", "after"), (before, after), motor, strict=True)
-    found = {s: {"rmse": {"validation": x}, "rmse_motor_angle": {"validation": m}} for s, x, m in stages}
-    return found | {"units": {"dynamic_error": "rad"}, "noise": {"dynamic_error": 1e-6}}
+    found = {s: {"rmse": {"test": x}, "rmse_motor_angle": {"test": m}} for s, x, m in stages}
+    return found | {"units": {"dynamic_error": "rad"}, "noise": {"dynamic_error": 1e-6}, "judged_on": "test"}

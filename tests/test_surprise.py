@@ -35,9 +35,9 @@ def band(of: FreeRun, std_parameters: float = 0.0, std_state: float = 0.0) -> Pr
 @pytest.fixture(scope="module")
 def fitted() -> tuple[Fit, Account]:
     """A model and its account, whose free runs are put in by hand."""
-    training, validation = split((rig.reduced_experiment(600, noise=2e-3),))
+    training, selection = split((rig.reduced_experiment(600, noise=2e-3),))
     found = fit(rig.reduced_model(), training, PATHS, horizon=128, substeps=2, count=8)
-    return found, account(found, training, validation, noise=found.covariance, halo=0)
+    return found, account(found, training, selection, noise=found.covariance, halo=0)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +84,8 @@ def test_bands_are_asked_where_names_do_not_explain(
 ):
     module = import_module("fitting.surprise")
     monkeypatch.setattr(module, "prediction_bands", lambda *args, runs, **options: [band(runs[0])])
-    found, known = fitted
-    then, now = (replace(known, validation=(run(times),)) for times in (before, after))
+    found, _ = fitted
+    then, now = ((run(times),) for times in (before, after))
     noise = NOISE**2 * jnp.eye(1)
     seen = surprise(found, then, now, replace(found, covariance=noise), noise=noise, halo=0)
     assert seen == (pytest.approx(after) if asked else None)
@@ -94,9 +94,11 @@ def test_bands_are_asked_where_names_do_not_explain(
 def test_a_right_model_does_not_surprise(fitted: tuple[Fit, Account]):
     """Its own free run, beside a base model that does no better: what is asked is the band."""
     found, known = fitted
-    _, validation = split((rig.reduced_experiment(600, noise=2e-3),))
-    held_out = replace(found, stretches=tuple(validation))
-    assert surprise(found, known, known, held_out, noise=found.covariance, halo=0) == pytest.approx(1.0, abs=0.2)
+    _, selection = split((rig.reduced_experiment(600, noise=2e-3),))
+    held_out = replace(found, stretches=tuple(selection))
+    assert surprise(found, known.test, known.test, held_out, noise=found.covariance, halo=0) == pytest.approx(
+        1.0, abs=0.2
+    )
 
 
 def test_nor_does_it_where_the_noise_has_a_memory():
@@ -105,10 +107,10 @@ def test_nor_does_it_where_the_noise_has_a_memory():
     forcing = rig.reduced_forcing(4000, rms=10.0, seed=3)
     noise = 2e-3 * np.asarray(lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.normal(size=4000)))
     log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0] + noise, forcing)
-    training, validation = split((experiment_from_log(log, hold="zero-order"),))
+    training, selection = split((experiment_from_log(log, hold="zero-order"),))
     found = fit(rig.reduced_model(), training, PATHS, horizon=256, substeps=2, count=16)
-    held_out = fit(found.model, validation, PATHS, horizon=256, substeps=2, count=16, hold_parameters=True)
+    held_out = fit(found.model, selection, PATHS, horizon=256, substeps=2, count=16, hold_parameters=True)
     of_pieces = measurement_noise(found).covariance
-    known = account(found, training, validation, noise=of_pieces, halo=0)
-    assert known.validation_rmse > 1.3 * np.sqrt(of_pieces[0, 0])
-    assert surprise(found, known, known, held_out, noise=of_pieces, halo=0) == pytest.approx(1.0, abs=0.15)
+    known = account(found, training, selection, noise=of_pieces, halo=0)
+    assert known.rmse["test"] > 1.3 * np.sqrt(of_pieces[0, 0])
+    assert surprise(found, known.test, known.test, held_out, noise=of_pieces, halo=0) == pytest.approx(1.0, abs=0.15)

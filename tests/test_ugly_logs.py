@@ -134,7 +134,7 @@ def test_an_ugly_log_gives_the_same_drive(tmp_path: Path):
         # Four standard errors, and the bridged sample's share of one.
         assert abs(found[name]["value"] - truth) < 5 * found[name]["std"], name
     noise = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
-    assert report["before"]["rmse"]["validation"] < 1.1 * noise
+    assert report["before"]["rmse"]["test"] < 1.1 * noise
     assert [log["name"] for log in report["logs"]] == ["log, part 1", "log, part 2"]
     told = " ".join(finding["what"] for finding in report["health"])
     for words in ("20 rows", "1 gaps", "1 samples of motor_torque", "12 samples stand out", "off zero"):

@@ -344,7 +344,7 @@ def test_what_the_catalogue_lacks_is_unexplained(loop: Loop):
     assert loop.decision == "unexplained"
     assert [f.family for f in loop.findings] == ["unknown"]
     assert loop.unknown is not None and "v" in loop.unknown.chosen.variables
-    assert loop.after.validation_rmse < 2 * NOISE < loop.before.validation_rmse
+    assert loop.after.rmse["selection"] < 2 * NOISE < loop.before.rmse["selection"]
     assert loop.findings[0].p_value <= 0.01
     assert float(loop.after.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=1e-3)
 
@@ -367,7 +367,7 @@ def test_the_report_tells_it(loop: Loop, tmp_path: Path):
     read = read_model(paths["model.json"])
     options = {"covariance": loop.noise, "halo": loop.setting.halo, "substeps": loop.after_substeps}
     (run,) = free_run(read.model, loop.stretches[1], **options)
-    assert run.rmse == pytest.approx(loop.after.validation_rmse, rel=0.05)
+    assert run.rmse == pytest.approx(loop.after.rmse["selection"], rel=0.05)
 
 
 @pytest.mark.slow
@@ -383,10 +383,10 @@ def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     assert [f.name for f in loop.findings] == ["coulomb_friction", "learned_mesh_torque"]
     assert loop.unknown is not None and loop.unknown.chosen.variables == ("x",)
     assert float(loop.after.model.get("coulomb_friction.T_c")) == pytest.approx(25.0, rel=0.05)
-    assert loop.after.validation_rmse < 1.2 * NOISE
+    assert loop.after.rmse["selection"] < 1.2 * NOISE
     # Of the gains the second begins where the first ends.
-    left = loop.before.validation_rmse * np.prod([1.0 - f.validation_gain for f in loop.findings])
-    assert left == pytest.approx(loop.after.validation_rmse, rel=1e-6)
+    left = loop.before.rmse["selection"] * np.prod([1.0 - f.gain for f in loop.findings])
+    assert left == pytest.approx(loop.after.rmse["selection"], rel=1e-6)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
     units = {"dynamic_error": "V", "forcing": "V"}
     paths = write_report(tmp_path, loop, model_json=to_json(stored), units=units)

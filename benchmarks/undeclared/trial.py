@@ -54,7 +54,8 @@ def run_case(folder: Path, answer: dict, *, leave_out: bool, seed: int, baseline
 
 def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
     drive = folder / "drive.toml"
-    rig = read_rig([folder / f"{name}.csv" for name in LOGS[:2]], drive)
+    first, second, last = (folder / f"{name}.csv" for name in LOGS)
+    rig = read_rig([first, second], drive, test=[last])
     loop = _close(rig, without, seed)
     report = report_dict(loop, units=rig.logs[0].units)
     drive_file = read_drive_file(drive)
@@ -70,7 +71,7 @@ def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
         "families": [e["family"] for e in effects],
         "names": [e["name"] for e in effects],
         "p_values": [e["p_value"] for e in effects],
-        "gains": [e["validation_gain"] for e in effects],
+        "gains": [e["gain"] for e in effects],
         "dropped": report["dropped"],
         "ties": sorted({a["family"] for a in ties if a["instead_of"] == first}),
         "all_ties": sorted({a["family"] for a in ties}),

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fitting.commands.options import DriveFileOption, ExperimentLimits, Logs, wanted
+from fitting.commands.options import DriveFileOption, ExperimentLimits, Logs, TestLogs, wanted
 from fitting.commands.start import start_jax
 from fitting.errors import InputError
 
@@ -71,12 +71,15 @@ def close_loop(
     *,
     drive: DriveFileOption,
     out: Path,
+    test: TestLogs = (),
     max_effects: int = 3,
     seed: int = 0,
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
 ) -> None:
-    """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on held-out data.
+    """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on test data.
+
+    The last fifth of each log is test data, unless other logs are: nothing but the final figures looks at them.
 
     Quasi-static logs (twist and joint torque) are explained without inertia: the equation is the torque-twist line.
 
@@ -98,7 +101,7 @@ def close_loop(
     start_jax()
     from fitting.commands.run_close_loop import close_loop_on_logs
 
-    close_loop_on_logs(logs, drive, out, max_effects, seed, asked)
+    close_loop_on_logs(logs, drive, out, max_effects, seed, asked, test)
 
 
 def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:

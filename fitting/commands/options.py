@@ -13,6 +13,10 @@ from fitting.errors import InputError
 Logs = Annotated[
     list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
 ]
+TestLogs = Annotated[
+    tuple[Path, ...],
+    Parameter(help="Logs of the same drive that are test data, in place of the last fifth of each log.", negative=""),
+]
 DriveFileOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
 
 

@@ -1,5 +1,6 @@
 """What `hdjax close-loop` and `hdjax demo` do."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from fitting.close_loop import close_loop
@@ -11,11 +12,17 @@ from fitting.drive_file import read_drive_file
 from fitting.model_file import StoredModel, to_json
 from fitting.next_experiment import experiment_for_ties
 from fitting.report import loop_text, write_loop_report
-from fitting.rig import Rig, read_rig, ready_logs, rig_of
+from fitting.rig import Rig, read_logs, read_rig, rig_of
 
 
 def close_loop_on_logs(
-    logs: list[Path], drive: Path, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None
+    logs: list[Path],
+    drive: Path,
+    out: Path,
+    max_effects: int,
+    seed: int,
+    limits: ExperimentLimits | None,
+    test: Sequence[Path] = (),
 ) -> None:
     """Close the loop on logs of one drive, write the report, and show it.
 
@@ -26,13 +33,14 @@ def close_loop_on_logs(
         max_effects: to add at most.
         seed: of the surrogates.
         limits: of the next experiment; None where none is asked for.
+        test: files of test data.
 
     Raises:
         InputError: for bad files.
         DataError: where the logs can't support a fit.
     """
     drive_file = read_drive_file(drive)
-    read = ready_logs(logs, drive_file)
+    read, tests = read_logs(logs, drive_file, test=test)
     if is_quasi_static(read, limits):
         # Loaded here: most logs are of other kinds.
         from fitting.quasi_static.commands import close_quasi_static_loop
@@ -43,7 +51,7 @@ def close_loop_on_logs(
             )
         print(shown)
     else:
-        _close_loop(rig_of(read, drive_file), out, max_effects, seed, limits)
+        _close_loop(rig_of(read, drive_file, test=tests), out, max_effects, seed, limits)
 
 
 def demonstrate(out: Path, seed: int) -> None:
@@ -63,7 +71,13 @@ def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: Experi
     stated = None if limits is None else stated_limits(limits, logs_of(rig))
     with Spinner() as progress:
         loop = close_loop(
-            rig.model, rig.experiments, hold=rig.hold, max_effects=max_effects, seed=seed, progress=progress
+            rig.model,
+            rig.experiments,
+            test=rig.test,
+            hold=rig.hold,
+            max_effects=max_effects,
+            seed=seed,
+            progress=progress,
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)

@@ -10,7 +10,7 @@ from fitting.errors import InputError
 from fitting.fit_only import fit_only
 from fitting.model_file import StoredModel, to_json
 from fitting.report import fit_text, write_fit_report
-from fitting.rig import Rig, ready_logs, rig_of
+from fitting.rig import Rig, read_logs, rig_of
 
 
 def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
@@ -30,7 +30,7 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
     if seed is not None:
         _check_posterior()
     drive_file = read_drive_file(drive)
-    read = ready_logs(logs, drive_file)
+    read, _ = read_logs(logs, drive_file)
     if is_quasi_static(read, limits):
         # Loaded here: most logs are of other kinds.
         from fitting.quasi_static.commands import fit_quasi_static_logs
@@ -54,7 +54,7 @@ def _check_posterior() -> None:
 def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
     stated = None if limits is None else stated_limits(limits, logs_of(rig))
     with Spinner() as progress:
-        fitted = fit_only(rig.model, rig.experiments, hold=rig.hold, seed=seed, progress=progress)
+        fitted = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold, seed=seed, progress=progress)
         proposed = None
         if stated is not None:
             # Loaded here: few fits look for a next experiment.

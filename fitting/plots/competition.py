@@ -10,7 +10,7 @@ from fitting.plots.plot import Plot
 
 
 def competition(this: Round, turn: int) -> Plot:
-    """What each form of the catalogue gains on held-out data, against chance."""
+    """What each form of the catalogue gains on selection data, against chance."""
     verdicts = sorted(this.verdicts, key=lambda v: v.gain)
     chance = float(np.quantile(this.screen.null_gains, 0.99))
     gains = np.array([v.gain for v in verdicts])
@@ -45,7 +45,7 @@ def competition(this: Round, turn: int) -> Plot:
     top = largest * (8 if wide else 1.25)
     view = [float(np.log10(v)) for v in (low, top)] if wide else [low - 0.25 * (top - low) if low < 0 else 0.0, top]
     layout = {
-        "xaxis": axis("gain on held-out data", range=view, exponentformat="power", **axis_scale(wide, low, top)),
+        "xaxis": axis("gain on selection data", range=view, exponentformat="power", **axis_scale(wide, low, top)),
         "yaxis": axis("", showgrid=False, automargin=True),
         "shapes": [vertical_line(x=chance)],
         "annotations": [note("chance (99 %)", x=float(np.log10(chance)) if wide else chance)],
@@ -56,9 +56,9 @@ def competition(this: Round, turn: int) -> Plot:
         f"competition-{turn}",
         "found",
         f"Round {turn}: {outcome}",
-        "Gain is the decrease of the logarithm of the held-out error. Filled bars were refitted inside the equations; "
-        "hollow ones are the first-order estimate of the screening; below zero an effect does harm. The dotted line is "
-        "what the best of the whole catalogue reaches by chance in 99 of 100 cases.",
+        "Gain is the decrease of the logarithm of the error on selection data. Filled bars were refitted inside the "
+        "equations; hollow ones are the first-order estimate of the screening; below zero an effect does harm. The "
+        "dotted line is what the best of the whole catalogue reaches by chance in 99 of 100 cases.",
         figure([bars, labels], 120 + 24 * len(verdicts), **layout),
     )
 

@@ -1,6 +1,7 @@
 """Which pictures a report has, in the order of the story."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -58,12 +59,13 @@ def _noise(outcome: Loop | FitOnly) -> float:
 
 
 def _predictions(before: Account, after: Account | None, unit: str, bands: Sequence[PredictionBand] = ()) -> list[Plot]:
-    """The same held-out stretch before and after, of the first few logs; with the bands of the model before."""
-    later: Sequence[FreeRun | None] = [None] * len(before.validation) if after is None else after.validation
+    """The same stretch before and after, of the first few logs; with the bands of the model before."""
+    later: Sequence[FreeRun | None] = [None] * len(before.judged) if after is None else after.judged
     omega_0 = float(before.model.drive.omega_0)
-    pairs = list(zip(before.validation, later, strict=True))[:_MOST_LOGS]
+    common: dict[str, Any] = {"part": list(before.parts())[-1], "omega_0": omega_0, "unit": unit}
+    pairs = list(zip(before.judged, later, strict=True))[:_MOST_LOGS]
     return [
-        predictions(runs, omega_0=omega_0, unit=unit, key=f"prediction-{i}", band=bands[i] if bands else None)
+        predictions(runs, key=f"prediction-{i}", band=bands[i] if bands else None, **common)
         for i, runs in enumerate(pairs)
     ]
 

@@ -19,15 +19,17 @@ _BAND = "rgba(0,114,178,0.25)"
 def predictions(
     runs: tuple[FreeRun, FreeRun | None],
     *,
+    part: str,
     omega_0: float,
     unit: str,
     key: str,
     band: PredictionBand | None = None,
 ) -> Plot:
-    """Measured and predicted dynamic error on held-out data, and the error of each prediction.
+    """Measured and predicted dynamic error, and the error of each prediction.
 
     Args:
         runs: the same stretch by the base model and by the final one.
+        part: of the data that the stretch is.
         omega_0: natural frequency [rad/s], for the first view.
         unit: of the dynamic error.
         key: of the plot.
@@ -61,7 +63,7 @@ def predictions(
     return Plot(
         key,
         "fit",
-        f"Held-out data of {first.name}: measured and predicted",
+        f"{part.capitalize()} data of {first.name}: measured and predicted",
         "Free run from the first samples on; the model sees the torque only. Below: measured minus predicted. "
         f"The view starts where the {'base ' if runs[1] else ''}model errs most; "
         f"double-click for the whole stretch, drag to zoom.{_coverage(band)}",

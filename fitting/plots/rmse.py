@@ -11,9 +11,9 @@ from fitting.plots.plot import Plot
 
 
 def rmse_bars(before: Account, after: Account | None, *, noise: float, unit: str) -> Plot:
-    """Rms error on training and held-out data against the measurement noise."""
+    """Rms error on each part of the data against the measurement noise."""
     accounts = [before] if after is None else [before, after]
-    values = [[a.training_rmse, a.validation_rmse] for a in accounts]
+    values = [list(a.rmse.values()) for a in accounts]
     finite = [v for pair in values for v in pair if np.isfinite(v)]
     factor, label = scaled_unit(max([noise, *finite]), unit)
     wide = max([noise, *finite]) > 20 * min([noise, *finite])
@@ -22,7 +22,7 @@ def rmse_bars(before: Account, after: Account | None, *, noise: float, unit: str
             "type": "bar",
             "orientation": "h",
             "name": name,
-            "y": ["training", "held out"],
+            "y": list(before.rmse),
             "x": numbers(factor * np.array(pair)),
             "marker": {"color": color},
             "text": [f" {text(factor * v)} " for v in pair],

@@ -30,17 +30,17 @@ def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
 def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, Any]:
     experiment = separating_experiment(winner.family, verdict.family)
     if verdict.separable:
-        experiment = "None is needed: the held-out data tell the two apart."
+        experiment = "None is needed: the selection data tell the two apart."
     return {
         "family": verdict.family,
         "name": verdict.name,
-        "validation_rmse": trial.held_out.dynamic_error_std,
+        "selection_rmse": trial.held_out.dynamic_error_std,
         "separable": verdict.separable,
         "separating_experiment": experiment,
         "instead_of": winner.name,
-        "validation_rmse_of_found": None if winner.trial is None else winner.trial.held_out.dynamic_error_std,
+        "selection_rmse_of_found": None if winner.trial is None else winner.trial.held_out.dynamic_error_std,
     }
 
 
 def _closeness(alternative: Mapping[str, Any]) -> tuple[bool, float]:
-    return alternative["separable"], alternative["validation_rmse"]
+    return alternative["separable"], alternative["selection_rmse"]

@@ -11,13 +11,13 @@ import numpy as np
 from fitting import findings
 from fitting.close_loop import Loop
 from fitting.files import finite
-from fitting.free_run import FreeRun
 from fitting.next_experiment import NextExperiment
 from fitting.report.alternatives import alternatives
+from fitting.report.earlier_schema import with_old_names
 from fitting.report.fit_content import fit_dict, meaning
 from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
-from fitting.report.parameters import account_dict, effect_dict, no_account
+from fitting.report.parameters import PARTS, account_dict, effect_dict, no_account
 from fitting.report.posterior import posterior_dict
 from fitting.report.proposal import proposal_dict
 from fitting.report.steps import steps
@@ -25,7 +25,7 @@ from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
 from fitting.report.unknown import unknown_dict
 
-SCHEMA = "hdjax-report/1"
+SCHEMA = "hdjax-report/2"
 
 _LIBRARIES = ("hdjax", "jax", "diffrax", "optimistix", "equinox", "numpy", "scipy")
 
@@ -58,6 +58,7 @@ def report_dict(
         "version": version("hdjax"),
         "name": name,
         "decision": outcome.decision,
+        "judged_on": list(outcome.after.parts())[-1],
         "summary": "",
         "units": units,
         "noise": {"dynamic_error": noise, "memory": outcome.noise_memory if is_loop else None},
@@ -92,23 +93,21 @@ def report_dict(
     report["summary"] = summary(report)
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)
-    return report
+    return with_old_names(report)
 
 
 def _logs(outcome: Outcome) -> list[dict[str, Any]]:
-    runs = list(zip(outcome.before.training, outcome.before.validation, strict=True))
-    late = outcome.put_back if isinstance(outcome, Loop) else (0.0,) * len(runs)
-    return [_log_dict(*each, by) for each, by in zip(runs, late, strict=True)]
-
-
-def _log_dict(training: FreeRun, validation: FreeRun, put_back: float) -> dict[str, Any]:
-    return {
-        "name": training.name,
-        "samples": int(training.time.size + validation.time.size),
-        "held_out": int(validation.time.size),
-        "seconds": float(validation.time[-1] - training.time[0]),
-        "clock_put_back": put_back,
-    }
+    """Of each log, or test log, how many samples serve what."""
+    found: dict[str, dict[str, Any]] = {}
+    for part, runs in outcome.after.parts().items():
+        for run in runs:
+            log = found.setdefault(run.name, {"name": run.name, "samples": 0} | dict.fromkeys(PARTS, 0))
+            log[part] += int(run.time.size)
+            log["samples"] += int(run.time.size)
+            log["seconds"] = log.get("seconds", 0.0) + float(run.time[-1] - run.time[0])
+    late = outcome.put_back if isinstance(outcome, Loop) else ()
+    put_back = dict(zip((run.name for run in outcome.after.training), late, strict=False))
+    return [log | {"clock_put_back": put_back.get(name, 0.0)} for name, log in found.items()]
 
 
 def _engine(not_machine_code: str | None) -> dict[str, str | None]:

@@ -16,7 +16,7 @@ from fitting.prediction_band import coverage
 
 # Measured and modelled resonance that differ by less than this, or than the lines' distance, agree.
 _AGREES = 0.03
-# Held-out error over training error, and error over noise, from which on it is worth a word.
+# Test error over training error, and error over noise, from which on it is worth a word.
 _DRIFTED = 1.5
 _NOTHING_BUT_NOISE = 1.1
 
@@ -32,10 +32,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     return {
         "goodness": {
             "fit_percent": dict(g.fit_percent),
-            "rmse_over_noise": {
-                "training": account.training_rmse / noise,
-                "validation": account.validation_rmse / noise,
-            },
+            "rmse_over_noise": {part: rmse / noise for part, rmse in account.rmse.items()},
             "band_coverage": coverage(fitted.bands),
             "error_over_noise": dict(g.error_over_noise),
             "reduced_chi_square": g.reduced_chi_square,
@@ -68,13 +65,14 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
 def meaning(report: Mapping[str, Any]) -> list[str]:
     """What to make of a fit's report, most important first, a sentence or two each."""
     verdicts = {t["name"].split(" of ")[0]: t["verdict"] for t in report["residual_tests"]}
-    rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"]["validation"]
+    on = report["judged_on"]
+    rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"][on]
     notes = []
     if not report["goodness"]["converged"]:
         notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")
     missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
     if over_noise is None:
-        notes.append("The free run diverges on held-out data: the model doesn't stand for this drive.")
+        notes.append(f"The free run diverges on {on} data: the model doesn't stand for this drive.")
     elif missing:
         notes.append(
             "The residual is not white noise: the model lacks something, or the sensors' noise has a memory. What is "
@@ -85,9 +83,9 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
             notes.append("The estimate of the measurement noise holds a part of what is missing: don't lean on it.")
     elif over_noise < _NOTHING_BUT_NOISE:
         notes.append("The model explains these logs down to the measurement noise.")
-    if None not in rmse.values() and rmse["validation"] > _DRIFTED * rmse["training"]:
+    if rmse["training"] is not None and rmse["test"] is not None and rmse["test"] > _DRIFTED * rmse["training"]:
         notes.append(
-            "The error is larger on held-out data than on the data that were fitted: the drive or its conditions "
+            "The error is larger on test data than on the data that were fitted: the drive or its conditions "
             "changed along the log, or the initial state is poorly known."
         )
     if verdicts.get("normality") == "failed" and not missing:

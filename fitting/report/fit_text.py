@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fitting.formatting import open_interval, p_value, percent, plain
+from fitting.report.parameters import parts_of
 from fitting.report.posterior import QUANTILES
 from fitting.report.proposal import next_lines
 
@@ -99,9 +100,9 @@ def _correlations(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _goodness(report: Mapping[str, Any]) -> list[str]:
     g, rmse, unit = report["goodness"], report["before"]["rmse"], report["units"]["dynamic_error"]
-    sides = ("training", "validation")
+    sides = parts_of(report)
     rows = [
-        ["free run", "training", "held out", ""],
+        ["free run", *sides, ""],
         ["fit", *(plain(g["fit_percent"][s]) for s in sides), "%"],
         ["rms error", *(plain(rmse[s]) for s in sides), unit],
         ["rms error / noise", *(plain(g["rmse_over_noise"][s], 3) for s in sides), ""],
@@ -109,15 +110,15 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
     met = "converged" if g["converged"] else "NOT CONVERGED"
     samples = sum(log["samples"] for log in report["logs"])
     left = ", ".join(f"{output} {plain(v, 3)}" for output, v in g["error_over_noise"].items())
-    held_out = sum(log["held_out"] for log in report["logs"])
-    return _table(rows, left=(0, 3)) + _prose(
+    test = sum(log["test"] for log in report["logs"])
+    return _table(rows, left=(0, len(sides) + 1)) + _prose(
         [
             f"measurement noise {plain(report['noise']['dynamic_error'])} {unit} rms",
-            f"held-out samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
+            f"{report['judged_on']} samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
             f"left over in short simulations, in units of the noise: {left}",
             f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
             f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
-            f"{len(report['logs'])} log(s), {samples} samples, {held_out} of them held out; "
+            f"{len(report['logs'])} log(s), {samples} samples, {test} of them test data; "
             f"{g['data']} numbers fitted by "
             f"{g['parameters']} parameters and {g['initial_states']} initial states",
             f"{g['iterations']} iterations ({met}); {g['substeps']} solver step(s) a sample; {report['hold']} hold",

@@ -82,11 +82,18 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     for other in report["alternatives"]:
         if not other["separable"]:
             notes.append(
-                f"A tie: {other['name']} ({plain_family(other['family'])}) explains the held-out data about as well "
+                f"A tie: {other['name']} ({plain_family(other['family'])}) explains the selection data about as well "
                 f"as {other['instead_of']}. {other['separating_experiment']}"
             )
     notes += _own_phases(report)
-    drifting = beyond_prediction(report, final["rmse"]["validation"])
+    if report["judged_on"] != "test":
+        notes.append(
+            "The logs are too short to keep a part of them for a test: no error on data that nothing has looked at is "
+            "stated. Record longer logs, or name another one with --test."
+            if report["decision"] != "fit_only"
+            else "The logs are too short to keep a part of them for a test: the errors are those of the fitted data."
+        )
+    drifting = beyond_prediction(report, final["rmse"]["selection"])
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])

@@ -9,6 +9,7 @@ from plotly.offline import get_plotlyjs
 
 from fitting import formatting
 from fitting.plots import Plot
+from fitting.report.parameters import parts_of
 from fitting.report.posterior import QUANTILES
 from fitting.report.separating import plain_family
 from fitting.report.summary import chance
@@ -46,6 +47,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         .get_template(template)
         .render(
             report=report,
+            parts=parts_of(report),
             noise=report["noise"]["dynamic_error"],
             x_unit=report["units"]["dynamic_error"],
             chance=lambda effect: chance(effect, report),

@@ -19,6 +19,17 @@ from hdjax.effects import ActuatorEffect
 _TOLD_CORRELATION = 0.1
 
 
+PARTS = ("training", "selection", "test")
+"""Parts of the data: what is fitted, what selects the model, and what nothing has looked at."""
+
+_NO_PARTS: dict[str, float | None] = dict.fromkeys(PARTS)
+
+
+def parts_of(report: Mapping[str, Any]) -> tuple[str, ...]:
+    """The parts of the data that a report tells of."""
+    return tuple(part for part in PARTS if any(log[part] for log in report["logs"]))
+
+
 def account_dict(
     account: Account, units: Mapping[str, str], x_max: float, *, start: Model | None = None
 ) -> dict[str, Any]:
@@ -37,16 +48,15 @@ def account_dict(
         "parameters": {path: _estimate_dict(path, account, units, start) for path in base},
         "derived": {name: _derived_dict(name, q) for name, q in figures.items()},
         "correlations": _correlations(account.uncertainty),
-        "rmse": {"training": account.training_rmse, "validation": account.validation_rmse},
-        "rmse_motor_angle": {"training": account.training_motor_rmse, "validation": account.validation_motor_rmse},
+        "rmse": _NO_PARTS | account.rmse,
+        "rmse_motor_angle": _NO_PARTS | account.motor_rmse,
     }
 
 
 def no_account() -> dict[str, Any]:
     """Likewise where no second model was fitted."""
     empty = {"effects": [], "parameters": {}, "derived": {}, "correlations": []}
-    none = {"training": None, "validation": None}
-    return empty | {"rmse": none, "rmse_motor_angle": dict(none)}
+    return empty | {"rmse": dict(_NO_PARTS), "rmse_motor_angle": dict(_NO_PARTS)}
 
 
 def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start: Model | None = None) -> dict[str, Any]:
@@ -111,7 +121,7 @@ def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) ->
         "family": finding.family,
         "name": finding.name,
         "parameters": {},
-        "validation_gain": finding.validation_gain,
+        "gain": finding.gain,
         "p_value": finding.p_value,
     }
     if finding.effect is None:

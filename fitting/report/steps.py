@@ -1,4 +1,4 @@
-"""What each step of the loop did to the held-out error, over times so short that little can pile up."""
+"""What each step of the loop did to the error on selection data, over times so short that little can pile up."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,8 +13,8 @@ _NOISE, _OFF = 1.2, 3.0
 
 
 def steps(outcome: Outcome) -> list[dict[str, Any]]:
-    """The base model, then the model after each step, each with its error on held-out segments whose initial states
-    are fitted; empty for a fit alone."""
+    """The base model, then the model after each step, each with its error on segments of the selection data
+    whose initial states are fitted; empty for a fit alone."""
     if not isinstance(outcome, Loop) or not outcome.rounds:
         return []
     seconds = outcome.setting.horizon * outcome.stretches[0][0].experiment.time_step
@@ -28,7 +28,7 @@ def steps(outcome: Outcome) -> list[dict[str, Any]]:
 
 
 def _step(added: str | None, trial: Trial, seconds: float) -> dict[str, Any]:
-    return {"added": added, "held_out_rmse": trial.held_out.dynamic_error_std, "segment_seconds": seconds}
+    return {"added": added, "selection_segments_rmse": trial.held_out.dynamic_error_std, "segment_seconds": seconds}
 
 
 def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | None:
@@ -36,18 +36,18 @@ def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | No
 
     Args:
         report: the report's content so far.
-        free: rms error of the final model's free runs on held-out data; None where they diverged.
+        free: rms error of the final model's free runs on selection data; None where they diverged.
     """
     if not report["steps"]:
         return None
     last, noise = report["steps"][-1], report["noise"]["dynamic_error"]
-    short = last["held_out_rmse"]
+    short = last["selection_segments_rmse"]
     if short is None or short > _NOISE * noise or (free is not None and free < _OFF * noise):
         return None
     unit = report["units"]["dynamic_error"]
     return (
         f"Over {formatting.quantity(last['segment_seconds'], 's')} at a time the model errs by "
-        f"{formatting.quantity(short, unit)} rms ({formatting.number(short / noise)} times the noise) on held-out "
+        f"{formatting.quantity(short, unit)} rms ({formatting.number(short / noise)} times the noise) on selection "
         "data. Its longer free runs leave the data all the same: along this motion small errors of the initial state "
         "and of the parameters grow (as behind a dead zone), or something slow acts that the log does not show."
     )

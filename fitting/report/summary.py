@@ -17,16 +17,16 @@ def summary(report: Mapping[str, Any]) -> str:
     """The decision in plain words."""
     unit = report["units"]["dynamic_error"]
     noise = report["noise"]["dynamic_error"]
-    before = report["before"]["rmse"]["validation"]
-    after = report["after"]["rmse"]["validation"]
+    on = report["judged_on"]
+    before, after = (report[stage]["rmse"][on] for stage in ("before", "after"))
     families = list(dict.fromkeys(e["family"] for e in report["after"]["effects"] if e["family"] != "unknown"))
     found = formatting.words([plain_family(f) for f in families]) if families else ""
     decision = report["decision"]
     if decision == "fit_only":
-        return f"The base model was fitted. On held-out data it errs by {_against_noise(before, noise, unit)}."
+        return f"The base model was fitted. On {on} data it errs by {_against_noise(before, noise, unit)}."
     if decision == "model_sufficient":
         return (
-            f"The model suffices: on held-out data it errs by {_against_noise(before, noise, unit)}, and none of the "
+            f"The model suffices: on {on} data it errs by {_against_noise(before, noise, unit)}, and none of the "
             f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
             + _remembering(report)
         )
@@ -51,7 +51,7 @@ def summary(report: Mapping[str, Any]) -> str:
     beyond = left["free_runs_times_expected"]
     if beyond is not None:
         return (
-            f"{opening} Short segments, each of which may start anew, show little of it: free runs of whole held-out "
+            f"{opening} Short segments, each of which may start anew, show little of it: free runs of whole "
             f"stretches err by {_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and "
             "uncertainty allow."
         )
@@ -80,21 +80,22 @@ def _learned(report: Mapping[str, Any]) -> str:
 
 
 def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -> str:
-    """What became of the held-out error by what was found."""
-    before, after = (report[stage]["rmse"]["validation"] for stage in ("before", "after"))
+    """What became of the error by what was found."""
+    on = report["judged_on"]
+    before, after = (report[stage]["rmse"][on] for stage in ("before", "after"))
     unit, s = report["units"]["dynamic_error"], "" if several else "s"
     then, now = _rmse(before, unit), _against_noise(after, report["noise"]["dynamic_error"], unit, like=before)
-    motor = [report[stage]["rmse_motor_angle"]["validation"] for stage in ("before", "after")]
+    motor = [report[stage]["rmse_motor_angle"][on] for stage in ("before", "after")]
     if not _falls(before, after) and _falls(*motor):
         first, last = (_rmse(value, "rad", motor[0]) for value in motor)
         return (
-            f"{subject} show{s} in the motor's angle, whose held-out error falls by {_removed(*motor)}, from {first} "
-            f"to {last}. Hardly in the dynamic error, which is off by {then} before and {now} after."
+            f"{subject} show{s} in the motor's angle, whose error on {on} data falls by {_removed(*motor)}, from "
+            f"{first} to {last}. Hardly in the dynamic error, which is off by {then} before and {now} after."
         )
     if before is not None and (after is None or after > before):
-        where = "short segments alone; over whole held-out stretches the error rises"
+        where = f"short segments alone; over whole stretches of {on} data the error rises"
         return f"{subject} explain{s} {where} from {then} to {now}."
-    return f"{subject} remove{s} {_removed(before, after)} of the held-out error, which falls from {then} to {now}."
+    return f"{subject} remove{s} {_removed(before, after)} of the error on {on} data, which falls from {then} to {now}."
 
 
 def _count(number: int) -> str:

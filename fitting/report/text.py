@@ -6,6 +6,7 @@ from typing import Any
 from fitting import formatting
 from fitting.formatting import open_interval, plain
 from fitting.report.fit_text import fit_lines
+from fitting.report.parameters import parts_of
 from fitting.report.proposal import next_lines
 from fitting.report.summary import chance
 
@@ -27,17 +28,18 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
     if report["after"]["effects"]:
         shown = [("before", report["before"]), ("after", report["after"])]
     lines.append("    " + " " * 12 + "".join(f"{n:>14}" for n, _ in shown))
-    for key, label in (("training", "training"), ("validation", "held out")):
-        values = "".join(f"{plain(a['rmse'][key]):>14}" for _, a in shown)
-        lines.append(f"    {label:12}{values} {unit}")
-    if report["after"]["effects"] and report["before"]["rmse_motor_angle"]["validation"] is not None:
-        values = "".join(f"{plain(a['rmse_motor_angle']['validation']):>14}" for _, a in shown)
-        lines.append(f"    {'motor angle':12}{values} rad, held out")
+    for part in parts_of(report):
+        values = "".join(f"{plain(a['rmse'][part]):>14}" for _, a in shown)
+        lines.append(f"    {part:12}{values} {unit}")
+    on = report["judged_on"]
+    if report["after"]["effects"] and report["before"]["rmse_motor_angle"][on] is not None:
+        values = "".join(f"{plain(a['rmse_motor_angle'][on]):>14}" for _, a in shown)
+        lines.append(f"    {'motor angle':12}{values} rad, {on}")
     lines.append(f"    {'noise':12}{plain(report['noise']['dynamic_error']):>14} {unit}")
     lines.append("[Parameters]")
     lines += _parameter_lines(final["parameters"])
     for effect in report["after"]["effects"]:
-        gain = formatting.percent(effect["validation_gain"])
+        gain = formatting.percent(effect["gain"])
         lines.append(f"[Effect: {effect['name']}] {effect['family']}, gain {gain}, {chance(effect, report)}")
         if effect["family"] != "unknown":
             lines += _parameter_lines(effect["parameters"])

@@ -1,0 +1,96 @@
+"""Test data: nothing but the final figures looks at them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+import rig
+from fitting.commands.run_close_loop import close_loop_on_logs
+from fitting.drive_file import read_drive_file
+from fitting.logs import read_log
+from fitting.test_part import parted
+
+COUNT, TEST = 1500, 300
+OUTPUTS = ("motor_angle", "load_angle")
+DRIVE = f"""
+[drive]
+reduction_ratio = {rig.N}
+motor_inertia = {rig.J_M}
+load_inertia = {rig.J_L}
+
+[signals]
+torque_hold = "zero-order"
+"""
+
+
+def write_logs(folder: Path, scrambled: bool, offset: float = 0.0) -> tuple[Path, Path]:
+    """A log of a drive with motor friction, its last fifth of the outputs in any order where asked for."""
+    torque = rig.drive_torque(COUNT)
+    log = rig.drive_log(rig.drive_motion(torque, motor_friction=(0.03, 0.05)), torque)
+    order = np.arange(COUNT)
+    if scrambled:
+        order[-TEST:] = np.random.default_rng(0).permutation(order[-TEST:])
+    columns = {name: getattr(log, name)[order] for name in OUTPUTS}
+    columns["load_angle"] = columns["load_angle"] + offset
+    table = pl.DataFrame({"time": log.time, "motor_torque": torque} | columns)
+    path, drive = folder / "log.csv", folder / "drive.toml"
+    table.write_csv(path, float_precision=17)
+    drive.write_text(DRIVE)
+    return path, drive
+
+
+def without_test(found: dict) -> dict:
+    """A report without what tells of test data, of the health of logs, and of the time that it took."""
+    kept = {k: v for k, v in found.items() if k not in ("health", "seconds", "summary")}
+    for stage in ("before", "after"):
+        for name in ("rmse", "rmse_motor_angle"):
+            kept[stage][name] = {k: v for k, v in kept[stage][name].items() if k not in ("test", "validation")}
+    return kept
+
+
+def test_scrambled_test_data_change_nothing_but_the_test_figures(tmp_path: Path):
+    found = []
+    for scrambled in (False, True):
+        folder = tmp_path / str(scrambled)
+        folder.mkdir()
+        path, drive = write_logs(folder, scrambled)
+        close_loop_on_logs([path], drive, folder / "out", 1, 0, None)
+        found.append(json.loads((folder / "out" / "report.json").read_text()))
+    plain, scrambled = found
+    assert plain["judged_on"] == "test" and plain["logs"][0]["test"] == TEST
+    assert scrambled["after"]["rmse"]["test"] > 10 * plain["after"]["rmse"]["test"] > 0
+    assert without_test(plain) == without_test(scrambled)
+    models = [(tmp_path / str(s) / "out" / "model.json").read_bytes() for s in (False, True)]
+    assert models[0] == models[1]
+
+
+def test_both_parts_are_counted_from_the_zero_of_the_first(tmp_path: Path):
+    path, drive = write_logs(tmp_path, False, offset=0.3)
+    drive_file = read_drive_file(drive)
+    whole = read_log(path, drive_file)
+    known, test = parted(whole, drive_file)
+    assert test is not None and len(known) == COUNT - TEST and len(test) == TEST
+    assert known.zero == test.zero == pytest.approx(-0.3, abs=1e-4)
+    np.testing.assert_allclose(test.dynamic_error + test.zero, whole.dynamic_error[-TEST:], rtol=0, atol=1e-12)
+
+
+def test_a_short_log_keeps_all_of_its_data(tmp_path: Path):
+    path, drive = write_logs(tmp_path, False)
+    drive_file = read_drive_file(drive)
+    short = read_log(path, drive_file).rows(0, 400)
+    known, test = parted(short, drive_file)
+    assert len(known) == 400 and test is None
+
+
+def test_another_log_is_test_data_from_beginning_to_end(tmp_path: Path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    path, drive = write_logs(tmp_path / "one", False)
+    other, _ = write_logs(tmp_path / "two", False)
+    close_loop_on_logs([path], drive, tmp_path / "out", 0, 0, None, test=[other])
+    found = json.loads((tmp_path / "out" / "report.json").read_text())
+    counted = {log["name"]: (log["training"] + log["selection"], log["test"]) for log in found["logs"]}
+    assert counted == {"one/log": (COUNT, 0), "two/log": (0, COUNT)}
