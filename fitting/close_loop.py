@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import Round, leaves_imperfection, look
+from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, attempt, gone_on, halo_for
+from fitting.attribution.effect_evidence import Evidence, evidence
+from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
+from fitting.attribution.selection_round import Round, leaves_imperfection, look
 from fitting.base_fit import base_fit, is_held
 from fitting.clock import Clock
-from fitting.clocks import put_back, put_back_as, with_clocks_set
 from fitting.compare import EXCESS, EXPLAINED, Account, account, excess, free_runs
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.doubt import what_is_unknown
 from fitting.errors import DataError
 from fitting.estimate import Fit, lost
-from fitting.evidence import Evidence, evidence
 from fitting.experiment import Experiment, Stretch, segment_count, split, whole
 from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import long_fit, refitted_on_all
@@ -26,7 +27,6 @@ from fitting.noise_memory import noise_with_memory
 from fitting.outliers import with_weights
 from fitting.posing import segment_length
 from fitting.surprise import SURPRISED, surprise
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt, gone_on, halo_for
 from fitting.unknown import Unknown, learn_supported
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from fitting.attribution import leaves_imperfection, told_from_zero
+from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, attempt
+from fitting.attribution.selection_round import leaves_imperfection, told_from_zero
 from fitting.base_fit import leaves_white_noise
 from fitting.compare import EXCESS, excess
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
 from fitting.unknown import Unknown, learn_supported, share_of
 
 # Share of a learned torque's mean square that named effects must make up for it to have come out as them.

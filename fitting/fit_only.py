@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import Round
+from fitting.attribution.selection_round import Round
 from fitting.base_fit import base_fit
 from fitting.clock import Clock
 from fitting.close_loop import Finding

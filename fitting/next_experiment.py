@@ -11,7 +11,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution import Verdict
+from fitting.attribution.candidate_fit import Trial
+from fitting.attribution.selection_round import Verdict
 from fitting.base_fit import as_followed
 from fitting.close_loop import Loop
 from fitting.command_search import Candidate, is_smooth, largest_twist, search
@@ -23,7 +24,6 @@ from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
 from fitting.posing import segment_length, typical_scales
-from fitting.trial import Trial
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.along import place_of
-from fitting.lead_refit import try_lead
+from fitting.attribution.candidate_fit import Data, Setting, Trial
+from fitting.attribution.candidate_refit import try_lead
+from fitting.attribution.screening import Lead, Screen, screen
+from fitting.attribution.shortlist import worth_a_refit
 from fitting.learned_look import LearnedLook, own_functions
-from fitting.screening import Lead, Screen, screen
-from fitting.shortlist import worth_a_refit
-from fitting.trial import Data, Setting, Trial
 from hdjax.effects.learned import LearnedMeshTorque
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY, LearnedMemory
 

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.along import place_of, unit_reading
-from fitting.attribution import SIGNIFICANCE
+from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, challenge
+from fitting.attribution.selection_round import SIGNIFICANCE
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.learned_look import (
@@ -32,7 +33,6 @@ from fitting.linear_look import surrogate_gains
 from fitting.remembering import Remembered, Remembering, remembering
 from fitting.sight import motion_states
 from fitting.surrogates import surrogates
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, challenge
 from hdjax import Model, sampled
 from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import Learned, LearnedReading

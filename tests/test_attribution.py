@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import rig
-from fitting import attribution
-from fitting import trial as of_a_trial
-from fitting.attribution import Verdict, look
+from fitting.attribution import candidate_fit as of_a_trial
+from fitting.attribution import selection_round as attribution
+from fitting.attribution.candidate_fit import Setting, Trial, attempt, halo_for
+from fitting.attribution.selection_round import Verdict, look
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
 from fitting.free import effect_paths
 from fitting.measurement_noise import MeasurementNoise
 from fitting.posing import segment_length
-from fitting.trial import Setting, Trial, attempt, halo_for
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects import Effect

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, halo_for
+from fitting.attribution.log_alignment import Phasors, put_back, with_clocks_set
 from fitting.base_fit import base_fit
-from fitting.clocks import Phasors, put_back, with_clocks_set
 from fitting.experiment import Experiment, experiment_from_log, segment_count, split
 from fitting.linear_look import Acting, look_along, products
 from fitting.posing import segment_length
-from fitting.trial import Data, Setting, Trial, attempt, halo_for
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
 

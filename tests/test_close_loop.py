@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.attribution import Round, Verdict
+from fitting.attribution.selection_round import Round, Verdict
 from fitting.close_loop import Loop, _holds_given_up, close_loop
 from fitting.experiment import Experiment, experiment_from_log
 from hdjax import Hold

@@ -9,12 +9,12 @@ import pytest
 
 import rig
 from fitting import doubt
+from fitting.attribution.candidate_fit import Setting, Trial
 from fitting.close_loop import _base_trial
 from fitting.doubt import _explain_all_but_little, _is_little, _names_stand
 from fitting.experiment import split
 from fitting.learned_look import Candidate
 from fitting.measurement_noise import MeasurementNoise
-from fitting.trial import Setting, Trial
 from fitting.unknown import Unknown
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.effect_evidence import Evidence, evidence
 from fitting.estimate import Fit, fit
-from fitting.evidence import Evidence, evidence
 from fitting.experiment import Stretch
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
@@ -54,7 +54,7 @@ def test_no_picture_of_what_no_quantity_shows():
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
 def test_hats_add_up_to_one_and_straight_lines_to_themselves(direction: float):
-    from fitting.evidence import _hats
+    from fitting.attribution.effect_evidence import _hats
 
     nodes = np.array([-1.0, -0.2, 0.5, 2.0, np.nan])
     value = direction * np.linspace(-0.9, 0.9, 7)[None]

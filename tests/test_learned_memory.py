@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import rig
 from fitting.along import place_of
+from fitting.attribution.screening import Screen
 from fitting.close_loop import Loop, _base_trial, close_loop
 from fitting.experiment import experiment_from_log, split
 from fitting.learned_look import learned_look
@@ -21,7 +22,6 @@ from fitting.model_file import StoredModel, read_model, to_json
 from fitting.plots import response_plot
 from fitting.remembering import remembering
 from fitting.report import write_report
-from fitting.screening import Screen
 from fitting.uncertainty import Estimate, Uncertainty
 from fitting.unknown import share_of
 from hdjax import Model

@@ -20,7 +20,7 @@ from scipy import stats
 
 import rig
 from fitting import formatting
-from fitting.attribution import Verdict
+from fitting.attribution.selection_round import Verdict
 from fitting.close_loop import Loop, close_loop
 from fitting.diagnostics import Dependence
 from fitting.estimate import Fit

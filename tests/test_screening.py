@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.screening import Screen, screen
 from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.explained import solved, without_untold
 from fitting.free import FreeParameters, base_paths
 from fitting.residual import Blocks
-from fitting.screening import Screen, screen
 from fitting.surrogates import DRAWS, surrogates
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from fitting.screening import Lead, Screen
-from fitting.shortlist import first_of_each_family, further_forms, worth_a_refit
+from fitting.attribution.screening import Lead, Screen
+from fitting.attribution.shortlist import first_of_each_family, further_forms, worth_a_refit
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash, UndampedBacklash
 from hdjax.effects.creep import Creep

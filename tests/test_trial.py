@@ -3,10 +3,10 @@
 import pytest
 
 import rig
+from fitting.attribution.candidate_fit import Data, Setting, attempt, challenge, halo_for
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
 from fitting.posing import segment_length
-from fitting.trial import Data, Setting, attempt, challenge, halo_for
 from hdjax import Hold
 from hdjax.effects.friction import CoulombFriction
 

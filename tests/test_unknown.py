@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.candidate_fit import Setting, Trial, attempt
 from fitting.close_loop import Loop, close_loop
 from fitting.experiment import Stretch, experiment_from_log, split
 from fitting.free_run import free_run
@@ -18,7 +19,6 @@ from fitting.model_file import StoredModel, read_model, to_json
 from fitting.plots import learned_plot
 from fitting.report import report_dict, write_report
 from fitting.shapes import shapes
-from fitting.trial import Setting, Trial, attempt
 from fitting.uncertainty import uncertainty
 from fitting.unknown import Unknown, is_supported, learn, share_of
 from hdjax import Model

@@ -4,7 +4,7 @@ import html
 
 import numpy as np
 
-from fitting.attribution import Round, Verdict
+from fitting.attribution.selection_round import Round, Verdict
 from fitting.plots.look import AFTER, FAINT, MEASURED, axis, axis_scale, figure, note, numbers, text, vertical_line
 from fitting.plots.plot import Plot
 

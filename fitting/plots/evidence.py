@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fitting.evidence import Evidence
+from fitting.attribution.effect_evidence import Evidence
 from fitting.formatting import axis_label, pretty_unit
 from fitting.plots.look import AFTER, BEFORE, INK, axis, figure, numbers
 from fitting.plots.plot import Figure, Plot

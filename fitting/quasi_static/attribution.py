@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fitting.attribution import SIGNIFICANCE
+from fitting.attribution.candidate_fit import LEAST_GAIN
+from fitting.attribution.selection_round import SIGNIFICANCE
+from fitting.attribution.shortlist import NEARLY
 from fitting.quasi_static.candidates import is_possible, is_usual
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import Lead, Screen, screen
 from fitting.quasi_static.stretches import folds, worse
 from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out
-from fitting.shortlist import NEARLY
-from fitting.trial import LEAST_GAIN
 
 # A form that explains less than this share of what the best one does is no rival, and is not refitted.
 _RIVAL = 0.25

@@ -7,12 +7,12 @@ from functools import partial
 import numpy as np
 from scipy.interpolate import BSpline
 
-from fitting.attribution import SIGNIFICANCE
+from fitting.attribution.candidate_fit import LEAST_GAIN
+from fitting.attribution.selection_round import SIGNIFICANCE
 from fitting.quasi_static.attribution import Held, Trial, torque_error
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import screen
-from fitting.trial import LEAST_GAIN
 
 _SPLINES = 8
 _HARMONICS = 6

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from fitting.attribution.candidate_fit import LEAST_GAIN
 from fitting.quasi_static.attribution import Held, Round, Trial, look
 from fitting.quasi_static.candidates import catalogue, choices
 from fitting.quasi_static.form import Form
@@ -12,7 +13,6 @@ from fitting.quasi_static.points import Points
 from fitting.quasi_static.rests import RestLook, look_at_rests
 from fitting.quasi_static.stretches import stretches
 from fitting.quasi_static.twist_model import TwistModel, fit_twist
-from fitting.trial import LEAST_GAIN
 
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 

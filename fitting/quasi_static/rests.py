@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from fitting.attribution import SIGNIFICANCE
+from fitting.attribution.selection_round import SIGNIFICANCE
 from fitting.quasi_static.attribution import Held, Round, Trial, look
 from fitting.quasi_static.form import START, Form
 from fitting.quasi_static.points import Points

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fitting.attribution import Verdict
+from fitting.attribution.candidate_fit import Trial
+from fitting.attribution.selection_round import Verdict
 from fitting.report.outcome import Outcome
 from fitting.report.separating import separating_experiment
-from fitting.trial import Trial
 
 
 def alternatives(outcome: Outcome) -> list[dict[str, Any]]:

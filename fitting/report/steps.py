@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
+from fitting.attribution.candidate_fit import Trial
 from fitting.close_loop import Loop
 from fitting.report.outcome import Outcome
-from fitting.trial import Trial
 
 # In units of the measurement noise: what leaves nothing but noise, and what a free run may be off without a word.
 _NOISE, _OFF = 1.2, 3.0

@@ -6,16 +6,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, long_gains
+from fitting.attribution.candidate_refit import begin, go_on, try_hold
+from fitting.attribution.screening import Lead, Screen, screen
+from fitting.attribution.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.experiment import scales
 from fitting.free import effect_paths, strength_paths
-from fitting.lead_refit import begin, go_on, try_hold
 from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
-from fitting.screening import Lead, Screen, screen
-from fitting.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, long_gains
 from fitting.uncertainty import Estimate, Uncertainty, uncertainty
 from hdjax import ReducedModel
 from hdjax.effects import Effect

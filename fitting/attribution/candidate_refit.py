@@ -4,10 +4,7 @@ from dataclasses import replace
 
 import equinox as eqx
 
-from fitting.estimate import Fit
-from fitting.experiment import scales
-from fitting.screening import Lead
-from fitting.trial import (
+from fitting.attribution.candidate_fit import (
     LEAST_GAIN,
     Data,
     Setting,
@@ -18,6 +15,9 @@ from fitting.trial import (
     to_the_end,
     trained,
 )
+from fitting.attribution.screening import Lead
+from fitting.estimate import Fit
+from fitting.experiment import scales
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters

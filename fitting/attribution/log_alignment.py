@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from fitting.along import place_of
+from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, attempt
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
 from fitting.explained import solved
 from fitting.free import effect_paths
 from fitting.linear_look import Acting, Look, best_steps, left_after, look_along, products
 from fitting.spectral_lines import spectral_lines
-from fitting.trial import LEAST_GAIN, Data, Setting, Trial, attempt
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, Learned, LearnedPeriodic, LearnedTorque
 from hdjax.effects.learned_axes import PeriodicAxis

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
+from fitting.attribution.screening import Lead, Screen
 from fitting.free import effect_paths
-from fitting.screening import Lead, Screen
 from hdjax.effects import CATALOGUE
 
 NEARLY = 0.95
