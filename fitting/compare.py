@@ -15,12 +15,6 @@ from fitting.profile import with_profiles
 from fitting.uncertainty import Uncertainty, uncertainty
 from hdjax import Model
 
-EXCESS = 1.5
-"""A residual this many times as large as the measurement noise is not noise."""
-
-EXPLAINED = 0.9
-"""Share of the unexplained variance that found effects must remove to be the explanation: two thirds of its rms."""
-
 
 class Account(eqx.Module):
     """What one fitted model is worth.

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 from fitting.attribution.selection_round import Round
 from fitting.base_fit import base_fit
 from fitting.clock import Clock
-from fitting.close_loop import Finding
 from fitting.compare import Account, account
 from fitting.diagnostics import ResidualDiagnostics, diagnose
 from fitting.experiment import Experiment, whole
@@ -18,6 +17,7 @@ from fitting.frequency_response import FrequencyResponse, frequency_response
 from fitting.goodness import Goodness, goodness
 from fitting.long_fit import long_fit
 from fitting.measurement_noise import measurement_noise
+from fitting.outcome import Finding
 from fitting.posterior import Posterior, posterior
 from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.residual_tests import ResidualTests, residual_tests

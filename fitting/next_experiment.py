@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.selection_round import Verdict
 from fitting.base_fit import as_followed
-from fitting.close_loop import Loop
 from fitting.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
 from fitting.estimate import Fit, fit, whitening
@@ -23,6 +22,7 @@ from fitting.experiment import Experiment, Stretch, scales, segment_count
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
+from fitting.outcome import Loop
 from fitting.posing import segment_length, typical_scales
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 

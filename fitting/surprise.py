@@ -6,14 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.compare import EXPLAINED
+from fitting.attribution.decisions import RULES
 from fitting.estimate import Fit
 from fitting.free_run import FreeRun, rms_error
 from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.uncertainty import uncertainty
-
-SURPRISED = 1.25
-"""Free runs that are farther off than this, in units of what their bands allow, are not what the model promised."""
 
 
 def surprise(
@@ -43,7 +40,7 @@ def surprise(
     short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
     variance = float(short[-1, -1])
     at_first = rms_error(before) ** 2 - variance
-    if rms_error(after) ** 2 - variance <= (1.0 - EXPLAINED) * at_first:
+    if rms_error(after) ** 2 - variance <= (1.0 - RULES.explained) * at_first:
         return None
     bands = prediction_bands(final, uncertainty(final), held_out.stretches, noise=short, halo=halo, runs=after)
     return over_bands(bands)

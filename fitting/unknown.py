@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.along import place_of, unit_reading
-from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, challenge
-from fitting.attribution.selection_round import SIGNIFICANCE
+from fitting.attribution.candidate_fit import Data, Setting, Trial, challenge
+from fitting.attribution.decisions import RULES
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.learned_look import (
@@ -188,7 +188,7 @@ def _refined(
 
 def is_supported(found: Unknown | None) -> bool:
     """Whether a learned function is more than chance and more than an imperfection of the solver."""
-    return found is not None and found.gain > LEAST_GAIN and found.p_value <= SIGNIFICANCE
+    return found is not None and found.gain > RULES.least_gain and found.p_value <= RULES.significance
 
 
 def share_of(named: Model, found: Unknown, fit: Fit | None = None) -> float:

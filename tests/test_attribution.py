@@ -10,6 +10,7 @@ import pytest
 import rig
 from fitting.attribution import candidate_fit as of_a_trial
 from fitting.attribution import selection_round as attribution
+from fitting.attribution import support
 from fitting.attribution.candidate_fit import Setting, Trial, attempt, halo_for
 from fitting.attribution.selection_round import Verdict, look
 from fitting.base_fit import base_fit
@@ -113,7 +114,8 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
         return None if None in gains else gains
 
     monkeypatch.setattr(attribution, "long_gains", long_gains)
-    assert attribution._simplest_first(tied, before, {}, SETTING)[0].name == leader
+    ordered, _ = attribution._simplest_first(tied, before, {}, SETTING)
+    assert ordered[0].name == leader
 
 
 @pytest.mark.parametrize(
@@ -133,7 +135,8 @@ def test_whole_stretches_judge_what_remembers(
     ]
     long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
     monkeypatch.setattr(attribution, "long_gains", lambda before, trials, data, setting: [long[id(t)] for t in trials])
-    first, second = attribution._simplest_first(ordered, before, {}, SETTING)
+    (first, second), rivals = attribution._simplest_first(ordered, before, {}, SETTING)
+    assert {r.name: r.long_gain for r in rivals} == ({"torque_bias": 2.0, "creep": creep_long} if share > 0.5 else {})
     assert (first.name, first.separable, second.separable) == (leader, False, True)
 
 
@@ -148,7 +151,7 @@ def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monke
 
     dahl, dry = DahlMotorFriction(T_c=0.1, bend=0.1, settling=1e-3), MotorFriction(T_c=0.1, transition=0.1)
     assert len(effect_paths(dahl)) == len(effect_paths(dry))
-    ordered = attribution._simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, {}, SETTING)
+    ordered, _ = attribution._simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, {}, SETTING)
     assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 
@@ -160,8 +163,8 @@ def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
         return eqx.tree_at(lambda t: t.held_out.covariance, trial, jnp.asarray([[1.0 + rms**2]]))
 
     base, before, after = with_error(1000.0), with_error(1.0), with_error(0.0)
-    assert attribution._share_of_removed(after, before, base) == pytest.approx(1e-3, rel=1e-3)
-    assert attribution._share_of_removed(after, base, base) == np.inf
+    assert support.share_of_removed(after, before, base) == pytest.approx(1e-3, rel=1e-3)
+    assert support.share_of_removed(after, base, base) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -196,7 +199,7 @@ def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
     monkeypatch.setattr(MeasurementNoise, "and_beside", lambda self, fit: seen_as(noise))
     base, by_base = with_error(1000.0), seen_as(5.0)
     before = base if effect is None else with_error(left, effect)
-    found, seen = attribution.leaves_imperfection(before, base, by_base)
+    found, seen = support.leaves_imperfection(before, base, by_base)
     assert found == is_all
     assert (seen is not by_base) == asked
 
@@ -213,9 +216,9 @@ def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest
         for (p, v), s in zip(values.items(), spread, strict=True)
     }
     found = Uncertainty(estimates, covariance / np.outer(spread, spread), covariance, covariance)
-    monkeypatch.setattr(attribution, "uncertainty", lambda *args, **options: found)
+    monkeypatch.setattr(support, "uncertainty", lambda *args, **options: found)
     before, _ = verdicts
-    return attribution.told_from_zero(eqx.tree_at(lambda f: f.model, before.training, model), {effect.name}) != set()
+    return support.told_from_zero(eqx.tree_at(lambda f: f.model, before.training, model), {effect.name}) != set()
 
 
 def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: pytest.MonkeyPatch):

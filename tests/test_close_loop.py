@@ -10,8 +10,10 @@ import pytest
 
 import rig
 from fitting.attribution.selection_round import Round, Verdict
-from fitting.close_loop import Loop, _holds_given_up, close_loop
+from fitting.close_loop import close_loop
+from fitting.effect_search import _holds_given_up
 from fitting.experiment import Experiment, experiment_from_log
+from fitting.outcome import Loop
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias

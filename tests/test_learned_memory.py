@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 import rig
 from fitting.along import place_of
 from fitting.attribution.screening import Screen
-from fitting.close_loop import Loop, _base_trial, close_loop
+from fitting.close_loop import close_loop
+from fitting.effect_search import base_trial
 from fitting.experiment import experiment_from_log, split
 from fitting.learned_look import learned_look
 from fitting.learned_response import learned_response
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.outcome import Loop
 from fitting.plots import response_plot
 from fitting.remembering import remembering
 from fitting.report import write_report
@@ -177,7 +179,7 @@ def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: p
 
     monkeypatch.setattr("fitting.remembering.screen", screen)
     data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
-    before = _base_trial(rig.reduced_model(), data, "zero-order")[0]
+    before = base_trial(rig.reduced_model(), data, "zero-order")[0]
     seen = learned_look(before.training)
     before = replace(before, model=before.model.with_effects(KNOWN["Dahl"][0]))
     remembering(before, seen, least=0.1, seed=0, progress=lambda message: None)

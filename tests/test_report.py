@@ -21,12 +21,13 @@ from scipy import stats
 import rig
 from fitting import formatting
 from fitting.attribution.selection_round import Verdict
-from fitting.close_loop import Loop, close_loop
+from fitting.close_loop import close_loop
 from fitting.diagnostics import Dependence
 from fitting.estimate import Fit
 from fitting.experiment import Experiment, whole
 from fitting.findings import Finding
 from fitting.fit_only import FitOnly, fit_only
+from fitting.outcome import Loop
 from fitting.plots import decimated, fit_plots, plots
 from fitting.posterior import Posterior
 from fitting.report import (
@@ -167,7 +168,7 @@ def test_each_step_with_its_error_on_selection_data(loop: Loop):
 def test_free_runs_that_leave_a_right_model_are_told(loop: Loop):
     """As behind a dead zone: short simulations stay at the noise, long ones can't."""
     assert not any("grow" in note for note in report_dict(loop)["cannot_tell"])
-    lost = eqx.tree_at(lambda x: x.after.test[0].predicted, loop, replace_fn=lambda p: p + 1e-3)
+    lost = eqx.tree_at(lambda x: x.after.selection[0].predicted, loop, replace_fn=lambda p: p + 1e-3)
     (note,) = (n for n in report_dict(lost)["cannot_tell"] if "grow" in n)
     assert "times the noise" in note
 

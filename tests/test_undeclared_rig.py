@@ -292,7 +292,9 @@ def test_a_case_becomes_a_log_folder_that_the_loop_reads(tmp_path: Path, monkeyp
     assert answer == json.loads((tmp_path / "answer.json").read_text())
     assert answer["families"] == ["temperature"]
     assert answer["detection_limits"][0] >= drawing.LEAST
-    rig = read_rig([tmp_path / "train_1.csv", tmp_path / "train_2.csv"], tmp_path / "drive.toml")
+    first, second, last = (tmp_path / f"{name}.csv" for name in ("train_1", "train_2", "heldout"))
+    rig = read_rig([first, second], tmp_path / "drive.toml", test=[last])
+    assert [e.time.size for e in rig.test["zero-order"]] == [800]
     log = rig.logs[0]
     assert log.time.size == 1200
     assert rig.hold == "zero-order"

@@ -11,11 +11,12 @@ import pytest
 
 import rig
 from fitting.attribution.candidate_fit import Setting, Trial, attempt
-from fitting.close_loop import Loop, close_loop
+from fitting.close_loop import close_loop
 from fitting.experiment import Stretch, experiment_from_log, split
 from fitting.free_run import free_run
 from fitting.learned_curve import LearnedCurve, learned_curve
 from fitting.model_file import StoredModel, read_model, to_json
+from fitting.outcome import Loop
 from fitting.plots import learned_plot
 from fitting.report import report_dict, write_report
 from fitting.shapes import shapes

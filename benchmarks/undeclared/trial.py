@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from fitting.close_loop import Loop, close_loop
+from fitting.close_loop import close_loop
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError
 from fitting.experiment import Stretch
 from fitting.files import finite
 from fitting.free_run import WINDOW, free_run
+from fitting.outcome import Loop
 from fitting.report import report_dict
 from fitting.rig import Rig, experiments, read_rig, ready_log
 from hdjax import Model, SimulationError
@@ -83,6 +84,7 @@ def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
         "held_out": held_out,
         "forms_tried": report["forms_tried"],
         "laps": report["seconds"],
+        "evidence": report["evidence"],
     }
 
 

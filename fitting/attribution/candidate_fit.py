@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitting.attribution.decisions import RULES
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit, fit, needed_substeps
 from fitting.experiment import Stretch
@@ -19,16 +20,13 @@ from fitting.posing import states_from
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
-LEAST_GAIN = 1e-3
-"""Smallest accepted gain, a tenth of a percent of the error: below it a solver's imperfection counts too."""
-
 # Iterations of a trial at most: a form that needs more than this has no clear minimum.
 _TRIAL_STEPS = 25
 # Those that tell a good start from a poor one.
 _FIRST_STEPS = 12
 # A few steps that together lower the objective by less than half of this are not worth another; nor by less than half
 # of the latter while a model is but one of several.
-_LEAST_PROGRESS, _LEAST_OF_A_RIVAL = 0.1 * LEAST_GAIN, LEAST_GAIN
+_LEAST_PROGRESS, _LEAST_OF_A_RIVAL = 0.1 * RULES.least_gain, RULES.least_gain
 # What a first pass may fall short of because of what effects remember: it must have come so far towards what it is to
 # reach.
 _MOST_OF_THE_WAY = 2.0 / 3.0
@@ -206,7 +204,7 @@ def to_the_end(
     [`challenge`][]."""
     to_judge, setting = setting, setting.for_rivals()
     before = champion.training.objective
-    limit = min(give_up_above, before + LEAST_GAIN)
+    limit = min(give_up_above, before + RULES.least_gain)
     remembers_more = first.model.state_names != champion.model.state_names and _may_remember_better(first)
     if remembers_more and first.objective <= before - _MOST_OF_THE_WAY * (before - limit):
         first = with_memory_carried(first, least_progress=setting.least_progress)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import equinox as eqx
 
 from fitting.attribution.candidate_fit import (
-    LEAST_GAIN,
     Data,
     Setting,
     Trial,
@@ -15,6 +14,7 @@ from fitting.attribution.candidate_fit import (
     to_the_end,
     trained,
 )
+from fitting.attribution.decisions import RULES
 from fitting.attribution.screening import Lead
 from fitting.estimate import Fit
 from fitting.experiment import scales
@@ -78,7 +78,7 @@ def try_hold(before: Trial, data: Data, hold: Hold, setting: Setting) -> Trial |
         setting: how the stretches are cut.
     """
     near = trained(before.model, data, hold, setting, before.training, max_steps=_HOLD_STEPS, reweigh=False)
-    if near.objective > before.training.objective + LEAST_GAIN:
+    if near.objective > before.training.objective + RULES.least_gain:
         return None
     return challenge([near.model], data, hold, setting, champion=before)
 

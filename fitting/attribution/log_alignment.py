@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from fitting.along import place_of
-from fitting.attribution.candidate_fit import LEAST_GAIN, Data, Setting, Trial, attempt
+from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt
+from fitting.attribution.decisions import RULES
 from fitting.estimate import Fit
 from fitting.experiment import Stretch
 from fitting.explained import solved
@@ -142,7 +143,7 @@ def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | 
     for _ in range(_REFITS):
         data = _with_clocks_put_back(data, seen.late)
         near = attempt(base.model.with_effects(seen.in_phase.effect), data, base.hold, setting, start=near)
-        if not near.training.objective < base.training.objective - LEAST_GAIN:
+        if not near.training.objective < base.training.objective - RULES.least_gain:
             return None
         seen = _fitted(near.training)
         if np.all(np.abs(seen.late) * seen.omega * seen.told < _SETTLED):

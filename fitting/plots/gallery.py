@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from fitting.close_loop import Loop
 from fitting.compare import Account
 from fitting.diagnostics import ResidualDiagnostics
 from fitting.fit_only import FitOnly
 from fitting.free_run import FreeRun
+from fitting.outcome import Loop
 from fitting.plots.competition import competition
 from fitting.plots.correlations import correlations
 from fitting.plots.frequency_response import bode

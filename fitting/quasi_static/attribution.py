@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fitting.attribution.candidate_fit import LEAST_GAIN
-from fitting.attribution.selection_round import SIGNIFICANCE
+from fitting.attribution.decisions import RULES
 from fitting.attribution.shortlist import NEARLY
 from fitting.quasi_static.candidates import is_possible, is_usual
 from fitting.quasi_static.form import Form
@@ -151,7 +150,7 @@ def look(
         # The law of chance holds for the grid of shapes; what a search between its points gains has to count as chance.
         rivals.append(Rival(lead, trial, gain, screened.p_value(min(gain, lead.gain))))
     rivals.sort(key=lambda rival: -rival.gain)
-    if not rivals or rivals[0].p_value > SIGNIFICANCE or rivals[0].gain < LEAST_GAIN:
+    if not rivals or rivals[0].p_value > RULES.significance or rivals[0].gain < RULES.least_gain:
         return Round(before, screened, tuple(rivals), accepted=False)
     winner, told = _compared(held, rivals, screened, list(choices))
     removed = before.mean_square - winner.trial.mean_square
@@ -170,7 +169,7 @@ def torque_error(points: Points, base: Trial) -> float:
 def _worth_a_refit(screened: Screen) -> list[Lead]:
     """The best forms of each family that come near the best of all, or none where that one is no more than chance."""
     best = screened.leads[0].gain if screened.leads else 0.0
-    if best < LEAST_GAIN or screened.p_value(best) > SIGNIFICANCE:
+    if best < RULES.least_gain or screened.p_value(best) > RULES.significance:
         return []
     near = [lead for lead in screened.leads if lead.gain >= _RIVAL * best]
     return [lead for i, lead in enumerate(near) if sum(other.families == lead.families for other in near[:i]) < _FORMS]
@@ -187,7 +186,7 @@ def _compared(
     as much.
     """
     supported = [
-        rival for rival in rivals if rival.p_value <= SIGNIFICANCE and rival.gain >= _PLAUSIBLE * rivals[0].gain
+        rival for rival in rivals if rival.p_value <= RULES.significance and rival.gain >= _PLAUSIBLE * rivals[0].gain
     ]
     leader = next((rival for rival in supported if _is_possible(held.points, rival)), rivals[0])
     others = [rival for rival in rivals if rival is not leader]
@@ -218,7 +217,7 @@ def _strengths(points: Points, rival: Rival) -> list[tuple[Form, np.ndarray, np.
 
 
 def _is_tied(held: Held, rival: Rival, leader: Rival, screened: Screen) -> bool:
-    if rival.p_value > SIGNIFICANCE or held.is_worse(rival.trial, leader.trial):
+    if rival.p_value > RULES.significance or held.is_worse(rival.trial, leader.trial):
         return False
     both = held.beside(rival.trial, leader.lead)
-    return screened.p_value(both.gain_over(rival.trial)) > SIGNIFICANCE
+    return screened.p_value(both.gain_over(rival.trial)) > RULES.significance

@@ -7,8 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.interpolate import BSpline
 
-from fitting.attribution.candidate_fit import LEAST_GAIN
-from fitting.attribution.selection_round import SIGNIFICANCE
+from fitting.attribution.decisions import RULES
 from fitting.quasi_static.attribution import Held, Trial, torque_error
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
@@ -48,7 +47,11 @@ def leftover(held: Held, trial: Trial, base: Trial, seed: int) -> Leftover | Non
     best = found.leads[0]
     p_value = found.p_value(best.gain)
     share = 1.0 - math.exp(-2.0 * best.gain)
-    if best.gain < LEAST_GAIN or p_value > SIGNIFICANCE or share * trial.mean_square < torque_error(held.points, base):
+    if (
+        best.gain < RULES.least_gain
+        or p_value > RULES.significance
+        or share * trial.mean_square < torque_error(held.points, base)
+    ):
         return None
     return Leftover(best.name, share, p_value)
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from fitting.attribution.candidate_fit import LEAST_GAIN
+from fitting.attribution.decisions import RULES
 from fitting.quasi_static.attribution import Held, Round, Trial, look
 from fitting.quasi_static.candidates import catalogue, choices
 from fitting.quasi_static.form import Form
@@ -156,7 +156,7 @@ def _without_superfluous(held: Held, trial: Trial, base: Trial) -> tuple[Trial, 
     for form in trial.model.forms if len(trial.model.forms) > 1 else ():
         poorer = held.without(trial, [form])
         least = _IMPERFECTION**2 * (base.mean_square - trial.mean_square)
-        if trial.gain_over(poorer) < LEAST_GAIN or poorer.mean_square - trial.mean_square < least:
+        if trial.gain_over(poorer) < RULES.least_gain or poorer.mean_square - trial.mean_square < least:
             trial = poorer
             dropped.append(form.name)
     return trial, tuple(dropped)

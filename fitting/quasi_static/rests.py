@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from fitting.attribution.selection_round import SIGNIFICANCE
+from fitting.attribution.decisions import RULES
 from fitting.quasi_static.attribution import Held, Round, Trial, look
 from fitting.quasi_static.form import START, Form
 from fitting.quasi_static.points import Points
@@ -32,7 +32,7 @@ _FEWEST = 50
 _MOST_RESTS = 10
 _POINTS_IN_CONSTANT, _CONSTANTS = 8, 12
 # This is a second look at the same logs.
-_SIGNIFICANCE = 0.5 * SIGNIFICANCE
+_SIGNIFICANCE = 0.5 * RULES.significance
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from fitting import findings
-from fitting.close_loop import Loop
 from fitting.files import finite
 from fitting.next_experiment import NextExperiment
+from fitting.outcome import Loop
 from fitting.report.alternatives import alternatives
 from fitting.report.earlier_schema import with_old_names
 from fitting.report.fit_content import fit_dict, meaning
@@ -20,6 +20,7 @@ from fitting.report.outcome import Outcome
 from fitting.report.parameters import PARTS, account_dict, effect_dict, no_account
 from fitting.report.posterior import posterior_dict
 from fitting.report.proposal import proposal_dict
+from fitting.report.rules import rules_dict
 from fitting.report.steps import steps
 from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
@@ -60,6 +61,8 @@ def report_dict(
         "decision": outcome.decision,
         "judged_on": list(outcome.after.parts())[-1],
         "summary": "",
+        "rules": rules_dict(outcome.checks) if is_loop else [],
+        "evidence": dataclasses.asdict(outcome.case) if is_loop else None,
         "units": units,
         "noise": {"dynamic_error": noise, "memory": outcome.noise_memory if is_loop else None},
         "before": account_dict(outcome.before, units, x_max, start=start),

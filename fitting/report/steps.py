@@ -5,7 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.attribution.candidate_fit import Trial
-from fitting.close_loop import Loop
+from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 
 # In units of the measurement noise: what leaves nothing but noise, and what a free run may be off without a word.

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from fitting.close_loop import Loop
 from fitting.diagnostics import Dependence, diagnose
+from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from fitting import formatting
 from fitting.along import place_of
-from fitting.close_loop import Loop
 from fitting.free import effect_paths
 from fitting.learned_curve import PLACES, WORDS, LearnedCurve, learned_curve
 from fitting.learned_response import LearnedResponse, learned_response
+from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from fitting.shapes import Shape, shapes

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from fitting import findings
-from fitting.close_loop import Loop
 from fitting.files import write_whole
 from fitting.fit_only import FitOnly
 from fitting.learned_curve import LearnedCurve
 from fitting.next_experiment import NextExperiment
+from fitting.outcome import Loop
 from fitting.plots import Plot, evidence_plot, fit_plots, learned_plot, next_experiment_plot, plots, response_plot
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome

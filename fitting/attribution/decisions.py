@@ -1,0 +1,505 @@
+"""Every decision of the loop: the rules with their thresholds, and what they make of the evidence.
+
+Nothing here fits, simulates or reads: the same evidence and the same rules give the same decision, so that stored
+evidence can be decided anew under other rules.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import stdtrit
+
+Outcome = Literal["effect_found", "model_sufficient", "unexplained"]
+Question = Literal["instead", "beside"]
+
+
+def _rule(default: float, unit: str, meaning: str, source: str) -> Any:
+    return field(default=default, metadata={"unit": unit, "meaning": meaning, "source": source})
+
+
+_UNDECLARED = "study of undeclared effects, `docs/undeclared.md`"
+
+
+@dataclass(frozen=True)
+class DecisionRules:
+    """Every threshold that decides something; `docs/rules.md` is made of the fields."""
+
+    significance: float = _rule(
+        0.01,
+        "1",
+        "largest chance that the best of the catalogue gains as much where nothing is missing",
+        "convention; at 0.01 at most one false alarm in a hundred looks",
+    )
+    least_gain: float = _rule(
+        1e-3,
+        "log of rms error",
+        "smallest decrease of the error that counts: a tenth of a percent",
+        "an imperfection of the solver counts for as much",
+    )
+    tie_level: float = _rule(
+        0.05,
+        "1",
+        "chance at which a candidate counts as worse than the best one, by a paired t test over blocks",
+        "convention",
+    )
+    fewest_blocks: float = _rule(5.0, "blocks", "with fewer blocks than this nothing is told apart", "assumed")
+    near: float = _rule(
+        0.1,
+        "share of the best gain",
+        "what is not told from the best one and gains as much but for this share competes over whole stretches",
+        _UNDECLARED,
+    )
+    rival_of_memory: float = _rule(
+        0.5,
+        "share of the best gain",
+        "beside a form with memory, whose states short segments leave free, so does all that gains this share",
+        "Silverbox",
+    )
+    same_gain: float = _rule(
+        0.02, "share of the best gain", "gains over whole stretches that differ by less are the same", _UNDECLARED
+    )
+    strength_errors: float = _rule(
+        3.9,
+        "standard errors",
+        "by which a strength must differ from zero",
+        "one percent of chance over a hundred forms and shapes (Bonferroni)",
+    )
+    excess: float = _rule(
+        1.5, "times the noise", "a residual larger than this is not noise", "the noise is known to a few per cent"
+    )
+    explained: float = _rule(
+        0.9,
+        "share of variance",
+        "of the error beyond noise that found effects must remove to be the explanation",
+        _UNDECLARED,
+    )
+    little: float = _rule(
+        0.05,
+        "share of the gain",
+        "what a learned term adds to names, or names leave beyond noise, is little below this share of their gain",
+        _UNDECLARED,
+    )
+    come_out: float = _rule(
+        0.75,
+        "share of mean square",
+        "of a learned term that named effects must make up for it to have come out as them",
+        _UNDECLARED,
+    )
+    noise_margin: float = _rule(
+        0.05, "log of rms error", "by which fitted initial states and the noise's estimate may be off", "a few per cent"
+    )
+    many: float = _rule(3.0, "names", "so many names may be the terms of one function", _UNDECLARED)
+    surprise: float = _rule(
+        1.25,
+        "times the band",
+        "free runs that are farther off than this are not what the model promised",
+        "a right model stays within 1.2 (`tests/test_surprise.py`)",
+    )
+
+
+RULES = DecisionRules()
+"""The rules as they are."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A rule as it was applied.
+
+    Attributes:
+        rule: its name in [`DecisionRules`][].
+        about: what it was asked of.
+        statistic: what the data say.
+        threshold: what the rule compares it with.
+        holds: whether it is met.
+    """
+
+    rule: str
+    about: str
+    statistic: float
+    threshold: float
+    holds: bool
+
+
+@dataclass(frozen=True)
+class EffectEvidence:
+    """What the data say of the best candidate of a round.
+
+    Attributes:
+        name: of the form.
+        gain: decrease of the objective on selection data.
+        p_value: chance that the best of the catalogue gains as much where nothing is missing.
+        removed: what it removes of the error, over what the effects before it have removed (rms).
+        imperfection: what the laws of the effects before it may get wrong, likewise.
+        strength_errors: standard errors by which its best known strength differs from zero.
+    """
+
+    name: str
+    gain: float
+    p_value: float
+    removed: float = np.inf
+    imperfection: float = 0.0
+    strength_errors: float = np.inf
+
+
+def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
+    """Whether the data support an effect: all checks must hold.
+
+    Args:
+        seen: what they say.
+        rules: the thresholds.
+    """
+    least, errors, chance = rules.least_gain, rules.strength_errors, rules.significance
+    return (
+        Check("least_gain", seen.name, seen.gain, least, seen.gain > least),
+        Check("significance", seen.name, seen.p_value, chance, seen.p_value <= chance),
+        Check("imperfection", seen.name, seen.removed, seen.imperfection, seen.removed > seen.imperfection),
+        Check("strength_errors", seen.name, seen.strength_errors, errors, seen.strength_errors > errors),
+    )
+
+
+def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = RULES) -> Check:
+    """Whether a candidate can't be told from the best one: paired differences over blocks, one-sided.
+
+    Args:
+        name: of the candidate.
+        behind: log predictive density of the best one less that of the candidate, block by block.
+        rules: the thresholds.
+    """
+    count = behind.size
+    if count < rules.fewest_blocks:
+        return Check("fewest_blocks", name, float(count), rules.fewest_blocks, True)
+    error = float(np.std(behind, ddof=1) / np.sqrt(count))
+    mean, limit = float(np.mean(behind)), float(stdtrit(count - 1, 1.0 - rules.tie_level))
+    statistic = mean / error if error > 0 else 0.0
+    return Check("tie_level", name, statistic, limit, statistic <= limit)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A candidate among those that can't be told from the best one.
+
+    Attributes:
+        name: of the form.
+        gain: over short segments.
+        long_gain: in free runs along whole stretches; over short segments where these tell nothing.
+        tied: whether it can't be told from the best one over short segments.
+        parameters: number of free parameters.
+        states: likewise of states.
+        plausible: whether no parameter is larger than real drives show.
+        remembers: whether it has states that the model before it has not.
+    """
+
+    name: str
+    gain: float
+    long_gain: float
+    tied: bool
+    parameters: int
+    states: int
+    plausible: bool
+    remembers: bool
+
+
+def compete(best: Rival, others: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, ...]:
+    """Those that compete over whole stretches, the best one included.
+
+    Args:
+        best: the candidate with the largest gain over short segments.
+        others: the others.
+        rules: the thresholds.
+    """
+    free = rules.rival_of_memory if best.remembers else 1.0
+    least = (1.0 - rules.near) * best.gain - rules.least_gain
+    kept = [r for r in others if r.gain > free * best.gain or (r.tied and r.gain > least)]
+    return best, *kept
+
+
+def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, tuple[str, ...]]:
+    """Which candidate is taken: of those that gain as much over whole stretches the simplest, a plausible one first.
+
+    Args:
+        rivals: those that compete.
+        rules: the thresholds.
+
+    Returns:
+        The candidate, and the names of those that gain as much.
+    """
+    most = max(r.long_gain for r in rivals)
+    least = most - max(rules.least_gain, rules.same_gain * most)
+    close = [r for r in rivals if r.long_gain >= least]
+    first = min(close, key=lambda r: (not r.plausible, r.parameters, r.states, -r.gain))
+    return first, tuple(r.name for r in close)
+
+
+@dataclass(frozen=True)
+class ModelEvidence:
+    """A fitted model as the final decision sees it.
+
+    Attributes:
+        training: objective on training data: half the log-determinant of the error's covariance.
+        selection: likewise on selection data.
+        parameters: number of free parameters.
+        excess: what short segments of the selection data leave of each output, over the measurement noise.
+        white: whether training data leave nothing of the dynamic error that its colour betrays, and of no output more
+            than the noise.
+    """
+
+    training: float
+    selection: float
+    parameters: int
+    excess: tuple[float, ...]
+    white: bool
+
+
+@dataclass(frozen=True)
+class ChallengeEvidence:
+    """What is known when a learned term challenges names.
+
+    Attributes:
+        base: the model without effects.
+        named: the model with those that were found; the base model where there are none.
+        names: how many there are.
+        noise: the objective that nothing but measurement noise makes.
+        imperfect: whether all that is left is what the laws of the names may get wrong.
+        beside: the named model with a learned term beside them; None where none is supported or it was not asked.
+        instead: the base model with a learned term in their place; likewise.
+        asked: what was learned, or could not be.
+        come_out: share of the term in their place that the names make up.
+        shown: whether every name still has a strength that is told from zero beside the learned term.
+        one_shape: whether a name is one shape of the function that was learned both beside it and in its place.
+    """
+
+    base: ModelEvidence
+    named: ModelEvidence
+    names: int
+    noise: float
+    imperfect: bool
+    beside: ModelEvidence | None = None
+    instead: ModelEvidence | None = None
+    asked: tuple[Question, ...] = ()
+    come_out: float = 0.0
+    shown: bool = True
+    one_shape: bool = False
+
+    def answered(self, question: Question, found: ModelEvidence | None, **changes: Any) -> "ChallengeEvidence":
+        """The same with one more answer."""
+        return replace(self, asked=(*self.asked, question), **{question: found}, **changes)
+
+
+def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Question | None:
+    """What must be learned next before names can be trusted; None where enough is known.
+
+    Args:
+        seen: what is known.
+        rules: the thresholds.
+    """
+    enough = seen.named.white or seen.imperfect
+    if enough and seen.names < rules.many:
+        return None
+    little = _leaves_little(seen, rules)
+    if seen.names and not enough and not little and "instead" not in seen.asked:
+        return "instead"
+    if seen.instead is not None and seen.instead.white and seen.come_out < rules.come_out:
+        # Nothing beside the names could be better.
+        return None
+    if not enough and "beside" not in seen.asked:
+        return "beside"
+    if not seen.names or "instead" in seen.asked:
+        return None
+    settled = _adds_little(seen, rules) if seen.beside is not None else little and not enough
+    return None if settled else "instead"
+
+
+def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
+    """Whether names can be trusted: one check that holds is enough.
+
+    A name is doubtful where a learned term in its place, which is free to be anything, predicts selection data as well
+    as one beside it, and either does not come out as the named effect or does better by far with fewer parameters.
+
+    Args:
+        seen: all that was asked.
+        rules: the thresholds.
+    """
+    if seen.instead is None:
+        return (Check("come_out", "no learned term in their place is supported", 1.0, rules.come_out, True),)
+    beside, instead = seen.beside, seen.instead
+    enough = seen.named.white or seen.imperfect
+    rival = seen.named if beside is None else beside
+    better_by = rival.selection - instead.selection
+    gain = seen.base.selection - instead.selection
+    fewer = rival.parameters - instead.parameters
+    by_far = better_by > rules.little * gain
+    as_good = by_far or ((beside is not None or (enough and fewer > 0)) and better_by >= -rules.least_gain)
+    come_out = seen.come_out >= rules.come_out and seen.shown
+    simpler = (by_far and fewer > 0) or (seen.one_shape and fewer >= 0)
+    if beside is not None and _adds_little(seen, rules):
+        added = seen.named.selection - beside.selection
+        return (Check("little", "what a learned term adds to the names", added, rules.little, True),)
+    return (
+        Check("little", "a learned term in their place predicts as well", better_by, -rules.least_gain, not as_good),
+        Check(
+            "come_out",
+            "a learned term in their place comes out as the names",
+            seen.come_out,
+            rules.come_out,
+            come_out and not simpler,
+        ),
+    )
+
+
+def _leaves_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
+    """Whether not even a term that left nothing but noise would be better than the names by far."""
+    least = seen.noise - rules.noise_margin
+    return seen.named.selection - least < rules.little * (seen.base.selection - least)
+
+
+def _adds_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
+    """Whether a term beside the names adds next to nothing, on training and on selection data: either may show motions
+    that the other does not."""
+    if seen.beside is None:
+        return False
+    pairs = [
+        (seen.named.training - seen.beside.training, seen.base.training - seen.named.training),
+        (seen.named.selection - seen.beside.selection, seen.base.selection - seen.named.selection),
+    ]
+    return all(added < rules.little * explained for added, explained in pairs)
+
+
+@dataclass(frozen=True)
+class FinalEvidence:
+    """What the last decision rests on.
+
+    Attributes:
+        names: of the effects that are trusted.
+        learned: whether a term was learned beside them, or in the place of all.
+        excess: what short segments of the selection data leave of each output under the names alone, over the noise.
+        excess_at_first: likewise under the base model.
+        noise_explains: whether what is left is noise with a memory or noise of the torque.
+        surprise: by how much free runs are farther off than they promised; None where that is not asked.
+    """
+
+    names: tuple[str, ...]
+    learned: bool
+    excess: tuple[float, ...]
+    excess_at_first: tuple[float, ...]
+    noise_explains: bool = False
+    surprise: float | None = None
+
+
+def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome, tuple[Check, ...]]:
+    """What the data say in the end, and the checks that led there.
+
+    Args:
+        seen: the evidence.
+        rules: the thresholds.
+    """
+    left, first = np.array(seen.excess), np.array(seen.excess_at_first)
+    if not seen.names:
+        most = float(np.max(left))
+        check = Check("excess", "what the model leaves over", most, rules.excess, most < rules.excess)
+        enough = not seen.learned and (check.holds or seen.noise_explains)
+        return "model_sufficient" if enough else "unexplained", (check,)
+    output = int(np.argmax(first))
+    share = float(1.0 - (left[output] ** 2 - 1.0) / max(first[output] ** 2 - 1.0, 1e-12))
+    about = "what the named effects leave over"
+    checks = [
+        Check("excess", about, float(left[output]), rules.excess, bool(left[output] < rules.excess)),
+        Check("explained", "what they remove", share, rules.explained, share >= rules.explained),
+    ]
+    found = any(check.holds for check in checks) or (seen.noise_explains and not seen.learned)
+    if found and seen.surprise is not None:
+        as_promised = seen.surprise <= rules.surprise
+        checks.append(Check("surprise", "free runs over their bands", seen.surprise, rules.surprise, as_promised))
+        found = as_promised
+    return "effect_found" if found else "unexplained", tuple(checks)
+
+
+@dataclass(frozen=True)
+class RoundEvidence:
+    """What one look at the catalogue rests on.
+
+    Attributes:
+        asked: what the data say of the candidate that leads, and of those before it that they do not support.
+        behind: of each candidate that was refitted, how far it is behind the best one, block by block.
+        rivals: those that competed over whole stretches.
+    """
+
+    asked: tuple[EffectEvidence, ...]
+    behind: dict[str, tuple[float, ...]]
+    rivals: tuple[Rival, ...]
+
+
+@dataclass(frozen=True)
+class CaseEvidence:
+    """All that the decision on one case rests on.
+
+    Attributes:
+        rounds: every look at the catalogue.
+        challenge: of the names that were found.
+        final: what the last decision rests on.
+    """
+
+    rounds: tuple[RoundEvidence, ...]
+    challenge: ChallengeEvidence
+    final: FinalEvidence
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the rules make of the evidence.
+
+    Attributes:
+        outcome: what the data say.
+        names: of the effects that are trusted.
+        checks: every rule as it was applied.
+        lacking: what these rules would have asked for and the evidence does not hold; None where it holds all.
+    """
+
+    outcome: Outcome
+    names: tuple[str, ...]
+    checks: tuple[Check, ...]
+    lacking: str | None = None
+
+
+def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
+    """Decide a case.
+
+    Args:
+        evidence: all that is known of it.
+        rules: the thresholds; other ones than those by which it was gathered may ask for more than it holds.
+    """
+    checks: list[Check] = []
+    lacking: list[str] = []
+    for number, this in enumerate(evidence.rounds, start=1):
+        checks += [tie(name, np.array(behind), rules) for name, behind in this.behind.items()]
+        supported = [support(seen, rules) for seen in this.asked]
+        checks += [check for those in supported for check in those]
+        last = number == len(evidence.rounds)
+        first = next((i for i, those in enumerate(supported) if all(c.holds for c in those)), None)
+        accepted = all(c.holds for c in support(this.asked[-1])) if this.asked else False
+        if (first is not None) != accepted or (first is not None and first != len(supported) - 1):
+            lacking.append(f"round {number}: another candidate would be accepted")
+        elif this.rivals and not last and leader(this.rivals, rules)[0].name != this.asked[-1].name:
+            lacking.append(f"round {number}: another candidate would lead")
+    question = next_question(evidence.challenge, rules)
+    if question is not None:
+        lacking.append(f"a learned term {question}")
+    names = evidence.final.names
+    if evidence.challenge.names:
+        stand = names_stand(evidence.challenge, rules)
+        checks += stand
+        if any(check.holds for check in stand) != bool(names):
+            lacking.append("the final model where names are trusted otherwise")
+    outcome, last_checks = conclude(evidence.final, rules)
+    return Decision(outcome, names, (*checks, *last_checks), lacking[0] if lacking else None)
+
+
+def rules_table(rules: DecisionRules = RULES) -> list[dict[str, Any]]:
+    """The rules as rows: name, threshold, unit, meaning, source."""
+    return [
+        {"name": f.name, "threshold": getattr(rules, f.name)}
+        | {k: f.metadata[k] for k in ("unit", "meaning", "source")}
+        for f in fields(rules)
+    ]

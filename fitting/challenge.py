@@ -1,0 +1,146 @@
+"""Names challenged by a learned term: where they leave something, one is learned beside them and in their place."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+
+from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt
+from fitting.attribution.decisions import RULES, ChallengeEvidence, ModelEvidence, names_stand, next_question
+from fitting.attribution.support import leaves_imperfection, told_from_zero
+from fitting.base_fit import leaves_white_noise
+from fitting.compare import excess
+from fitting.estimate import half_log_determinant
+from fitting.measurement_noise import MeasurementNoise
+from fitting.unknown import Unknown, learn_supported, share_of
+
+
+class Challenge(eqx.Module):
+    """The outcome of a challenge.
+
+    Attributes:
+        trusted: the model whose names can be trusted.
+        unknown: what was learned beside them, or in the place of all.
+        seen: what that rests on.
+    """
+
+    trusted: Trial
+    unknown: Unknown | None
+    seen: ChallengeEvidence = eqx.field(static=True)
+
+
+def challenge_names(
+    base: Trial,
+    named: Trial,
+    data: Data,
+    setting: Setting,
+    *,
+    noise: MeasurementNoise,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Challenge:
+    """Learn what decides whether names can be trusted, as far as the rules ask for it.
+
+    Names of which a learned term beside them leaves nothing fall in any case.
+
+    Args:
+        base: the model without effects.
+        named: the model with those that were found.
+        data: the stretches.
+        setting: how they are cut.
+        noise: of the measured outputs, as far as fits have been asked for it.
+        seed: of the surrogates behind the p-values.
+        progress: told what is being done.
+    """
+
+    def seen_as(trial: Trial) -> ModelEvidence:
+        return model_evidence(trial, noise)
+
+    beside: Unknown | None = None
+    instead: Unknown | None = None
+    imperfect = leaves_imperfection(named, base, noise)[0]
+    least = half_log_determinant(noise.covariance)
+    seen = ChallengeEvidence(seen_as(base), seen_as(named), len(_names(base, named)), least, imperfect)
+    while (question := next_question(seen)) is not None:
+        if question == "instead":
+            instead = learn_supported(base, data, setting, seed=seed, progress=progress)
+            if instead is None:
+                seen = seen.answered("instead", None)
+                continue
+            come_out = share_of(named.model, instead, named.training) if named.hold == base.hold else 0.0
+            seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
+        else:
+            finer = setting.with_steps_of(named.training)
+            beside = learn_supported(named, data, finer, seed=seed, progress=progress)
+            if beside is not None:
+                named, beside = _without_superfluous(base, named, beside, data, setting)
+            seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
+            seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
+    if named is base:
+        return Challenge(base, beside, seen)
+    if instead is not None and beside is not None:
+        names = {e.name for e in named.model.effects}
+        seen = replace(
+            seen,
+            shown=told_from_zero(beside.trial.training, names) == names,
+            one_shape=beside.chosen.of == instead.chosen.of
+            and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
+        )
+    stand = any(check.holds for check in names_stand(seen))
+    return Challenge(named, beside, seen) if stand else Challenge(base, instead, seen)
+
+
+def model_evidence(trial: Trial, noise: MeasurementNoise) -> ModelEvidence:
+    """A fitted model as decisions see it.
+
+    Args:
+        trial: the model.
+        noise: of the measured outputs.
+    """
+    left = excess(trial.training, noise.covariance)
+    return ModelEvidence(
+        training=trial.training.objective,
+        selection=trial.held_out.objective,
+        parameters=len(trial.training.free.paths),
+        excess=tuple(map(float, excess(trial.held_out, noise.covariance))),
+        # What moves a motor as a whole hardly twists the gear.
+        white=leaves_white_noise(trial.training) and bool(np.all(left < RULES.excess)),
+    )
+
+
+def _names(base: Trial, named: Trial) -> set[str]:
+    """What was found: effects, or another hold of the torque."""
+    found = {e.name for e in named.model.effects}
+    return found | ({"hold"} if named.hold != base.hold else set())
+
+
+def _without_superfluous(
+    base: Trial, named: Trial, beside: Unknown, data: Data, setting: Setting
+) -> tuple[Trial, Unknown]:
+    """Names, and what was learned beside them, without the effects that this has made superfluous: none of their
+    strengths is told from zero any more, and selection data hardly miss them."""
+    names = {e.name for e in named.model.effects}
+    fallen = names - told_from_zero(beside.trial.training, names)
+    if not fallen:
+        return named, beside
+    trial = _refitted_without(fallen, beside.trial, data, setting)
+    missed = trial.held_out.objective - beside.trial.held_out.objective
+    if missed >= max(RULES.least_gain, RULES.little * beside.gain):
+        return named, beside
+    bare = base
+    if fallen != names or named.hold != base.hold:
+        bare = _refitted_without(fallen, named, data, setting)
+    states = [n for n in named.model.state_names if n in bare.model.state_names]
+    kept = [named.model.state_names.index(n) for n in states]
+    gain = bare.held_out.objective - trial.held_out.objective
+    return bare, replace(
+        beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
+    )
+
+
+def _refitted_without(fallen: set[str], trial: Trial, data: Data, setting: Setting) -> Trial:
+    model = trial.model
+    for name in fallen:
+        model = model.without_effect(name)
+    return attempt(model, data, trial.hold, setting.with_steps_of(trial.training), start=trial)

@@ -1,0 +1,131 @@
+"""The conclusion: which model is trusted in the end, and what the data say of it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from fitting.attribution.candidate_fit import Data, Setting, Trial
+from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
+from fitting.challenge import Challenge
+from fitting.compare import excess, free_runs
+from fitting.estimate import Fit
+from fitting.free_run import FreeRun, rms_error
+from fitting.long_fit import long_fit
+from fitting.measurement_noise import MeasurementNoise
+from fitting.noise_memory import NoiseWithMemory, noise_with_memory
+from fitting.surprise import surprise
+from fitting.unknown import Unknown, learn_supported
+from hdjax import Hold
+
+
+class Conclusion(eqx.Module):
+    """What the data say in the end.
+
+    Attributes:
+        outcome: the same in a word.
+        seen: what that rests on.
+        trusted: the model whose names are trusted.
+        unknown: what was learned beside them, or in the place of all.
+        fitted: the final model on training data, over horizons as long as it follows.
+        runs: its free runs along the selection data.
+        runs_at_first: those of the base model.
+        noise: covariance of the measurement noise of the outputs.
+        slow: the same as noise with a memory, where what is left was taken for it.
+    """
+
+    outcome: Outcome = eqx.field(static=True)
+    seen: FinalEvidence = eqx.field(static=True)
+    trusted: Trial
+    unknown: Unknown | None
+    fitted: Fit
+    runs: tuple[FreeRun, ...]
+    runs_at_first: tuple[FreeRun, ...]
+    noise: Float[Array, "outputs outputs"]
+    slow: NoiseWithMemory | None
+
+    @property
+    def final(self) -> Trial:
+        """The final model over short horizons."""
+        return self.trusted if self.unknown is None else self.unknown.trial
+
+
+def draw_conclusion(
+    base: Trial,
+    challenge: Challenge,
+    data: Data,
+    setting: Setting,
+    *,
+    noise: MeasurementNoise,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Conclusion:
+    """Ask of the trusted model what is still open, and conclude.
+
+    Args:
+        base: the model without effects.
+        challenge: of the names that were found.
+        data: the stretches.
+        setting: how they are cut.
+        noise: of the measured outputs, as far as fits were asked for it.
+        seed: of the surrogates behind the p-values.
+        progress: told what is being done.
+    """
+    trusted, unknown = challenge.trusted, challenge.unknown
+    covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
+    seen, slow = _as_noise_tells(base, trusted, unknown, covariance)
+    if slow is not None:
+        covariance = slow.covariance
+    outcome, _ = conclude(seen)
+    if outcome == "effect_found" and max(seen.excess) < RULES.excess:
+        # What the names leave is hardly more than noise.
+        unknown, seen = None, replace(seen, learned=False)
+
+    def along_selection(fitted: Fit, hold: Hold) -> tuple[FreeRun, ...]:
+        return free_runs(fitted, data[hold][1], noise=covariance, halo=setting.halo)
+
+    progress("final fit over long horizons")
+    current = trusted if unknown is None else unknown.trial
+    fitted = long_fit(current.training)
+    at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
+    if outcome == "effect_found":
+        beyond = surprise(fitted, at_first, runs, current.held_out, noise=covariance, halo=setting.halo)
+        seen = replace(seen, surprise=beyond)
+        outcome, _ = conclude(seen)
+        if outcome == "unexplained":
+            # What follows over long times may be learned in the place of names that do not.
+            instead = learn_supported(base, data, setting, seed=seed, progress=progress)
+            other = None if instead is None else long_fit(instead.trial.training)
+            if instead is not None and other is not None:
+                instead_runs = along_selection(other, instead.trial.hold)
+                if rms_error(instead_runs) < rms_error(runs):
+                    trusted, unknown, fitted, runs = base, instead, other, instead_runs
+                    seen = replace(_final_evidence(base, base, instead, covariance), surprise=None)
+    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, slow)
+
+
+def _as_noise_tells(
+    base: Trial, trusted: Trial, unknown: Unknown | None, covariance: Float[Array, "outputs outputs"]
+) -> tuple[FinalEvidence, NoiseWithMemory | None]:
+    """The evidence, and noise with a memory where what is left is that: pieces of half a period take its slow part for
+    motion."""
+    seen = _final_evidence(base, trusted, unknown, covariance)
+    if conclude(seen)[0] != "unexplained" or unknown is not None:
+        return seen, None
+    slow = noise_with_memory(trusted.held_out)
+    return replace(seen, noise_explains=slow is not None), slow
+
+
+def _final_evidence(
+    base: Trial, trusted: Trial, unknown: Unknown | None, covariance: Float[Array, "outputs outputs"]
+) -> FinalEvidence:
+    names = [e.name for e in trusted.model.effects]
+    if trusted.hold != base.hold:
+        names.append(f"{trusted.hold} hold")
+    return FinalEvidence(
+        names=tuple(names),
+        learned=unknown is not None,
+        excess=tuple(map(float, excess(trusted.held_out, covariance))),
+        excess_at_first=tuple(map(float, excess(base.held_out, covariance))),
+    )

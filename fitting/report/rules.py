@@ -1,0 +1,50 @@
+"""Why a decision came out as it did: every rule with its statistic and its threshold."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from fitting.attribution.decisions import Check, rules_table
+
+
+def rules_dict(checks: Sequence[Check]) -> list[dict[str, Any]]:
+    """The rules as they were applied, in the order of the loop.
+
+    Args:
+        checks: of a decision.
+    """
+    known = {rule["name"]: rule for rule in rules_table()}
+    return [_entry(check, known.get(check.rule, {})) for check in checks]
+
+
+def _entry(check: Check, rule: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "name": check.rule,
+        "about": check.about,
+        "statistic": check.statistic,
+        "threshold": check.threshold,
+        "outcome": "holds" if check.holds else "fails",
+        "unit": rule.get("unit", ""),
+        "meaning": rule.get("meaning", ""),
+    }
+
+
+def rules_page() -> str:
+    """The rules as a page of Markdown."""
+    rows = [
+        f"| `{rule['name']}` | {rule['threshold']:g} | {rule['unit']} | {rule['meaning']} | {rule['source']} |"
+        for rule in rules_table()
+    ]
+    return "\n".join(
+        [
+            "# Rules of decision",
+            "",
+            "Every threshold that decides what a loop says (`fitting/attribution/decisions.py`). A report has each",
+            "rule with its statistic and its outcome, under `rules` and in the section *Why this decision*. The page",
+            "is what `fitting.report.rules.rules_page()` gives.",
+            "",
+            "| rule | threshold | unit | meaning | source |",
+            "|---|---|---|---|---|",
+            *rows,
+            "",
+        ]
+    )

@@ -1,0 +1,198 @@
+"""When a name stands, and when it falls."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting import challenge as module
+from fitting.attribution.candidate_fit import Setting, Trial
+from fitting.attribution.decisions import ChallengeEvidence, ModelEvidence, names_stand, next_question
+from fitting.effect_search import base_trial
+from fitting.experiment import split
+from fitting.learned_look import Candidate
+from fitting.unknown import Unknown
+from hdjax.effects import Conditions
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.creep import Creep
+from hdjax.effects.learned import LearnedMeshTorque
+from hdjax.effects.learned_axes import axes_over
+
+NOISE = 1e-3
+AXES = axes_over({"v": (-1.0, 1.0)})[0]
+LEARNED = LearnedMeshTorque.made_of(AXES, np.eye(AXES[0].count)[:, :1], (1.0,))
+
+
+NOISE_OBJECTIVE = float(np.log(NOISE))
+
+
+def model(
+    selection: float, *, parameters: int = 5, white: bool = False, training: float | None = None
+) -> ModelEvidence:
+    return ModelEvidence(selection if training is None else training, selection, parameters, (10.0,), white)
+
+
+def challenge(better_by: float, *, beside: bool, enough: bool, fewer: int, **answers) -> ChallengeEvidence:
+    """Names that gain 9 or more, with a learned term in their place that gains 10."""
+    instead = model(-10.0, parameters=5 - fewer)
+    rival = model(-10.0 + better_by)
+    named = model(-5.0, white=enough) if beside else replace(rival, white=enough)
+    return ChallengeEvidence(
+        model(0.0),
+        named,
+        2,
+        NOISE_OBJECTIVE,
+        False,
+        rival if beside else None,
+        instead,
+        ("instead", "beside"),
+        **answers,
+    )
+
+
+@pytest.mark.parametrize(
+    ("better_by", "beside", "enough", "come_out", "fewer", "one_shape", "stands"),
+    [
+        (-0.5, True, False, False, 1, True, True),  # what stands in their place is poorer
+        (0.0, True, False, False, 0, False, False),  # as good as with what is learned beside them, and something else
+        (0.0, True, False, True, 1, False, True),  # as good, and what they name
+        (0.0, True, False, True, 0, True, False),  # what they name has another shape
+        (0.0, True, False, True, -1, True, True),  # another shape, for more parameters
+        (0.9, True, False, True, 0, False, True),
+        (0.9, True, False, True, 1, False, False),  # better by far and simpler
+        (0.0, False, False, False, 1, False, True),  # as good as they are alone
+        (0.9, False, False, False, 0, False, False),
+        (0.9, False, False, True, 1, False, False),
+        (0.0, False, True, False, 1, False, False),  # they leave but noise, and one function with fewer parameters does
+        (0.0, False, True, False, 0, False, True),
+        (0.0, False, True, True, 1, False, True),  # it has come out as what they name
+        (-0.5, False, True, False, 3, False, True),
+    ],
+)
+def test_when_names_stand(
+    better_by: float, beside: bool, enough: bool, come_out: bool, fewer: int, one_shape: bool, stands: bool
+):
+    answers = {"come_out": 0.9 if come_out else 0.5, "one_shape": one_shape}
+    seen = challenge(better_by, beside=beside, enough=enough, fewer=fewer, **answers)
+    assert any(check.holds for check in names_stand(seen)) == stands
+
+
+@pytest.mark.parametrize(
+    ("names", "white", "imperfect", "asks_for"),
+    [
+        (2, True, False, []),
+        (2, False, False, ["instead", "beside"]),
+        (2, False, True, []),
+        (3, True, False, ["instead"]),  # many names that leave but noise
+        (3, False, True, ["instead"]),
+        (3, False, False, ["instead", "beside"]),
+        (0, False, False, ["beside"]),
+        (0, True, False, []),
+    ],
+)
+def test_what_is_learned_to_challenge_names(names: int, white: bool, imperfect: bool, asks_for: list[str]):
+    seen = ChallengeEvidence(model(0.0), model(-2.0, white=white), names, NOISE_OBJECTIVE, imperfect)
+    asked = []
+    while (question := next_question(seen)) is not None:
+        asked.append(question)
+        seen = seen.answered(question, None)
+    assert asked == asks_for
+    assert not seen.names or any(check.holds for check in names_stand(seen))
+
+
+@pytest.mark.parametrize(("come_out", "asks_for"), [(0.5, ["instead"]), (0.9, ["instead", "beside"])])
+def test_where_what_stands_in_their_place_leaves_noise_nothing_is_learned_beside_names(
+    come_out: float, asks_for: list[str]
+):
+    """Unless it has come out as what they name."""
+    seen = ChallengeEvidence(model(0.0), model(-2.0), 1, NOISE_OBJECTIVE, False)
+    asked = []
+    while (question := next_question(seen)) is not None:
+        asked.append(question)
+        found = model(-7.0, white=True, parameters=4) if question == "instead" else None
+        seen = seen.answered(question, found, come_out=come_out)
+    assert asked == asks_for
+    assert not any(check.holds for check in names_stand(seen))
+
+
+@pytest.mark.parametrize(
+    ("left", "asks_for"),
+    [
+        (1.02, ["beside"]),
+        (1.15, ["beside"]),  # of a hundredfold error: a twentieth of its logarithm
+        (1.3, ["instead", "beside"]),
+    ],
+)
+def test_names_that_noise_itself_would_hardly_better_are_in_no_doubt(left: float, asks_for: list[str]):
+    base, named = (model(float(np.log(ratio * NOISE))) for ratio in (100.0, left))
+    seen = ChallengeEvidence(base, named, 1, NOISE_OBJECTIVE, False)
+    asked = []
+    while (question := next_question(seen)) is not None:
+        asked.append(question)
+        seen = seen.answered(question, None)
+    assert asked == asks_for
+
+
+@pytest.mark.parametrize(
+    ("training", "selection", "little"),
+    [
+        (0.01, 0.01, True),
+        (0.3, 0.01, False),  # the selection data don't show the motion where the names fail
+        (0.01, 0.3, False),
+    ],
+)
+def test_what_little_a_learned_term_adds(training: float, selection: float, little: bool):
+    """Names that gain 2 on training data and 1 on selection data."""
+    base, named = model(0.0), model(-1.0, training=-2.0)
+    beside = model(-1.0 - selection, training=-2.0 - training)
+    instead = model(-3.0, parameters=1)
+    seen = ChallengeEvidence(base, named, 1, -9.0, False, beside, instead, ("instead", "beside"))
+    assert any(check.holds for check in names_stand(seen)) == little
+
+
+@pytest.fixture(scope="module")
+def base() -> Trial:
+    data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
+    return base_trial(rig.reduced_model(), data, "zero-order")[0]
+
+
+@pytest.mark.parametrize(
+    ("told", "missed_by", "left"),
+    [
+        (set(), 0.0, set()),
+        (set(), 0.09, set()),  # hardly missed, of a gain of two
+        (set(), 0.2, {"creep", "torque_bias"}),
+        ({"torque_bias"}, 0.0, {"torque_bias"}),
+        ({"creep"}, 0.0, {"creep"}),
+        ({"creep", "torque_bias"}, 0.0, {"creep", "torque_bias"}),
+    ],
+)
+def test_names_that_what_is_learned_leaves_nothing_fall(
+    base: Trial, told: set[str], missed_by: float, left: set[str], monkeypatch: pytest.MonkeyPatch
+):
+    def with_effects(*effects, objective: float) -> Trial:
+        model = base.model.with_effects(*effects)
+        return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
+
+    def refitted_without(fallen, trial, data, setting):
+        kept = [e for e in trial.model.effects if e.name not in fallen]
+        learned = any(isinstance(e, LearnedMeshTorque) for e in kept)
+        return with_effects(*kept, objective=-7.0 + missed_by if learned else -5.0)
+
+    monkeypatch.setattr(module, "told_from_zero", lambda fit, names: told)
+    monkeypatch.setattr(module, "_refitted_without", refitted_without)
+    names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
+    chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
+    named, trial = with_effects(*names, objective=-5.0), with_effects(*names, LEARNED, objective=-7.0)
+    motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
+    instants = np.arange(2)
+    beside = Unknown(named, trial, (), chosen, instants, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
+    bare, beside = module._without_superfluous(base, named, beside, {}, Setting(32, 4, 1, 8))
+    assert {e.name for e in bare.model.effects} == left
+    assert (bare is base) == (left == set()) and beside.before is bare
+    assert {e.name for e in beside.trial.model.effects} == left | {LEARNED.name}
+    # The states of what fell are gone with it; creep has one.
+    assert beside.states.shape == beside.push.shape == (2, 3 if "creep" in left else 2)
+    assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)

@@ -1,0 +1,129 @@
+"""Decisions: pure functions of the evidence and the rules."""
+
+import ast
+import json
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fitting
+from fitting.attribution.decisions import (
+    RULES,
+    CaseEvidence,
+    ChallengeEvidence,
+    EffectEvidence,
+    FinalEvidence,
+    ModelEvidence,
+    Rival,
+    RoundEvidence,
+    conclude,
+    decide,
+    leader,
+    support,
+    tie,
+)
+from fitting.attribution.stored_evidence import case_evidence
+from fitting.files import finite
+from fitting.report.rules import rules_page
+
+SEEN = EffectEvidence("friction", 1.0, 0.005)
+MODEL = ModelEvidence(-1.0, -1.0, 3, (1.0, 1.0), True)
+CHALLENGE = ChallengeEvidence(MODEL, MODEL, 1, -1.0, False)
+FINAL = FinalEvidence(("friction",), False, (1.0, 1.0), (9.0, 9.0))
+CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, ()),), CHALLENGE, FINAL)
+
+
+@pytest.mark.parametrize(
+    ("change", "failed"),
+    [
+        ({}, None),
+        ({"gain": 1e-4}, "least_gain"),
+        ({"p_value": 0.02}, "significance"),
+        ({"removed": 0.01, "imperfection": 0.02}, "imperfection"),
+        ({"strength_errors": 3.0}, "strength_errors"),
+    ],
+)
+def test_what_supports_an_effect(change: dict, failed: str | None):
+    checks = support(replace(SEEN, **change))
+    assert [c.rule for c in checks if not c.holds] == ([failed] if failed else [])
+
+
+def test_a_tie_is_what_scatter_over_blocks_explains():
+    random = np.random.default_rng(0)
+    scatter = random.normal(size=30)
+    assert tie("a", scatter - scatter.mean()).holds
+    assert not tie("a", scatter + 2.0).holds
+    # Worse in every block, by little: told apart all the same.
+    assert not tie("a", 0.1 + 0.01 * scatter).holds
+    assert tie("a", np.full(4, 9.0)).rule == "fewest_blocks"
+
+
+def test_false_alarms_of_a_tie_are_as_many_as_the_level():
+    random = np.random.default_rng(1)
+    draws = random.normal(size=(4000, 12))
+    told = np.mean([not tie("a", draw).holds for draw in draws])
+    assert told == pytest.approx(RULES.tie_level, abs=0.012)
+
+
+def test_of_equals_the_simplest_leads():
+    one = Rival("one", 1.0, 2.0, True, 5, 2, True, False)
+    other = replace(one, name="other", long_gain=2.01, parameters=7)
+    assert leader([other, one])[0].name == "one"
+    assert leader([replace(other, long_gain=3.0), one])[0].name == "other"
+    assert leader([other, replace(one, plausible=False)])[0].name == "other"
+
+
+@pytest.mark.parametrize(
+    ("change", "outcome"),
+    [
+        ({}, "effect_found"),
+        ({"excess": (1.0, 4.0)}, "unexplained"),
+        ({"excess": (1.0, 4.0), "noise_explains": True}, "effect_found"),
+        ({"surprise": 2.0}, "unexplained"),
+        ({"surprise": 1.1}, "effect_found"),
+        ({"names": ()}, "model_sufficient"),
+        ({"names": (), "learned": True}, "unexplained"),
+        ({"names": (), "excess": (1.0, 2.0)}, "unexplained"),
+        ({"names": (), "excess": (1.0, 2.0), "noise_explains": True}, "model_sufficient"),
+    ],
+)
+def test_conclusion(change: dict, outcome: str):
+    assert conclude(replace(FINAL, excess_at_first=(1.0, 9.0), **change))[0] == outcome
+
+
+def test_stored_evidence_is_decided_anew():
+    stored = json.loads(json.dumps(finite(asdict(CASE))))
+    again = case_evidence(stored)
+    assert decide(again) == decide(CASE)
+    assert decide(CASE).outcome == "effect_found" and decide(CASE).lacking is None
+    stricter = decide(again, replace(RULES, significance=1e-3))
+    assert stricter.lacking == "round 1: another candidate would be accepted"
+
+
+def test_every_rule_has_a_unit_a_meaning_and_a_source():
+    for rule in fields(RULES):
+        assert all(rule.metadata[key] for key in ("unit", "meaning", "source")), rule.name
+
+
+def test_the_page_of_rules_is_the_code_s():
+    page = Path(fitting.__file__).parents[1] / "docs" / "rules.md"
+    assert page.read_text(encoding="utf-8") == rules_page()
+
+
+# Numbers that are no thresholds of a decision: neutral elements, halves, and sizes of work.
+_PLAIN = {0, 1, 2, -1, 0.5, 1e-12, 1e-300, 1e-6}
+
+
+def test_no_other_number_decides():
+    """Literals of the modules that decide: each comparison takes its threshold from the rules."""
+    room = Path(fitting.__file__).parent
+    deciding = ["challenge.py", "conclusion.py", "effect_search.py", "surprise.py", "attribution/support.py"]
+    for name in deciding:
+        tree = ast.parse((room / name).read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Compare):
+                literals = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)]
+                numbers = [v for v in literals if isinstance(v, int | float) and not isinstance(v, bool)]
+                assert set(numbers) <= _PLAIN, (name, node.lineno, numbers)
