@@ -7,12 +7,26 @@ import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt
-from fitting.attribution.decisions import RULES, ChallengeEvidence, ModelEvidence, names_stand, next_question
-from fitting.attribution.support import leaves_imperfection, told_from_zero
+from fitting.attribution.decisions import (
+    RULES,
+    ChallengeEvidence,
+    ModelEvidence,
+    names_stand,
+    next_question,
+)
+from fitting.attribution.support import (
+    is_noisy_torque,
+    leaves_imperfection,
+    noise_evidence,
+    over_torque_noise,
+    told_from_zero,
+    torque_noise_left,
+)
 from fitting.base_fit import leaves_white_noise
 from fitting.compare import excess
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
+from fitting.process_noise import TorqueNoise
 from fitting.unknown import Unknown, learn_supported, share_of
 
 
@@ -22,11 +36,13 @@ class Challenge(eqx.Module):
     Attributes:
         trusted: the model whose names can be trusted.
         unknown: what was learned beside them, or in the place of all.
+        torque: noise of the logged torque, where that is what the names leave.
         seen: what that rests on.
     """
 
     trusted: Trial
     unknown: Unknown | None
+    torque: TorqueNoise | None
     seen: ChallengeEvidence = eqx.field(static=True)
 
 
@@ -62,9 +78,12 @@ def challenge_names(
     imperfect = leaves_imperfection(named, base, noise)[0]
     least = half_log_determinant(noise.covariance)
     seen = ChallengeEvidence(seen_as(base), seen_as(named), len(_names(base, named)), least, imperfect)
+    torque = None if seen.enough else torque_noise_left(named, noise)
+    if torque is not None:
+        seen = replace(seen, torque=noise_evidence(torque))
     while (question := next_question(seen)) is not None:
         if question == "instead":
-            instead = learn_supported(base, data, setting, seed=seed, progress=progress)
+            instead = _learned(base, data, setting, noise=noise, seed=seed, progress=progress)
             if instead is None:
                 seen = seen.answered("instead", None)
                 continue
@@ -72,13 +91,14 @@ def challenge_names(
             seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
         else:
             finer = setting.with_steps_of(named.training)
-            beside = learn_supported(named, data, finer, seed=seed, progress=progress)
+            beside = _learned(named, data, finer, noise=noise, seed=seed, progress=progress)
             if beside is not None:
                 named, beside = _without_superfluous(base, named, beside, data, setting)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
+    torque = torque if beside is None and is_noisy_torque(torque) else None
     if named is base:
-        return Challenge(base, beside, seen)
+        return Challenge(base, beside, torque, seen)
     if instead is not None and beside is not None:
         names = {e.name for e in named.model.effects}
         seen = replace(
@@ -88,7 +108,18 @@ def challenge_names(
             and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
         )
     stand = any(check.holds for check in names_stand(seen))
-    return Challenge(named, beside, seen) if stand else Challenge(base, instead, seen)
+    return Challenge(named, beside, torque, seen) if stand else Challenge(base, instead, None, seen)
+
+
+def _learned(
+    before: Trial, data: Data, setting: Setting, *, noise: MeasurementNoise, seed: int, progress: Callable[[str], None]
+) -> Unknown | None:
+    """What can be learned that the data support, beyond noise of the torque where that would explain as much."""
+    found = learn_supported(before, data, setting, seed=seed, progress=progress)
+    if found is None:
+        return None
+    over = over_torque_noise(found.trial, before, torque_noise_left(before, noise), noise)
+    return found if over > RULES.torque_noise_gain else None
 
 
 def model_evidence(trial: Trial, noise: MeasurementNoise) -> ModelEvidence:

@@ -11,7 +11,7 @@ from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks
 from fitting.attribution.selection_round import Round
 from fitting.challenge import challenge_names
 from fitting.clock import Clock
-from fitting.compare import Account, account, free_runs
+from fitting.compare import Account, account, excess, free_runs
 from fitting.conclusion import Conclusion, draw_conclusion
 from fitting.diagnostics import diagnose
 from fitting.effect_search import Search, base_trial, refitted_without, search_effects
@@ -97,6 +97,8 @@ def close_loop(
         evidence=seen,
         noise=end.noise,
         noise_memory=None if end.slow is None else end.slow.memory(data[base.hold][0][0].experiment.time_step),
+        torque_noise=None if end.torque is None else end.torque.std,
+        left=tuple(map(float, excess(end.final.held_out, end.noise))),
         residual_before=diagnose(base.training),
         residual_after=diagnose(end.final.training),
         hold=end.final.hold,

@@ -15,6 +15,7 @@ from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import long_fit
 from fitting.measurement_noise import MeasurementNoise
 from fitting.noise_memory import NoiseWithMemory, noise_with_memory
+from fitting.process_noise import TorqueNoise
 from fitting.surprise import surprise
 from fitting.unknown import Unknown, learn_supported
 from hdjax import Hold
@@ -33,6 +34,7 @@ class Conclusion(eqx.Module):
         runs_at_first: those of the base model.
         noise: covariance of the measurement noise of the outputs.
         slow: the same as noise with a memory, where what is left was taken for it.
+        torque: noise of the logged torque, likewise.
     """
 
     outcome: Outcome = eqx.field(static=True)
@@ -44,6 +46,7 @@ class Conclusion(eqx.Module):
     runs_at_first: tuple[FreeRun, ...]
     noise: Float[Array, "outputs outputs"]
     slow: NoiseWithMemory | None
+    torque: TorqueNoise | None
 
     @property
     def final(self) -> Trial:
@@ -74,7 +77,8 @@ def draw_conclusion(
     """
     trusted, unknown = challenge.trusted, challenge.unknown
     covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
-    seen, slow = _as_noise_tells(base, trusted, unknown, covariance)
+    torque = challenge.torque
+    seen, slow = _as_noise_tells(base, trusted, unknown, covariance, torque)
     if slow is not None:
         covariance = slow.covariance
     outcome, _ = conclude(seen)
@@ -90,7 +94,8 @@ def draw_conclusion(
     fitted = long_fit(current.training)
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
-        beyond = surprise(fitted, at_first, runs, current.held_out, noise=covariance, halo=setting.halo)
+        known = {"noise": covariance, "halo": setting.halo, "torque_noise": 0.0 if torque is None else torque.std}
+        beyond = surprise(fitted, at_first, runs, current.held_out, **known)
         seen = replace(seen, surprise=beyond)
         outcome, _ = conclude(seen)
         if outcome == "unexplained":
@@ -102,15 +107,19 @@ def draw_conclusion(
                 if rms_error(instead_runs) < rms_error(runs):
                     trusted, unknown, fitted, runs = base, instead, other, instead_runs
                     seen = replace(_final_evidence(base, base, instead, covariance), surprise=None)
-    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, slow)
+    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, slow, torque)
 
 
 def _as_noise_tells(
-    base: Trial, trusted: Trial, unknown: Unknown | None, covariance: Float[Array, "outputs outputs"]
+    base: Trial,
+    trusted: Trial,
+    unknown: Unknown | None,
+    covariance: Float[Array, "outputs outputs"],
+    torque: TorqueNoise | None,
 ) -> tuple[FinalEvidence, NoiseWithMemory | None]:
     """The evidence, and noise with a memory where what is left is that: pieces of half a period take its slow part for
     motion."""
-    seen = _final_evidence(base, trusted, unknown, covariance)
+    seen = replace(_final_evidence(base, trusted, unknown, covariance), noise_explains=torque is not None)
     if conclude(seen)[0] != "unexplained" or unknown is not None:
         return seen, None
     slow = noise_with_memory(trusted.held_out)

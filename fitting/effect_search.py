@@ -103,7 +103,8 @@ def search_effects(
             if enough:
                 break
         turn = seed + len(rounds)
-        this = look(current, data, setting, catalogue=catalogue, seed=turn, progress=progress, base=base)
+        options = {"catalogue": catalogue, "seed": turn, "progress": progress}
+        this = look(current, data, setting, base=base, noise=noise, **options)
         rounds.append(this)
         if not this.accepted:
             break

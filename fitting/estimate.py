@@ -276,6 +276,13 @@ def half_log_determinant(covariance: Array | np.ndarray) -> float:
     return float(0.5 * value) if sign > 0 else np.inf
 
 
+def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
+    """Which segments of a fit are of which of its stretches."""
+    count, length = found.problem.segments.weight.shape
+    number = np.repeat(np.arange(len(found.stretches)), [-(-len(s) // length) for s in found.stretches])
+    return np.pad(number, (0, count - number.size), constant_values=-1) == np.arange(len(found.stretches))[:, None]
+
+
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     """The segments in which the simulation runs away."""
     white = np.asarray(found.error) @ np.asarray(found.problem.whitening).T

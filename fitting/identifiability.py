@@ -249,19 +249,44 @@ def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> s
         info: of the parameter.
         start: what the fit started from.
     """
-    low, high = info.bounds
     if info.positive and value < _VANISHED * start:
         return (
             f"{path} ran from {start:.2g} to {value:.2g} {info.unit}, towards its bound at zero: the logs want none, "
             "and its standard error means nothing."
         )
+    bound = reached_bound(value, info)
+    if bound is None:
+        return None
+    return (
+        f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense, and its "
+        "standard error means nothing."
+    )
+
+
+def reached_bound(value: float, info: ParameterInfo) -> float | None:
+    """The bound of its domain, zero apart, at which a parameter ended or that it passed; None where there is none.
+
+    Args:
+        value: fitted.
+        info: of the parameter.
+    """
+    low, high = info.bounds
     for bound, beyond in ((low, value < low), (high, value > high)):
         if beyond or (bound and np.isfinite(bound) and abs(value - bound) <= _AT_BOUND * abs(bound)):
-            return (
-                f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense, and "
-                "its standard error means nothing."
-            )
+            return bound
     return None
+
+
+def parameters_at_bounds(model: Model, name: str) -> list[str]:
+    """The paths of an effect's parameters that ended at a bound of their domain; a shape that went to zero has become
+    another law, and is none.
+
+    Args:
+        model: with fitted values.
+        name: of the effect.
+    """
+    known = {p: v for p, v in model.parameters().items() if p.startswith(f"{name}.")}
+    return [p for p, (v, info) in known.items() if reached_bound(float(v), _in_units_of(model, info)) is not None]
 
 
 # What the logs do not see at all has no bounds.

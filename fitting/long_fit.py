@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -67,7 +68,9 @@ def refitted_on_all(found: Fit, selection: Fit) -> Fit:
 def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
     segments = found.problem.segments
     states = np.concatenate([np.asarray(f.unknowns.states)[: _with_data(f)] for f in (found, selection)])
-    return fit(
+    # Parameters that a fit has not moved were held.
+    held = all(float(found.model.get(p)) == float(found.problem.model.get(p)) for p in found.free.paths)
+    both = fit(
         found.model,
         (*found.stretches, *selection.stretches),
         found.free.paths,
@@ -81,7 +84,10 @@ def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
         begin_anew_above=np.inf,
         retry_states=False,
         max_steps=_STEPS,
+        hold_parameters=held,
     )
+    # What the data say of them is asked all the same.
+    return eqx.tree_at(lambda f: f.problem.active, both, jnp.ones_like(both.problem.active))
 
 
 def _with_data(found: Fit) -> int:

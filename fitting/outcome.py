@@ -52,6 +52,10 @@ class Loop(eqx.Module):
         noise: covariance of the measurement noise of the outputs.
         noise_memory: for how long [s] what is left over remembers itself, where it is more than short pieces tell of
             the noise and was taken for noise with a memory; None elsewhere.
+        torque_noise: standard deviation of the noise of a sample of the logged torque [N m], where that is what is
+            left; None elsewhere.
+        left: what short segments of the selection data leave of each output under the final model, over the
+            measurement noise.
         residual_before: diagnostics of what the base model leaves over.
         residual_after: likewise of the final model.
         hold: what the torque does between samples, as used.
@@ -77,6 +81,8 @@ class Loop(eqx.Module):
     evidence: tuple[Evidence, ...]
     noise: Float[Array, "outputs outputs"]
     noise_memory: float | None
+    torque_noise: float | None
+    left: tuple[float, ...] = eqx.field(static=True)
     residual_before: ResidualDiagnostics
     residual_after: ResidualDiagnostics
     hold: Hold = eqx.field(static=True)
@@ -86,3 +92,9 @@ class Loop(eqx.Module):
     surprise: float | None
     put_back: tuple[float, ...] = eqx.field(static=True)
     seconds: dict[str, float]
+
+    @property
+    def times_noise(self) -> float:
+        """What short segments of the selection data leave under the final model, over the measurement noise; of the
+        output where it is largest. Noise of the torque does not count."""
+        return 1.0 if self.torque_noise is not None else max(self.left)

@@ -12,6 +12,7 @@ from fitting.estimate import Fit, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
 from fitting.normal_law import NORMAL_95
+from fitting.process_noise import spread_by_torque
 from fitting.residual import Problem, Unknowns
 from fitting.uncertainty import Uncertainty
 
@@ -28,17 +29,19 @@ class PredictionBand(eqx.Module):
             follows the parameters, as it does in the window that it is taken from.
         std_state: what the noise in that window does [rad].
         std_noise: of the measured dynamic error [rad].
+        std_torque: of the predicted one, by noise of the torque [rad].
     """
 
     run: FreeRun
     std_parameters: Float[np.ndarray, " n"]
     std_state: Float[np.ndarray, " n"]
     std_noise: float
+    std_torque: Float[np.ndarray, " n"] | float = 0.0
 
     @property
     def std_predicted(self) -> Float[np.ndarray, " n"]:
         """Standard error of the predicted dynamic error [rad]."""
-        return np.hypot(self.std_parameters, self.std_state)
+        return np.sqrt(self.std_parameters**2 + self.std_state**2 + self.std_torque**2)
 
     @property
     def std_measured(self) -> Float[np.ndarray, " n"]:
@@ -74,6 +77,7 @@ def prediction_bands(
     halo: int = 0,
     window: int = WINDOW,
     runs: Sequence[FreeRun] | None = None,
+    torque_noise: float = 0.0,
 ) -> tuple[PredictionBand, ...]:
     """Free runs along stretches, with their bands.
 
@@ -85,6 +89,7 @@ def prediction_bands(
         halo: intervals of torque before the start, for delays.
         window: samples for the initial state.
         runs: the free runs along the stretches, where they are at hand.
+        torque_noise: standard deviation of the noise of a torque sample [N m].
     """
     substeps = fitted.substeps
     if runs is None:
@@ -98,9 +103,12 @@ def prediction_bands(
     states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
     by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
     white = np.asarray(whitening(noise))
+    driven = np.zeros(by_parameter.shape[:2])
+    if torque_noise > 0.0:
+        driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
     return tuple(
-        _band(run, by_parameter[i, : len(s)], by_state[i, : len(s)], white, found.covariance, window)
-        for i, (run, s) in enumerate(zip(runs, stretches, strict=True))
+        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance, window)
+        for i, (run, n) in enumerate(zip(runs, map(len, stretches), strict=True))
     )
 
 
@@ -134,16 +142,18 @@ def _band(
     run: FreeRun,
     by_parameter: np.ndarray,
     by_state: np.ndarray,
+    driven: np.ndarray,
     white: np.ndarray,
     covariance: np.ndarray,
     window: int,
 ) -> PredictionBand:
-    """The band of one run, from the derivatives of its outputs; it has no width where they left the numbers."""
+    """The band of one run, from the derivatives of its outputs, and what noise of the torque drives; it has no width
+    where they left the numbers."""
     variance = np.linalg.inv(white)
     std_noise = float(np.sqrt((variance @ variance.T)[-1, -1]))
     if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
         unknown = np.full(len(by_parameter), np.nan)
-        return PredictionBand(run, unknown, unknown, std_noise)
+        return PredictionBand(run, unknown, unknown, std_noise, driven)
     seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
     moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
     # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
@@ -157,4 +167,5 @@ def _band(
         std_parameters=np.sqrt(np.maximum(np.einsum("np,pq,nq->n", total, covariance, total), 0.0)),
         std_state=np.linalg.norm(spread, axis=1),
         std_noise=std_noise,
+        std_torque=driven,
     )

@@ -21,6 +21,7 @@ def surprise(
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int,
+    torque_noise: float = 0.0,
 ) -> float | None:
     """Rms by which free runs of held-out stretches are off, over the rms that their bands allow: what short segments
     leave, and what it leaves open of parameters and initial state.
@@ -36,13 +37,22 @@ def surprise(
         held_out: the final model on short segments of the held-out stretches, which show noise with a memory whole.
         noise: covariance of the measurement noise, as shorter pieces tell it.
         halo: intervals of torque before a stretch.
+        torque_noise: standard deviation of the noise of a torque sample [N m].
     """
     short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
     variance = float(short[-1, -1])
     at_first = rms_error(before) ** 2 - variance
     if rms_error(after) ** 2 - variance <= (1.0 - RULES.explained) * at_first:
         return None
-    bands = prediction_bands(final, uncertainty(final), held_out.stretches, noise=short, halo=halo, runs=after)
+    bands = prediction_bands(
+        final,
+        uncertainty(final),
+        held_out.stretches,
+        noise=short,
+        halo=halo,
+        runs=after,
+        torque_noise=torque_noise,
+    )
     return over_bands(bands)
 
 

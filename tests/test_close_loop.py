@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import rig
+from fitting.attribution.decisions import ChallengeEvidence
 from fitting.attribution.selection_round import Round, Verdict
+from fitting.challenge import Challenge, model_evidence
 from fitting.close_loop import close_loop
 from fitting.effect_search import _holds_given_up
 from fitting.experiment import Experiment, experiment_from_log
@@ -187,7 +189,7 @@ def test_single_precision_is_refused():
 
 def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatch: pytest.MonkeyPatch):
     """What is found over short segments is named all the same where nothing else can be learned; more is missing."""
-    module = import_module("fitting.close_loop")
+    module = import_module("fitting.conclusion")
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
     monkeypatch.setattr(module, "learn_supported", lambda *args, **options: None)
     loop = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION))
@@ -199,10 +201,17 @@ def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatc
 def test_what_explains_whole_stretches_is_learned_in_place_of_names_that_do_not(monkeypatch: pytest.MonkeyPatch):
     """Damping by the rate's square, made to pass for an explanation, stands for dry friction; a learned jump explains
     more."""
-    module = import_module("fitting.close_loop")
+    module, loop_module = import_module("fitting.conclusion"), import_module("fitting.close_loop")
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
-    monkeypatch.setattr(module, "_decide", lambda *args: "effect_found")
-    monkeypatch.setattr(module, "what_is_unknown", lambda base, named, *args, **options: (named, None))
+    explains = {"excess": (1.0,), "excess_at_first": (9.0,), "learned": False}
+    final = module._final_evidence
+    monkeypatch.setattr(module, "_final_evidence", lambda *args: replace(final(*args), **explains))
+
+    def unchallenged(base, named, *args, **options):
+        seen = model_evidence(named, options["noise"])
+        return Challenge(named, None, None, ChallengeEvidence(seen, seen, 1, 0.0, True))
+
+    monkeypatch.setattr(loop_module, "challenge_names", unchallenged)
     experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)
     loop = reduced_loop(experiment, catalogue=(QuadraticDamping,))
     assert [f.name for f in loop.findings] == ["learned_mesh_torque"]

@@ -43,6 +43,8 @@ CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, ()),), CHA
         ({"p_value": 0.02}, "significance"),
         ({"removed": 0.01, "imperfection": 0.02}, "imperfection"),
         ({"strength_errors": 3.0}, "strength_errors"),
+        ({"over_torque_noise": 2.0}, "torque_noise_gain"),
+        ({"at_bounds": 1}, "at_bounds"),
     ],
 )
 def test_what_supports_an_effect(change: dict, failed: str | None):

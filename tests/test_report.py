@@ -37,6 +37,7 @@ from fitting.report import (
     separating_experiment,
     write_report,
 )
+from fitting.report.intervals import say_what_intervals_hold
 from fitting.report.limits import limits, parameter_note
 from fitting.report.summary import _change, _remembering
 from fitting.starting_values import starting_models
@@ -331,6 +332,7 @@ def test_the_page_tells_the_story_in_order(page: str):
         "What was fitted",
         "What was left over",
         "What was found",
+        "Why this decision",
         "What it changed",
         "What it can&rsquo;t tell",
         "The data",
@@ -713,3 +715,24 @@ def _changed(before: float, after: float | None, *, motor: tuple[float | None, f
     stages = zip(("before", "after"), (before, after), motor, strict=True)
     found = {s: {"rmse": {"test": x}, "rmse_motor_angle": {"test": m}} for s, x, m in stages}
     return found | {"units": {"dynamic_error": "rad"}, "noise": {"dynamic_error": 1e-6}, "judged_on": "test"}
+
+
+@pytest.mark.parametrize(
+    ("decision", "times_noise", "withheld", "flagged"),
+    [
+        ("effect_found", 1.1, False, False),
+        ("effect_found", 2.7, False, True),
+        ("unexplained", 44.0, True, True),
+        ("unexplained", 1.1, False, True),
+    ],
+)
+def test_intervals_say_what_is_left(decision: str, times_noise: float, withheld: bool, flagged: bool):
+    def account() -> dict[str, Any]:
+        return {"parameters": {"K": {"ci95": [1.0, 2.0], "interval": "quadratic", "flag": None, "note": None}}}
+
+    report = {"decision": decision, "before": account(), "after": account()}
+    say_what_intervals_hold(report, times_noise)
+    K = report["after"]["parameters"]["K"]
+    assert (K["ci95"] == [None, None]) == withheld
+    assert (K["flag"] is not None) == (K["note"] is not None) == flagged
+    assert not flagged or "K may be off" in K["note"]

@@ -67,6 +67,12 @@ class DecisionRules:
         "by which a strength must differ from zero",
         "one percent of chance over a hundred forms and shapes (Bonferroni)",
     )
+    at_bounds: float = _rule(
+        0.0,
+        "parameters",
+        "of an effect that may have ended at a bound: beyond it the law makes no sense, so that it names nothing",
+        "bounds are in the code of each effect",
+    )
     excess: float = _rule(
         1.5, "times the noise", "a residual larger than this is not noise", "the noise is known to a few per cent"
     )
@@ -92,6 +98,18 @@ class DecisionRules:
         0.05, "log of rms error", "by which fitted initial states and the noise's estimate may be off", "a few per cent"
     )
     many: float = _rule(3.0, "names", "so many names may be the terms of one function", _UNDECLARED)
+    torque_noise_gain: float = _rule(
+        5.0,
+        "nats",
+        "log likelihood by which an effect must better noise of the torque, where that would explain as much",
+        "the best of fifty forms gains 4 by chance",
+    )
+    innovations: float = _rule(
+        0.1,
+        "share of variance",
+        "of a Kalman filter's innovations that earlier ones may predict where what is left is noise of the torque",
+        "0.01 under noise of the torque; 0.2 and more where an effect is missing (practice logs, `docs/method.md`)",
+    )
     surprise: float = _rule(
         1.25,
         "times the band",
@@ -134,6 +152,9 @@ class EffectEvidence:
         removed: what it removes of the error, over what the effects before it have removed (rms).
         imperfection: what the laws of the effects before it may get wrong, likewise.
         strength_errors: standard errors by which its best known strength differs from zero.
+        over_torque_noise: log likelihood by which it betters noise of the torque; infinite where that is no
+            explanation.
+        at_bounds: how many of its parameters ended at a bound.
     """
 
     name: str
@@ -142,6 +163,8 @@ class EffectEvidence:
     removed: float = np.inf
     imperfection: float = 0.0
     strength_errors: float = np.inf
+    over_torque_noise: float = np.inf
+    at_bounds: int = 0
 
 
 def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
@@ -152,11 +175,14 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
         rules: the thresholds.
     """
     least, errors, chance = rules.least_gain, rules.strength_errors, rules.significance
+    nats, over = rules.torque_noise_gain, seen.over_torque_noise
     return (
         Check("least_gain", seen.name, seen.gain, least, seen.gain > least),
         Check("significance", seen.name, seen.p_value, chance, seen.p_value <= chance),
         Check("imperfection", seen.name, seen.removed, seen.imperfection, seen.removed > seen.imperfection),
         Check("strength_errors", seen.name, seen.strength_errors, errors, seen.strength_errors > errors),
+        Check("torque_noise_gain", seen.name, over, nats, over > nats),
+        Check("at_bounds", seen.name, float(seen.at_bounds), rules.at_bounds, seen.at_bounds <= rules.at_bounds),
     )
 
 
@@ -254,6 +280,35 @@ class ModelEvidence:
 
 
 @dataclass(frozen=True)
+class NoiseEvidence:
+    """What a Kalman filter with noise of the torque leaves.
+
+    Attributes:
+        share: the noise of the torque over its rms.
+        predictable: share of the innovations' variance that earlier ones predict.
+        size: rms of the innovations in units of what the filter expects, of the output where it is largest.
+    """
+
+    share: float
+    predictable: float
+    size: float
+
+
+def noisy_torque(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
+    """Whether what a model leaves is noise of the torque: all checks must hold.
+
+    Args:
+        seen: what the filter leaves.
+        rules: the thresholds.
+    """
+    about = f"noise of the torque, {100 * seen.share:.2g} % of its rms"
+    return (
+        Check("innovations", about, seen.predictable, rules.innovations, seen.predictable <= rules.innovations),
+        Check("excess", "innovations of that filter", seen.size, rules.excess, seen.size < rules.excess),
+    )
+
+
+@dataclass(frozen=True)
 class ChallengeEvidence:
     """What is known when a learned term challenges names.
 
@@ -269,6 +324,7 @@ class ChallengeEvidence:
         come_out: share of the term in their place that the names make up.
         shown: whether every name still has a strength that is told from zero beside the learned term.
         one_shape: whether a name is one shape of the function that was learned both beside it and in its place.
+        torque: what noise of the torque would explain of what the names leave; None where they leave nothing else.
     """
 
     base: ModelEvidence
@@ -282,6 +338,12 @@ class ChallengeEvidence:
     come_out: float = 0.0
     shown: bool = True
     one_shape: bool = False
+    torque: NoiseEvidence | None = None
+
+    @property
+    def enough(self) -> bool:
+        """Whether the names leave nothing that could be learned."""
+        return self.named.white or self.imperfect
 
     def answered(self, question: Question, found: ModelEvidence | None, **changes: Any) -> "ChallengeEvidence":
         """The same with one more answer."""
@@ -295,7 +357,7 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
         seen: what is known.
         rules: the thresholds.
     """
-    enough = seen.named.white or seen.imperfect
+    enough = seen.enough
     if enough and seen.names < rules.many:
         return None
     little = _leaves_little(seen, rules)
@@ -325,7 +387,7 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
     if seen.instead is None:
         return (Check("come_out", "no learned term in their place is supported", 1.0, rules.come_out, True),)
     beside, instead = seen.beside, seen.instead
-    enough = seen.named.white or seen.imperfect
+    enough = seen.enough
     rival = seen.named if beside is None else beside
     better_by = rival.selection - instead.selection
     gain = seen.base.selection - instead.selection
@@ -483,6 +545,8 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
             lacking.append(f"round {number}: another candidate would be accepted")
         elif this.rivals and not last and leader(this.rivals, rules)[0].name != this.asked[-1].name:
             lacking.append(f"round {number}: another candidate would lead")
+    if evidence.challenge.torque is not None:
+        checks += noisy_torque(evidence.challenge.torque, rules)
     question = next_question(evidence.challenge, rules)
     if question is not None:
         lacking.append(f"a learned term {question}")

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
 from fitting.along import place_of
 from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt
 from fitting.attribution.decisions import RULES
-from fitting.estimate import Fit
+from fitting.estimate import Fit, segments_of_logs
 from fitting.experiment import Stretch
 from fitting.explained import solved
 from fitting.free import effect_paths
@@ -182,7 +182,7 @@ def _at(place: type[LearnedTorque], omega: float, look: Look, found: Fit, own: S
     parameters `own`."""
     angle = omega * np.asarray(look.conditions.time)
     size = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    by_log = products(look, Acting((look.pushes[place.name],)), (size,)).added(_segments_of_logs(found))
+    by_log = products(look, Acting((look.pushes[place.name],)), (size,)).added(segments_of_logs(found))
     kept = by_log.columns([*(i for i, path in enumerate(found.free.paths) if path not in own), -2, -1])
     steps = best_steps(kept)
     weight = np.linalg.pinv(left_after(kept, steps) / np.maximum(kept.samples, 1.0)[:, None, None], hermitian=True)
@@ -190,13 +190,6 @@ def _at(place: type[LearnedTorque], omega: float, look: Look, found: Fit, own: S
     information = np.array([_information(g) for g in gram])
     values = float(np.sum(kept.samples)) * kept.square.shape[1]
     return Phasors(place, omega, steps[:, -2] + 1j * steps[:, -1], information, values)
-
-
-def _segments_of_logs(found: Fit) -> Bool[np.ndarray, "logs segments"]:
-    count, length = found.problem.segments.weight.shape
-    logs = np.arange(len(found.stretches))
-    log = np.repeat(logs, [-(-len(s) // length) for s in found.stretches])
-    return np.pad(log, (0, count - log.size), constant_values=-1) == logs[:, None]
 
 
 def _information(gram: Float[np.ndarray, "columns columns"]) -> float:

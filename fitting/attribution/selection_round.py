@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import equinox as eqx
 import numpy as np
@@ -12,9 +13,19 @@ from fitting.attribution.decisions import RULES, EffectEvidence, Rival, RoundEvi
 from fitting.attribution.score import block_scores
 from fitting.attribution.screening import Lead, Screen, screen
 from fitting.attribution.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
-from fitting.attribution.support import imperfection, is_plausible, share_of_removed, strength_errors
+from fitting.attribution.support import (
+    imperfection,
+    is_plausible,
+    over_torque_noise,
+    share_of_removed,
+    strength_errors,
+    torque_noise_left,
+)
 from fitting.base_fit import leaves_white_noise
 from fitting.experiment import scales
+from fitting.identifiability import parameters_at_bounds
+from fitting.measurement_noise import MeasurementNoise, measurement_noise
+from fitting.process_noise import TorqueNoise
 from hdjax.effects import Effect
 
 # Work in proportion: what is tied with the best gains as much but for this share; so it must in its first pass to be
@@ -79,6 +90,7 @@ def look(
     seed: int,
     progress: Callable[[str], None],
     base: Trial | None = None,
+    noise: MeasurementNoise | None = None,
 ) -> Round:
     """Look for the effect that explains most of what a model leaves over.
 
@@ -90,6 +102,7 @@ def look(
         seed: of the surrogates.
         progress: told what is being done.
         base: the model without any effect; where not given, `before`.
+        noise: of the measured outputs; where not given, that which the present model shows.
     """
     base = before if base is None else base
     progress("looking through the catalogue")
@@ -144,39 +157,53 @@ def look(
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     found, behind = _with_ties(found)
     rivals: tuple[Rival, ...] = ()
-    verdicts, asked, accepted = _supported_first(found, before, base)
+    against = _Against(before, base, measurement_noise(before.training) if noise is None else noise)
+    verdicts, asked, accepted = _supported_first(found, against)
     if accepted:
         found, rivals = _simplest_first(found, before, data, setting)
-        verdicts, asked, accepted = _supported_first(found, before, base)
+        verdicts, asked, accepted = _supported_first(found, against)
     return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
 
 
-def _evidence(verdict: Verdict, before: Trial, base: Trial) -> EffectEvidence:
-    """What the data say of a competitor; another hold has no strength to tell from zero."""
-    trial = verdict.trial
-    assert trial is not None
-    own = {verdict.name} & {e.name for e in trial.model.effects}
-    errors = strength_errors(trial.training, own)
-    return EffectEvidence(
-        name=verdict.name,
-        gain=verdict.gain,
-        p_value=verdict.p_value,
-        removed=share_of_removed(trial, before, base),
-        imperfection=imperfection(before),
-        strength_errors=min(errors.values(), default=np.inf),
-    )
+class _Against:
+    """What a competitor has to better."""
+
+    def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise) -> None:
+        self.before, self.base, self.noise = before, base, noise
+
+    @cached_property
+    def torque(self) -> TorqueNoise | None:
+        """What the model before leaves, as noise of the torque."""
+        return torque_noise_left(self.before, self.noise)
+
+    def evidence(self, verdict: Verdict) -> EffectEvidence:
+        """What the data say of a competitor; another hold has no strength to tell from zero."""
+        trial = verdict.trial
+        assert trial is not None
+        own = {verdict.name} & {e.name for e in trial.model.effects}
+        errors = strength_errors(trial.training, own)
+        return EffectEvidence(
+            name=verdict.name,
+            gain=verdict.gain,
+            p_value=verdict.p_value,
+            removed=share_of_removed(trial, self.before, self.base),
+            imperfection=imperfection(self.before),
+            strength_errors=min(errors.values(), default=np.inf),
+            over_torque_noise=over_torque_noise(trial, self.before, self.torque, self.noise),
+            at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
+        )
 
 
 def _supported_first(
-    verdicts: list[Verdict], before: Trial, base: Trial
+    verdicts: list[Verdict], against: _Against
 ) -> tuple[list[Verdict], tuple[EffectEvidence, ...], bool]:
     """The list from its first supported competitor on, the unsupported ones behind it, unchanged where none is; what
     the data say of each that was asked; and whether there is one."""
     asked = []
     for i, verdict in enumerate(verdicts):
-        if verdict.trial is None or verdict.gain <= RULES.least_gain:
+        if verdict.trial is None or verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:
             break
-        asked.append(_evidence(verdict, before, base))
+        asked.append(against.evidence(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
     return verdicts, tuple(asked), False

@@ -10,12 +10,13 @@ from fitting.attribution.decisions import (
     EffectEvidence,
     FinalEvidence,
     ModelEvidence,
+    NoiseEvidence,
     Rival,
     RoundEvidence,
 )
 
 # What JSON has no number for.
-_UNBOUNDED = ("removed", "strength_errors", "gain", "long_gain", "training", "selection", "noise")
+_UNBOUNDED = ("removed", "strength_errors", "over_torque_noise", "gain", "long_gain", "training", "selection", "noise")
 
 
 def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
@@ -29,6 +30,8 @@ def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
     known["asked"] = tuple(challenge["asked"])
     for name in ("base", "named", "beside", "instead"):
         known[name] = None if challenge[name] is None else _model(challenge[name])
+    torque = challenge["torque"]
+    known["torque"] = None if torque is None else NoiseEvidence(**torque)
     final = dict(stored["final"])
     for name in ("names", "excess", "excess_at_first"):
         final[name] = tuple(final[name])

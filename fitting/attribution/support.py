@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.decisions import RULES, DecisionRules
+from fitting.attribution.decisions import RULES, DecisionRules, NoiseEvidence, noisy_torque
 from fitting.estimate import Fit
 from fitting.free import effect_paths, strength_paths
 from fitting.measurement_noise import MeasurementNoise
 from fitting.normal_law import NORMAL_95
+from fitting.process_noise import TorqueNoise, torque_noise
 from fitting.uncertainty import Estimate, Uncertainty, uncertainty
 from hdjax import ReducedModel
 from hdjax.effects import Effect
@@ -84,6 +85,47 @@ def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> 
         return False, noise
     noise = noise.and_beside(before.training)
     return _share(before, base, np.diag(np.asarray(noise.covariance))) <= small, noise
+
+
+def torque_noise_left(before: Trial, noise: MeasurementNoise) -> TorqueNoise | None:
+    """Noise of the torque as far as it would explain what a model leaves; None where the model leaves hardly more than
+    measurement noise.
+
+    Args:
+        before: the model.
+        noise: of the outputs.
+    """
+    outputs = np.asarray(noise.covariance)
+    left = np.diag(np.asarray(before.training.covariance)) / np.diag(outputs)
+    return torque_noise(before.training, outputs) if np.max(left) > RULES.excess**2 else None
+
+
+def noise_evidence(left: TorqueNoise) -> NoiseEvidence:
+    """The same as decisions see it."""
+    return NoiseEvidence(left.share, left.predictable, left.innovations)
+
+
+def is_noisy_torque(left: TorqueNoise | None) -> bool:
+    """Whether what a model leaves may all be noise of the torque."""
+    return left is not None and all(check.holds for check in noisy_torque(noise_evidence(left)))
+
+
+def over_torque_noise(trial: Trial, before: Trial, left: TorqueNoise | None, noise: MeasurementNoise) -> float:
+    """Log likelihood [nats] by which a model betters the one before it, where each may have noise of the torque of its
+    own, less what its further parameters would gain on noise (Schwarz 1978). Infinite where noise of the torque is no
+    explanation of what the model before it leaves.
+
+    Args:
+        trial: the model.
+        before: the one before it.
+        left: what that leaves, as noise of the torque.
+        noise: of the outputs.
+    """
+    if left is None or not is_noisy_torque(left):
+        return np.inf
+    own = torque_noise(trial.training, np.asarray(noise.covariance))
+    further = len(trial.training.free.paths) - len(before.training.free.paths)
+    return own.likelihood - left.likelihood - 0.5 * further * float(np.log(left.count))
 
 
 def share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:

@@ -15,6 +15,7 @@ from fitting.outcome import Loop
 from fitting.report.alternatives import alternatives
 from fitting.report.earlier_schema import with_old_names
 from fitting.report.fit_content import fit_dict, meaning
+from fitting.report.intervals import say_what_intervals_hold
 from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
 from fitting.report.parameters import PARTS, account_dict, effect_dict, no_account
@@ -64,7 +65,11 @@ def report_dict(
         "rules": rules_dict(outcome.checks) if is_loop else [],
         "evidence": dataclasses.asdict(outcome.case) if is_loop else None,
         "units": units,
-        "noise": {"dynamic_error": noise, "memory": outcome.noise_memory if is_loop else None},
+        "noise": {
+            "dynamic_error": noise,
+            "memory": outcome.noise_memory if is_loop else None,
+            "torque": outcome.torque_noise if is_loop else None,
+        },
         "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
         "identifiability": identifiability_dict(outcome.after.identifiability, units),
@@ -93,6 +98,8 @@ def report_dict(
     if not is_loop:
         report |= fit_dict(outcome, noise) | {"posterior": posterior_dict(outcome.posterior)}
     report = finite(report)
+    if is_loop:
+        say_what_intervals_hold(report, outcome.times_noise)
     report["summary"] = summary(report)
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)

@@ -77,7 +77,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
         told += [e.get("note") for path, e in effect.items() if path not in silent]
         told += [_absence(effect, unit, paths) for unit, paths in _absent(effect).items()]
     told += [d["sentence"] for d in found["directions"] if not silent.issuperset(d["members"])]
-    notes = [n for n in told if n]
+    notes = list(dict.fromkeys(n for n in told if n))
     notes += [h["sentence"] for h in found["held"]]
     for other in report["alternatives"]:
         if not other["separable"]:

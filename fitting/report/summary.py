@@ -29,6 +29,7 @@ def summary(report: Mapping[str, Any]) -> str:
             f"The model suffices: on {on} data it errs by {_against_noise(before, noise, unit)}, and none of the "
             f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
             + _remembering(report)
+            + _noisy_torque(report)
         )
     if decision == "effect_found":
         opening = (
@@ -41,7 +42,7 @@ def summary(report: Mapping[str, Any]) -> str:
             rest = f" More than noise is left, which has no name: a learned {_learned(report)}, stands for it."
         several = bool(rest) or len(families) > 1
         change = _change("Together they" if several else "It", report, several=several)
-        return f"{opening}: {found}.{rest} {change}{_remembering(report)}"
+        return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
     left = report["unexplained"]
     opening = "Something is missing that the catalogue does not explain."
     if families:
@@ -71,6 +72,17 @@ def _remembering(report: Mapping[str, Any]) -> str:
         f" What is left over remembers itself for about {formatting.quantity(memory, 's', digits=2)}, and was taken "
         "for noise of the sensors, since whole stretches leave no more of it than such noise would. Something as slow "
         "that nothing tried here can follow would look the same."
+    )
+
+
+def _noisy_torque(report: Mapping[str, Any]) -> str:
+    """That the torque channel is noisy; empty where it is not."""
+    std = report["noise"]["torque"]
+    if std is None:
+        return ""
+    return (
+        f" The torque channel is noisy by {formatting.quantity(std, report['units']['forcing'], digits=2)} rms. The "
+        "drive answers to it, so that free runs leave more than the encoders' noise, and no model follows them closer."
     )
 
 

@@ -143,10 +143,15 @@ class Graph:
         """What stays the same during a simulation and is asked for, by the wanted nodes or by what they are made of:
         each with a place of its own."""
         wanted = list(wanted)
-        asked = {n for n in wanted if self.level[n] == PARAMETER}
+
+        def is_steady(node: Node) -> bool:
+            # What is made of numbers alone is one too, where it was not simplified to a number.
+            return self.level[node] < VARYING and self.known(node) is None
+
+        asked = {n for n in wanted if is_steady(n)}
         for node in self.needed(wanted):
             if self.level[node] == VARYING:
-                asked |= {a for a in self.arguments(node) if self.level[a] == PARAMETER}
+                asked |= {a for a in self.arguments(node) if is_steady(a)}
         return {node: i for i, node in enumerate(sorted(asked))}
 
     def arguments(self, node: Node) -> Sequence[Node]:
