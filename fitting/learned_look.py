@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.along import ERROR, SLOPE, place_of, unit_reading
+from fitting.attribution.decisions import RULES
 from fitting.estimate import Fit
 from fitting.free import effect_paths
 from fitting.linear_look import (
@@ -54,8 +55,6 @@ from hdjax.engine.pointwise import at_instants, slopes_at_instants
 _FOLDS = 4
 # How many coefficients a function of one variable may have, and of two.
 _SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (1, 2, 3, 5, 7, 9, 12, 16, 20, 24)}
-# A poorer error by this share (in the objective) is no reason for more coefficients.
-WORTH_A_COEFFICIENT = 0.005
 # What explains this share of what the best one does, to first order, may be the better one after all.
 NEARLY = 0.8
 # Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
@@ -151,7 +150,7 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
 
     alone = {form: look_at(form, [(name,) for name in may[form]]) for form in forms}
     found = [candidate for those in alone.values() for candidate in those]
-    any_two = all(candidate.gain < WORTH_A_COEFFICIENT for candidate in found)
+    any_two = all(candidate.gain < RULES.coefficient for candidate in found)
     for form, those in alone.items():
         best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
         pairs = (p for p in combinations(may[form], 2) if any_two or best & set(p))
@@ -239,7 +238,7 @@ def _simplest(
     """One place and choice of variables, by the simplest function that explains as much as any."""
     best: Candidate | None = None
     for candidate in _functions_of(seen, form, variables, own):
-        if best is None or candidate.gain > best.gain + WORTH_A_COEFFICIENT:
+        if best is None or candidate.gain > best.gain + RULES.coefficient:
             best = candidate
     return best
 
@@ -287,7 +286,7 @@ def _candidate(
     base, *left = _left_out(found, [parameters, *(parameters + s for s in sizes)])
     gain, size = 0.0, 0
     for more, after in zip(sizes, left, strict=True):
-        if size == 0 or base - after > gain + WORTH_A_COEFFICIENT:
+        if size == 0 or base - after > gain + RULES.coefficient:
             gain, size = float(base - after), more
     if not gain > 0:
         return None

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from fitting.attribution.decisions import RULES
 from fitting.autocorrelation import autocovariance, basis_of_states
 from fitting.estimate import Fit, half_log_determinant
 from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed
@@ -21,11 +22,8 @@ _DRAWS = 99
 _START = 2000
 # The longest memory that is told from a drift [samples].
 _LONGEST = 1000.0
-# How much more than noise of the same memory whole stretches may leave, in the objective: a quarter of the error.
-_MORE = float(np.log(1.25))
-# Lags over which the autocovariance is looked at, where it is still this share of its slow part's variance; and what it
-# may bend the other way in any case, since parameters are off by a little.
-_LAGS, _SHARE, _BENT = 1024, 0.5, 0.9
+# Lags over which the autocovariance is looked at, where it is still this share of its slow part's variance.
+_LAGS, _SHARE = 1024, 0.5
 
 
 class NoiseWithMemory(eqx.Module):
@@ -68,7 +66,7 @@ def noise_with_memory(found: Fit) -> NoiseWithMemory | None:
     drawn = _drawn(noise, segments * samples)
     if _swings(error, drawn[:, : len(error)]):
         return None
-    if with_gaps_closed(whole) > found.objective + _taken_by_states(found, drawn) + _MORE:
+    if with_gaps_closed(whole) > found.objective + _taken_by_states(found, drawn) + RULES.whole_stretches:
         return None
     return noise
 
@@ -86,7 +84,7 @@ def _described(error: Float[np.ndarray, "samples outputs"]) -> NoiseWithMemory:
 def _swings(error: Float[np.ndarray, "samples outputs"], drawn: Float[np.ndarray, "draws samples outputs"]) -> bool:
     """Whether the autocovariance of an error bends as that of relaxations does not, and less than that of any draw."""
     by_chance = np.min([_convexity(draw) for draw in drawn], axis=0)
-    return bool(np.any(_convexity(error) < np.minimum(by_chance, _BENT)))
+    return bool(np.any(_convexity(error) < np.minimum(by_chance, RULES.convexity)))
 
 
 def _convexity(error: Float[np.ndarray, "samples outputs"]) -> Float[np.ndarray, " outputs"]:

@@ -21,7 +21,6 @@ from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.learned_look import (
     NEARLY,
-    WORTH_A_COEFFICIENT,
     Candidate,
     LearnedLook,
     candidates,
@@ -38,13 +37,11 @@ from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import Learned, LearnedReading
 from hdjax.parameters import as_scalar
 
-# A poorer error by this share (in the objective) is no reason for a second variable.
-_WORTH_A_VARIABLE = 0.03
 # What explains less than this share of the error, to first order, is not refitted: of what the base model leaves,
 # and beside effects that have a name already.
 _LEAST_SHARE, _LEAST_SHARE_BESIDE = 0.005, 0.02
 # Steps that together take less than this share off the sum of squares are no better than one more coefficient.
-_LEAST_PROGRESS = 2.0 * WORTH_A_COEFFICIENT
+_LEAST_PROGRESS = 2.0 * RULES.coefficient
 
 
 class Unknown(eqx.Module):
@@ -109,7 +106,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
             remembered = memory.put_inside(before, data, setting, rival=best, progress=progress)
     if not _is_enough(remembered):
         if not _is_enough(best):
-            worth = [c for c in pairs if best is None or c.gain >= best[0].gain + _WORTH_A_VARIABLE]
+            worth = [c for c in pairs if best is None or c.gain >= best[0].gain + RULES.variable]
             best = _likeliest(worth, best, before, data, setting, progress)
         best = None if best is None else _refined(best, data, setting, progress)
         if memory is not None and remembered is None and not _is_enough(best):

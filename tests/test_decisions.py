@@ -27,6 +27,7 @@ from fitting.attribution.decisions import (
 from fitting.attribution.stored_evidence import case_evidence
 from fitting.files import finite
 from fitting.report.rules import rules_page
+from undeclared.replay import OFF, differing
 
 SEEN = EffectEvidence("friction", 1.0, 0.005)
 MODEL = ModelEvidence(-1.0, -1.0, 3, (1.0, 1.0), True)
@@ -129,3 +130,14 @@ def test_no_other_number_decides():
                 literals = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)]
                 numbers = [v for v in literals if isinstance(v, int | float) and not isinstance(v, bool)]
                 assert set(numbers) <= _PLAIN, (name, node.lineno, numbers)
+
+
+def test_what_a_replay_switches_off_is_a_rule():
+    assert set(OFF) <= {rule.name for rule in fields(RULES)}
+    cases = {"one": CASE}
+    assert differing(cases, RULES) == {}
+    assert differing(cases, replace(RULES, significance=1e-3)) == {
+        "one": "round 1: another candidate would be accepted"
+    }
+    unsure = replace(CASE, final=replace(FINAL, surprise=1.2))
+    assert differing({"one": unsure}, replace(RULES, surprise=1.1)) == {"one": "effect_found -> unexplained"}

@@ -52,6 +52,7 @@ class Case:
         faint: whether what is hidden is drawn near its detection limit instead of from its usual range.
         coloured: whether the noise is; where None, by chance.
         remembering: whether all of the noise has a memory instead.
+        noisy_torque: whether the torque was logged with noise of 1 to 5 % of its rms.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Case:
     faint: bool = False
     coloured: bool | None = None
     remembering: bool = False
+    noisy_torque: bool = False
 
 
 class NoExperimentError(RuntimeError):
@@ -138,6 +140,11 @@ def pair_cases(count: int, seed: int) -> list[Case]:
 def with_remembering_noise(case: Case) -> Case:
     """A case of the same kind whose noise has a memory altogether: another drive, since its name is another."""
     return replace(case, name=f"{case.name}-remembering", remembering=True)
+
+
+def with_noisy_torque(case: Case) -> Case:
+    """A case of the same kind whose torque was logged with noise."""
+    return replace(case, name=f"{case.name}-noisy_torque", noisy_torque=True)
 
 
 def _pair(random: np.random.Generator, families: Sequence[str]) -> tuple[Form, ...]:

@@ -23,6 +23,9 @@ def record(drawn: Drawn, folder: Path) -> dict:
     random = stream(drawn.case.seed, drawn.case.name + "/noise")
     braked = any(np.any(run.excitation.brake) for run in drawn.runs)
     heated = any(np.any(run.warm) for run in drawn.runs)
+    torque_noise = 0.0
+    if drawn.case.noisy_torque:
+        torque_noise = float(random.uniform(0.01, 0.05) * np.std(drawn.runs[0].torque))
     errors = []
     for name, run in zip(LOGS, drawn.runs, strict=True):
         readings = drawn.encoders.read(run.readings, random)
@@ -32,7 +35,9 @@ def record(drawn: Drawn, folder: Path) -> dict:
             "time": drawn.dt * np.arange(len(readings)),
             "motor_angle": readings[:, 0],
             "load_angle": readings[:, 1],
-            "motor_torque": run.torque,
+            "motor_torque": run.torque + torque_noise * random.normal(size=len(readings))
+            if torque_noise
+            else run.torque,
         }
         if braked:
             columns["load_torque"] = run.excitation.brake
@@ -41,7 +46,7 @@ def record(drawn: Drawn, folder: Path) -> dict:
         table = np.column_stack(list(columns.values()))
         np.savetxt(folder / f"{name}.csv", table, fmt="%.10g", delimiter=",", header=",".join(columns), comments="")
     (folder / "drive.toml").write_text(_drive_file(drawn.base, heated), encoding="utf-8")
-    answer = _answer(drawn, float(np.sqrt(np.mean(np.concatenate(errors) ** 2))))
+    answer = _answer(drawn, float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))) | {"torque_noise": torque_noise}
     (folder / "answer.json").write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")
     return answer
 

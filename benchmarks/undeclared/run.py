@@ -30,6 +30,7 @@ from undeclared.drawing import (
     draw,
     pair_cases,
     single_cases,
+    with_noisy_torque,
     with_remembering_noise,
 )
 from undeclared.hidden import FAMILIES
@@ -77,6 +78,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--kinds", nargs="+", choices=FAMILIES, default=[f for f in FAMILIES if f != "unknown"])
     parser.add_argument("--leave-out", action="store_true", help="take the hidden families out of the catalogue")
     parser.add_argument("--remembering", action="store_true", help="noise that has a memory altogether in every case")
+    parser.add_argument("--noisy-torque", action="store_true", help="torque that was logged with noise in every case")
     parser.add_argument("--only", nargs="+", help="cases of these names alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder of the results, one JSON a case")
@@ -95,6 +97,8 @@ def _cases(args: argparse.Namespace) -> list[Case]:
         *clean_cases(args.clean, args.seed),
         *pair_cases(args.pairs, args.seed),
     ]
+    if args.noisy_torque:
+        cases = [with_noisy_torque(case) for case in cases]
     if args.remembering:
         cases = [with_remembering_noise(case) for case in cases]
     return [case for case in cases if not args.only or case.name in args.only]

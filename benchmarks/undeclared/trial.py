@@ -77,6 +77,7 @@ def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
         "ties": sorted({a["family"] for a in ties if a["instead_of"] == first}),
         "all_ties": sorted({a["family"] for a in ties}),
         "noise": report["noise"]["dynamic_error"],
+        "torque_noise": report["noise"]["torque"],
         "before": report["before"]["parameters"],
         "after": report["after"]["parameters"],
         "effect_parameters": [e["parameters"] for e in effects],

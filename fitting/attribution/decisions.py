@@ -117,6 +117,55 @@ class DecisionRules:
         "a right model stays within 1.2 (`tests/test_surprise.py`)",
     )
 
+    line_errors: float = _rule(
+        5.0, "standard errors", "by which a spectral line is in a log", "one in 2e6 by chance, over some thousand lines"
+    )
+    line_share: float = _rule(
+        0.25,
+        "share of squares",
+        "of what is left that a line must explain for the clocks of several logs to be set by it",
+        "lines that a multisine leaves behind explain less each (`tests/test_clocks.py`)",
+    )
+    line_in_phase: float = _rule(
+        0.9,
+        "share of amplitude",
+        "that a line of one phase keeps of what it has with a phase of each log's own where clocks are right",
+        "phases within 0.45 rad",
+    )
+    whole_stretches: float = _rule(
+        float(np.log(1.25)),
+        "log of rms error",
+        "what whole stretches may leave beyond noise of the same autocovariance",
+        "a missing torque moves the drive ever farther (`tests/test_noise_memory.py`)",
+    )
+    convexity: float = _rule(
+        0.9,
+        "1",
+        "least ratio of autocovariances at which coloured noise may bend the other way",
+        "1 by Cauchy and Schwarz for relaxations; a tenth for errors of parameters",
+    )
+    coefficient: float = _rule(
+        0.005,
+        "log of rms error",
+        "that a further coefficient of a learned function must gain on parts of the training data left out",
+        "assumed: half a percent of the error",
+    )
+    variable: float = _rule(
+        0.03, "log of rms error", "that a second variable of a learned function must gain", "assumed: three percent"
+    )
+    quasi_static_imperfection: float = _rule(
+        0.05,
+        "share of rms",
+        "of what effects of quasi-static logs have removed that their laws may get wrong",
+        "laws of hysteresis and stiffness are good to some hundredths (`docs/quasi_static.md`)",
+    )
+    wander: float = _rule(
+        20.0,
+        "times the noise",
+        "by which a residual of quasi-static logs may wander and still be coloured noise",
+        "an encoder's noise correlated by 0.98 from row to row would be nine times",
+    )
+
 
 RULES = DecisionRules()
 """The rules as they are."""

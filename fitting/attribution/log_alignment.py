@@ -21,13 +21,6 @@ from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, Learned, LearnedPeriodic, LearnedTorque
 from hdjax.effects.learned_axes import PeriodicAxis
 
-# A line is in a log where it is told from zero by this many standard errors.
-_TOLD = 5.0
-# Clocks are right where a line of one phase does so much of what it would do with a phase of each log's own.
-_COHERENT = 0.9
-# Clocks are set by a line that explains this share of all that is left, noise included. Less of one is found in one log
-# at least, and the lines that an excitation of many lines leaves behind explain little each.
-_LEAST_SHARE = 0.25
 # Refits after which the clocks have settled, and by how many standard errors of a phase they may still be off.
 _REFITS = 4
 _SETTLED = 0.1
@@ -75,7 +68,7 @@ class Phasors(eqx.Module):
     @property
     def first(self) -> int:
         """The first log that has the line."""
-        return int(np.argmax(self.told > _TOLD))
+        return int(np.argmax(self.told > RULES.line_errors))
 
     @property
     def late(self) -> Float[np.ndarray, " logs"]:
@@ -88,7 +81,7 @@ class Phasors(eqx.Module):
     def in_phase(self) -> "Phasors":
         """The same with the first phase in all logs that have the line."""
         turned = np.abs(self.torque) * np.exp(1j * np.angle(self.torque[self.first]))
-        return replace(self, torque=np.where(self.told > _TOLD, turned, self.torque))
+        return replace(self, torque=np.where(self.told > RULES.line_errors, turned, self.torque))
 
 
 def with_clocks_set(
@@ -108,9 +101,9 @@ def with_clocks_set(
     if len(data[base.hold][0]) < 2:
         return base, data
     seen = max(_lines(base.training), key=lambda line: line.share, default=None)
-    if seen is None or seen.share < _LEAST_SHARE or np.sum(seen.told > _TOLD) < 2:
+    if seen is None or seen.share < RULES.line_share or np.sum(seen.told > RULES.line_errors) < 2:
         return base, data
-    if abs(seen.mean) >= _COHERENT * abs(seen.in_phase.mean):
+    if abs(seen.mean) >= RULES.line_in_phase * abs(seen.in_phase.mean):
         return base, data
     progress("setting the logs' clocks by a line")
     clocked = _set_by(seen, base, data, setting)

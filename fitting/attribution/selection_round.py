@@ -201,11 +201,14 @@ def _supported_first(
     the data say of each that was asked; and whether there is one."""
     asked = []
     for i, verdict in enumerate(verdicts):
-        if verdict.trial is None or verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:
+        if verdict.trial is None:
             break
         asked.append(against.evidence(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
+        if verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:
+            # Those behind it gain less.
+            break
     return verdicts, tuple(asked), False
 
 

@@ -16,15 +16,6 @@ from fitting.quasi_static.twist_model import TwistModel, fit_twist
 
 Decision = Literal["effect_found", "model_sufficient", "unexplained"]
 
-# As in the loop for drive logs: a residual this much larger than the noise is not noise, and effects that remove this
-# share of the unexplained variance are the explanation.
-_EXCESS, _EXPLAINED = 1.5, 0.75
-# What wanders by more than this many times the noise from row to row is no noise of an encoder, assumed: correlated by
-# 0.98 from row to row it would be nine times.
-_WANDER = 20.0
-# A further effect must remove this share (rms) of what those before it removed. Laws of hysteresis and of stiffness are
-# good to some hundredths, so that less may be what they get wrong themselves.
-_IMPERFECTION = 0.05
 # Forms of one family in a model: orders of an angle, sliders side by side.
 _MOST_OF_A_FAMILY = 4
 
@@ -106,7 +97,7 @@ def close_loop(
     current, rounds = base, []
     while still_open := _still_open(forms, current, max_effects):
         progress("looking through the catalogue")
-        this = look(held, current, base, still_open, seed + len(rounds), _IMPERFECTION)
+        this = look(held, current, base, still_open, seed + len(rounds), RULES.quasi_static_imperfection)
         rounds.append(this)
         if not this.accepted:
             break
@@ -155,7 +146,7 @@ def _without_superfluous(held: Held, trial: Trial, base: Trial) -> tuple[Trial, 
     dropped = []
     for form in trial.model.forms if len(trial.model.forms) > 1 else ():
         poorer = held.without(trial, [form])
-        least = _IMPERFECTION**2 * (base.mean_square - trial.mean_square)
+        least = RULES.quasi_static_imperfection**2 * (base.mean_square - trial.mean_square)
         if trial.gain_over(poorer) < RULES.least_gain or poorer.mean_square - trial.mean_square < least:
             trial = poorer
             dropped.append(form.name)
@@ -178,9 +169,9 @@ def _findings(held: Held, after: Trial, rounds: list[Round], at_rest: RestLook |
 def _decide(base: Trial, after: Trial, left: Leftover | None, noise: float) -> Decision:
     """Something unexplained is what predictably depends on something, or what is too large for noise of any colour."""
     if after is base and left is None:
-        return "unexplained" if base.rmse > _WANDER * noise else "model_sufficient"
-    if left is None or after.rmse < _EXCESS * noise:
+        return "unexplained" if base.rmse > RULES.wander * noise else "model_sufficient"
+    if left is None or after.rmse < RULES.excess * noise:
         return "effect_found" if after is not base else "model_sufficient"
     before, behind = (max(t.mean_square - noise**2, 0.0) for t in (base, after))
     explained = 1.0 - behind / before if before > 0 else 0.0
-    return "effect_found" if after is not base and explained >= _EXPLAINED else "unexplained"
+    return "effect_found" if after is not base and explained >= RULES.explained else "unexplained"
