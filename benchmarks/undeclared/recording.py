@@ -35,10 +35,10 @@ def record(drawn: Drawn, folder: Path) -> dict:
             "time": drawn.dt * np.arange(len(readings)),
             "motor_angle": readings[:, 0],
             "load_angle": readings[:, 1],
-            "motor_torque": run.torque + torque_noise * random.normal(size=len(readings))
-            if torque_noise
-            else run.torque,
+            "motor_torque": run.torque,
         }
+        if torque_noise:
+            columns["motor_torque"] = run.torque + torque_noise * random.normal(size=len(readings))
         if braked:
             columns["load_torque"] = run.excitation.brake
         if heated:
