@@ -1,6 +1,7 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 
@@ -9,14 +10,15 @@ from fitting.attribution.decisions import CaseEvidence, decide
 from fitting.attribution.effect_evidence import evidence
 from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
 from fitting.attribution.selection_round import Round
-from fitting.challenge import challenge_names
+from fitting.challenge import Challenge, challenge_names
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, free_runs
 from fitting.conclusion import Conclusion, draw_conclusion
 from fitting.diagnostics import diagnose
 from fitting.effect_search import Search, base_trial, refitted_without, search_effects
+from fitting.estimate import Fit
 from fitting.experiment import Experiment, Stretch, split, whole
-from fitting.free_run import rms_error
+from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import refitted_on_all
 from fitting.outcome import Finding, Loop
 from hdjax import Hold, Model
@@ -36,6 +38,7 @@ def close_loop(
     max_effects: int = 3,
     catalogue: Sequence[type[Effect]] = CATALOGUE,
     seed: int = 0,
+    thorough: bool = False,
     progress: Callable[[str], None] = _silent,
 ) -> Loop:
     """Close the loop between a model and the logs of one drive.
@@ -49,6 +52,7 @@ def close_loop(
         max_effects: effects to add at most.
         catalogue: forms to look for.
         seed: of the surrogates behind the p-values.
+        thorough: whether all forms are refitted in each round, in place of those that the score test finds likely.
         progress: told what is being done.
 
     Returns:
@@ -62,6 +66,7 @@ def close_loop(
     clock = Clock()
     progress("finding starting values")
     base, setting, data = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)
+    setting = replace(setting, thorough=thorough)
     clock.lap("base fit")
     base, clocked = with_clocks_set(base, data, setting, progress=progress)
     late, data = put_back(data[base.hold][0], clocked[base.hold][0]), clocked
@@ -73,85 +78,105 @@ def close_loop(
     clock.lap("unknown effects")
     end = draw_conclusion(base, challenge, data, setting, noise=found.noise, **seeds)
     clock.lap("final fit")
-    case = CaseEvidence(tuple(this.evidence for this in found.rounds), challenge.seen, end.seen)
     progress("free runs")
     tests = put_back_as(late, {h: whole(e) for h, e in (test or {}).items()}, data[base.hold][0])
-    before, after = _accounts(base, end, data, tests, setting)
-    findings = _findings(base, found, end, after, data, setting)
-    clock.lap("free runs")
-    progress("asking the data for each effect")
-    seen = evidence(end.final.training)
-    clock.lap("evidence")
-    trusted = {e.name for e in end.trusted.model.effects}
-    return Loop(
-        decision=end.outcome,
-        checks=decide(case).checks,
-        before=before,
-        after=after,
-        findings=findings,
-        rounds=found.rounds,
-        dropped=found.dropped,
-        doubted=tuple(e.name for e in found.named.model.effects if e.name not in trusted),
-        unknown=end.unknown,
-        case=case,
-        evidence=seen,
-        noise=end.noise,
-        noise_memory=None if end.slow is None else end.slow.memory(data[base.hold][0][0].experiment.time_step),
-        torque_noise=None if end.torque is None else end.torque.std,
-        left=tuple(map(float, excess(end.final.held_out, end.noise))),
-        residual_before=diagnose(base.training),
-        residual_after=diagnose(end.final.training),
-        hold=end.final.hold,
-        setting=setting,
-        after_substeps=end.fitted.substeps,
-        stretches=data[end.final.hold],
-        surprise=end.seen.surprise,
-        put_back=late,
-        seconds=clock.laps,
-    )
+    return _Closed(base, data, setting, found, challenge, end).told(tests, late, clock)
 
 
-def _accounts(
-    base: Trial, end: Conclusion, data: Data, tests: Mapping[Hold, tuple[Stretch, ...]], setting: Setting
-) -> tuple[Account, Account]:
-    """The base model's and the final model's, each fitted to the data that selected it as well; the same where nothing
-    was found."""
+@dataclass(frozen=True)
+class _Closed:
+    """What each stage has come to."""
 
-    def accounted(trial: Trial, fitted, runs) -> Account:
-        whole_fit = refitted_on_all(fitted, trial.held_out)
-        test = tests.get(trial.hold, ())
-        return account(whole_fit, data[trial.hold][0], test, selection=runs, noise=end.noise, halo=setting.halo)
+    base: Trial
+    data: Data
+    setting: Setting
+    found: Search
+    challenge: Challenge
+    end: Conclusion
 
-    after = accounted(end.final, end.fitted, end.runs)
-    if end.final is base:
-        return after, after
-    return accounted(base, base.training, end.runs_at_first), after
+    def told(self, tests: Mapping[Hold, tuple[Stretch, ...]], late: tuple[float, ...], clock: Clock) -> Loop:
+        """All that can be said of it."""
+        end, found, base, final = self.end, self.found, self.base, self.end.final
+        case = CaseEvidence(tuple(this.evidence for this in found.rounds), self.challenge.seen, end.seen)
+        before, after = self._accounts(tests)
+        findings = self._findings(after)
+        clock.lap("free runs")
+        seen = evidence(final.training)
+        clock.lap("evidence")
+        trusted = {e.name for e in end.trusted.model.effects}
+        time_step = self.data[base.hold][0][0].experiment.time_step
+        return Loop(
+            decision=end.outcome,
+            checks=decide(case).checks,
+            before=before,
+            after=after,
+            findings=findings,
+            rounds=found.rounds,
+            dropped=found.dropped,
+            doubted=tuple(e.name for e in found.named.model.effects if e.name not in trusted),
+            unknown=end.unknown,
+            case=case,
+            evidence=seen,
+            noise=end.noise,
+            noise_memory=None if end.slow is None else end.slow.memory(time_step),
+            torque_noise=None if end.torque is None else end.torque.std,
+            left=tuple(map(float, excess(final.held_out, end.noise))),
+            residual_before=diagnose(base.training),
+            residual_after=diagnose(final.training),
+            hold=final.hold,
+            setting=self.setting,
+            after_substeps=end.fitted.substeps,
+            stretches=self.data[final.hold],
+            surprise=end.seen.surprise,
+            put_back=late,
+            seconds=clock.laps,
+        )
 
+    def _accounts(self, tests: Mapping[Hold, tuple[Stretch, ...]]) -> tuple[Account, Account]:
+        """The base model's and the final model's, each fitted to the data that selected it as well; the same where
+        nothing was found."""
+        end = self.end
 
-def _findings(
-    base: Trial, found: Search, end: Conclusion, after: Account, data: Data, setting: Setting
-) -> tuple[Finding, ...]:
-    """The trusted effects with their final values, largest gain first; what was learned comes last."""
+        def accounted(trial: Trial, fitted: Fit, runs: tuple[FreeRun, ...]) -> Account:
+            both, test = refitted_on_all(fitted, trial.held_out), tests.get(trial.hold, ())
+            known = {"noise": end.noise, "halo": self.setting.halo}
+            return account(both, self.data[trial.hold][0], test, selection=runs, **known)
 
-    def rmse_of(trial: Trial) -> float:
-        if trial is base:
-            return rms_error(end.runs_at_first)
-        return rms_error(free_runs(trial.training, data[trial.hold][1], noise=end.noise, halo=setting.halo))
+        after = accounted(end.final, end.fitted, end.runs)
+        if end.final is self.base:
+            return after, after
+        return accounted(self.base, self.base.training, end.runs_at_first), after
 
-    without = found.without
-    if end.trusted is not found.named:
-        fallen = {e.name for e in found.named.model.effects} - {e.name for e in end.trusted.model.effects}
-        kept = [] if end.trusted is base else [n for n in without if n not in fallen]
-        finer = setting.with_steps_of(end.trusted.training)
-        without = {n: base if len(kept) == 1 else refitted_without(n, end.trusted, base, data, finer) for n in kept}
-    by_name = rms_error(end.runs) if end.unknown is None else rmse_of(end.trusted)
-    rmse_without = {name: rmse_of(trial) for name, trial in without.items()}
-    findings = _named_findings(found.rounds, after.model, by_name, rmse_without)
-    if end.unknown is None:
-        return findings
-    effect = after.model.effect(end.unknown.chosen.form.name)
-    gain = 1.0 - rms_error(end.runs) / by_name
-    return (*findings, Finding(effect, effect.name, effect.family, gain, end.unknown.p_value))
+    def _findings(self, after: Account) -> tuple[Finding, ...]:
+        """The trusted effects with their final values, largest gain first; what was learned comes last."""
+        end = self.end
+        by_name = rms_error(end.runs) if end.unknown is None else self._rmse(end.trusted)
+        rmse_without = {name: self._rmse(trial) for name, trial in self._without().items()}
+        findings = _named_findings(self.found.rounds, after.model, by_name, rmse_without)
+        if end.unknown is None:
+            return findings
+        effect = after.model.effect(end.unknown.chosen.form.name)
+        gain = 1.0 - rms_error(end.runs) / by_name
+        return (*findings, Finding(effect, effect.name, effect.family, gain, end.unknown.p_value))
+
+    def _without(self) -> dict[str, Trial]:
+        """The trusted model without each of its effects."""
+        base, named, trusted, without = self.base, self.found.named, self.end.trusted, self.found.without
+        if trusted is named:
+            return without
+        fallen = {e.name for e in named.model.effects} - {e.name for e in trusted.model.effects}
+        kept = [] if trusted is base else [name for name in without if name not in fallen]
+        if len(kept) == 1:
+            return {kept[0]: base}
+        finer = self.setting.with_steps_of(trusted.training)
+        return {name: refitted_without(name, trusted, base, self.data, finer) for name in kept}
+
+    def _rmse(self, trial: Trial) -> float:
+        """Of a model's free runs along selection data."""
+        if trial is self.base:
+            return rms_error(self.end.runs_at_first)
+        stretches = self.data[trial.hold][1]
+        return rms_error(free_runs(trial.training, stretches, noise=self.end.noise, halo=self.setting.halo))
 
 
 def _named_findings(

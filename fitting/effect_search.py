@@ -7,7 +7,7 @@ import numpy as np
 
 from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, gone_on, halo_for
 from fitting.attribution.decisions import RULES
-from fitting.attribution.selection_round import Round, look
+from fitting.attribution.selection_round import Round, Standing, look
 from fitting.attribution.support import leaves_imperfection
 from fitting.base_fit import base_fit, is_held
 from fitting.errors import DataError
@@ -104,7 +104,7 @@ def search_effects(
                 break
         turn = seed + len(rounds)
         options = {"catalogue": catalogue, "seed": turn, "progress": progress}
-        this = look(current, data, setting, base=base, noise=noise, **options)
+        this = look(Standing(current, base, noise), data, setting, **options)
         rounds.append(this)
         if not this.accepted:
             break

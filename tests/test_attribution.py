@@ -12,11 +12,11 @@ from fitting.attribution import candidate_fit as of_a_trial
 from fitting.attribution import selection_round as attribution
 from fitting.attribution import support
 from fitting.attribution.candidate_fit import Setting, Trial, attempt, halo_for
-from fitting.attribution.selection_round import Verdict, look
+from fitting.attribution.selection_round import Standing, Verdict, look
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
 from fitting.free import effect_paths
-from fitting.measurement_noise import MeasurementNoise
+from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.posing import segment_length
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
@@ -41,7 +41,8 @@ def verdicts():
     count = segment_count(training, segment_length(base.horizon))
     setting = Setting(base.horizon, halo_for(training), base.substeps, count)
     before = attempt(base.model, data, HOLD, setting)
-    found = look(before, data, setting, catalogue=(TorqueBias, Creep), seed=0, progress=lambda _: None)
+    standing = Standing(before, before, measurement_noise(before.training))
+    found = look(standing, data, setting, catalogue=(TorqueBias, Creep), seed=0, progress=lambda _: None)
     return before, {v.name: v for v in found.verdicts}
 
 

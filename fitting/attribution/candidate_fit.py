@@ -41,6 +41,7 @@ class Setting(eqx.Module):
         substeps: solver steps in a sample interval.
         count: segments in each program.
         least_progress: share of the sum of squares that a few steps of a fit must take off it.
+        thorough: whether all forms of the catalogue are refitted in each round.
     """
 
     horizon: int = eqx.field(static=True)
@@ -48,6 +49,7 @@ class Setting(eqx.Module):
     substeps: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
     least_progress: float = eqx.field(static=True, default=_LEAST_PROGRESS)
+    thorough: bool = eqx.field(static=True, default=False)
 
     @property
     def options(self) -> dict[str, Any]:

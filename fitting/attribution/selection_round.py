@@ -24,7 +24,7 @@ from fitting.attribution.support import (
 from fitting.base_fit import leaves_white_noise
 from fitting.experiment import scales
 from fitting.identifiability import parameters_at_bounds
-from fitting.measurement_noise import MeasurementNoise, measurement_noise
+from fitting.measurement_noise import MeasurementNoise
 from fitting.process_noise import TorqueNoise
 from hdjax.effects import Effect
 
@@ -81,99 +81,21 @@ class Round(eqx.Module):
         return self.verdicts[0]
 
 
-def look(
-    before: Trial,
-    data: Data,
-    setting: Setting,
-    *,
-    catalogue: Sequence[type[Effect]],
-    seed: int,
-    progress: Callable[[str], None],
-    base: Trial | None = None,
-    noise: MeasurementNoise | None = None,
-) -> Round:
-    """Look for the effect that explains most of what a model leaves over.
+class Standing:
+    """A model with effects, and what a further one has to better.
 
-    Args:
+    Attributes:
         before: the current model.
-        data: the stretches; every hold that is here competes with the present one.
-        setting: how they are cut.
-        catalogue: forms to consider.
-        seed: of the surrogates.
-        progress: told what is being done.
-        base: the model without any effect; where not given, `before`.
-        noise: of the measured outputs; where not given, that which the present model shows.
+        base: the model without any effect.
+        noise: of the measured outputs.
     """
-    base = before if base is None else base
-    progress("looking through the catalogue")
-    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
-    refitted: dict[str, Trial] = {}
-    worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
-    swing = scales(before.training.stretches, before.model)
-    behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
-    suspects = [lead for lead in behind if lead not in worth]
-
-    def refit(leads: Sequence[Lead], setting: Setting, share: float = _HOPELESS) -> None:
-        begun = []
-        for lead in leads:
-            progress(f"refitting with {lead.effect.name}")
-            begun.append((lead, begin(before, lead, data, setting)))
-        # The one that has come farthest goes on first: beside it most others need not.
-        for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
-            best = min((t.training.objective for t in refitted.values()), default=np.inf)
-            trial = go_on(before, lead, found, data, setting, _on_the_way(before, best, share))
-            if trial is not None and np.isfinite(trial.held_out.objective):
-                refitted[lead.effect.name] = trial
-
-    def refit_beside(best: Trial, leads: Sequence[Lead]) -> None:
-        # What is to come near it in its first pass needs its steps.
-        refit(leads, setting.with_steps_of(best.training), 1.0 - _NEAR_TIE)
-
-    first = first_of_each_family(worth, suspects)
-    refit(first[:1], setting)
-    leader = refitted.get(first[0].effect.name) if first else None
-    if leader is not None and leaves_white_noise(leader.training):
-        refit_beside(leader, [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])])
-    else:
-        refit(first[1:], setting)
-        if refitted:
-            best = max(refitted.values(), key=lambda trial: trial.gain_over(before))
-            near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
-            families = [a.effect.family for a in first if _reaches(refitted.get(a.effect.name), near)]
-            refit_beside(best, further_forms([*worth, *suspects], families, first))
-    found: list[Verdict] = []
-    for lead in screened.leads:
-        trial = refitted.get(lead.effect.name)
-        gain = lead.gain if trial is None else trial.gain_over(before)
-        p_value = screened.p_value(gain)
-        found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
-    for hold in data:
-        if hold == before.hold:
-            continue
-        progress(f"refitting with a {hold} torque")
-        trial = try_hold(before, data, hold, setting)
-        gain = -np.inf if trial is None else trial.gain_over(before)
-        found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
-    found.sort(key=lambda v: (v.trial is None, -v.gain))
-    found, behind = _with_ties(found)
-    rivals: tuple[Rival, ...] = ()
-    against = _Against(before, base, measurement_noise(before.training) if noise is None else noise)
-    verdicts, asked, accepted = _supported_first(found, against)
-    if accepted:
-        found, rivals = _simplest_first(found, before, data, setting)
-        verdicts, asked, accepted = _supported_first(found, against)
-    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
-
-
-class _Against:
-    """What a competitor has to better."""
 
     def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise) -> None:
         self.before, self.base, self.noise = before, base, noise
 
     @cached_property
     def torque(self) -> TorqueNoise | None:
-        """What the model before leaves, as noise of the torque."""
+        """What the current model leaves, as noise of the torque."""
         return torque_noise_left(self.before, self.noise)
 
     def evidence(self, verdict: Verdict) -> EffectEvidence:
@@ -194,8 +116,114 @@ class _Against:
         )
 
 
+def look(
+    standing: Standing,
+    data: Data,
+    setting: Setting,
+    *,
+    catalogue: Sequence[type[Effect]],
+    seed: int,
+    progress: Callable[[str], None],
+) -> Round:
+    """Look for the effect that explains most of what a model leaves over.
+
+    Args:
+        standing: the current model.
+        data: the stretches; every hold that is here competes with the present one.
+        setting: how they are cut, and whether all forms are refitted.
+        catalogue: forms to consider.
+        seed: of the surrogates.
+        progress: told what is being done.
+    """
+    before = standing.before
+    progress("looking through the catalogue")
+    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
+    refits = _Refits(before, data, setting, progress)
+    refits.of_all(screened) if setting.thorough else refits.in_proportion(screened)
+    found = [*refits.forms(screened), *refits.holds(screened)]
+    found.sort(key=lambda v: (v.trial is None, -v.gain))
+    found, behind = _with_ties(found)
+    rivals: tuple[Rival, ...] = ()
+    verdicts, asked, accepted = _supported_first(found, standing)
+    if accepted:
+        found, rivals = _simplest_first(found, before, data, setting)
+        verdicts, asked, accepted = _supported_first(found, standing)
+    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
+
+
+class _Refits:
+    """Forms that are put inside the equations and refitted, one after the other."""
+
+    def __init__(self, before: Trial, data: Data, setting: Setting, progress: Callable[[str], None]) -> None:
+        self.before, self.data, self.setting, self.progress = before, data, setting, progress
+        self.done: dict[str, Trial] = {}
+
+    def of_all(self, screened: Screen) -> None:
+        """Every form, to the end."""
+        self._refit(screened.leads, self.setting, 0.0)
+
+    def in_proportion(self, screened: Screen) -> None:
+        """The likeliest form of each family, and further forms near the best one."""
+        before = self.before
+        worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
+        swing = scales(before.training.stretches, before.model)
+        behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
+        suspects = [lead for lead in behind if lead not in worth]
+        first = first_of_each_family(worth, suspects)
+        self._refit(first[:1], self.setting)
+        leader = self.done.get(first[0].effect.name) if first else None
+        if leader is not None and leaves_white_noise(leader.training):
+            self._beside(leader, [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])])
+            return
+        self._refit(first[1:], self.setting)
+        if self.done:
+            best = max(self.done.values(), key=lambda trial: trial.gain_over(before))
+            near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
+            families = [a.effect.family for a in first if _reaches(self.done.get(a.effect.name), near)]
+            self._beside(best, further_forms([*worth, *suspects], families, first))
+
+    def _refit(self, leads: Sequence[Lead], setting: Setting, share: float = _HOPELESS) -> None:
+        begun = []
+        for lead in leads:
+            self.progress(f"refitting with {lead.effect.name}")
+            begun.append((lead, begin(self.before, lead, self.data, setting)))
+        # The one that has come farthest goes on first: beside it most others need not.
+        for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
+            best = min((t.training.objective for t in self.done.values()), default=np.inf)
+            limit = _on_the_way(self.before, best, share)
+            trial = go_on(self.before, lead, found, self.data, setting, limit)
+            if trial is not None and np.isfinite(trial.held_out.objective):
+                self.done[lead.effect.name] = trial
+
+    def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
+        # What is to come near it in its first pass needs its steps.
+        self._refit(leads, self.setting.with_steps_of(best.training), 1.0 - _NEAR_TIE)
+
+    def forms(self, screened: Screen) -> list[Verdict]:
+        """All forms; a first-order gain stands for those that were not refitted."""
+        found = []
+        for lead in screened.leads:
+            trial = self.done.get(lead.effect.name)
+            gain = lead.gain if trial is None else trial.gain_over(self.before)
+            p_value = screened.p_value(gain)
+            found.append(Verdict(lead.effect.name, lead.effect.family, trial, gain, p_value, True))
+        return found
+
+    def holds(self, screened: Screen) -> list[Verdict]:
+        """Other assumptions about the torque between samples."""
+        found = []
+        for hold in self.data:
+            if hold == self.before.hold:
+                continue
+            self.progress(f"refitting with a {hold} torque")
+            trial = try_hold(self.before, self.data, hold, self.setting)
+            gain = -np.inf if trial is None else trial.gain_over(self.before)
+            found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
+        return found
+
+
 def _supported_first(
-    verdicts: list[Verdict], against: _Against
+    verdicts: list[Verdict], standing: Standing
 ) -> tuple[list[Verdict], tuple[EffectEvidence, ...], bool]:
     """The list from its first supported competitor on, the unsupported ones behind it, unchanged where none is; what
     the data say of each that was asked; and whether there is one."""
@@ -203,7 +231,7 @@ def _supported_first(
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None:
             break
-        asked.append(against.evidence(verdict))
+        asked.append(standing.evidence(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
         if verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:

@@ -74,6 +74,7 @@ def close_loop(
     test: TestLogs = (),
     max_effects: int = 3,
     seed: int = 0,
+    thorough: bool = False,
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
 ) -> None:
@@ -91,6 +92,9 @@ def close_loop(
         Effects to add at most.
     seed
         Of the surrogates behind the p-values.
+    thorough
+        Refit every form of the catalogue in each round, in place of those that a first-order look finds likely
+        (minutes).
     next_experiment
         Where explanations are tied, look for the motor torque that would tell them apart within limits (minutes), and
         write it to next_experiment.csv.
@@ -99,9 +103,9 @@ def close_loop(
         raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
     asked = wanted(limits, next_experiment)
     start_jax()
-    from fitting.commands.run_close_loop import close_loop_on_logs
+    from fitting.commands.run_close_loop import Asked, close_loop_on_logs
 
-    close_loop_on_logs(logs, drive, out, max_effects, seed, asked, test)
+    close_loop_on_logs(logs, drive, out, Asked(max_effects, seed, thorough), test=test, limits=asked)
 
 
 def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:

@@ -1,6 +1,7 @@
 """What `hdjax close-loop` and `hdjax demo` do."""
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from fitting.close_loop import close_loop
@@ -9,20 +10,36 @@ from fitting.commands.options import ExperimentLimits
 from fitting.commands.spinner import Spinner
 from fitting.demonstration import write_demo_logs
 from fitting.drive_file import read_drive_file
+from fitting.errors import InputError
 from fitting.model_file import StoredModel, to_json
 from fitting.next_experiment import experiment_for_ties
 from fitting.report import loop_text, write_loop_report
 from fitting.rig import Rig, read_logs, read_rig, rig_of
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of the loop.
+
+    Attributes:
+        max_effects: effects to add at most.
+        seed: of the surrogates.
+        thorough: whether all forms are refitted in each round.
+    """
+
+    max_effects: int = 3
+    seed: int = 0
+    thorough: bool = False
+
+
 def close_loop_on_logs(
     logs: list[Path],
     drive: Path,
     out: Path,
-    max_effects: int,
-    seed: int,
-    limits: ExperimentLimits | None,
+    asked: Asked = Asked(),
+    *,
     test: Sequence[Path] = (),
+    limits: ExperimentLimits | None = None,
 ) -> None:
     """Close the loop on logs of one drive, write the report, and show it.
 
@@ -30,10 +47,9 @@ def close_loop_on_logs(
         logs: files.
         drive: drive file.
         out: folder of the report.
-        max_effects: to add at most.
-        seed: of the surrogates.
-        limits: of the next experiment; None where none is asked for.
+        asked: of the loop.
         test: files of test data.
+        limits: of the next experiment; None where none is asked for.
 
     Raises:
         InputError: for bad files.
@@ -42,16 +58,19 @@ def close_loop_on_logs(
     drive_file = read_drive_file(drive)
     read, tests = read_logs(logs, drive_file, test=test)
     if is_quasi_static(read, limits):
+        if test:
+            raise InputError(
+                f"{test[0]}: --test is for logs of a motion, but {read[0].path} is quasi-static; leave it out"
+            )
         # Loaded here: most logs are of other kinds.
         from fitting.quasi_static.commands import close_quasi_static_loop
 
         with Spinner() as progress:
-            shown = close_quasi_static_loop(
-                read, drive_file, out, max_effects=max_effects, seed=seed, progress=progress
-            )
+            options = {"max_effects": asked.max_effects, "seed": asked.seed, "progress": progress}
+            shown = close_quasi_static_loop(read, drive_file, out, **options)
         print(shown)
     else:
-        _close_loop(rig_of(read, drive_file, test=tests), out, max_effects, seed, limits)
+        _close_loop(rig_of(read, drive_file, test=tests), out, asked, limits)
 
 
 def demonstrate(out: Path, seed: int) -> None:
@@ -64,10 +83,10 @@ def demonstrate(out: Path, seed: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     logs, drive = write_demo_logs(out, seed=seed)
     print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
-    _close_loop(read_rig(logs, drive), out, max_effects=3, seed=seed, limits=None)
+    _close_loop(read_rig(logs, drive), out, Asked(seed=seed), limits=None)
 
 
-def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: ExperimentLimits | None) -> None:
+def _close_loop(rig: Rig, out: Path, asked: Asked, limits: ExperimentLimits | None) -> None:
     stated = None if limits is None else stated_limits(limits, logs_of(rig))
     with Spinner() as progress:
         loop = close_loop(
@@ -75,9 +94,8 @@ def _close_loop(rig: Rig, out: Path, max_effects: int, seed: int, limits: Experi
             rig.experiments,
             test=rig.test,
             hold=rig.hold,
-            max_effects=max_effects,
-            seed=seed,
             progress=progress,
+            **asdict(asked),
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)

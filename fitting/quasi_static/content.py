@@ -48,7 +48,12 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         "torque_range": [float(np.min(blocks.torque)), float(np.max(blocks.torque))],
         "twist_range": float(np.ptp(blocks.twist)),
         "before": _account(fit, fit.chosen, parameters),
-        "after": {"effects": [], "parameters": {}, "derived": {}, "rmse": {"training": None, "validation": None}},
+        "after": {
+            "effects": [],
+            "parameters": {},
+            "derived": {},
+            "rmse": dict.fromkeys(("training", "selection", "test", "validation")),
+        },
         "alternatives": [_alternative(fit, shape) for shape in SHAPES if shape != fit.chosen],
         "shapes": shapes,
         "cannot_tell": [],
@@ -95,7 +100,7 @@ def _account(fit: QuasiStaticFit, shape: Shape, known: Mapping[str, Known]) -> d
         "effects": [],
         "parameters": estimates(known),
         "derived": {},
-        "rmse": {"training": training, "validation": validation},
+        "rmse": {"training": training, "selection": validation, "test": None, "validation": validation},
     }
 
 

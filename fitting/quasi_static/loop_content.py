@@ -32,7 +32,8 @@ def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
         loop: On these logs.
     """
     points, nothing = loop.held.points, loop.after is loop.before
-    after = {"effects": [], "parameters": {}, "derived": {}, "rmse": {"training": None, "validation": None}}
+    no_errors = dict.fromkeys(("training", "selection", "test", "validation"))
+    after = {"effects": [], "parameters": {}, "derived": {}, "rmse": no_errors}
     if not nothing:
         after = _account(loop, loop.after) | {"effects": [_effect(loop, one) for one in loop.findings]}
     report = heading(data) | {
@@ -69,7 +70,9 @@ def _account(loop: QuasiStaticLoop, trial: Trial) -> dict[str, Any]:
 
 
 def _rmse(trial: Trial) -> dict[str, float]:
-    return {"training": float(np.sqrt(np.mean(trial.model.misfit**2))), "validation": trial.rmse}
+    # Folds of whole stretches select the model; there are no test data yet. Schema 1 called them validation.
+    training = float(np.sqrt(np.mean(trial.model.misfit**2)))
+    return {"training": training, "selection": trial.rmse, "test": None, "validation": trial.rmse}
 
 
 def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
