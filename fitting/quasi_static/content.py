@@ -26,6 +26,9 @@ _TYPICAL_ALPHA = 1.1e5
 _SEPARATING = "Cycle the torque slowly to larger twists, past the knees, in both directions."
 
 
+_PARTS = ("training", "selection", "test", "validation")
+
+
 def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
     """The report as JSON has it: finite numbers and nulls only.
 
@@ -48,12 +51,7 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         "torque_range": [float(np.min(blocks.torque)), float(np.max(blocks.torque))],
         "twist_range": float(np.ptp(blocks.twist)),
         "before": _account(fit, fit.chosen, parameters),
-        "after": {
-            "effects": [],
-            "parameters": {},
-            "derived": {},
-            "rmse": dict.fromkeys(("training", "selection", "test", "validation")),
-        },
+        "after": {"effects": [], "parameters": {}, "derived": {}, "rmse": dict.fromkeys(_PARTS)},
         "alternatives": [_alternative(fit, shape) for shape in SHAPES if shape != fit.chosen],
         "shapes": shapes,
         "cannot_tell": [],

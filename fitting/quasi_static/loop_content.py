@@ -69,7 +69,7 @@ def _account(loop: QuasiStaticLoop, trial: Trial) -> dict[str, Any]:
     }
 
 
-def _rmse(trial: Trial) -> dict[str, float]:
+def _rmse(trial: Trial) -> dict[str, float | None]:
     # Folds of whole stretches select the model; there are no test data yet. Schema 1 called them validation.
     training = float(np.sqrt(np.mean(trial.model.misfit**2)))
     return {"training": training, "selection": trial.rmse, "test": None, "validation": trial.rmse}
