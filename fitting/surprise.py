@@ -42,7 +42,7 @@ def surprise(
     short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
     variance = float(short[-1, -1])
     at_first = rms_error(before) ** 2 - variance
-    if rms_error(after) ** 2 - variance <= (1.0 - RULES.explained) * at_first:
+    if rms_error(after) ** 2 - variance <= (1.0 - RULES.free_run_explained) * at_first:
         return None
     bands = prediction_bands(
         final,

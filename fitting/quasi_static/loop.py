@@ -174,4 +174,4 @@ def _decide(base: Trial, after: Trial, left: Leftover | None, noise: float) -> D
         return "effect_found" if after is not base else "model_sufficient"
     before, behind = (max(t.mean_square - noise**2, 0.0) for t in (base, after))
     explained = 1.0 - behind / before if before > 0 else 0.0
-    return "effect_found" if after is not base and explained >= RULES.explained else "unexplained"
+    return "effect_found" if after is not base and explained >= RULES.quasi_static_explained else "unexplained"

@@ -62,6 +62,7 @@ def report_dict(
         "decision": outcome.decision,
         "judged_on": list(outcome.after.parts())[-1],
         "summary": "",
+        "times_noise": outcome.times_noise if is_loop else None,
         "rules": rules_dict(outcome.checks) if is_loop else [],
         "evidence": dataclasses.asdict(outcome.case) if is_loop else None,
         "units": units,

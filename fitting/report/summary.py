@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
+from fitting.attribution.decisions import RULES
 from fitting.report.separating import plain_family
 from fitting.report.unknown import place_and_variables
 
@@ -40,7 +41,9 @@ def summary(report: Mapping[str, Any]) -> str:
         rest = ""
         if report["unknown"]:
             rest = f" More than noise is left, which has no name: a learned {_learned(report)}, stands for it."
-        several = bool(rest) or len(families) > 1
+        elif report["times_noise"] >= RULES.excess:
+            rest = f" What is left is {formatting.number(report['times_noise'])} times the noise, and has no name."
+        several = bool(report["unknown"]) or len(families) > 1
         change = _change("Together they" if several else "It", report, several=several)
         return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
     left = report["unexplained"]
