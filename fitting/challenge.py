@@ -6,7 +6,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt
+from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, long_gains
 from fitting.attribution.decisions import (
     RULES,
     ChallengeEvidence,
@@ -99,6 +99,12 @@ def challenge_names(
     torque = torque if beside is None and is_noisy_torque(torque) else None
     if named is base:
         return Challenge(base, beside, torque, seen)
+    if instead is not None:
+        rival = named if beside is None else beside.trial
+        gains = long_gains(base, [rival, instead.trial], data, setting)
+        # Where both leave the numbers neither is worse.
+        follow = gains is not None and np.isfinite(gains).any()
+        seen = replace(seen, longer_worse=gains[0] - gains[1] if gains is not None and follow else 0.0)
     if instead is not None and beside is not None:
         names = {e.name for e in named.model.effects}
         seen = replace(

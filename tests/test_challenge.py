@@ -79,6 +79,12 @@ def test_when_names_stand(
     assert any(check.holds for check in names_stand(seen)) == stands
 
 
+@pytest.mark.parametrize(("longer_worse", "stand"), [(0.0, False), (0.05, False), (3.6, True)])
+def test_names_stand_where_what_is_in_their_place_does_not_last(longer_worse: float, stand: bool):
+    seen = challenge(0.9, beside=False, enough=False, fewer=0, come_out=0.72, longer_worse=longer_worse)
+    assert any(check.holds for check in names_stand(seen)) == stand
+
+
 @pytest.mark.parametrize(
     ("names", "white", "imperfect", "asks_for"),
     [

@@ -35,6 +35,7 @@ OFF: Mapping[str, float] = {
     "explained": -np.inf,
     "little": 0.0,
     "come_out": 0.0,
+    "lasting": -np.inf,
     "noise_margin": 0.0,
     "many": np.inf,
     "torque_noise_gain": -np.inf,

@@ -100,6 +100,12 @@ class DecisionRules:
         "of a learned term that named effects must make up for it to have come out as them",
         _UNDECLARED,
     )
+    lasting: float = _rule(
+        0.1,
+        "log of rms error",
+        "by which free runs of a learned term may be worse than those of the names that it would replace",
+        "a lag in the place of creep left 40 times as much (study, seed 95)",
+    )
     noise_margin: float = _rule(
         0.05, "log of rms error", "by which fitted initial states and the noise's estimate may be off", "a few per cent"
     )
@@ -386,6 +392,8 @@ class ChallengeEvidence:
         shown: whether every name still has a strength that is told from zero beside the learned term.
         one_shape: whether a name is one shape of the function that was learned both beside it and in its place.
         torque: what noise of the torque would explain of what the names leave; None where they leave nothing else.
+        longer_worse: log of the rms error of free runs with the term in their place, over that with the names; zero
+            where free runs tell nothing.
     """
 
     base: ModelEvidence
@@ -400,6 +408,7 @@ class ChallengeEvidence:
     shown: bool = True
     one_shape: bool = False
     torque: NoiseEvidence | None = None
+    longer_worse: float = 0.0
 
     @property
     def enough(self) -> bool:
@@ -468,6 +477,13 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
             seen.come_out,
             rules.come_out,
             come_out and not simpler,
+        ),
+        Check(
+            "lasting",
+            "free runs with the learned term, against the names",
+            seen.longer_worse,
+            rules.lasting,
+            seen.longer_worse > rules.lasting,
         ),
     )
 

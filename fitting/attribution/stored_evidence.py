@@ -16,7 +16,17 @@ from fitting.attribution.decisions import (
 )
 
 # What JSON has no number for.
-_UNBOUNDED = ("removed", "strength_errors", "over_torque_noise", "gain", "long_gain", "training", "selection", "noise")
+_UNBOUNDED = (
+    "removed",
+    "strength_errors",
+    "over_torque_noise",
+    "gain",
+    "long_gain",
+    "training",
+    "selection",
+    "noise",
+    "longer_worse",
+)
 
 
 def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
