@@ -42,7 +42,8 @@ def over_step(
     dry = [effect for effect in model.effects if isinstance(effect, DryFriction)]
     if not dry:
         return None
-    motion = model.motion(state, conditions)
+    # What is learned on the motor may depend on the torque that comes in there.
+    motion = model.motion(state, dataclasses.replace(conditions, T_m=torque))
     names = sorted({effect.opposes for effect in dry})
     against = [[effect for effect in dry if effect.opposes == name] for name in names]
     levels = [_total(effect.level(motion, model.drive) for effect in same) for same in against]

@@ -186,6 +186,15 @@ def test_how_far_it_jumps_may_depend_on_something():
     np.testing.assert_allclose(effect.torque(motion, rig.drive_model().drive, jnp.zeros(0)), -4.25, rtol=1e-12)
 
 
+def test_how_far_it_jumps_may_depend_on_the_torque_that_comes_in():
+    """Over a step as well: under a constant torque it is a friction of constant level."""
+    torque = sampled(1e-3 * np.arange(100), np.full(100, 2.0), hold="zero-order")
+    kinds = {"on": PowerAxis("T_m", largest=4.0), "level": 0.5}, {"level": 0.5 * 2.125}
+    models = [rig.drive_model().with_effects(jumping(LearnedMotorTorque, corner=3e-3, **kind)) for kind in kinds]
+    runs = [march(m, torque, None, jnp.zeros(4), solver=dfx.Tsit5(), substeps=1)[0] for m in models]
+    np.testing.assert_allclose(runs[0], runs[1], rtol=1e-9, atol=1e-12 * np.abs(runs[1]).max())
+
+
 def test_its_value_has_the_width_that_a_fit_gave_it():
     model = rig.drive_model().with_effects(jumping(LearnedMeshTorque, level=2.0, corner=3e-3, slope=0.5))
     (effect,) = model.replace({"learned_mesh_torque.transition": 0.1}).effects
