@@ -455,7 +455,7 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
         rules: the thresholds.
     """
     if seen.instead is None:
-        return (Check("come_out", "no learned term in their place is supported", 1.0, rules.come_out, True),)
+        return (Check("come_out", "no learned term contradicts the names", 1.0, rules.come_out, True),)
     beside, instead = seen.beside, seen.instead
     enough = seen.enough
     rival = seen.named if beside is None else beside

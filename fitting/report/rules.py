@@ -5,6 +5,9 @@ from typing import Any
 
 from fitting.attribution.decisions import Check, rules_table
 
+# The one threshold that each form has for itself, in the code of the effect.
+_OF_LAWS = {"unit": "share of rms", "meaning": "of what earlier effects removed that their laws may get wrong"}
+
 
 def rules_dict(checks: Sequence[Check]) -> list[dict[str, Any]]:
     """The rules as they were applied, in the order of the loop.
@@ -12,7 +15,7 @@ def rules_dict(checks: Sequence[Check]) -> list[dict[str, Any]]:
     Args:
         checks: of a decision.
     """
-    known = {rule["name"]: rule for rule in rules_table()}
+    known = {rule["name"]: rule for rule in rules_table()} | {"imperfection": _OF_LAWS}
     return [_entry(check, known.get(check.rule, {})) for check in checks]
 
 
