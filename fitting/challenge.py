@@ -15,12 +15,11 @@ from fitting.attribution.decisions import (
     next_question,
 )
 from fitting.attribution.support import (
+    Standing,
     is_noisy_torque,
     leaves_imperfection,
     noise_evidence,
-    over_torque_noise,
     told_from_zero,
-    torque_noise_left,
 )
 from fitting.base_fit import leaves_white_noise
 from fitting.compare import excess
@@ -78,12 +77,13 @@ def challenge_names(
     imperfect = leaves_imperfection(named, base, noise)[0]
     least = half_log_determinant(noise.covariance)
     seen = ChallengeEvidence(seen_as(base), seen_as(named), len(_names(base, named)), least, imperfect)
-    torque = None if seen.enough else torque_noise_left(named, noise)
+    standing = Standing(named, base, noise)
+    torque = None if seen.enough else standing.torque
     if torque is not None:
         seen = replace(seen, torque=noise_evidence(torque))
     while (question := next_question(seen)) is not None:
         if question == "instead":
-            instead = _learned(base, data, setting, noise=noise, seed=seed, progress=progress)
+            instead = _learned(Standing(base, base, noise), data, setting, seed=seed, progress=progress)
             if instead is None:
                 seen = seen.answered("instead", None)
                 continue
@@ -91,7 +91,7 @@ def challenge_names(
             seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
         else:
             finer = setting.with_steps_of(named.training)
-            beside = _learned(named, data, finer, noise=noise, seed=seed, progress=progress)
+            beside = _learned(standing, data, finer, seed=seed, progress=progress)
             if beside is not None:
                 named, beside = _without_superfluous(base, named, beside, data, setting)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
@@ -118,14 +118,12 @@ def challenge_names(
 
 
 def _learned(
-    before: Trial, data: Data, setting: Setting, *, noise: MeasurementNoise, seed: int, progress: Callable[[str], None]
+    standing: Standing, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
 ) -> Unknown | None:
     """What can be learned that the data support, beyond noise of the torque where that would explain as much."""
-    found = learn_supported(before, data, setting, seed=seed, progress=progress)
-    if found is None:
-        return None
-    over = over_torque_noise(found.trial, before, torque_noise_left(before, noise), noise)
-    return found if over > RULES.torque_noise_gain else None
+    found = learn_supported(standing.before, data, setting, seed=seed, progress=progress)
+    supported = found is not None and standing.over_torque_noise(found.trial) > RULES.torque_noise_gain
+    return found if supported else None
 
 
 def model_evidence(trial: Trial, noise: MeasurementNoise) -> ModelEvidence:

@@ -7,8 +7,8 @@ import numpy as np
 
 from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, gone_on, halo_for
 from fitting.attribution.decisions import RULES
-from fitting.attribution.selection_round import Round, Standing, look
-from fitting.attribution.support import leaves_imperfection
+from fitting.attribution.selection_round import Round, look
+from fitting.attribution.support import Standing, leaves_imperfection
 from fitting.base_fit import base_fit, is_held
 from fitting.errors import DataError
 from fitting.estimate import lost

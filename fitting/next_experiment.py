@@ -18,7 +18,7 @@ from fitting.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
 from fitting.estimate import Fit, fit, whitening
 from fitting.excitation import Excitation, Limits, excitations, reached
-from fitting.experiment import Experiment, Stretch, scales, segment_count
+from fitting.experiment import Experiment, Stretch, scales, segment_count, whole
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
@@ -203,7 +203,7 @@ def experiment_for_alpha(
     estimate = fitted.account.uncertainty.estimates.get("alpha")
     if estimate is None or estimate.identifiable:
         return None
-    stretches = tuple(Stretch(e, 0, len(e)) for e in experiments)
+    stretches = whole(experiments)
     paths = [p for p in fitted.account.uncertainty.estimates if p != "alpha"]
     without = explanation("no alpha", fitted.account.model.replace({"alpha": 0.0}), paths, hold=fitted.hold)
     # An alpha so small that its square does not count shows against less noise; what noise does is in proportion to it.

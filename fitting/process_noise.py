@@ -6,18 +6,15 @@ The filter's innovations are white under the right variances, which maximise the
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Bool, Float
 
 from fitting.engines import linearise
 from fitting.estimate import Fit, segments_of_logs
 from fitting.followed import Followed, follow
 from fitting.residual import Problem, Unknowns
+from fitting.torque_noise import torque_pushes
 from hdjax import Model
-from hdjax.effects import Conditions
-from hdjax.engine.pointwise import slopes_at_instants
 
 # Standard deviations, in units of what simulations leave, by which a segment's first state may be off.
 _FREE = 10.0
@@ -124,7 +121,7 @@ def _steps(fit: Fit, problem: Problem, followed: Followed, own: Bool[np.ndarray,
 
     return _Steps(
         in_time(followed.transition[used]),
-        in_time((followed.from_start[used] + followed.from_end[used]) @ _rate_of_torque(problem.model)),
+        in_time(torque_pushes(problem.model, followed)[used]),
         in_time(read),
         in_time(np.concatenate([np.asarray(fit.error)[used, ..., None], _by_parameter(fit)[used]], axis=3)),
         in_time(weight[used] > 0),
@@ -149,17 +146,6 @@ def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray
     angle = _FREE * np.max(np.where(shown > 0, rms[:, None] / np.where(shown > 0, shown, 1.0), 0.0), axis=0)
     hidden = np.std(states.reshape(-1, states.shape[-1]), axis=0)[2 * angles :]
     return np.concatenate([angle, angle * float(model.drive.omega_0), hidden])
-
-
-def _rate_of_torque(model: Model) -> Float[np.ndarray, " states"]:
-    """What a unit of torque adds to the rates of the state."""
-    return slopes_at_instants(_rates, (np.zeros(1), 0), (model, 0), (np.asarray(model.rest()), 0))[:, 0]
-
-
-def _rates(torque: Array, model: Model, state: Array) -> Array:
-    # The same at any time and temperature.
-    zero = jnp.zeros_like(torque[0])
-    return model.rates(state, torque[0], zero, Conditions(time=zero, temperature=zero))
 
 
 def _filtered(
@@ -212,7 +198,7 @@ def spread_by_torque(problem: Problem, unknowns: Unknowns, std: float) -> Float[
         std: of the noise of one sample.
     """
     followed = follow(problem, unknowns)
-    push = std * (followed.from_start + followed.from_end) @ _rate_of_torque(problem.model)
+    push = std * torque_pushes(problem.model, followed)
     segments, samples, size = push.shape
     spread, found = np.zeros((segments, size, size)), np.zeros((segments, samples))
     for i in range(samples):

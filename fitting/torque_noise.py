@@ -185,8 +185,13 @@ def _power(series: np.ndarray) -> np.ndarray:
     return np.abs(np.fft.rfft(series, axis=0)) ** 2 / series.shape[0]
 
 
-def _pushes(model: Model, followed: Followed) -> Float[np.ndarray, "segments samples states"]:
-    """What a unit of torque through a sample interval adds to the state at its end."""
+def torque_pushes(model: Model, followed: Followed) -> Float[np.ndarray, "segments samples states"]:
+    """What a unit of torque through a sample interval adds to the state at its end.
+
+    Args:
+        model: the equations.
+        followed: the motion.
+    """
     torque, rest = np.zeros(1), np.asarray(model.rest())
     rate = slopes_at_instants(_rates, (torque, 0), (model, 0), (rest, 0))[:, 0]
     return (followed.from_start + followed.from_end) @ rate
@@ -202,7 +207,7 @@ def _answers(
     problem: Problem, followed: Followed, noise: Float[np.ndarray, "segments samples draws"]
 ) -> Float[np.ndarray, "segments samples outputs draws"]:
     """Whitened residual that torque noise leaves; it does not stop where a segment goes on where another one ends."""
-    forces = Forces(_pushes(problem.model, followed)[..., None], noise[:, :, None, :])
+    forces = Forces(torque_pushes(problem.model, followed)[..., None], noise[:, :, None, :])
     joined = np.asarray(problem.segments.joined)
     before = np.roll(respond(followed, forces)[1], 1, axis=0), np.roll(_across(followed), 1, axis=0)
     own, across = (np.where(joined[:, None, None], a, 0.0) for a in before)
@@ -223,7 +228,7 @@ def _torque_scores(
     problem: Problem, followed: Followed, slopes: Float[np.ndarray, "segments samples outputs parameters"]
 ) -> Float[np.ndarray, "parameters parameters"]:
     """Covariance of J^T r for torque noise of unit variance, by the adjoint of the linear response."""
-    pushes = _pushes(problem.model, followed)
+    pushes = torque_pushes(problem.model, followed)
     white = np.asarray(problem.whitening) @ followed.readout
     read = -np.swapaxes(white, 2, 3) @ slopes * np.asarray(problem.segments.weight)[:, :, None, None]
 

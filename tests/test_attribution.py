@@ -12,7 +12,8 @@ from fitting.attribution import candidate_fit as of_a_trial
 from fitting.attribution import selection_round as attribution
 from fitting.attribution import support
 from fitting.attribution.candidate_fit import Setting, Trial, attempt, halo_for
-from fitting.attribution.selection_round import Standing, Verdict, look
+from fitting.attribution.selection_round import Verdict, look
+from fitting.attribution.support import Standing
 from fitting.base_fit import base_fit
 from fitting.experiment import segment_count, split
 from fitting.free import effect_paths

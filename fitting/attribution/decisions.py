@@ -447,8 +447,9 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
 def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
     """Whether names can be trusted: one check that holds is enough.
 
-    A name is doubtful where a learned term in its place, which is free to be anything, predicts selection data as well
-    as one beside it, and either does not come out as the named effect or does better by far with fewer parameters.
+    A learned term in the place of a name is free to be anything. The name is doubtful where that term predicts
+    selection data as well as one beside the name. It must also differ from the named effect, or do better by far with
+    fewer parameters.
 
     Args:
         seen: all that was asked.

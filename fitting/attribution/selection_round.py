@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import equinox as eqx
 import numpy as np
@@ -14,18 +13,15 @@ from fitting.attribution.score import block_scores
 from fitting.attribution.screening import Lead, Screen, screen
 from fitting.attribution.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
 from fitting.attribution.support import (
+    Standing,
     imperfection,
     is_plausible,
-    over_torque_noise,
     share_of_removed,
     strength_errors,
-    torque_noise_left,
 )
 from fitting.base_fit import leaves_white_noise
 from fitting.experiment import scales
 from fitting.identifiability import parameters_at_bounds
-from fitting.measurement_noise import MeasurementNoise
-from fitting.process_noise import TorqueNoise
 from hdjax.effects import Effect
 
 # Work in proportion: what is tied with the best gains as much but for this share; so it must in its first pass to be
@@ -81,39 +77,22 @@ class Round(eqx.Module):
         return self.verdicts[0]
 
 
-class Standing:
-    """A model with effects, and what a further one has to better.
-
-    Attributes:
-        before: the current model.
-        base: the model without any effect.
-        noise: of the measured outputs.
-    """
-
-    def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise) -> None:
-        self.before, self.base, self.noise = before, base, noise
-
-    @cached_property
-    def torque(self) -> TorqueNoise | None:
-        """What the current model leaves, as noise of the torque."""
-        return torque_noise_left(self.before, self.noise)
-
-    def evidence(self, verdict: Verdict) -> EffectEvidence:
-        """What the data say of a competitor; another hold has no strength to tell from zero."""
-        trial = verdict.trial
-        assert trial is not None
-        own = {verdict.name} & {e.name for e in trial.model.effects}
-        errors = strength_errors(trial.training, own)
-        return EffectEvidence(
-            name=verdict.name,
-            gain=verdict.gain,
-            p_value=verdict.p_value,
-            removed=share_of_removed(trial, self.before, self.base),
-            imperfection=imperfection(self.before),
-            strength_errors=min(errors.values(), default=np.inf),
-            over_torque_noise=over_torque_noise(trial, self.before, self.torque, self.noise),
-            at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
-        )
+def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
+    """What the data say of a competitor; another hold has no strength to tell from zero."""
+    trial = verdict.trial
+    assert trial is not None
+    own = {verdict.name} & {e.name for e in trial.model.effects}
+    errors = strength_errors(trial.training, own)
+    return EffectEvidence(
+        name=verdict.name,
+        gain=verdict.gain,
+        p_value=verdict.p_value,
+        removed=share_of_removed(trial, standing.before, standing.base),
+        imperfection=imperfection(standing.before),
+        strength_errors=min(errors.values(), default=np.inf),
+        over_torque_noise=standing.over_torque_noise(trial),
+        at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
+    )
 
 
 def look(
@@ -231,7 +210,7 @@ def _supported_first(
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None:
             break
-        asked.append(standing.evidence(verdict))
+        asked.append(_evidence(verdict, standing))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
         if verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:

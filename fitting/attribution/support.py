@@ -1,6 +1,7 @@
 """What the data say of an effect that was refitted: its strength, what it removes, whether its values are plausible."""
 
 from collections.abc import Collection
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -87,19 +88,6 @@ def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> 
     return _share(before, base, np.diag(np.asarray(noise.covariance))) <= small, noise
 
 
-def torque_noise_left(before: Trial, noise: MeasurementNoise) -> TorqueNoise | None:
-    """Noise of the torque as far as it would explain what a model leaves; None where the model leaves hardly more than
-    measurement noise.
-
-    Args:
-        before: the model.
-        noise: of the outputs.
-    """
-    outputs = np.asarray(noise.covariance)
-    left = np.diag(np.asarray(before.training.covariance)) / np.diag(outputs)
-    return torque_noise(before.training, outputs) if np.max(left) > RULES.excess**2 else None
-
-
 def noise_evidence(left: TorqueNoise) -> NoiseEvidence:
     """The same as decisions see it."""
     return NoiseEvidence(left.share, left.predictable, left.innovations)
@@ -110,22 +98,40 @@ def is_noisy_torque(left: TorqueNoise | None) -> bool:
     return left is not None and all(check.holds for check in noisy_torque(noise_evidence(left)))
 
 
-def over_torque_noise(trial: Trial, before: Trial, left: TorqueNoise | None, noise: MeasurementNoise) -> float:
-    """Log likelihood [nats] by which a model betters the one before it, where each may have noise of the torque of its
-    own, less what its further parameters would gain on noise (Schwarz 1978). Infinite where noise of the torque is no
-    explanation of what the model before it leaves.
+class Standing:
+    """A model with effects, and what a further one has to better.
 
-    Args:
-        trial: the model.
-        before: the one before it.
-        left: what that leaves, as noise of the torque.
-        noise: of the outputs.
+    Attributes:
+        before: the current model.
+        base: the model without any effect.
+        noise: of the measured outputs.
     """
-    if left is None or not is_noisy_torque(left):
-        return np.inf
-    own = torque_noise(trial.training, np.asarray(noise.covariance))
-    further = len(trial.training.free.paths) - len(before.training.free.paths)
-    return own.likelihood - left.likelihood - 0.5 * further * float(np.log(left.count))
+
+    def __init__(self, before: Trial, base: Trial, noise: MeasurementNoise) -> None:
+        self.before, self.base, self.noise = before, base, noise
+
+    @cached_property
+    def torque(self) -> TorqueNoise | None:
+        """Noise of the torque as far as it would explain what the current model leaves; None where that is hardly more
+        than measurement noise."""
+        outputs = np.asarray(self.noise.covariance)
+        left = np.diag(np.asarray(self.before.training.covariance)) / np.diag(outputs)
+        return torque_noise(self.before.training, outputs) if np.max(left) > RULES.excess**2 else None
+
+    def over_torque_noise(self, trial: Trial) -> float:
+        """Log likelihood [nats] by which a model betters the current one, where each may have noise of the torque of
+        its own, less what its further parameters would gain on noise (Schwarz 1978). Infinite where noise of the torque
+        is no explanation of what the current model leaves.
+
+        Args:
+            trial: the model.
+        """
+        left = self.torque
+        if left is None or not is_noisy_torque(left):
+            return np.inf
+        own = torque_noise(trial.training, np.asarray(self.noise.covariance))
+        further = len(trial.training.free.paths) - len(self.before.training.free.paths)
+        return own.likelihood - left.likelihood - 0.5 * further * float(np.log(left.count))
 
 
 def share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fitting import formatting
 from fitting.files import finite
-from fitting.quasi_static.facts import ABOUT_SCALE, ending, estimates, few_stretches, heading, log_dict
+from fitting.quasi_static.facts import ABOUT_SCALE, ending, estimates, few_stretches, heading, log_dict, rmse_dict
 from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.preparation import QuasiStaticData
@@ -24,9 +24,6 @@ PLAIN_SHAPE: dict[Shape, str] = {
 # The least of the values that vendors' tables imply.
 _TYPICAL_ALPHA = 1.1e5
 _SEPARATING = "Cycle the torque slowly to larger twists, past the knees, in both directions."
-
-
-_PARTS = ("training", "selection", "test", "validation")
 
 
 def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
@@ -51,7 +48,7 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         "torque_range": [float(np.min(blocks.torque)), float(np.max(blocks.torque))],
         "twist_range": float(np.ptp(blocks.twist)),
         "before": _account(fit, fit.chosen, parameters),
-        "after": {"effects": [], "parameters": {}, "derived": {}, "rmse": dict.fromkeys(_PARTS)},
+        "after": {"effects": [], "parameters": {}, "derived": {}, "rmse": rmse_dict(None, None)},
         "alternatives": [_alternative(fit, shape) for shape in SHAPES if shape != fit.chosen],
         "shapes": shapes,
         "cannot_tell": [],
@@ -98,7 +95,7 @@ def _account(fit: QuasiStaticFit, shape: Shape, known: Mapping[str, Known]) -> d
         "effects": [],
         "parameters": estimates(known),
         "derived": {},
-        "rmse": {"training": training, "selection": validation, "test": None, "validation": validation},
+        "rmse": rmse_dict(training, validation),
     }
 
 

@@ -24,6 +24,16 @@ ABOUT_SCALE = (
 )
 
 
+def rmse_dict(training: float | None, selection: float | None) -> dict[str, float | None]:
+    """Rms errors by part of the data. Folds of whole stretches select the model; there are no test data yet.
+
+    Args:
+        training: On what was fitted [rad].
+        selection: On the folds that were left out [rad]; schema 1 called them validation.
+    """
+    return {"training": training, "selection": selection, "test": None, "validation": selection}
+
+
 def heading(data: QuasiStaticData) -> dict[str, Any]:
     """What a report begins with."""
     return {

@@ -9,7 +9,16 @@ import numpy as np
 from fitting import formatting
 from fitting.files import finite
 from fitting.quasi_static.attribution import Rival, Trial
-from fitting.quasi_static.facts import ABOUT_SCALE, ARCMIN, ending, estimates, few_stretches, heading, log_dict
+from fitting.quasi_static.facts import (
+    ABOUT_SCALE,
+    ARCMIN,
+    ending,
+    estimates,
+    few_stretches,
+    heading,
+    log_dict,
+    rmse_dict,
+)
 from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.noise_colour import DRAWS
@@ -32,8 +41,7 @@ def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
         loop: On these logs.
     """
     points, nothing = loop.held.points, loop.after is loop.before
-    no_errors = dict.fromkeys(("training", "selection", "test", "validation"))
-    after = {"effects": [], "parameters": {}, "derived": {}, "rmse": no_errors}
+    after = {"effects": [], "parameters": {}, "derived": {}, "rmse": rmse_dict(None, None)}
     if not nothing:
         after = _account(loop, loop.after) | {"effects": [_effect(loop, one) for one in loop.findings]}
     report = heading(data) | {
@@ -70,9 +78,7 @@ def _account(loop: QuasiStaticLoop, trial: Trial) -> dict[str, Any]:
 
 
 def _rmse(trial: Trial) -> dict[str, float | None]:
-    # Folds of whole stretches select the model; there are no test data yet. Schema 1 called them validation.
-    training = float(np.sqrt(np.mean(trial.model.misfit**2)))
-    return {"training": training, "selection": trial.rmse, "test": None, "validation": trial.rmse}
+    return rmse_dict(float(np.sqrt(np.mean(trial.model.misfit**2))), trial.rmse)
 
 
 def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
