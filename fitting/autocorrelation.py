@@ -11,6 +11,8 @@ from fitting.explained import FirstStates
 
 # Directions of a chain's first state that its samples hardly see.
 _BLIND = 1e-12
+# Slopes beyond any whose square is a number.
+_NO_SLOPE = 1e150
 
 
 def left_over(fit: Fit) -> Float[np.ndarray, " samples"]:
@@ -84,6 +86,8 @@ def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directio
 
 def _orthonormal(slopes: np.ndarray, chain: np.ndarray) -> np.ndarray:
     """Columns that span the same as those of each chain, orthonormal over its rows."""
+    # Where a simulation runs away, no slope tells what its first state could do.
+    slopes = np.where(np.abs(slopes) < _NO_SLOPE, slopes, 0.0)
     count = int(chain[-1]) + 1
     square = np.zeros((count, *slopes.shape[2:] * 2))
     np.add.at(square, chain, np.einsum("srp,srq->spq", slopes, slopes))

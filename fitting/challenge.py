@@ -16,7 +16,7 @@ from fitting.attribution.decisions import (
 )
 from fitting.attribution.support import (
     Standing,
-    is_noisy_torque,
+    is_noise,
     leaves_imperfection,
     noise_evidence,
     told_from_zero,
@@ -25,7 +25,7 @@ from fitting.base_fit import leaves_white_noise
 from fitting.compare import excess
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
-from fitting.process_noise import TorqueNoise
+from fitting.noise_model import NoiseModel
 from fitting.unknown import Unknown, learn_supported, share_of
 
 
@@ -35,13 +35,13 @@ class Challenge(eqx.Module):
     Attributes:
         trusted: the model whose names can be trusted.
         unknown: what was learned beside them, or in the place of all.
-        torque: noise of the logged torque, where that is what the names leave.
+        left: noise of the sensors and of the torque, where that is what the names leave.
         seen: what that rests on.
     """
 
     trusted: Trial
     unknown: Unknown | None
-    torque: TorqueNoise | None
+    left: NoiseModel | None
     seen: ChallengeEvidence = eqx.field(static=True)
 
 
@@ -78,9 +78,9 @@ def challenge_names(
     least = half_log_determinant(noise.covariance)
     seen = ChallengeEvidence(seen_as(base), seen_as(named), len(_names(base, named)), least, imperfect)
     standing = Standing(named, base, noise)
-    torque = None if seen.enough else standing.torque
-    if torque is not None:
-        seen = replace(seen, torque=noise_evidence(torque))
+    left = None if seen.enough else standing.left
+    if left is not None:
+        seen = replace(seen, left=noise_evidence(left))
     while (question := next_question(seen)) is not None:
         if question == "instead":
             instead = _learned(Standing(base, base, noise), data, setting, seed=seed, progress=progress)
@@ -96,9 +96,9 @@ def challenge_names(
                 named, beside = _without_superfluous(base, named, beside, data, setting)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
-    torque = torque if beside is None and is_noisy_torque(torque) else None
+    left = left if beside is None and is_noise(left) else None
     if named is base:
-        return Challenge(base, beside, torque, seen)
+        return Challenge(base, beside, left, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
         gains = long_gains(base, [rival, instead.trial], data, setting)
@@ -114,15 +114,15 @@ def challenge_names(
             and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
         )
     stand = any(check.holds for check in names_stand(seen))
-    return Challenge(named, beside, torque, seen) if stand else Challenge(base, instead, None, seen)
+    return Challenge(named, beside, left, seen) if stand else Challenge(base, instead, None, seen)
 
 
 def _learned(
     standing: Standing, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
 ) -> Unknown | None:
-    """What can be learned that the data support, beyond noise of the torque where that would explain as much."""
+    """What can be learned that the data support, beyond noise where that would explain as much."""
     found = learn_supported(standing.before, data, setting, seed=seed, progress=progress)
-    supported = found is not None and standing.over_torque_noise(found.trial) > RULES.torque_noise_gain
+    supported = found is not None and standing.over_noise(found.trial) > RULES.noise_gain
     return found if supported else None
 
 

@@ -10,6 +10,7 @@ from fitting.attribution.decisions import CaseEvidence, decide
 from fitting.attribution.effect_evidence import evidence
 from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
 from fitting.attribution.selection_round import Round
+from fitting.attribution.support import noise_of_torque
 from fitting.challenge import Challenge, challenge_names
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, free_runs
@@ -118,8 +119,8 @@ class _Closed:
             case=case,
             evidence=seen,
             noise=end.noise,
-            noise_memory=None if end.slow is None else end.slow.memory(time_step),
-            torque_noise=None if end.torque is None else end.torque.std,
+            noise_memory=None if end.left is None else end.left.sensors.memory(time_step),
+            torque_noise=noise_of_torque(end.left),
             left=tuple(map(float, excess(final.held_out, end.noise))),
             residual_before=diagnose(base.training),
             residual_after=diagnose(final.training),

@@ -4,18 +4,19 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fitting.attribution.candidate_fit import Data, Setting, Trial
 from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
+from fitting.attribution.support import noise_of_torque
 from fitting.challenge import Challenge
 from fitting.compare import excess, free_runs
 from fitting.estimate import Fit
 from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import long_fit
 from fitting.measurement_noise import MeasurementNoise
-from fitting.noise_memory import NoiseWithMemory, noise_with_memory
-from fitting.process_noise import TorqueNoise
+from fitting.noise_model import NoiseModel
 from fitting.surprise import surprise
 from fitting.unknown import Unknown, learn_supported
 from hdjax import Hold
@@ -33,8 +34,7 @@ class Conclusion(eqx.Module):
         runs: its free runs along the selection data.
         runs_at_first: those of the base model.
         noise: covariance of the measurement noise of the outputs.
-        slow: the same as noise with a memory, where what is left was taken for it.
-        torque: noise of the logged torque, likewise.
+        left: noise of the sensors, with a memory, and of the torque, where what is left was taken for it.
     """
 
     outcome: Outcome = eqx.field(static=True)
@@ -45,8 +45,7 @@ class Conclusion(eqx.Module):
     runs: tuple[FreeRun, ...]
     runs_at_first: tuple[FreeRun, ...]
     noise: Float[Array, "outputs outputs"]
-    slow: NoiseWithMemory | None
-    torque: TorqueNoise | None
+    left: NoiseModel | None
 
     @property
     def final(self) -> Trial:
@@ -77,10 +76,10 @@ def draw_conclusion(
     """
     trusted, unknown = challenge.trusted, challenge.unknown
     covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
-    torque = challenge.torque
-    seen, slow = _as_noise_tells(base, trusted, unknown, covariance, torque)
-    if slow is not None:
-        covariance = slow.covariance
+    left = challenge.left
+    seen = replace(_final_evidence(base, trusted, unknown, covariance), noise_explains=left is not None)
+    if left is not None:
+        covariance = jnp.asarray(left.sensors.covariance)
     outcome, _ = conclude(seen)
     if outcome == "effect_found" and max(seen.excess) < RULES.excess:
         # What the names leave is hardly more than noise.
@@ -94,7 +93,7 @@ def draw_conclusion(
     fitted = long_fit(current.training)
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
-        known = {"noise": covariance, "halo": setting.halo, "torque_noise": 0.0 if torque is None else torque.std}
+        known = {"noise": covariance, "halo": setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
         beyond = surprise(fitted, at_first, runs, current.held_out, **known)
         seen = replace(seen, surprise=beyond)
         outcome, _ = conclude(seen)
@@ -107,23 +106,7 @@ def draw_conclusion(
                 if rms_error(instead_runs) < rms_error(runs):
                     trusted, unknown, fitted, runs = base, instead, other, instead_runs
                     seen = replace(_final_evidence(base, base, instead, covariance), surprise=None)
-    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, slow, torque)
-
-
-def _as_noise_tells(
-    base: Trial,
-    trusted: Trial,
-    unknown: Unknown | None,
-    covariance: Float[Array, "outputs outputs"],
-    torque: TorqueNoise | None,
-) -> tuple[FinalEvidence, NoiseWithMemory | None]:
-    """The evidence, and noise with a memory where what is left is that: pieces of half a period take its slow part for
-    motion."""
-    seen = replace(_final_evidence(base, trusted, unknown, covariance), noise_explains=torque is not None)
-    if conclude(seen)[0] != "unexplained" or unknown is not None:
-        return seen, None
-    slow = noise_with_memory(trusted.held_out)
-    return replace(seen, noise_explains=slow is not None), slow
+    return Conclusion(outcome, seen, trusted, unknown, fitted, runs, at_first, covariance, left)
 
 
 def _final_evidence(

@@ -50,8 +50,8 @@ class Loop(eqx.Module):
         case: what the decision rests on.
         evidence: what each effect of the final model does, and what the data say of it.
         noise: covariance of the measurement noise of the outputs.
-        noise_memory: for how long [s] what is left over remembers itself, where it is more than short pieces tell of
-            the noise and was taken for noise with a memory; None elsewhere.
+        noise_memory: for how long [s] what is left over remembers itself, where it was taken for noise of the sensors
+            with a memory; None elsewhere.
         torque_noise: standard deviation of the noise of a sample of the logged torque [N m], where that is what is
             left; None elsewhere.
         left: what short segments of the selection data leave of each output under the final model, over the

@@ -11,8 +11,8 @@ from fitting.engines import linearise, with_engine
 from fitting.estimate import Fit, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
+from fitting.noise_model import spread_by_torque
 from fitting.normal_law import NORMAL_95
-from fitting.process_noise import spread_by_torque
 from fitting.residual import Problem, Unknowns
 from fitting.uncertainty import Uncertainty
 

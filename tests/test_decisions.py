@@ -44,7 +44,7 @@ CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, ()),), CHA
         ({"p_value": 0.02}, "significance"),
         ({"removed": 0.01, "imperfection": 0.02}, "imperfection"),
         ({"strength_errors": 3.0}, "strength_errors"),
-        ({"over_torque_noise": 2.0}, "torque_noise_gain"),
+        ({"over_noise": 2.0}, "noise_gain"),
         ({"at_bounds": 1}, "at_bounds"),
     ],
 )

@@ -38,7 +38,7 @@ OFF: Mapping[str, float] = {
     "lasting": -np.inf,
     "noise_margin": 0.0,
     "many": np.inf,
-    "torque_noise_gain": -np.inf,
+    "noise_gain": -np.inf,
     "innovations": np.inf,
     "surprise": np.inf,
 }

@@ -110,17 +110,17 @@ class DecisionRules:
         0.05, "log of rms error", "by which fitted initial states and the noise's estimate may be off", "a few per cent"
     )
     many: float = _rule(3.0, "names", "so many names may be the terms of one function", _UNDECLARED)
-    torque_noise_gain: float = _rule(
+    noise_gain: float = _rule(
         5.0,
         "nats",
-        "log likelihood by which an effect must better noise of the torque, where that would explain as much",
+        "log likelihood by which an effect, or noise of the torque, must better noise that would explain as much",
         "the best of fifty forms gains 4 by chance",
     )
     innovations: float = _rule(
-        0.1,
+        0.03,
         "share of variance",
-        "of a Kalman filter's innovations that earlier ones may predict where what is left is noise of the torque",
-        "0.01 under noise of the torque; 0.2 and more where an effect is missing (practice logs, `docs/method.md`)",
+        "of a Kalman filter's innovations that earlier ones may predict where all that is left is noise",
+        "below 0.01 under noise, above 0.06 where an effect is missing (`tests/test_noise_model.py`)",
     )
     free_run_explained: float = _rule(
         0.9,
@@ -149,18 +149,6 @@ class DecisionRules:
         "share of amplitude",
         "that a line of one phase keeps of what it has with a phase of each log's own where clocks are right",
         "phases within 0.45 rad",
-    )
-    whole_stretches: float = _rule(
-        float(np.log(1.25)),
-        "log of rms error",
-        "what whole stretches may leave beyond noise of the same autocovariance",
-        "a missing torque moves the drive ever farther (`tests/test_noise_memory.py`)",
-    )
-    convexity: float = _rule(
-        0.9,
-        "1",
-        "least ratio of autocovariances at which coloured noise may bend the other way",
-        "1 by Cauchy and Schwarz for relaxations; a tenth for errors of parameters",
     )
     coefficient: float = _rule(
         0.005,
@@ -219,8 +207,7 @@ class EffectEvidence:
         removed: what it removes of the error, over what the effects before it have removed (rms).
         imperfection: what the laws of the effects before it may get wrong, likewise.
         strength_errors: standard errors by which its best known strength differs from zero.
-        over_torque_noise: log likelihood by which it betters noise of the torque; infinite where that is no
-            explanation.
+        over_noise: log likelihood by which it betters noise; infinite where that is no explanation.
         at_bounds: how many of its parameters ended at a bound.
     """
 
@@ -230,7 +217,7 @@ class EffectEvidence:
     removed: float = np.inf
     imperfection: float = 0.0
     strength_errors: float = np.inf
-    over_torque_noise: float = np.inf
+    over_noise: float = np.inf
     at_bounds: int = 0
 
 
@@ -242,13 +229,13 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
         rules: the thresholds.
     """
     least, errors, chance = rules.least_gain, rules.strength_errors, rules.significance
-    nats, over = rules.torque_noise_gain, seen.over_torque_noise
+    nats, over = rules.noise_gain, seen.over_noise
     return (
         Check("least_gain", seen.name, seen.gain, least, seen.gain > least),
         Check("significance", seen.name, seen.p_value, chance, seen.p_value <= chance),
         Check("imperfection", seen.name, seen.removed, seen.imperfection, seen.removed > seen.imperfection),
         Check("strength_errors", seen.name, seen.strength_errors, errors, seen.strength_errors > errors),
-        Check("torque_noise_gain", seen.name, over, nats, over > nats),
+        Check("noise_gain", seen.name, over, nats, over > nats),
         Check("at_bounds", seen.name, float(seen.at_bounds), rules.at_bounds, seen.at_bounds <= rules.at_bounds),
     )
 
@@ -348,7 +335,7 @@ class ModelEvidence:
 
 @dataclass(frozen=True)
 class NoiseEvidence:
-    """What a Kalman filter with noise of the torque leaves.
+    """What a Kalman filter with noise of sensors and torque leaves.
 
     Attributes:
         share: the noise of the torque over its rms.
@@ -361,14 +348,14 @@ class NoiseEvidence:
     size: float
 
 
-def noisy_torque(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
-    """Whether what a model leaves is noise of the torque: all checks must hold.
+def only_noise(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
+    """Whether what a model leaves is noise of sensors and torque: all checks must hold.
 
     Args:
         seen: what the filter leaves.
         rules: the thresholds.
     """
-    about = f"noise of the torque, {100 * seen.share:.2g} % of its rms"
+    about = f"noise of the sensors, and of the torque by {100 * seen.share:.2g} % of its rms"
     return (
         Check("innovations", about, seen.predictable, rules.innovations, seen.predictable <= rules.innovations),
         Check("excess", "innovations of that filter", seen.size, rules.excess, seen.size < rules.excess),
@@ -391,7 +378,7 @@ class ChallengeEvidence:
         come_out: share of the term in their place that the names make up.
         shown: whether every name still has a strength that is told from zero beside the learned term.
         one_shape: whether a name is one shape of the function that was learned both beside it and in its place.
-        torque: what noise of the torque would explain of what the names leave; None where they leave nothing else.
+        left: what the names leave as noise; None where they leave no more than white measurement noise.
         longer_worse: log of the rms error of free runs with the term in their place, over that with the names; zero
             where free runs tell nothing.
     """
@@ -407,7 +394,7 @@ class ChallengeEvidence:
     come_out: float = 0.0
     shown: bool = True
     one_shape: bool = False
-    torque: NoiseEvidence | None = None
+    left: NoiseEvidence | None = None
     longer_worse: float = 0.0
 
     @property
@@ -516,7 +503,7 @@ class FinalEvidence:
         learned: whether a term was learned beside them, or in the place of all.
         excess: what short segments of the selection data leave of each output under the names alone, over the noise.
         excess_at_first: likewise under the base model.
-        noise_explains: whether what is left is noise with a memory or noise of the torque.
+        noise_explains: whether what is left is noise of the sensors, with a memory, and of the torque.
         surprise: by how much free runs are farther off than they promised; None where that is not asked.
     """
 
@@ -623,8 +610,8 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
             lacking.append(f"round {number}: another candidate would be accepted")
         elif this.rivals and not last and leader(this.rivals, rules)[0].name != this.asked[-1].name:
             lacking.append(f"round {number}: another candidate would lead")
-    if evidence.challenge.torque is not None:
-        checks += noisy_torque(evidence.challenge.torque, rules)
+    if evidence.challenge.left is not None:
+        checks += only_noise(evidence.challenge.left, rules)
     question = next_question(evidence.challenge, rules)
     if question is not None:
         lacking.append(f"a learned term {question}")

@@ -90,7 +90,7 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
         removed=share_of_removed(trial, standing.before, standing.base),
         imperfection=imperfection(standing.before),
         strength_errors=min(errors.values(), default=np.inf),
-        over_torque_noise=standing.over_torque_noise(trial),
+        over_noise=standing.over_noise(trial),
         at_bounds=len(parameters_at_bounds(trial.model, verdict.name)),
     )
 

@@ -19,7 +19,7 @@ from fitting.attribution.decisions import (
 _UNBOUNDED = (
     "removed",
     "strength_errors",
-    "over_torque_noise",
+    "over_noise",
     "gain",
     "long_gain",
     "training",
@@ -40,8 +40,8 @@ def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
     known["asked"] = tuple(challenge["asked"])
     for name in ("base", "named", "beside", "instead"):
         known[name] = None if challenge[name] is None else _model(challenge[name])
-    torque = challenge["torque"]
-    known["torque"] = None if torque is None else NoiseEvidence(**torque)
+    left = challenge["left"]
+    known["left"] = None if left is None else NoiseEvidence(**left)
     final = dict(stored["final"])
     for name in ("names", "excess", "excess_at_first"):
         final[name] = tuple(final[name])

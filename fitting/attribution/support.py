@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.decisions import RULES, DecisionRules, NoiseEvidence, noisy_torque
+from fitting.attribution.decisions import RULES, DecisionRules, NoiseEvidence, only_noise
 from fitting.estimate import Fit
 from fitting.free import effect_paths, strength_paths
 from fitting.measurement_noise import MeasurementNoise
+from fitting.noise_model import NoiseModel, noise_model
 from fitting.normal_law import NORMAL_95
-from fitting.process_noise import TorqueNoise, torque_noise
 from fitting.uncertainty import Estimate, Uncertainty, uncertainty
 from hdjax import ReducedModel
 from hdjax.effects import Effect
@@ -88,14 +88,23 @@ def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> 
     return _share(before, base, np.diag(np.asarray(noise.covariance))) <= small, noise
 
 
-def noise_evidence(left: TorqueNoise) -> NoiseEvidence:
+def noise_evidence(left: NoiseModel) -> NoiseEvidence:
     """The same as decisions see it."""
-    return NoiseEvidence(left.share, left.predictable, left.innovations)
+    return NoiseEvidence(left.share, left.predictable, left.size)
 
 
-def is_noisy_torque(left: TorqueNoise | None) -> bool:
-    """Whether what a model leaves may all be noise of the torque."""
-    return left is not None and all(check.holds for check in noisy_torque(noise_evidence(left)))
+def is_noise(left: NoiseModel | None) -> bool:
+    """Whether what a model leaves may all be noise."""
+    return left is not None and all(check.holds for check in only_noise(noise_evidence(left)))
+
+
+def noise_of_torque(left: NoiseModel | None) -> float | None:
+    """Standard deviation of the torque's noise [N m]; None where the sensors' noise alone explains as much."""
+    return left.std if left is not None and left.likelihood - left.without > RULES.noise_gain else None
+
+
+def _noise_of(trial: Trial, outputs: Float[np.ndarray, "outputs outputs"]) -> NoiseModel:
+    return noise_model(trial.training, outputs, predictable=RULES.innovations)
 
 
 class Standing:
@@ -111,25 +120,25 @@ class Standing:
         self.before, self.base, self.noise = before, base, noise
 
     @cached_property
-    def torque(self) -> TorqueNoise | None:
-        """Noise of the torque as far as it would explain what the current model leaves; None where that is hardly more
-        than measurement noise."""
+    def left(self) -> NoiseModel | None:
+        """What the current model leaves as noise of the sensors, with a memory, and of the torque; None where that is
+        hardly more than white measurement noise."""
         outputs = np.asarray(self.noise.covariance)
         left = np.diag(np.asarray(self.before.training.covariance)) / np.diag(outputs)
-        return torque_noise(self.before.training, outputs) if np.max(left) > RULES.excess**2 else None
+        return _noise_of(self.before, outputs) if np.max(left) > RULES.excess**2 else None
 
-    def over_torque_noise(self, trial: Trial) -> float:
-        """Log likelihood [nats] by which a model betters the current one, where each may have noise of the torque of
-        its own, less what its further parameters would gain on noise (Schwarz 1978). Infinite where noise of the torque
-        is no explanation of what the current model leaves.
+    def over_noise(self, trial: Trial) -> float:
+        """Log likelihood [nats] by which a model betters the current one, where each has a noise model of its own, less
+        what its further parameters would gain on noise (Schwarz 1978). Infinite where noise is no explanation of what
+        the current model leaves.
 
         Args:
             trial: the model.
         """
-        left = self.torque
-        if left is None or not is_noisy_torque(left):
+        left = self.left
+        if left is None or not is_noise(left):
             return np.inf
-        own = torque_noise(trial.training, np.asarray(self.noise.covariance))
+        own = _noise_of(trial, np.asarray(self.noise.covariance))
         further = len(trial.training.free.paths) - len(self.before.training.free.paths)
         return own.likelihood - left.likelihood - 0.5 * further * float(np.log(left.count))
 

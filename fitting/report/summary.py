@@ -73,8 +73,8 @@ def _remembering(report: Mapping[str, Any]) -> str:
         return ""
     return (
         f" What is left over remembers itself for about {formatting.quantity(memory, 's', digits=2)}, and was taken "
-        "for noise of the sensors, since whole stretches leave no more of it than such noise would. Something as slow "
-        "that nothing tried here can follow would look the same."
+        "for noise of the sensors: beside such noise nothing is left that could be predicted. Something as slow that "
+        "nothing tried here can follow would look the same."
     )
 
 
@@ -85,7 +85,7 @@ def _noisy_torque(report: Mapping[str, Any]) -> str:
         return ""
     return (
         f" The torque channel is noisy by {formatting.quantity(std, report['units']['forcing'], digits=2)} rms. The "
-        "drive answers to it, so that free runs leave more than the encoders' noise, and no model follows them closer."
+        "drive answers to it, so that free runs leave more than the sensors' noise, and no model follows them closer."
     )
 
 

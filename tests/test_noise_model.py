@@ -1,0 +1,174 @@
+"""Noise of sensors and torque channel, from innovations: against what the rig was given."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Float
+from scipy.signal import lfilter
+from scipy.stats import multivariate_normal
+
+import rig
+from fitting.attribution.decisions import RULES
+from fitting.attribution.support import is_noise, noise_of_torque
+from fitting.close_loop import close_loop
+from fitting.engines import with_engine
+from fitting.estimate import Fit, fit
+from fitting.experiment import Experiment, experiment_from_log, whole
+from fitting.free import base_paths
+from fitting.measurement_noise import measurement_noise
+from fitting.noise_model import NoiseModel, SensorNoise, _filtered, _Steps, noise_model, spread_by_torque
+from fitting.prediction_band import prediction_bands
+from fitting.residual import Unknowns
+from fitting.uncertainty import uncertainty
+from hdjax import Hold
+
+COUNT, STD = 3000, 0.01
+OUTPUTS = np.array([[1.0, 1.0], [1.0, 1.0]]) * (rig.MOTOR_NOISE / rig.N) ** 2 + np.diag([0.0, rig.LOAD_NOISE**2])
+# Of noise with a memory, of the motor's and of the load's encoder [rad].
+SIZES = 3.0 * np.array([rig.MOTOR_NOISE, rig.LOAD_NOISE])
+TWIST = float(np.hypot(SIZES[0] / rig.N, SIZES[1]))
+
+
+def noisy_experiment(
+    *, seed: int = 0, count: int = COUNT, std: float = STD, correlation: float | None = None, **physics: Any
+) -> Experiment:
+    """A log whose torque was logged with noise, and where asked for whose encoders' noise has a memory."""
+    acting = rig.drive_torque(count, seed=seed)
+    motion = rig.drive_motion(acting, **physics)
+    if correlation is not None:
+        motion[:, :2] += slow_noise(correlation, count) * SIZES
+    log = rig.drive_log(motion, acting, seed=seed, noise=1.0 if correlation is None else 0.0)
+    logged = acting + std * np.random.default_rng(seed + 7).normal(size=count)
+    return experiment_from_log(replace(log, motor_torque=logged), hold="zero-order", N=rig.N)
+
+
+def slow_noise(correlation: float, count: int) -> Float[np.ndarray, "samples encoders"]:
+    """Of unit variance, each sample correlated with the one before."""
+    pushed = np.random.default_rng(5).normal(size=(count, 2))
+    pushed[1:] *= np.sqrt(1.0 - correlation**2)
+    return np.asarray(lfilter([1.0], [1.0, -correlation], pushed, axis=0))
+
+
+def fitted(experiment: Experiment) -> Fit:
+    model = rig.drive_model()
+    return fit(model, whole([experiment]), base_paths(model), horizon=128)
+
+
+def left(found: Fit) -> NoiseModel:
+    outputs = measurement_noise(found).covariance
+    return noise_model(found, outputs, predictable=RULES.innovations)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Fit:
+    return fitted(noisy_experiment())
+
+
+def test_the_noise_is_that_of_the_log(noisy: Fit):
+    found = noise_model(noisy, OUTPUTS, predictable=RULES.innovations)
+    assert found.std == pytest.approx(STD, rel=0.05)
+    assert found.size == pytest.approx(1.0, abs=0.05)
+    assert found.predictable < 0.02 and found.sensors.memory(rig.STEP) is None
+    assert noise_of_torque(found) == found.std
+
+
+@pytest.mark.parametrize("correlation, std", [(0.8, 0.0), (0.98, 0.0), (0.8, STD), (0.98, STD)])
+def test_noise_of_the_sensors_is_known_with_its_memory_and_its_size(correlation: float, std: float):
+    found = left(fitted(noisy_experiment(correlation=correlation, std=std, count=8000)))
+    assert is_noise(found)
+    memory = found.sensors.memory(rig.STEP)
+    assert memory is not None and memory == pytest.approx(-rig.STEP / np.log(correlation), rel=0.4)
+    # So many samples of white noise would tell as much as those that are looked at.
+    counts = 12 * 128 * (1.0 - correlation) / (1.0 + correlation)
+    assert found.sensors.covariance[-1, -1] ** 0.5 == pytest.approx(TWIST, rel=3.0 / np.sqrt(2.0 * counts))
+    torque = noise_of_torque(found)
+    assert torque is None if std == 0.0 else torque == pytest.approx(std, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [
+        {"motor_friction": (2e-3, 1.0)},
+        {"mesh_friction": (0.5, 1e-2)},
+        {"tether": 20.0},
+        {"kinematic": (1e-4, 0.0)},
+        {"gap": 5e-5},
+    ],
+    ids=lambda missing: next(iter(missing)),
+)
+def test_what_is_missing_does_not_pass_for_noise(missing: dict[str, Any]):
+    assert not is_noise(left(fitted(noisy_experiment(correlation=0.95, std=0.0, count=8000, **missing))))
+
+
+def test_the_likelihood_is_that_of_the_gaussian_law():
+    """By the covariance of all samples at once."""
+    random = np.random.default_rng(0)
+    samples, size, std = 40, 2, 0.3
+    transition = np.array([[0.9, 0.2], [-0.2, 0.9]])
+    push, readout = np.array([0.3, 1.0]), np.array([[1.0, 0.0], [0.5, -1.0]])
+    sensors = SensorNoise(
+        np.array([[1.0, 0.0], [0.4, 0.8]]), np.array([0.2, 0.5]), np.array([0.7, 0.1]), np.full(2, 0.9)
+    )
+    error = random.normal(size=(samples, 1, 2, 1))
+    shapes = {"transition": transition, "push": push, "readout": readout}
+    stacked = {name: np.broadcast_to(v, (samples, 1, *v.shape)) for name, v in shapes.items()}
+    steps = _Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), prior=np.eye(size), torque=1.0)
+    innovations, logarithms = _filtered(steps, std, sensors)
+    spread = np.zeros((samples, size, samples, size))
+    variance = np.eye(size)
+    for i in range(samples):
+        forward = variance
+        for k in range(i, samples):
+            spread[i, :, k], spread[k, :, i] = forward, forward.T
+            forward = forward @ transition.T
+        variance = transition @ variance @ transition.T + std**2 * np.outer(push, push)
+    seen = np.einsum("oa,iakb,qb->iokq", readout, spread, readout)
+    lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+    own = sensors.slow * 0.9 ** lags[..., None] + sensors.white * (lags == 0)[..., None]
+    seen += np.einsum("od,ikd,qd->iokq", sensors.combined, own, sensors.combined)
+    law = multivariate_normal(cov=seen.reshape(2 * samples, -1))
+    # In units of the sensors' independent combinations.
+    units = samples * np.log(np.linalg.det(sensors.combined)) + samples * np.log(2.0 * np.pi)
+    likelihood = -np.sum(0.5 * innovations**2 + logarithms) - units
+    assert likelihood == pytest.approx(law.logpdf(error[:, 0, :, 0].ravel()), rel=1e-9)
+
+
+def test_the_spread_is_that_of_simulations(noisy: Fit):
+    """By the rig: the same motion under fresh noise of the torque."""
+    count, draws = 300, 60
+    torque = rig.drive_torque(count)
+    silent = rig.drive_motion(torque)
+    random = np.random.default_rng(0)
+    moved = [rig.drive_motion(torque + STD * random.normal(size=count)) for _ in range(draws)]
+    scatter = np.std([(m - silent)[:, 0] / rig.N - (m - silent)[:, 1] for m in moved], axis=0)
+    experiment = rig.drive_experiment(count)
+    model = rig.drive_model()
+    problem = fit(model, whole([experiment]), (), horizon=count, length=count, substeps=4).problem
+    states = jnp.asarray(silent[:1, :4])
+    found = spread_by_torque(with_engine(problem), Unknowns(jnp.zeros(0), states), STD)[0]
+    # 60 draws know a standard deviation to 9 %; over all samples the ratio's median is known better.
+    assert np.median(scatter[20:] / found[20:count]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_bands_hold_what_noise_of_the_torque_drives(noisy: Fit):
+    unseen = whole([noisy_experiment(seed=seed, count=600) for seed in (3, 4, 5, 6)])
+    options = {"noise": jnp.asarray(OUTPUTS), "halo": noisy.problem.segments.halo}
+    blind, wide = (
+        prediction_bands(noisy, uncertainty(noisy), unseen, torque_noise=std, **options) for std in (0.0, STD)
+    )
+    assert np.mean([band.inside[50:] for band in blind]) < 0.8
+    # What the drive answers is a line at the resonance: four runs know the share to some per cent.
+    assert np.mean([band.inside[50:] for band in wide]) == pytest.approx(0.95, abs=0.05)
+
+
+def test_the_loop_says_that_the_model_suffices_and_the_torque_is_noisy():
+    data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (noisy_experiment(count=4000),)}
+    loop = close_loop(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), data, hold="zero-order")
+    assert loop.decision == "model_sufficient" and loop.unknown is None
+    assert loop.torque_noise == pytest.approx(STD, rel=0.1)
+    for path, truth in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}.items():
+        low, high = loop.after.uncertainty.estimates[path].ci95
+        assert low < truth < high, path
