@@ -60,7 +60,9 @@ def test_a_tie_is_what_scatter_over_blocks_explains():
     assert not tie("a", scatter + 2.0).holds
     # Worse in every block, by little: told apart all the same.
     assert not tie("a", 0.1 + 0.01 * scatter).holds
-    assert tie("a", np.full(4, 9.0)).rule == "fewest_blocks"
+    # Always worse by the same is told apart, one block is not.
+    assert not tie("a", np.full(4, 9.0)).holds
+    assert tie("a", np.full(1, 9.0)).holds
 
 
 def test_false_alarms_of_a_tie_are_as_many_as_the_level():

@@ -45,19 +45,6 @@ class DecisionRules:
         "chance at which a candidate counts as worse than the best one, by a paired t test over blocks",
         "convention",
     )
-    fewest_blocks: float = _rule(5.0, "blocks", "with fewer blocks than this nothing is told apart", "assumed")
-    near: float = _rule(
-        0.1,
-        "share of the best gain",
-        "what is not told from the best one and gains as much but for this share competes over whole stretches",
-        _UNDECLARED,
-    )
-    rival_of_memory: float = _rule(
-        0.5,
-        "share of the best gain",
-        "beside a form with memory, whose states short segments leave free, so does all that gains this share",
-        "Silverbox",
-    )
     same_gain: float = _rule(
         0.02, "share of the best gain", "gains over whole stretches that differ by less are the same", _UNDECLARED
     )
@@ -105,9 +92,6 @@ class DecisionRules:
         "log of rms error",
         "by which free runs of a learned term may be worse than those of the names that it would replace",
         "a lag in the place of creep left 40 times as much (study, seed 95)",
-    )
-    noise_margin: float = _rule(
-        0.05, "log of rms error", "by which fitted initial states and the noise's estimate may be off", "a few per cent"
     )
     many: float = _rule(3.0, "names", "so many names may be the terms of one function", _UNDECLARED)
     noise_gain: float = _rule(
@@ -249,11 +233,11 @@ def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = 
         rules: the thresholds.
     """
     count = behind.size
-    if count < rules.fewest_blocks:
-        return Check("fewest_blocks", name, float(count), rules.fewest_blocks, True)
+    if count < 2:
+        return Check("tie_level", name, 0.0, np.inf, True)
     error = float(np.std(behind, ddof=1) / np.sqrt(count))
     mean, limit = float(np.mean(behind)), float(stdtrit(count - 1, 1.0 - rules.tie_level))
-    statistic = mean / error if error > 0 else 0.0
+    statistic = mean / error if error > 0 else (np.inf if mean > 0 else 0.0)
     return Check("tie_level", name, statistic, limit, statistic <= limit)
 
 
@@ -283,17 +267,15 @@ class Rival:
 
 
 def compete(best: Rival, others: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, ...]:
-    """Those that compete over whole stretches, the best one included.
+    """Those that compete over whole stretches, the best one included: what is tied with it, and all where it has a
+    memory, whose states short segments leave free.
 
     Args:
         best: the candidate with the largest gain over short segments.
         others: the others.
         rules: the thresholds.
     """
-    free = rules.rival_of_memory if best.remembers else 1.0
-    least = (1.0 - rules.near) * best.gain - rules.least_gain
-    kept = [r for r in others if r.gain > free * best.gain or (r.tied and r.gain > least)]
-    return best, *kept
+    return best, *(r for r in others if r.gain > rules.least_gain and (r.tied or best.remembers))
 
 
 def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, tuple[str, ...]]:
@@ -478,8 +460,7 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
 
 def _leaves_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
     """Whether not even a term that left nothing but noise would be better than the names by far."""
-    least = seen.noise - rules.noise_margin
-    return seen.named.selection - least < rules.little * (seen.base.selection - least)
+    return seen.named.selection - seen.noise < rules.little * (seen.base.selection - seen.noise)
 
 
 def _adds_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
