@@ -121,24 +121,24 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
 
 
 @pytest.mark.parametrize(
-    ("share", "creep_long", "leader"),
-    [(0.6, 1.0, "torque_bias"), (0.6, 3.0, "creep"), (0.4, 1.0, "creep")],
+    ("creep_long", "leader"),
+    [(1.0, "torque_bias"), (3.0, "creep")],
 )
 def test_whole_stretches_judge_what_remembers(
-    verdicts, share: float, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
+    verdicts, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """A form with memory leads one that gains a large share of what it does over short segments only where it does so
-    over whole stretches; these then tell the two apart."""
+    """A form with memory leads another one that gains only where it does so over whole stretches; these then tell the
+    two apart."""
     before, found = verdicts
     bias, creep = found["torque_bias"], found["creep"]
     ordered = [
         Verdict("creep", creep.family, creep.trial, 0.1, 0.005, False),
-        Verdict("torque_bias", bias.family, bias.trial, 0.1 * share, 0.005, True),
+        Verdict("torque_bias", bias.family, bias.trial, 0.05, 0.005, True),
     ]
     long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
     monkeypatch.setattr(attribution, "long_gains", lambda before, trials, data, setting: [long[id(t)] for t in trials])
     (first, second), rivals = attribution._simplest_first(ordered, before, {}, SETTING)
-    assert {r.name: r.long_gain for r in rivals} == ({"torque_bias": 2.0, "creep": creep_long} if share > 0.5 else {})
+    assert {r.name: r.long_gain for r in rivals} == {"torque_bias": 2.0, "creep": creep_long}
     assert (first.name, first.separable, second.separable) == (leader, False, True)
 
 
