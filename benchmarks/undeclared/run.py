@@ -36,7 +36,7 @@ from undeclared.drawing import (
 from undeclared.hidden import FAMILIES
 from undeclared.recording import record
 from undeclared.sindy import sindy_is_there
-from undeclared.tally import tables, verdict
+from undeclared.tally import in_proportion, tables, verdict
 from undeclared.trial import run_case
 
 
@@ -51,9 +51,9 @@ def main() -> None:
     if args.baselines and not args.markdown and not sindy_is_there():
         print("PySINDy is not installed, so that it is left out; pip install -e '.[sindy]' brings it")
     cases = _cases(args)
-    results = []
+    results, pairs = [], []
     for number, case in enumerate(cases, start=1):
-        path = _result_path(args.out, case, args)
+        path = _result_path(args.out, case, args, thorough=args.thorough)
         if not path.exists() and not args.markdown:
             try:
                 result = _run(case, args)
@@ -64,9 +64,12 @@ def main() -> None:
             jax.clear_caches()
             write_whole({path: json.dumps(result, indent=1, allow_nan=False) + "\n"})
             print(f"{number:4d} of {len(cases)}  {_line(result)}", flush=True)
-        if path.exists():
-            results.append(json.loads(path.read_text(encoding="utf-8")))
-    for table in tables(results):
+        done, plain = _read(path), _read(_result_path(args.out, case, args, thorough=False))
+        if done is not None:
+            results.append(done)
+            if args.thorough and plain is not None:
+                pairs.append((plain, done))
+    for table in (*tables(results), *([in_proportion(pairs)] if pairs else [])):
         print("\n" + table.text(markdown=args.markdown))
 
 
@@ -79,6 +82,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--leave-out", action="store_true", help="take the hidden families out of the catalogue")
     parser.add_argument("--remembering", action="store_true", help="noise that has a memory altogether in every case")
     parser.add_argument("--noisy-torque", action="store_true", help="torque that was logged with noise in every case")
+    parser.add_argument("--thorough", action="store_true", help="refit every form, and compare with results without it")
     parser.add_argument("--only", nargs="+", help="cases of these names alone")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder of the results, one JSON a case")
@@ -108,8 +112,12 @@ def _folder(case: Case, args: argparse.Namespace) -> str:
     return f"{'left_out-' if args.leave_out and case.forms else ''}{case.name}-seed{case.seed}"
 
 
-def _result_path(out: Path, case: Case, args: argparse.Namespace) -> Path:
-    return out / "results" / f"{_folder(case, args)}.json"
+def _result_path(out: Path, case: Case, args: argparse.Namespace, *, thorough: bool) -> Path:
+    return out / "results" / f"{'thorough-' if thorough else ''}{_folder(case, args)}.json"
+
+
+def _read(path: Path) -> dict | None:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
 
 def _run(case: Case, args: argparse.Namespace) -> dict:
@@ -117,7 +125,8 @@ def _run(case: Case, args: argparse.Namespace) -> dict:
         folder = args.out / "logs" / _folder(case, args) if args.keep_logs else Path(room)
         answer = record(draw(case), folder)
         leave_out = args.leave_out and bool(case.forms)
-        return run_case(folder, answer, leave_out=leave_out, seed=args.seed, baselines=args.baselines)
+        how = {"seed": args.seed, "baselines": args.baselines, "thorough": args.thorough}
+        return run_case(folder, answer, leave_out=leave_out, **how)
 
 
 def _line(result: dict) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest
 
-_NOTHING, _UNEXPLAINED, _ERROR = "nothing", "unexplained", "error"
+_NOTHING, _UNEXPLAINED, _SUFFICIENT, _ERROR = "nothing", "unexplained", "model_sufficient", "error"
 _PARAMETERS = ("K", "alpha", "B_sp")
 
 
@@ -35,22 +35,23 @@ def verdict(result: dict) -> str:
     """How a case with one hidden effect, or with none, ended.
 
     right, tied (the truth is among what can't be told from the first effect), wrong, missed, unexplained, error; of a
-    clean case right, or false alarm. What nobody's catalogue holds, and what was left out of it, is right where it is
-    called unexplained or unknown, and tied where look-alikes are stated.
+    clean case right where the model suffices, or false alarm. What nobody's catalogue holds, and what was left out of
+    it, is right where it is called unexplained or unknown, and tied where look-alikes are stated, or that something
+    unknown is missing beside a name.
     """
     truth = result["case"]["families"]
     if result["error"]:
         return "error"
     named = result["families"]
     if not truth:
-        return "right" if not named else "false alarm"
+        return "right" if result["decision"] == _SUFFICIENT else "false alarm"
     unknown = result["leave_out"] or truth == ["unknown"]
     if result["decision"] == _UNEXPLAINED and (unknown or not named):
         return "right" if unknown else "unexplained"
     if not named:
         return "missed"
     if unknown:
-        return "right" if named[0] == "unknown" else "tied" if result["ties"] else "wrong"
+        return "right" if named[0] == "unknown" else "tied" if result["ties"] or result["unknown_beside"] else "wrong"
     if named[0] in truth:
         return "right"
     return "tied" if set(truth) & set(result["ties"]) else "wrong"
@@ -68,6 +69,7 @@ def tables(results: Sequence[dict]) -> list[Table]:
         found += [
             _confusion(single),
             _verdicts("Hidden effect, by strength", sorted(single, key=_limits), _by_strength),
+            _look_alikes(single),
         ]
     if clean:
         found.append(_false_alarms(clean))
@@ -118,6 +120,41 @@ def _confusion(results: Sequence[dict]) -> Table:
     return Table("First family named (rows: truth)", columns, rows)
 
 
+def _look_alikes(results: Sequence[dict]) -> Table:
+    """What can't be told from the first effect that was named, by the hidden family."""
+    groups = list(dict.fromkeys(r["case"]["families"][0] for r in results))
+    rows = []
+    for truth in groups:
+        chosen = [r for r in results if r["case"]["families"][0] == truth and not r["error"]]
+        tied = [set(r["ties"]) - {r["families"][0]} for r in chosen if r["families"]]
+        counts = Counter(family for families in tied for family in families)
+        told = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+        rows.append((truth, str(len(chosen)), str(sum(bool(families) for families in tied)), told))
+    return Table("Look-alikes: families tied with the first one named", ("hidden", "cases", "with ties", "tied"), rows)
+
+
+def in_proportion(pairs: Sequence[tuple[dict, dict]]) -> Table:
+    """How often refitting every form changes what is said.
+
+    Args:
+        pairs: results of the same case, as usual and with every form refitted.
+    """
+
+    def said(result: dict) -> tuple:
+        return result.get("decision"), tuple(result.get("families") or ())
+
+    def name(result: dict) -> str:
+        names = ", ".join(result.get("names") or ()) or str(result.get("decision"))
+        return f"{result['case']['name']}: {names}"
+
+    other = [(plain, all_forms) for plain, all_forms in pairs if said(plain) != said(all_forms)]
+    rows = [("decision or families", _share(len(other), len(pairs)), "; ".join(name(plain) for plain, _ in other))]
+    rows.append(("with every form", "", "; ".join(name(all_forms) for _, all_forms in other)))
+    ratio = np.median([all_forms["seconds"] / plain["seconds"] for plain, all_forms in pairs])
+    rows.append(("time, times as long (median)", f"{ratio:.1f}", ""))
+    return Table("What refitting every form changes", ("", "share", "cases"), rows)
+
+
 def _limits(result: dict) -> float:
     return min(result["case"]["detection_limits"])
 
@@ -141,17 +178,24 @@ def _verdicts(title: str, results: Sequence[dict], key: Callable[[dict], str]) -
 
 
 def _false_alarms(results: Sequence[dict]) -> Table:
+    groups: dict[str, list[dict]] = {}
+    for result in results:
+        groups.setdefault(_noise_of(result["case"]), []).append(result)
     rows = []
-    for name, chosen in (
-        ("white noise", [r for r in results if not r["case"]["coloured"]]),
-        ("coloured noise", [r for r in results if r["case"]["coloured"]]),
-        ("all", results),
-    ):
-        if chosen:
-            alarms = [r for r in chosen if verdict(r) != "right"]
-            told = Counter(_named(r) for r in alarms)
-            rows.append((name, _share(len(alarms), len(chosen)), ", ".join(f"{k} {n}" for k, n in told.items())))
+    for name, chosen in (*groups.items(), ("all", results)):
+        alarms = [r for r in chosen if verdict(r) != "right"]
+        told = Counter(_named(r) for r in alarms)
+        rows.append((name, _share(len(alarms), len(chosen)), ", ".join(f"{k} {n}" for k, n in told.items())))
     return Table("Clean cases: false alarms", ("noise", "rate", "named"), rows)
+
+
+def _noise_of(case: dict) -> str:
+    """The kind of noise, by the case's name."""
+    if case["name"].endswith("-remembering"):
+        return "noise with a memory altogether"
+    return ("coloured" if case["coloured"] else "white") + (
+        " noise, noisy torque" if case["torque_noise"] else " noise"
+    )
 
 
 def _pairs(results: Sequence[dict]) -> Table:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fitting.attribution.decisions import RULES
 from fitting.close_loop import close_loop
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError
@@ -25,7 +26,9 @@ from undeclared.logs import read_tables
 from undeclared.sindy import sindy_error, sindy_is_there
 
 
-def run_case(folder: Path, answer: dict, *, leave_out: bool, seed: int, baselines: bool) -> dict:
+def run_case(
+    folder: Path, answer: dict, *, leave_out: bool, seed: int, baselines: bool, thorough: bool = False
+) -> dict:
     """The loop, and the baselines where asked for, on a case's logs.
 
     Args:
@@ -34,6 +37,7 @@ def run_case(folder: Path, answer: dict, *, leave_out: bool, seed: int, baseline
         leave_out: whether the hidden families are taken out of the catalogue.
         seed: of the loop.
         baselines: whether to run these too.
+        thorough: whether every form is refitted.
 
     Returns:
         JSON's numbers, strings and nulls only. What goes wrong is told in `error`, and the study goes on.
@@ -41,7 +45,7 @@ def run_case(folder: Path, answer: dict, *, leave_out: bool, seed: int, baseline
     begun = time.perf_counter()
     result: dict[str, Any] = {"case": answer, "leave_out": leave_out, "error": None}
     try:
-        result |= _loop(folder, frozenset(answer["families"]) if leave_out else frozenset(), seed)
+        result |= _loop(folder, frozenset(answer["families"]) if leave_out else frozenset(), seed, thorough)
     except (DataError, SimulationError) as error:
         result["error"] = f"refused: {error}"
     except Exception:
@@ -53,11 +57,11 @@ def run_case(folder: Path, answer: dict, *, leave_out: bool, seed: int, baseline
     return finite(result)
 
 
-def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
+def _loop(folder: Path, without: frozenset[str], seed: int, thorough: bool) -> dict:
     drive = folder / "drive.toml"
     first, second, last = (folder / f"{name}.csv" for name in LOGS)
     rig = read_rig([first, second], drive, test=[last])
-    loop = _close(rig, without, seed)
+    loop = _close(rig, without, seed, thorough)
     report = report_dict(loop, units=rig.logs[0].units)
     drive_file = read_drive_file(drive)
     effects = report["after"]["effects"]
@@ -76,6 +80,7 @@ def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
         "dropped": report["dropped"],
         "ties": sorted({a["family"] for a in ties if a["instead_of"] == first}),
         "all_ties": sorted({a["family"] for a in ties}),
+        "unknown_beside": bool(report["unknown"]) or report["times_noise"] >= RULES.excess,
         "noise": report["noise"]["dynamic_error"],
         "torque_noise": report["noise"]["torque"],
         "before": report["before"]["parameters"],
@@ -89,16 +94,14 @@ def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
     }
 
 
-def _close(rig: Rig, without: frozenset[str], seed: int) -> Loop:
+def _close(rig: Rig, without: frozenset[str], seed: int, thorough: bool) -> Loop:
     """The loop as the command line runs it, or with families taken out of the catalogue."""
-    if not without:
-        return close_loop(rig.model, rig.experiments, hold=rig.hold, seed=seed)
     offered = rig.experiments
     if "input_delay" in without:
         # Another hold of the torque is a form of this family too.
         offered = {hold: e for hold, e in offered.items() if hold == rig.hold}
     catalogue = tuple(form for form in CATALOGUE if form.family not in without)
-    return close_loop(rig.model, offered, hold=rig.hold, catalogue=catalogue, seed=seed)
+    return close_loop(rig.model, offered, hold=rig.hold, catalogue=catalogue, seed=seed, thorough=thorough)
 
 
 def held_out_error(loop: Loop, model: Model, folder: Path, drive_file: DriveFile) -> float:

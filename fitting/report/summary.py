@@ -40,9 +40,10 @@ def summary(report: Mapping[str, Any]) -> str:
         )
         rest = ""
         if report["unknown"]:
-            rest = f" More than noise is left, which has no name: a learned {_learned(report)}, stands for it."
+            rest = f" Something unknown is missing beside it: a learned {_learned(report)}, stands for it."
         elif report["times_noise"] >= RULES.excess:
-            rest = f" What is left is {formatting.number(report['times_noise'])} times the noise, and has no name."
+            left = formatting.number(report["times_noise"])
+            rest = f" Something unknown is missing beside it: {left} times the noise is left."
         several = bool(report["unknown"]) or len(families) > 1
         change = _change("Together they" if several else "It", report, several=several)
         return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
