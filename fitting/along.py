@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.experiment import Segments, Stretch
-from fitting.followed import NODES, WEIGHTS, Followed, acting, polynomial, signals_at
+from fitting.followed import NODES, WEIGHTS, Followed, acting, inputs_at, polynomial
 from fitting.machine_code import actuated
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import (
@@ -76,7 +76,7 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     pieces = -(-samples // length)
     firsts = np.cumsum(pieces) - pieces
     ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
-    _, _, conditions = signals_at(model, segments, PART * _width(segments)[..., None])
+    conditions = inputs_at(model, segments, PART * _width(segments)[..., None]).conditions
     at_knots = motions(model, followed.states, conditions_at_knots(segments))
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
