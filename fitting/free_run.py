@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.engines import linearise, simulate
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Start, Strategy, fit
 from fitting.experiment import Stretch, cut
 from fitting.free import free_parameters
-from fitting.posing import suggested_substeps
+from fitting.posing import Segmentation, suggested_substeps
 from fitting.residual import Problem, Unknowns
 from hdjax import Model, TwoInertiaModel
 
@@ -85,10 +85,9 @@ def free_run(
     covariance: Float[Array, "outputs outputs"],
     halo: int = 0,
     substeps: int | None = None,
-    window: int = WINDOW,
     like: Fit | None = None,
 ) -> tuple[FreeRun, ...]:
-    """Simulate each stretch from its first `window` samples on.
+    """Simulate each stretch from its first [`WINDOW`][] samples on.
 
     Args:
         model: the equations with their values.
@@ -96,14 +95,11 @@ def free_run(
         covariance: of the measurement noise of the outputs.
         halo: intervals of torque before the start, for delays.
         substeps: solver steps in a sample interval.
-        window: samples for the initial state.
         like: a fit of the same model, whose compiled program then finds the initial states as well.
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    starts = fitted_starts(
-        model, stretches, covariance=covariance, halo=halo, substeps=substeps, window=window, like=like
-    )
+    starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))
     length = max(len(s) for s in stretches)
     segments = cut(stretches, length, halo=halo, count=len(stretches))
@@ -146,26 +142,20 @@ def fitted_starts(
     covariance: Float[Array, "outputs outputs"],
     halo: int,
     substeps: int,
-    window: int = WINDOW,
     like: Fit | None = None,
 ) -> Fit:
-    """Initial states fitted to the first `window` samples of each stretch; arguments as in [`free_run`][]."""
-    windows = [s.beginning(window) for s in stretches]
-    paths, length, count = (), max(window, *(len(w) for w in windows)), len(stretches)
+    """Initial states fitted to the first samples of each stretch; arguments as in [`free_run`][]."""
+    windows = [s.beginning(WINDOW) for s in stretches]
+    paths, length, count = (), max(WINDOW, *(len(w) for w in windows)), len(stretches)
     if like is not None and _holds(like, count, length):
         paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
     return fit(
         model,
         windows,
         paths,
-        horizon=length,
-        length=length,
-        halo=halo,
-        substeps=substeps,
-        covariance=covariance,
-        reweigh=False,
-        hold_parameters=True,
-        count=count,
+        Segmentation(length, length, halo, substeps, count),
+        start=Start(covariance),
+        strategy=Strategy(reweigh=False, hold_parameters=True),
     )
 
 

@@ -16,14 +16,14 @@ from fitting.attribution.selection_round import Verdict
 from fitting.base_fit import as_followed
 from fitting.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
-from fitting.estimate import Fit, fit, whitening
+from fitting.estimate import Fit, Start, Strategy, fit, whitening
 from fitting.excitation import Excitation, Limits, excitations, reached
 from fitting.experiment import Experiment, Stretch, scales, segment_count, whole
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
 from fitting.outcome import Loop
-from fitting.posing import segment_length, typical_scales
+from fitting.posing import Segmentation, segment_length, typical_scales
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000
@@ -248,11 +248,8 @@ def _rival(loop: Loop, winner: Verdict, verdict: Verdict) -> Explanation:
             model.with_effects(*others),
             stretches,
             fitted_paths(model.with_effects(*others)),
-            horizon=training.horizon,
-            halo=loop.setting.halo,
-            substeps=loop.after_substeps,
-            count=loop.setting.count,
-            covariance=training.covariance,
+            replace(loop.setting.segmentation, substeps=loop.after_substeps),
+            start=Start(training.covariance),
         ).model
     return _explanation(verdict.name, model, stretches, hold=trial.hold)
 
@@ -308,18 +305,14 @@ class _Judge(eqx.Module):
 
     def fitted(self, model: Explanation, stretches: Sequence[Stretch], *, hold_parameters: bool = False) -> Fit:
         """A fit of simulations as long as the stretches, under the weights of the measurement noise."""
+        horizon, count = max(len(s) for s in stretches), max(self.count, segment_count(stretches, self.length))
         return fit(
             model.model,
             stretches,
             model.free.paths,
-            horizon=max(len(s) for s in stretches),
-            length=self.length,
-            halo=self.bench.halo,
-            substeps=self.bench.substeps,
-            covariance=self.bench.noise,
-            reweigh=False,
-            hold_parameters=hold_parameters,
-            count=max(self.count, segment_count(stretches, self.length)),
+            Segmentation(horizon, self.length, self.bench.halo, self.bench.substeps, count),
+            start=Start(self.bench.noise),
+            strategy=Strategy(reweigh=False, hold_parameters=hold_parameters),
         )
 
 

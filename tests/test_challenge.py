@@ -8,8 +8,9 @@ import pytest
 
 import rig
 from fitting import challenge as module
-from fitting.attribution.candidate_fit import Setting, Trial
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.decisions import ChallengeEvidence, ModelEvidence, names_stand, next_question
+from fitting.attribution.study import Setting, Study
 from fitting.effect_search import base_trial
 from fitting.experiment import split
 from fitting.learned_look import Candidate
@@ -182,7 +183,7 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
         model = base.model.with_effects(*effects)
         return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
 
-    def refitted_without(fallen, trial, data, setting):
+    def refitted_without(fallen, trial, study):
         kept = [e for e in trial.model.effects if e.name not in fallen]
         learned = any(isinstance(e, LearnedMeshTorque) for e in kept)
         return with_effects(*kept, objective=-7.0 + missed_by if learned else -5.0)
@@ -195,7 +196,7 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
     motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
     instants = np.arange(2)
     beside = Unknown(named, trial, (), chosen, instants, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
-    bare, beside = module._without_superfluous(base, named, beside, {}, Setting(32, 4, 1, 8))
+    bare, beside = module._without_superfluous(base, named, beside, Study({}, Setting(32, 4, 1, 8)))
     assert {e.name for e in bare.model.effects} == left
     assert (bare is base) == (left == set()) and beside.before is bare
     assert {e.name for e in beside.trial.model.effects} == left | {LEARNED.name}

@@ -8,10 +8,11 @@ from jaxtyping import Float
 from scipy.signal import lfilter
 
 import rig
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Strategy, fit
 from fitting.experiment import Stretch, experiment_from_log
 from fitting.long_fit import over_whole_stretches, with_gaps_closed
 from fitting.noise_memory import _described, _drawn, _taken_by_states, noise_with_memory
+from fitting.posing import Segmentation
 
 COUNT, HORIZON = 8000, 128
 # Of the motor's and of the load's encoder [rad].
@@ -35,9 +36,8 @@ def fitted(correlation: float, *, hold_parameters: bool = False, **missing: Any)
         rig.drive_model(),
         [Stretch(logged, 0, COUNT)],
         ("K", "alpha", "B_sp"),
-        horizon=HORIZON,
-        substeps=1,
-        hold_parameters=hold_parameters,
+        Segmentation(HORIZON, substeps=1),
+        strategy=Strategy(hold_parameters=hold_parameters),
     )
 
 

@@ -21,7 +21,7 @@ from scipy import stats
 import rig
 from fitting import formatting
 from fitting.attribution.selection_round import Verdict
-from fitting.close_loop import close_loop
+from fitting.close_loop import SearchOptions, close_loop
 from fitting.diagnostics import Dependence
 from fitting.estimate import Fit
 from fitting.experiment import Experiment, whole
@@ -66,7 +66,7 @@ def loop() -> Loop:
     data: dict[Hold, tuple[Experiment, ...]] = {HOLD: (known,)}
     start = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     forms = (MotorFriction, TorqueBias)
-    return close_loop(start, data, test={HOLD: (test,)}, hold=HOLD, max_effects=1, catalogue=forms)
+    return close_loop(start, data, test={HOLD: (test,)}, hold=HOLD, search=SearchOptions(1, forms))
 
 
 @pytest.fixture(scope="module")

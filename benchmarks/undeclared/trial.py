@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.close_loop import close_loop
+from fitting.close_loop import SearchOptions, close_loop
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError
 from fitting.experiment import Stretch
@@ -92,13 +92,13 @@ def _loop(folder: Path, without: frozenset[str], seed: int) -> dict:
 def _close(rig: Rig, without: frozenset[str], seed: int) -> Loop:
     """The loop as the command line runs it, or with families taken out of the catalogue."""
     if not without:
-        return close_loop(rig.model, rig.experiments, hold=rig.hold, seed=seed)
+        return close_loop(rig.model, rig.experiments, hold=rig.hold, search=SearchOptions(seed=seed))
     offered = rig.experiments
     if "input_delay" in without:
         # Another hold of the torque is a form of this family too.
         offered = {hold: e for hold, e in offered.items() if hold == rig.hold}
     catalogue = tuple(form for form in CATALOGUE if form.family not in without)
-    return close_loop(rig.model, offered, hold=rig.hold, catalogue=catalogue, seed=seed)
+    return close_loop(rig.model, offered, hold=rig.hold, search=SearchOptions(catalogue=catalogue, seed=seed))
 
 
 def held_out_error(loop: Loop, model: Model, folder: Path, drive_file: DriveFile) -> float:

@@ -4,7 +4,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -54,6 +54,59 @@ class DriveOptions:
     K: Annotated[float | None, Parameter(name="--K")] = None
     alpha: Annotated[float | None, Parameter(name="--alpha")] = None
     B_sp: Annotated[float | None, Parameter(name="--B_sp")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class LoopOptions:
+    """What is asked of the loop.
+
+    Attributes:
+        max_effects: Effects to add at most.
+        seed: Of the surrogates behind the p-values.
+        thorough: Refit every form of the catalogue in each round, in place of those that a first-order look finds
+            likely (minutes).
+    """
+
+    max_effects: int = 3
+    seed: int = 0
+    thorough: bool = False
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FleetOptions:
+    """Who fits the logs of a folder.
+
+    Attributes:
+        workers: Of a folder: processes on this machine that share its logs; threads where 0.
+        scheduler: Of a folder: address of a Dask scheduler whose workers do it, for instance tcp://10.0.0.1:8786.
+    """
+
+    workers: int = 0
+    scheduler: str | None = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ForcingOptions:
+    """A motor torque, and how it is sampled.
+
+    Attributes:
+        forcing: Shape of the motor torque.
+        amplitude: Its peak (multisine: rms) [N m].
+        frequency: Its frequency, or where a chirp or multisine begins [Hz].
+        frequency_end: Where a chirp or multisine ends [Hz].
+        duration: Length of the log [s].
+        rate: Sampling rate [Hz].
+    """
+
+    forcing: Literal["harmonic", "chirp", "multisine"] = "multisine"
+    amplitude: float = 0.5
+    frequency: float = 10.0
+    frequency_end: float = 100.0
+    duration: float = 4.0
+    rate: float = 2000.0
 
 
 def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits | None:

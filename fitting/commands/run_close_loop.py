@@ -1,12 +1,12 @@
 """What `hdjax close-loop` and `hdjax demo` do."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
-from fitting.close_loop import close_loop
+from fitting.close_loop import SearchOptions, close_loop
 from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_limits
-from fitting.commands.options import ExperimentLimits
+from fitting.commands.options import ExperimentLimits, LoopOptions
 from fitting.commands.spinner import Spinner
 from fitting.demonstration import write_demo_logs
 from fitting.drive_file import read_drive_file
@@ -17,26 +17,11 @@ from fitting.report import loop_text, write_loop_report
 from fitting.rig import Rig, read_logs, read_rig, rig_of
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What is asked of the loop.
-
-    Attributes:
-        max_effects: effects to add at most.
-        seed: of the surrogates.
-        thorough: whether all forms are refitted in each round.
-    """
-
-    max_effects: int = 3
-    seed: int = 0
-    thorough: bool = False
-
-
 def close_loop_on_logs(
     logs: list[Path],
     drive: Path,
     out: Path,
-    asked: Asked = Asked(),
+    asked: LoopOptions = LoopOptions(),
     *,
     test: Sequence[Path] = (),
     limits: ExperimentLimits | None = None,
@@ -83,10 +68,10 @@ def demonstrate(out: Path, seed: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     logs, drive = write_demo_logs(out, seed=seed)
     print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
-    _close_loop(read_rig(logs, drive), out, Asked(seed=seed), limits=None)
+    _close_loop(read_rig(logs, drive), out, LoopOptions(seed=seed), limits=None)
 
 
-def _close_loop(rig: Rig, out: Path, asked: Asked, limits: ExperimentLimits | None) -> None:
+def _close_loop(rig: Rig, out: Path, asked: LoopOptions, limits: ExperimentLimits | None) -> None:
     stated = None if limits is None else stated_limits(limits, logs_of(rig))
     with Spinner() as progress:
         loop = close_loop(
@@ -94,8 +79,8 @@ def _close_loop(rig: Rig, out: Path, asked: Asked, limits: ExperimentLimits | No
             rig.experiments,
             test=rig.test,
             hold=rig.hold,
+            search=SearchOptions(**asdict(asked)),
             progress=progress,
-            **asdict(asked),
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)

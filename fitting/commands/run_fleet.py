@@ -5,20 +5,20 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 
+from fitting.commands.options import FleetOptions
 from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.fleet import fit_fleet, fleet_text
 
 
-def fit_folder(folders: list[Path], drive: Path, out: Path, workers: int, scheduler: str | None) -> None:
+def fit_folder(folders: list[Path], drive: Path, out: Path, fleet: FleetOptions) -> None:
     """Fit each log of a folder on its own, into one table, and show it.
 
     Args:
         folders: one.
         drive: drive file.
         out: folder of the table.
-        workers: processes on this machine; threads where 0.
-        scheduler: address of a Dask scheduler, or None.
+        fleet: who does it.
 
     Raises:
         InputError: for several folders, or a bad drive file.
@@ -35,8 +35,8 @@ def fit_folder(folders: list[Path], drive: Path, out: Path, workers: int, schedu
             folders[0],
             drive,
             out,
-            workers=workers,
-            scheduler=scheduler,
+            workers=fleet.workers,
+            scheduler=fleet.scheduler,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     print(fleet_text(table))
