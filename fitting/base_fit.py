@@ -162,12 +162,8 @@ def leaves_white_noise(found: Fit) -> bool:
 
 def as_followed(found: Fit) -> tuple[Stretch, ...]:
     """The stretches with the outputs that a fit gives in place of the measured ones."""
-    length = found.error.shape[1]
-    parts, first = [], 0
-    for stretch in found.stretches:
-        pieces = -(-len(stretch) // length)
-        error = np.asarray(found.error[first : first + pieces]).reshape(pieces * length, -1)[: len(stretch)]
-        first += pieces
+    parts = []
+    for stretch, error in zip(found.stretches, found.by_stretch(np.asarray(found.error)), strict=True):
         measured = stretch.experiment.measured.copy()
         measured[stretch.start : stretch.stop] -= error
         parts.append(Stretch(replace(stretch.experiment, measured=measured), stretch.start, stretch.stop))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Trial, attempt, long_gains
+from fitting.attribution.candidate_fit import Trial, long_gains
 from fitting.attribution.decisions import (
     RULES,
     ChallengeEvidence,
@@ -23,6 +23,7 @@ from fitting.attribution.support import (
 )
 from fitting.base_fit import leaves_white_noise
 from fitting.compare import excess
+from fitting.effect_search import refitted_without
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
 from fitting.process_noise import TorqueNoise
@@ -142,23 +143,16 @@ def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Stud
     fallen = names - told_from_zero(beside.trial.training, names)
     if not fallen:
         return named, beside
-    trial = _refitted_without(fallen, beside.trial, study)
+    trial = refitted_without(fallen, beside.trial, base, study)
     missed = trial.held_out.objective - beside.trial.held_out.objective
     if missed >= max(RULES.least_gain, RULES.little * beside.gain):
         return named, beside
     bare = base
     if fallen != names or named.hold != base.hold:
-        bare = _refitted_without(fallen, named, study)
+        bare = refitted_without(fallen, named, base, study)
     states = [n for n in named.model.state_names if n in bare.model.state_names]
     kept = [named.model.state_names.index(n) for n in states]
     gain = bare.held_out.objective - trial.held_out.objective
     return bare, replace(
         beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
     )
-
-
-def _refitted_without(fallen: set[str], trial: Trial, study: Study) -> Trial:
-    model = trial.model
-    for name in fallen:
-        model = model.without_effect(name)
-    return attempt(model, study.with_steps_of(trial.training), trial.hold, start=trial)

@@ -1,6 +1,6 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from fitting.attribution.decisions import CaseEvidence, decide
 from fitting.attribution.effect_evidence import evidence
 from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
 from fitting.attribution.selection_round import Round
-from fitting.attribution.study import Study, silent
+from fitting.attribution.study import Study
 from fitting.challenge import Challenge, challenge_names
 from fitting.clock import Clock
 from fitting.compare import Account, account, excess, free_runs
@@ -22,6 +22,7 @@ from fitting.experiment import Experiment, Stretch, split, whole
 from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import refitted_on_all
 from fitting.outcome import Finding, Loop
+from fitting.progress import Progress, silent
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 
@@ -50,7 +51,7 @@ def close_loop(
     test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
     search: SearchOptions = SearchOptions(),
-    progress: Callable[[str], None] = silent,
+    progress: Progress = silent,
 ) -> Loop:
     """Close the loop between a model and the logs of one drive.
 
@@ -176,8 +177,7 @@ class _Closed:
         kept = [] if trusted is base else [name for name in without if name not in fallen]
         if len(kept) == 1:
             return {kept[0]: base}
-        finer = self.study.with_steps_of(trusted.training)
-        return {name: refitted_without(name, trusted, base, finer) for name in kept}
+        return {name: refitted_without([name], trusted, base, self.study) for name in kept}
 
     def _rmse(self, trial: Trial) -> float:
         """Of a model's free runs along selection data."""

@@ -1,6 +1,6 @@
 """The search for effects: add the best one, refit, look again; then drop what a later one has made superfluous."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -108,7 +108,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     if kept and not dropped:
         without[kept[-1].winner.name] = kept[-1].before
     for name in (this.winner.name for this in kept if this.winner.name not in without):
-        without[name] = base if len(kept) == 1 else refitted_without(name, current, base, study)
+        without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise)
 
 
@@ -117,7 +117,7 @@ def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Tri
     each of the others but the last."""
     dropped, without = [], {}
     for name in [e.name for e in current.model.effects][:-1]:
-        poorer = refitted_without(name, current, base, study)
+        poorer = refitted_without([name], current, base, study)
         if poorer.held_out.objective - current.held_out.objective < RULES.least_gain:
             dropped.append(name)
             current, without = poorer, {}
@@ -134,15 +134,17 @@ def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[st
     return [this.winner.name for this in holds if last == first or this is not holds[-1]]
 
 
-def refitted_without(name: str, current: Trial, base: Trial, study: Study) -> Trial:
-    """The model refitted without one of its effects, or under the base model's hold where that is the effect.
+def refitted_without(names: Collection[str], current: Trial, base: Trial, study: Study) -> Trial:
+    """The model refitted without some of what was found, by as many solver steps.
 
     Args:
-        name: of the effect.
+        names: of effects; any other one is that of another hold of the torque, which is taken back.
         current: the model.
         base: the model without effects.
         study: the data, and how they are cut.
     """
-    if name in {e.name for e in current.model.effects}:
-        return attempt(current.model.without_effect(name), study, current.hold, start=current)
-    return attempt(current.model, study, base.hold, start=current)
+    model, effects = current.model, {e.name for e in current.model.effects}
+    for name in effects.intersection(names):
+        model = model.without_effect(name)
+    hold = current.hold if effects.issuperset(names) else base.hold
+    return attempt(model, study.with_steps_of(current.training), hold, start=current)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.engines import linearise
 from fitting.experiment import Stretch, scales
@@ -121,6 +121,30 @@ class Fit(eqx.Module):
     def end(self) -> Start:
         """Where another fit of the same segments may start."""
         return Start(self.covariance, self.unknowns.states)
+
+    @property
+    def at_solution(self) -> Problem:
+        """What was solved, at the fitted values."""
+        return eqx.tree_at(lambda p: p.model, self.problem, self.model)
+
+    @property
+    def white_error(self) -> Float[np.ndarray, "segments samples outputs"]:
+        """Its error in units of what the outputs are weighed by."""
+        return np.asarray(self.error) @ np.asarray(self.problem.whitening).T
+
+    @property
+    def pieces(self) -> Int[np.ndarray, " stretches"]:
+        """How many segments each stretch was cut into; those that only fill up a program come last."""
+        return np.array([-(-len(s) // self.error.shape[1]) for s in self.stretches])
+
+    def by_stretch(self, values: Shaped[np.ndarray, "segments samples *each"]) -> list[Shaped[np.ndarray, "_ *each"]]:
+        """What belongs to samples of segments, stretch by stretch and without padding."""
+        parts = np.split(values, np.cumsum(self.pieces))
+        return [a.reshape(-1, *a.shape[2:])[: len(s)] for s, a in zip(self.stretches, parts, strict=False)]
+
+    def with_all_free(self) -> "Fit":
+        """The same, with parameters that were held counted among what the data are asked for."""
+        return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
 
     @property
     def dynamic_error_std(self) -> float:
@@ -306,15 +330,13 @@ def half_log_determinant(covariance: Array | np.ndarray) -> float:
 
 def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
     """Which segments of a fit are of which of its stretches."""
-    count, length = found.problem.segments.weight.shape
-    number = np.repeat(np.arange(len(found.stretches)), [-(-len(s) // length) for s in found.stretches])
-    return np.pad(number, (0, count - number.size), constant_values=-1) == np.arange(len(found.stretches))[:, None]
+    ends, place = np.cumsum(found.pieces)[:, None], np.arange(len(found.error))
+    return (ends - found.pieces[:, None] <= place) & (place < ends)
 
 
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     """The segments in which the simulation runs away."""
-    white = np.asarray(found.error) @ np.asarray(found.problem.whitening).T
-    return np.logical_not(np.all(np.abs(white) < RUNAWAY, axis=(1, 2)))
+    return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 16) -> int:
@@ -327,8 +349,7 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
             aside. An error too small to be seen in a sample adds up over all of them.
         most: where to stop.
     """
-    problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
-    substeps = found.substeps
+    problem, substeps = found.at_solution, found.substeps
     columns = None
     if np.isfinite(shift):
         slopes = linearise(problem, found.unknowns)

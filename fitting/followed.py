@@ -102,8 +102,8 @@ def _response_by_xla(problem: Problem, unknowns: Unknowns) -> Response:
             initial = jnp.append(start, 0.0)
             return march(pushed, torque, load, initial, temperature=warmth, **options)[1][:-1]
 
-        none, width = jnp.zeros_like(state), jnp.diff(own.knots)
-        intervals = own.knots[:-1, None] + width[:, None] * jnp.arange(2)
+        none, begin, width = jnp.zeros_like(state), own.knots[:-1], jnp.diff(own.knots)
+        intervals = jnp.stack([begin, begin + width], axis=1)
         pieces = tuple(
             None if s is None else PiecewisePolynomial(intervals, s.coefficients[:, None])
             for s in (own, load_torque, temperature)

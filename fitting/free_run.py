@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from fitting.engines import linearise, simulate
 from fitting.estimate import Fit, Start, Strategy, fit
 from fitting.experiment import Stretch, cut
-from fitting.free import free_parameters
+from fitting.free import FreeParameters, free_parameters
 from fitting.posing import Segmentation, suggested_substeps
 from fitting.residual import Problem, Unknowns
 from hdjax import Model, TwoInertiaModel
@@ -101,17 +101,7 @@ def free_run(
         substeps = suggested_substeps(model, stretches)
     starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))
-    length = max(len(s) for s in stretches)
-    segments = cut(stretches, length, halo=halo, count=len(stretches))
-    problem = Problem(
-        model,
-        free_parameters(model, (), {}),
-        segments,
-        jnp.asarray(np.eye(segments.measured.shape[-1])),
-        jnp.asarray(np.zeros(0)),
-        jnp.asarray(np.ones(states.shape[1])),
-        substeps=substeps,
-    )
+    problem = whole_simulations(model, free_parameters(model, (), {}), stretches, halo, substeps)
     outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
     runs = []
     for stretch, output in zip(stretches, outputs, strict=True):
@@ -133,6 +123,24 @@ def free_run(
             )
         )
     return tuple(runs)
+
+
+def whole_simulations(
+    model: Model, free: FreeParameters, stretches: Sequence[Stretch], halo: int, substeps: int
+) -> Problem:
+    """Each stretch as one simulation, with unit weights.
+
+    Args:
+        model: the equations.
+        free: parameters to differentiate by.
+        stretches: where to run.
+        halo: intervals of torque before the start.
+        substeps: solver steps in a sample interval.
+    """
+    segments = cut(stretches, max(len(s) for s in stretches), halo=halo, count=len(stretches))
+    whitening = jnp.asarray(np.eye(segments.measured.shape[-1]))
+    active, gap_weight = (jnp.asarray(np.ones(len(names))) for names in (free.paths, model.state_names))
+    return Problem(model, free, segments, whitening, active, gap_weight, substeps=substeps)
 
 
 def fitted_starts(

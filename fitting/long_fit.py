@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -76,7 +75,7 @@ def refitted_on_all(found: Fit, selection: Fit) -> Fit:
 
 
 def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
-    states = np.concatenate([np.asarray(f.unknowns.states)[: _with_data(f)] for f in (found, selection)])
+    states = np.concatenate([np.asarray(f.unknowns.states)[: f.pieces.sum()] for f in (found, selection)])
     # Parameters that a fit has not moved were held.
     held = all(float(found.model.get(p)) == float(found.problem.model.get(p)) for p in found.free.paths)
     both = fit(
@@ -87,14 +86,7 @@ def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
         start=Start(found.covariance, jnp.asarray(states)),
         strategy=replace(_CONTINUED, hold_parameters=held),
     )
-    # What the data say of them is asked all the same.
-    return eqx.tree_at(lambda f: f.problem.active, both, jnp.ones_like(both.problem.active))
-
-
-def _with_data(found: Fit) -> int:
-    """Segments that hold data; those that only fill up a program come last."""
-    length = found.problem.segments.weight.shape[1]
-    return sum(-(-len(s) // length) for s in found.stretches)
+    return both.with_all_free()
 
 
 def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_progress: float = 0.0) -> Fit:

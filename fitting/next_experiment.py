@@ -4,7 +4,7 @@ Tied explanations, or a drive with a small alpha against one without: both ask w
 search's own criterion, the fit that real logs get says how far apart the two would be on the logs and on the proposal.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -24,6 +24,7 @@ from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
 from fitting.outcome import Loop
 from fitting.posing import Segmentation, segment_length, typical_scales
+from fitting.progress import Progress, silent
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000
@@ -113,10 +114,6 @@ class NextExperiment(eqx.Module):
     precision: Precision | None
 
 
-def _silent(message: str) -> None:
-    pass
-
-
 def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
     """What explains selection data about as well as what was found: pairs of found and rival, the closest first."""
     names = {f.name for f in loop.findings}
@@ -132,7 +129,7 @@ def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
 
 
 def experiment_for_ties(
-    loop: Loop, limits: Mapping[str, float] | None = None, *, progress: Callable[[str], None] = _silent
+    loop: Loop, limits: Mapping[str, float] | None = None, *, progress: Progress = silent
 ) -> NextExperiment | None:
     """The experiment that tells what a loop found from what is tied with it.
 
@@ -187,7 +184,7 @@ def experiment_for_alpha(
     experiments: Sequence[Experiment],
     limits: Mapping[str, float] | None = None,
     *,
-    progress: Callable[[str], None] = _silent,
+    progress: Progress = silent,
 ) -> NextExperiment | None:
     """The experiment that knows alpha best.
 

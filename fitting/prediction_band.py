@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.engines import linearise, with_engine
 from fitting.estimate import Fit, whitening
-from fitting.experiment import Stretch, cut
-from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
+from fitting.experiment import Stretch
+from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run, whole_simulations
 from fitting.normal_law import NORMAL_95
 from fitting.process_noise import spread_by_torque
 from fitting.residual import Problem, Unknowns
@@ -94,7 +94,7 @@ def prediction_bands(
     if runs is None:
         runs = free_run(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
     starts = fitted_starts(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
-    whole = _whole(fitted, stretches, halo, substeps)
+    whole = whole_simulations(fitted.model, fitted.free, stretches, halo, substeps)
     states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
     by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
     white = np.asarray(whitening(noise))
@@ -104,20 +104,6 @@ def prediction_bands(
     return tuple(
         _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance)
         for i, (run, n) in enumerate(zip(runs, map(len, stretches), strict=True))
-    )
-
-
-def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) -> Problem:
-    """Each stretch as one simulation, with unit weights."""
-    segments = cut(stretches, max(len(s) for s in stretches), halo=halo, count=len(stretches))
-    return Problem(
-        fitted.model,
-        fitted.free,
-        segments,
-        jnp.asarray(np.eye(segments.measured.shape[-1])),
-        jnp.asarray(np.ones(len(fitted.free.paths))),
-        jnp.asarray(np.ones(fitted.unknowns.states.shape[1])),
-        substeps=substeps,
     )
 
 

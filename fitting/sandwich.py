@@ -8,7 +8,7 @@ smoothing in the presence of nonparametric autocorrelation"). Where leverage is 
 residuals are pooled with those of neighbouring frequencies.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -52,6 +52,14 @@ class Record(eqx.Module):
     slopes: Float[np.ndarray, "n outputs parameters"]
     states: tuple[tuple[int, np.ndarray], ...]
     present: float
+
+    def bases(self) -> Iterator[tuple[int, Float[np.ndarray, "samples outputs directions"]]]:
+        """First sample of each simulation, and orthonormal directions of what its initial state can do."""
+        for start, columns in self.states:
+            flat = columns.reshape(-1, columns.shape[2])
+            length = np.linalg.norm(flat, axis=0)
+            basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
+            yield start, basis.reshape(*columns.shape[:2], -1)
 
 
 class Linearised(eqx.Module):
@@ -98,7 +106,7 @@ class Covariance(eqx.Module):
 
 def linearised(fit: Fit) -> Linearised:
     """The regression that a fit is at its solution."""
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     found = linearise(problem, fit.unknowns)
     states = FirstStates.of(found, problem.segments.joined)
     residual, projected = np.asarray(found.residual), states.parameters_without(found)
@@ -247,13 +255,9 @@ def _leverage(record: Record, inverse: np.ndarray) -> np.ndarray:
     count, outputs = record.residual.shape
     values, vectors = np.linalg.eigh(inverse)
     found = _power(record.slopes @ (vectors * np.sqrt(np.maximum(values, 0.0))))
-    for start, columns in record.states:
-        samples, _, states = columns.shape
-        flat = columns.reshape(-1, states)
-        length = np.linalg.norm(flat, axis=0)
-        basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
-        placed = np.zeros((count, outputs, basis.shape[1]))
-        placed[start : start + samples] = basis.reshape(samples, outputs, -1)
+    for start, basis in record.bases():
+        placed = np.zeros((count, outputs, basis.shape[2]))
+        placed[start : start + len(basis)] = basis
         found += _power(placed)
     return np.minimum(found, 1.0)
 

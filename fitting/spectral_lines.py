@@ -65,11 +65,4 @@ def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarr
 
 def _longest(fit: Fit) -> Float[np.ndarray, "samples outputs"]:
     """The whitened residual along the longest stretch, its samples without weight zero."""
-    error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T
-    length = error.shape[1]
-    first, best = 0, (0, 0, 0)
-    for stretch in fit.stretches:
-        best = max(best, (len(stretch), first, first + -(-len(stretch) // length)))
-        first += -(-len(stretch) // length)
-    samples, start, stop = best
-    return error[start:stop].reshape(-1, error.shape[2])[:samples]
+    return max(reversed(fit.by_stretch(fit.white_error)), key=len)

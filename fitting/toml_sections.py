@@ -44,6 +44,12 @@ class Sections:
                 where = f"[{section}] {key}" if section else f"[{key}]"
                 raise self.refuse(f"{where} is not known here; there are {', '.join(names)}")
 
+    def needs(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> None:
+        """Refuse a table that lacks a key."""
+        for key in names:
+            if key not in table:
+                raise self.refuse(f"[{section}] must have `{key}`")
+
     def number(self, section: str, key: str, value: object) -> float:
         """A finite number."""
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):

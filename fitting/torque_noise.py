@@ -10,7 +10,6 @@ them, by one pass against time.
 from collections.abc import Sequence
 from itertools import combinations
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -45,7 +44,7 @@ def torque_noise_covariance(
     Returns:
         The covariance; None where the residual has another colour.
     """
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
     random = np.random.default_rng(0)
     noise = random.normal(size=(*problem.segments.weight.shape, _DRAWS))
@@ -171,13 +170,10 @@ def _unit(record: Record, output: int) -> Float[np.ndarray, "n outputs draws"]:
 def _left_over(record: Record, drawn: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """What a fit would leave of a disturbance: without what initial states and parameters take up."""
     left = drawn - np.einsum("nop,pq,mrq,mrd->nod", record.slopes, inverse, record.slopes, drawn, optimize=True)
-    for start, columns in record.states:
-        samples, _, states = columns.shape
-        flat = columns.reshape(-1, states)
-        length = np.linalg.norm(flat, axis=0)
-        basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
-        part = left[start : start + samples].reshape(flat.shape[0], -1)
-        left[start : start + samples] = (part - basis @ (basis.T @ part)).reshape(samples, *left.shape[1:])
+    for start, basis in record.bases():
+        own, flat = slice(start, start + len(basis)), basis.reshape(-1, basis.shape[2])
+        part = left[own].reshape(len(flat), -1)
+        left[own] = (part - flat @ (flat.T @ part)).reshape(len(basis), *left.shape[1:])
     return left
 
 

@@ -183,13 +183,13 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
         model = base.model.with_effects(*effects)
         return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
 
-    def refitted_without(fallen, trial, study):
+    def refitted_without(fallen, trial, base, study):
         kept = [e for e in trial.model.effects if e.name not in fallen]
         learned = any(isinstance(e, LearnedMeshTorque) for e in kept)
         return with_effects(*kept, objective=-7.0 + missed_by if learned else -5.0)
 
     monkeypatch.setattr(module, "told_from_zero", lambda fit, names: told)
-    monkeypatch.setattr(module, "_refitted_without", refitted_without)
+    monkeypatch.setattr(module, "refitted_without", refitted_without)
     names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
     chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
     named, trial = with_effects(*names, objective=-5.0), with_effects(*names, LEARNED, objective=-7.0)

@@ -115,7 +115,7 @@ def test_a_line_as_a_torque(place):
 
 def test_a_segment_that_runs_away_tells_nothing(begun):
     """A look along the motion leaves it out, whole, and the line is seen in the others."""
-    base, _, _ = begun(0.4, 2.3)
+    base, _ = begun(0.4, 2.3)
     fit = base.training
     states = np.array(fit.unknowns.states)
     states[2] = np.nan

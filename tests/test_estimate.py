@@ -29,13 +29,13 @@ def whole(*experiments) -> list[Stretch]:
     return [Stretch(e, 0, len(e)) for e in experiments]
 
 
-def drive_fit(start, stretches, **options) -> Fit:
+def drive_fit(model, stretches, **options) -> Fit:
     """All with the same shapes, so that they share one program."""
-    return fit(start, stretches, PATHS, Segmentation(HORIZON, substeps=1, count=8), **options)
+    return fit(model, stretches, PATHS, Segmentation(HORIZON, substeps=1, count=8), **options)
 
 
-def reduced_fit(start, stretches, **options) -> Fit:
-    return fit(start, stretches, base_paths(start), Segmentation(REDUCED_HORIZON, substeps=2, count=8), **options)
+def reduced_fit(model, stretches) -> Fit:
+    return fit(model, stretches, base_paths(model), Segmentation(REDUCED_HORIZON, substeps=2, count=8))
 
 
 def assert_recovered(found: Fit, truth: dict[str, float], *, within: float = 4.0):

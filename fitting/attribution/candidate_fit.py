@@ -68,10 +68,7 @@ def attempt(
     """
     near = None if start is None else start.training
     strategy = replace(_strategy_beside(near, model), hold_parameters=hold_parameters)
-    training = trained(model, study, hold, near, strategy)
-    # What the data say of them is asked all the same.
-    training = eqx.tree_at(lambda t: t.problem.active, training, jnp.ones_like(training.problem.active))
-    return _judged(training, study, hold)
+    return _judged(trained(model, study, hold, near, strategy).with_all_free(), study, hold)
 
 
 def gone_on(trial: Trial, study: Study) -> Trial:

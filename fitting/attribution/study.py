@@ -1,6 +1,5 @@
 """What a loop works on: training and selection data, how they are cut, the seed of its surrogates, who is told."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -9,6 +8,7 @@ from fitting.attribution.decisions import RULES
 from fitting.estimate import Fit, needed_substeps
 from fitting.experiment import Stretch
 from fitting.posing import Segmentation
+from fitting.progress import Progress, silent
 from hdjax import Hold
 
 # A few steps that together lower the objective by less than half of this are not worth another; nor by less than half
@@ -44,10 +44,6 @@ class Setting(eqx.Module):
         return Segmentation(self.horizon, halo=self.halo, substeps=self.substeps, count=self.count)
 
 
-def silent(message: str) -> None:
-    """Tell nobody."""
-
-
 @dataclass(frozen=True)
 class Study:
     """What a loop works on.
@@ -62,7 +58,7 @@ class Study:
     data: Data
     setting: Setting
     seed: int = 0
-    progress: Callable[[str], None] = silent
+    progress: Progress = silent
 
     def with_steps_of(self, found: Fit) -> "Study":
         """The same, with the solver steps of a fit."""

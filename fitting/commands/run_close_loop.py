@@ -13,7 +13,7 @@ from fitting.drive_file import read_drive_file
 from fitting.errors import InputError
 from fitting.model_file import StoredModel, to_json
 from fitting.next_experiment import experiment_for_ties
-from fitting.report import loop_text, write_loop_report
+from fitting.report import rig_text, write_rig_report
 from fitting.rig import Rig, read_logs, read_rig, rig_of
 
 
@@ -84,6 +84,6 @@ def _close_loop(rig: Rig, out: Path, asked: LoopOptions, limits: ExperimentLimit
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
-    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
-    print(loop_text(loop, rig=rig, next_experiment=proposed))
+    paths = write_rig_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(rig_text(loop, rig=rig, next_experiment=proposed))
     print(f"Report: {paths['report.html']}")
