@@ -79,7 +79,7 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
             come_out = share_of(named.model, instead, named.training) if named.hold == base.hold else 0.0
             seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
         else:
-            beside = _learned(standing, study.with_steps_of(named.training))
+            beside = _learned(standing, study.with_substeps(named.training.substeps))
             if beside is not None:
                 named, beside = _without_superfluous(base, named, beside, study)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))

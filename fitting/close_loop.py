@@ -23,25 +23,9 @@ from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import refitted_on_all
 from fitting.outcome import Finding, Loop
 from fitting.progress import Progress, silent
+from fitting.search_options import SearchOptions
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """How effects are searched for.
-
-    Attributes:
-        max_effects: effects to add at most.
-        catalogue: forms to look for.
-        seed: of the surrogates behind the p-values.
-        thorough: whether all forms are refitted in each round, in place of those that the score test finds likely.
-    """
-
-    max_effects: int = 3
-    catalogue: Sequence[type[Effect]] = CATALOGUE
-    seed: int = 0
-    thorough: bool = False
 
 
 def close_loop(
@@ -50,6 +34,7 @@ def close_loop(
     *,
     test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
+    catalogue: Sequence[type[Effect]] = CATALOGUE,
     search: SearchOptions = SearchOptions(),
     progress: Progress = silent,
 ) -> Loop:
@@ -61,7 +46,8 @@ def close_loop(
             model.
         test: likewise of data that only the final figures look at; where there are none, no figures are claimed.
         hold: the assumption that the user states; where None, the one that suits the base model best.
-        search: how effects are searched for.
+        catalogue: forms to look for.
+        search: how they are searched for.
         progress: told what is being done.
 
     Returns:
@@ -82,7 +68,7 @@ def close_loop(
     fitted = study.data[base.hold][0]
     late = put_back(read.data[base.hold][0], fitted)
     clock.lap("clocks")
-    found = search_effects(base, study, max_effects=search.max_effects, catalogue=search.catalogue)
+    found = search_effects(base, study, max_effects=search.max_effects, catalogue=catalogue)
     clock.lap("attribution")
     challenge = challenge_names(base, found.named, study, noise=found.noise)
     clock.lap("unknown effects")

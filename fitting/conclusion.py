@@ -82,7 +82,11 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     fitted = long_fit(current.training)
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
-        known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": 0.0 if torque is None else torque.std}
+        known = {
+            "noise": covariance,
+            "halo": study.setting.halo,
+            "torque_noise": 0.0 if torque is None else torque.std,
+        }
         beyond = surprise(fitted, at_first, runs, current.held_out, **known)
         seen = replace(seen, surprise=beyond)
         outcome, _ = conclude(seen)

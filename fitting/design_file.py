@@ -53,7 +53,11 @@ def read_design_file(path: Path) -> DesignFile:
         case = Case(_model(file), _excitation(file))
         variables = _variables(file)
         terms = tuple(
-            Term(label, _measure(file, "objective", label, table, ("weight",)), _weight(file, label, table))
+            Term(
+                label,
+                _measure(file, "objective", label, table, ("weight",)),
+                file.number(f"objective.{label}", "weight", table.get("weight", 1.0)),
+            )
             for label, table in _tables(file, "objective")
         )
         limits = tuple(_limit(file, label, table) for label, table in _tables(file, "limits"))
@@ -102,9 +106,8 @@ def _within(file: Sections, section: str, key: str, value: object, info: Paramet
 
 
 def _excitation(file: Sections) -> Excitation:
-    table = file.section("forcing")
-    file.known("forcing", table, [f.name for f in dataclasses.fields(Excitation)])
-    return Excitation(**{k: file.number("forcing", k, v) for k, v in table.items()})
+    names = [f.name for f in dataclasses.fields(Excitation)]
+    return Excitation(**file.numbers("forcing", file.section("forcing"), names))
 
 
 def _variables(file: Sections) -> tuple[Variable, ...]:

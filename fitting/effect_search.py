@@ -14,10 +14,8 @@ from fitting.attribution.support import Standing, leaves_imperfection
 from fitting.base_fit import base_fit, is_held
 from fitting.errors import DataError
 from fitting.estimate import lost
-from fitting.experiment import segment_count
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.outliers import with_weights
-from fitting.posing import segment_length
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -57,11 +55,9 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Stud
     """
     first = hold if hold is not None else next(iter(data))
     training = data[first][0]
-    halo = halo_for(training)
-    best = base_fit(model, training, halo=halo)
+    best = base_fit(model, training, halo=halo_for(training))
     data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
-    count = segment_count(training, segment_length(best.horizon))
-    study = Study(data, Setting(best.horizon, halo, best.substeps, count))
+    study = Study(data, Setting(best.segmentation))
     holds: list[Hold] = list(data) if hold is None else [hold]
     trials = [attempt(best.model, study, h, hold_parameters=is_held(best)) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
@@ -97,7 +93,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         if not this.accepted:
             break
         assert this.winner.trial is not None
-        study = study.with_steps_of(this.winner.trial.training)
+        study = study.with_substeps(this.winner.trial.training.substeps)
         # What a trial has not quite reached the next look would take for a further effect.
         current = gone_on(this.winner.trial, study)
         study.progress(f"found {this.winner.name}")
@@ -147,4 +143,4 @@ def refitted_without(names: Collection[str], current: Trial, base: Trial, study:
     for name in effects.intersection(names):
         model = model.without_effect(name)
     hold = current.hold if effects.issuperset(names) else base.hold
-    return attempt(model, study.with_steps_of(current.training), hold, start=current)
+    return attempt(model, study.with_substeps(current.training.substeps), hold, start=current)

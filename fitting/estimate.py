@@ -118,11 +118,6 @@ class Fit(eqx.Module):
         return Segmentation(self.horizon, length, self.problem.segments.halo, self.substeps, count)
 
     @property
-    def end(self) -> Start:
-        """Where another fit of the same segments may start."""
-        return Start(self.covariance, self.unknowns.states)
-
-    @property
     def at_solution(self) -> Problem:
         """What was solved, at the fitted values."""
         return eqx.tree_at(lambda p: p.model, self.problem, self.model)

@@ -67,10 +67,10 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
 
 def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segments states"]) -> Response:
     segments = problem.segments
-    knots, torque = np.asarray(segments.torque.knots), acting(model, segments)
+    torque = acting(model, segments)
     beside = {LOAD: segments.load_torque, TEMPERATURE: segments.temperature}
     found = {name: np.asarray(signal.coefficients) for name, signal in beside.items() if signal is not None}
-    own = knots[:, segments.halo :], torque[:, segments.halo :], found
+    own = segments.knots, torque[:, segments.halo :], found
     return response(model, states, *own, int(problem.substeps), problem.solver)
 
 
@@ -166,7 +166,7 @@ def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segment
         return polynomial(np.asarray(coefficients)[(*nodes, slice(None))], late)
 
     load, warmth = segments.load_torque, segments.temperature
-    time = np.asarray(segments.torque.knots)[:, segments.halo : -1][nodes] + late
+    time = segments.knots[:, :-1][nodes] + late
     conditions = Conditions(jnp.asarray(time), None if warmth is None else jnp.asarray(at(warmth.coefficients)))
     on_load = np.zeros(late.shape) if load is None else at(load.coefficients)
     torque = at(acting(model, segments)[:, segments.halo :])
@@ -181,7 +181,7 @@ def _between(
     model: Model, knots: Float[np.ndarray, "segments knots states"], segments: Segments
 ) -> Float[np.ndarray, "segments samples nodes states"]:
     """States inside the intervals: cubics with the right values and rates at both ends (Hermite)."""
-    width = np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
+    width = segments.width
     y0, y1 = knots[:, :-1], knots[:, 1:]
 
     def rise_at(states: np.ndarray, late: np.ndarray) -> np.ndarray:

@@ -159,4 +159,5 @@ def _fine_enough(found: Fit) -> int:
 
 def _again(found: Fit, segmentation: Segmentation, strategy: Strategy = _CONTINUED) -> Fit:
     """A fit of the same data on segments of the same length, which share its compiled program, from its states."""
-    return fit(found.model, found.stretches, found.free.paths, segmentation, start=found.end, strategy=strategy)
+    start = Start(found.covariance, found.unknowns.states)
+    return fit(found.model, found.stretches, found.free.paths, segmentation, start=start, strategy=strategy)

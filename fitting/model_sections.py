@@ -29,9 +29,9 @@ def with_stated_effects(file: Sections, model: Model) -> Model:
             raise file.refuse(f"[{where}] is no effect; there are {', '.join(BY_NAME)}")
         table = file.table(where, values)
         fields = {f.name: f for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata}
-        file.known(where, table, fields)
+        numbers = file.numbers(where, table, fields)
         file.needs(where, table, [n for n, f in fields.items() if f.default is dataclasses.MISSING])
-        model = model.with_effects(BY_NAME[name](**{k: file.number(where, k, v) for k, v in table.items()}))
+        model = model.with_effects(BY_NAME[name](**numbers))
     return model
 
 

@@ -151,7 +151,7 @@ def experiment_for_ties(
     rivals = [_rival(loop, *pair) for pair in pairs]
     bench = _bench(own, stretches, limits, noise=loop.noise, halo=loop.setting.halo, substeps=loop.after_substeps)
     progress("the next experiment: what the logs can tell")
-    judge = _Judge(bench, segment_length(loop.setting.horizon), loop.setting.count)
+    judge = _Judge(bench, replace(loop.setting.segmentation, substeps=loop.after_substeps))
     told = [_on_logs(judge, found, r, pair) for r, pair in zip(rivals, pairs, strict=True)]
     starts = _starts(bench, own, stretches)
     smooth = [k for k, rival in enumerate(rivals) if is_smooth(rival, starts, bench)]
@@ -291,8 +291,7 @@ class _Judge(eqx.Module):
     """The fit that tells how far a rival stays from what another model makes, by programs that the loop has used."""
 
     bench: Bench
-    length: int
-    count: int
+    segmentation: Segmentation = eqx.field(static=True)
 
     def ratio(self, rival: Explanation, stretches: Sequence[Stretch]) -> float:
         """The log-likelihood ratio to be expected against a rival, where the measured outputs are another model's."""
@@ -302,12 +301,14 @@ class _Judge(eqx.Module):
 
     def fitted(self, model: Explanation, stretches: Sequence[Stretch], *, hold_parameters: bool = False) -> Fit:
         """A fit of simulations as long as the stretches, under the weights of the measurement noise."""
-        horizon, count = max(len(s) for s in stretches), max(self.count, segment_count(stretches, self.length))
+        # As many segments as the loop's where these are enough.
+        own, horizon = self.segmentation, max(len(s) for s in stretches)
+        count = max(own.count or 0, segment_count(stretches, own.length or segment_length(own.horizon)))
         return fit(
             model.model,
             stretches,
             model.free.paths,
-            Segmentation(horizon, self.length, self.bench.halo, self.bench.substeps, count),
+            replace(own, horizon=horizon, count=count),
             start=Start(self.bench.noise),
             strategy=Strategy(reweigh=False, hold_parameters=hold_parameters),
         )

@@ -100,8 +100,8 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
 
     A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
     """
-    halo, length = segments.halo, segments.measured.shape[1]
-    measured, knots = np.asarray(segments.measured), np.asarray(segments.torque.knots)[:, halo:]
+    length = segments.measured.shape[1]
+    measured, knots = np.asarray(segments.measured), segments.knots
     step = float(np.median(np.diff(knots)))
     quarter = int(min(np.ceil(0.5 * np.pi / float(model.drive.omega_0) / step), _LONGEST_SEGMENT))
     time = knots[:, :-1] - knots[:, :1]

@@ -147,9 +147,8 @@ def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples
     segments = seen.segments
     knots, logged = np.asarray(segments.torque.knots), acting(seen.model, segments)
     found = some_at_a_time(functools.partial(_actuated, stacked), knots, logged)[:, segments.halo :]
-    width = np.diff(knots[:, segments.halo :])
     # By columns, and then by powers.
-    return polynomial(found[:, :, None], (PART * width[..., None])[..., None])
+    return polynomial(found[:, :, None], (PART * segments.width[..., None])[..., None])
 
 
 @jit_small
@@ -175,8 +174,7 @@ def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array
 def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:
     """Of effects that take inertia: what the others do changes with it."""
     model, segments, followed = seen.model, seen.segments, seen.followed
-    width = np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
-    inputs = inputs_at(model, segments, PART * width[..., None])
+    inputs = inputs_at(model, segments, PART * segments.width[..., None])
     rates = _by_strength(_rates, stacked, model, followed.between, inputs, own=own_between(states))
     own = np.moveaxis(states[:, :-1], 2, 0)
     reading = _by_strength(_outputs, stacked, model, followed.states[:, :-1], own=own)

@@ -59,14 +59,12 @@ def read_sweep_file(path: Path) -> SweepFile:
 def _model(file: Sections) -> Model:
     model = stated_model(file)
     own = {k: v for k, v in file.section("drive").items() if k not in SOURCES}
-    file.known("drive", own, [name for name in model.parameters() if "." not in name])
-    return with_stated_effects(file, model.replace({k: file.number("drive", k, v) for k, v in own.items()}))
+    numbers = file.numbers("drive", own, [name for name in model.parameters() if "." not in name])
+    return with_stated_effects(file, model.replace(numbers))
 
 
 def _forcing(file: Sections, table: dict[str, Any]) -> Harmonic:
-    file.known("forcing", table, _FORCING)
-    numbers = {k: file.number("forcing", k, v) for k, v in table.items()}
-    return Harmonic(**({"amplitude": 1.0, "omega": 1.0} | numbers))
+    return Harmonic(**({"amplitude": 1.0, "omega": 1.0} | file.numbers("forcing", table, _FORCING)))
 
 
 def _settings(file: Sections, table: dict[str, Any]) -> dict[str, Any]:

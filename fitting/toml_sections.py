@@ -56,6 +56,11 @@ class Sections:
             raise self.refuse(f"[{section}] {key} must be a number, but is {value!r}")
         return float(value)
 
+    def numbers(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> dict[str, float]:
+        """Finite numbers under keys that mean something."""
+        self.known(section, table, names)
+        return {key: self.number(section, key, value) for key, value in table.items()}
+
     def count(self, section: str, key: str, value: object, least: int = 1) -> int:
         """A whole number, at least `least`."""
         if isinstance(value, bool) or not isinstance(value, int) or value < least:

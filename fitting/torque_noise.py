@@ -50,12 +50,12 @@ def torque_noise_covariance(
     noise = random.normal(size=(*problem.segments.weight.shape, _DRAWS))
     answers = _answers(problem, followed, noise)
     records = regression.records
-    in_time = _in_time(records, answers)
+    in_time = fit.by_stretch(answers)
     variances = _variances(records, in_time, inverse)
     if variances is None:
         return None
     *encoders, torque = variances
-    slopes = _by_segment(records, problem)
+    slopes = _by_segment(records, fit)
     middle = torque * _torque_scores(problem, followed, slopes)
     # Noise of the motor's encoder is in both outputs.
     together = _covariance([r.residual[..., None] for r in records]) - torque * _covariance(in_time)
@@ -65,29 +65,11 @@ def torque_noise_covariance(
     return inverse @ middle @ inverse
 
 
-def _in_time(records: Sequence[Record], blocks: np.ndarray) -> list[np.ndarray]:
-    """Rows by segment as stretches."""
-    made, at = [], 0
-    for record in records:
-        count, samples = record.residual.shape[0], blocks.shape[1]
-        mine = slice(at, at - (-count // samples))
-        made.append(blocks[mine].reshape(-1, *blocks.shape[2:])[:count])
-        at = mine.stop
-    return made
-
-
-def _by_segment(
-    records: Sequence[Record], problem: Problem
-) -> Float[np.ndarray, "segments samples outputs parameters"]:
+def _by_segment(records: Sequence[Record], fit: Fit) -> Float[np.ndarray, "segments samples outputs parameters"]:
     """The records' slopes by segment, padded with zeros."""
-    segments, samples = problem.segments.weight.shape
-    found = np.zeros((segments, samples, *records[0].slopes.shape[1:]))
-    at = 0
-    for record in records:
-        count = record.residual.shape[0]
-        stop = at - (-count // samples)
-        found[at:stop].reshape(-1, *found.shape[2:])[:count] = record.slopes
-        at = stop
+    found = np.zeros((*fit.error.shape[:2], *records[0].slopes.shape[1:]))
+    for own, record in zip(np.split(found, np.cumsum(fit.pieces)), records, strict=False):
+        own.reshape(-1, *found.shape[2:])[: len(record.slopes)] = record.slopes
     return found
 
 

@@ -16,10 +16,10 @@ from fitting.attribution.selection_round import Verdict, look
 from fitting.attribution.study import Setting, Study
 from fitting.attribution.support import Standing
 from fitting.base_fit import base_fit
-from fitting.experiment import segment_count, split
+from fitting.experiment import split
 from fitting.free import effect_paths
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
-from fitting.posing import segment_length
+from fitting.posing import Segmentation
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects import Effect
@@ -30,7 +30,7 @@ from hdjax.effects.position import PositionDependentMotorFriction
 from hdjax.effects.presliding import DahlMotorFriction
 
 HOLD: Hold = "zero-order"
-STUDY = Study({}, Setting(horizon=32, halo=4, substeps=2, count=8))
+STUDY = Study({}, Setting(Segmentation(32, halo=4, substeps=2, count=8)))
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +40,7 @@ def verdicts():
     data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
     base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-    count = segment_count(training, segment_length(base.horizon))
-    study = Study(data, Setting(base.horizon, halo_for(training), base.substeps, count))
+    study = Study(data, Setting(base.segmentation))
     before = attempt(base.model, study, HOLD)
     standing = Standing(before, before, measurement_noise(before.training))
     found = look(standing, study, catalogue=(TorqueBias, Creep))

@@ -14,6 +14,7 @@ from fitting.attribution.study import Setting, Study
 from fitting.effect_search import base_trial
 from fitting.experiment import split
 from fitting.learned_look import Candidate
+from fitting.posing import Segmentation
 from fitting.unknown import Unknown
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
@@ -196,7 +197,7 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
     motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
     instants = np.arange(2)
     beside = Unknown(named, trial, (), chosen, instants, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
-    bare, beside = module._without_superfluous(base, named, beside, Study({}, Setting(32, 4, 1, 8)))
+    bare, beside = module._without_superfluous(base, named, beside, Study({}, Setting(Segmentation(32))))
     assert {e.name for e in bare.model.effects} == left
     assert (bare is base) == (left == set()) and beside.before is bare
     assert {e.name for e in beside.trial.model.effects} == left | {LEARNED.name}

@@ -13,9 +13,8 @@ from fitting.attribution.candidate_fit import Trial, attempt, halo_for
 from fitting.attribution.log_alignment import Phasors, put_back, with_clocks_set
 from fitting.attribution.study import Data, Setting, Study
 from fitting.base_fit import base_fit
-from fitting.experiment import Experiment, experiment_from_log, segment_count, split
+from fitting.experiment import Experiment, experiment_from_log, split
 from fitting.linear_look import Acting, look_along, products
-from fitting.posing import segment_length
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
 
@@ -49,8 +48,7 @@ def begun() -> Callable[..., Begun]:
         data: Data = {h: split([experiment(i, h, phase) for i, phase in enumerate(phases)]) for h in HOLDS}
         training = data[HOLDS[0]][0]
         found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-        count = segment_count(training, segment_length(found.horizon))
-        study = Study(data, Setting(found.horizon, halo_for(training), found.substeps, count))
+        study = Study(data, Setting(found.segmentation))
         return attempt(found.model, study, HOLDS[0]), study
 
     return fitted

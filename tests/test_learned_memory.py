@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import rig
 from fitting.along import place_of
 from fitting.attribution.screening import Screen
-from fitting.close_loop import SearchOptions, close_loop
+from fitting.close_loop import close_loop
 from fitting.effect_search import base_trial
 from fitting.experiment import experiment_from_log, split
 from fitting.learned_look import learned_look
@@ -24,6 +24,7 @@ from fitting.outcome import Loop
 from fitting.plots import response_plot
 from fitting.remembering import remembering
 from fitting.report import write_report
+from fitting.search_options import SearchOptions
 from fitting.uncertainty import Estimate, Uncertainty
 from fitting.unknown import share_of
 from hdjax import Model

@@ -13,7 +13,7 @@ import pytest
 
 import rig
 from fitting import command_search, discrimination
-from fitting.close_loop import SearchOptions, close_loop
+from fitting.close_loop import close_loop
 from fitting.command_search import Candidate, search
 from fitting.discrimination import Bench, Explanation, explanation, refit, respond, signals, start
 from fitting.estimate import Start, Strategy, fit
@@ -32,6 +32,7 @@ from fitting.plots import next_experiment_plot
 from fitting.posing import Segmentation
 from fitting.report import write_report
 from fitting.report.proposal import command_table, proposal_dict
+from fitting.search_options import SearchOptions
 from fitting.uncertainty import uncertainty
 from hdjax import Hold, sampled, simulate
 from hdjax.effects.friction import MotorFriction, StribeckMotorFriction
@@ -346,8 +347,8 @@ def test_a_loop_proposes_what_tells_ties_apart(tmp_path: Path):
     log = rig.drive_experiment(2000, motor_friction=(0.01, 1.0), noise=3.0)
     start_model = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (log,)}
-    search = SearchOptions(1, (MotorFriction, StribeckMotorFriction))
-    loop = close_loop(start_model, data, hold="zero-order", search=search)
+    forms = (MotorFriction, StribeckMotorFriction)
+    loop = close_loop(start_model, data, hold="zero-order", catalogue=forms, search=SearchOptions(1))
     assert [rival.name for _, rival in tied(loop)] == ["stribeck_motor_friction"]
     found = experiment_for_ties(loop)
     assert found is not None

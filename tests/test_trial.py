@@ -6,8 +6,7 @@ import rig
 from fitting.attribution.candidate_fit import attempt, challenge, halo_for
 from fitting.attribution.study import Data, Setting, Study
 from fitting.base_fit import base_fit
-from fitting.experiment import segment_count, split
-from fitting.posing import segment_length
+from fitting.experiment import split
 from hdjax import Hold
 from hdjax.effects.friction import CoulombFriction
 
@@ -23,8 +22,7 @@ def begun():
     data: Data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
     base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-    count = segment_count(training, segment_length(base.horizon))
-    study = Study(data, Setting(base.horizon, halo_for(training), base.substeps, count))
+    study = Study(data, Setting(base.segmentation))
     return attempt(base.model, study, HOLD), study
 
 
@@ -39,7 +37,7 @@ def test_a_sharp_corner_takes_finer_steps(begun):
     assert study.fine_enough(before.training) is study
     found = challenge([with_friction(before.model, 50.0, 0.3)], study, HOLD, champion=before)
     assert found is not None
-    assert found.training.substeps == found.held_out.substeps > study.setting.substeps
+    assert found.training.substeps == found.held_out.substeps > study.setting.segmentation.substeps
     assert float(found.model.effects[0].T_c) == pytest.approx(SHARP[0], rel=0.02)
 
 

@@ -12,14 +12,16 @@ import pytest
 import rig
 from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.study import Setting, Study
-from fitting.close_loop import SearchOptions, close_loop
+from fitting.close_loop import close_loop
 from fitting.experiment import Stretch, experiment_from_log, split
 from fitting.free_run import free_run
 from fitting.learned_curve import LearnedCurve, learned_curve
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.outcome import Loop
 from fitting.plots import learned_plot
+from fitting.posing import Segmentation
 from fitting.report import report_dict, write_report
+from fitting.search_options import SearchOptions
 from fitting.shapes import shapes
 from fitting.uncertainty import uncertainty
 from fitting.unknown import Unknown, is_supported, learn, share_of
@@ -36,7 +38,7 @@ from hdjax.effects.stiffness import QuadraticStiffness
 COUNT, STEP = 1600, 4e-3
 NOISE = 1e-3
 FRICTION = (10.0, 0.3)
-SETTING = Setting(horizon=128, halo=4, substeps=2, count=16)
+SETTING = Setting(Segmentation(128, halo=4, substeps=2, count=16))
 TRUTH = rig.reduced_model()
 TIME = STEP * np.arange(COUNT)
 WARMTH = 300.0 + 4.0 * np.sin(4.0 * np.pi * TIME / TIME[-1])
@@ -336,8 +338,8 @@ def loop() -> Loop:
     experiment = rig.reduced_experiment(COUNT, noise=NOISE, friction=FRICTION)
     catalogue = (QuadraticStiffness, QuadraticDamping)
     placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    search = SearchOptions(1, catalogue)
-    return close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", search=search)
+    options = {"catalogue": catalogue, "search": SearchOptions(1)}
+    return close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", **options)
 
 
 def test_what_the_catalogue_lacks_is_unexplained(loop: Loop):
@@ -376,8 +378,8 @@ def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     be anything, explains no more than friction does, and a function of the twist beside it all of the rest."""
     experiment = rig.reduced_experiment(COUNT, noise=NOISE, friction=(25.0, 0.3), quadratic=0.15)
     placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    search = SearchOptions(1, (CoulombFriction,))
-    loop = close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", search=search)
+    options = {"catalogue": (CoulombFriction,), "search": SearchOptions(1)}
+    loop = close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", **options)
     assert loop.decision == "effect_found" and not loop.doubted
     assert [f.name for f in loop.findings] == ["coulomb_friction", "learned_mesh_torque"]
     assert loop.unknown is not None and loop.unknown.chosen.variables == ("x",)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.close_loop import SearchOptions, close_loop
+from fitting.close_loop import close_loop
 from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError
 from fitting.experiment import Stretch
@@ -16,6 +16,7 @@ from fitting.free_run import WINDOW, free_run
 from fitting.outcome import Loop
 from fitting.report import report_dict
 from fitting.rig import Rig, experiments, read_rig, ready_log
+from fitting.search_options import SearchOptions
 from hdjax import Model, SimulationError
 from hdjax.effects import CATALOGUE
 from undeclared.black_box import black_box_error
@@ -98,7 +99,7 @@ def _close(rig: Rig, without: frozenset[str], seed: int) -> Loop:
         # Another hold of the torque is a form of this family too.
         offered = {hold: e for hold, e in offered.items() if hold == rig.hold}
     catalogue = tuple(form for form in CATALOGUE if form.family not in without)
-    return close_loop(rig.model, offered, hold=rig.hold, search=SearchOptions(catalogue=catalogue, seed=seed))
+    return close_loop(rig.model, offered, hold=rig.hold, catalogue=catalogue, search=SearchOptions(seed=seed))
 
 
 def held_out_error(loop: Loop, model: Model, folder: Path, drive_file: DriveFile) -> float:

@@ -153,7 +153,7 @@ def to_the_end(first: Fit, study: Study, hold: Hold, *, champion: Trial, give_up
     finer = study.fine_enough(best)
     if finer is not study:
         best = trained(best.model, finer, hold, best, strategy)
-    return _judged(best, to_judge.with_steps_of(best), hold) if best.objective <= limit else None
+    return _judged(best, to_judge.with_substeps(best.substeps), hold) if best.objective <= limit else None
 
 
 def trained(
@@ -254,7 +254,7 @@ def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
         study.data[trial.hold][1],
         covariance=trial.training.covariance,
         halo=study.setting.halo,
-        substeps=study.setting.substeps,
+        substeps=study.setting.segmentation.substeps,
         like=trial.held_out,
     )
 

@@ -19,8 +19,8 @@ from fitting.free import strength_paths
 from fitting.sight import Answered, Sight, batches, follow_on, sight
 from fitting.spectral_lines import spectral_lines
 from fitting.surrogates import DRAWS, Scores, null_gains
-from hdjax import Model, TwoInertiaModel
-from hdjax.effects import CATALOGUE, Effect, Scales, applicable
+from hdjax import TwoInertiaModel
+from hdjax.effects import CATALOGUE, Effect, applicable
 
 
 class Lead(eqx.Module):
@@ -74,7 +74,8 @@ def screen(
     model = training.model
     present = {e.name for e in model.effects}
     lines = replace(scales(training.stretches, model), residual_frequencies=spectral_lines(training))
-    found = _applicable([form for form in catalogue if form.name not in present], lines, model)
+    forms = [form for form in catalogue if form.name not in present]
+    found = applicable(forms, lines, has_motor=isinstance(model, TwoInertiaModel))
     proposals = tuple(effect for effects in found.values() for effect in effects)
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
@@ -99,12 +100,6 @@ def screen(
             leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
-
-
-def _applicable(
-    catalogue: Sequence[type[Effect]], scales: Scales, model: Model
-) -> dict[type[Effect], tuple[Effect, ...]]:
-    return applicable(catalogue, scales, has_motor=isinstance(model, TwoInertiaModel))
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:

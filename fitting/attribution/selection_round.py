@@ -166,7 +166,7 @@ class _Refits:
 
     def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
         # What is to come near it in its first pass needs its steps.
-        self._refit(leads, self.study.with_steps_of(best.training), 1.0 - _NEAR_TIE)
+        self._refit(leads, self.study.with_substeps(best.training.substeps), 1.0 - _NEAR_TIE)
 
     def forms(self, screened: Screen) -> list[Verdict]:
         """All forms; a first-order gain stands for those that were not refitted."""

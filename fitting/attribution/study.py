@@ -23,25 +23,19 @@ class Setting(eqx.Module):
     """How the data are cut and simulated; the same for all trials, so that they share programs.
 
     Attributes:
-        horizon: samples in a segment.
-        halo: intervals of torque before a segment.
-        substeps: solver steps in a sample interval.
-        count: segments in each program.
+        segmentation: into segments, and how finely these are simulated.
         least_progress: share of the sum of squares that a few steps of a fit must take off it.
         thorough: whether all forms of the catalogue are refitted in each round.
     """
 
-    horizon: int = eqx.field(static=True)
-    halo: int = eqx.field(static=True)
-    substeps: int = eqx.field(static=True)
-    count: int = eqx.field(static=True)
+    segmentation: Segmentation = eqx.field(static=True)
     least_progress: float = eqx.field(static=True, default=LEAST_PROGRESS)
     thorough: bool = eqx.field(static=True, default=False)
 
     @property
-    def segmentation(self) -> Segmentation:
-        """The same as fits take it."""
-        return Segmentation(self.horizon, halo=self.halo, substeps=self.substeps, count=self.count)
+    def halo(self) -> int:
+        """Intervals of torque before a segment."""
+        return self.segmentation.halo
 
 
 @dataclass(frozen=True)
@@ -60,18 +54,17 @@ class Study:
     seed: int = 0
     progress: Progress = silent
 
-    def with_steps_of(self, found: Fit) -> "Study":
-        """The same, with the solver steps of a fit."""
-        return self._with(substeps=found.substeps)
+    def with_substeps(self, count: int) -> "Study":
+        """The same, with so many solver steps in a sample interval."""
+        segmentation = replace(self.setting.segmentation, substeps=count)
+        return replace(self, setting=replace(self.setting, segmentation=segmentation))
 
     def for_rivals(self) -> "Study":
         """The same, with no more patience than one of several models needs."""
-        return self._with(least_progress=max(self.setting.least_progress, _LEAST_OF_A_RIVAL))
+        least = max(self.setting.least_progress, _LEAST_OF_A_RIVAL)
+        return replace(self, setting=replace(self.setting, least_progress=least))
 
     def fine_enough(self, found: Fit) -> "Study":
         """The same, with as many solver steps as the fitted motion needs; itself where these are enough."""
         substeps = needed_substeps(found)
-        return self._with(substeps=substeps) if substeps > self.setting.substeps else self
-
-    def _with(self, **changes: float) -> "Study":
-        return replace(self, setting=replace(self.setting, **changes))
+        return self.with_substeps(substeps) if substeps > (self.setting.segmentation.substeps or 0) else self

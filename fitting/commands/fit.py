@@ -7,12 +7,13 @@ from fitting.commands.options import (
     ExperimentLimits,
     FleetOptions,
     Logs,
-    LoopOptions,
+    Search,
     TestLogs,
     wanted,
 )
 from fitting.commands.start import start_jax
 from fitting.errors import InputError
+from fitting.search_options import SearchOptions
 
 
 def fit(
@@ -75,7 +76,7 @@ def close_loop(
     drive: DriveFileOption,
     out: Path,
     test: TestLogs = (),
-    loop: LoopOptions = LoopOptions(),
+    search: Search = SearchOptions(),
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
 ) -> None:
@@ -93,13 +94,13 @@ def close_loop(
         Where explanations are tied, look for the motor torque that would tell them apart within limits (minutes), and
         write it to next_experiment.csv.
     """
-    if loop.max_effects < 0:
-        raise InputError(f"--max-effects must be 0 or more, but is {loop.max_effects}")
+    if search.max_effects < 0:
+        raise InputError(f"--max-effects must be 0 or more, but is {search.max_effects}")
     asked = wanted(limits, next_experiment)
     start_jax()
     from fitting.commands.run_close_loop import close_loop_on_logs
 
-    close_loop_on_logs(logs, drive, out, loop, test=test, limits=asked)
+    close_loop_on_logs(logs, drive, out, search, test=test, limits=asked)
 
 
 def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from fitting.errors import InputError
+from fitting.search_options import SearchOptions
 
 Logs = Annotated[
     list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
@@ -17,6 +18,7 @@ TestLogs = Annotated[
     tuple[Path, ...],
     Parameter(help="Logs of the same drive that are test data, in place of the last fifth of each log.", negative=""),
 ]
+Search = Annotated[SearchOptions, Parameter(name="*")]
 DriveFileOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
 
 
@@ -54,23 +56,6 @@ class DriveOptions:
     K: Annotated[float | None, Parameter(name="--K")] = None
     alpha: Annotated[float | None, Parameter(name="--alpha")] = None
     B_sp: Annotated[float | None, Parameter(name="--B_sp")] = None
-
-
-@Parameter(name="*")
-@dataclass(frozen=True)
-class LoopOptions:
-    """What is asked of the loop.
-
-    Attributes:
-        max_effects: Effects to add at most.
-        seed: Of the surrogates behind the p-values.
-        thorough: Refit every form of the catalogue in each round, in place of those that a first-order look finds
-            likely (minutes).
-    """
-
-    max_effects: int = 3
-    seed: int = 0
-    thorough: bool = False
 
 
 @Parameter(name="*")

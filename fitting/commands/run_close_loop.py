@@ -1,12 +1,11 @@
 """What `hdjax close-loop` and `hdjax demo` do."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-from fitting.close_loop import SearchOptions, close_loop
+from fitting.close_loop import close_loop
 from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_limits
-from fitting.commands.options import ExperimentLimits, LoopOptions
+from fitting.commands.options import ExperimentLimits
 from fitting.commands.spinner import Spinner
 from fitting.demonstration import write_demo_logs
 from fitting.drive_file import read_drive_file
@@ -15,13 +14,14 @@ from fitting.model_file import StoredModel, to_json
 from fitting.next_experiment import experiment_for_ties
 from fitting.report import rig_text, write_rig_report
 from fitting.rig import Rig, read_logs, read_rig, rig_of
+from fitting.search_options import SearchOptions
 
 
 def close_loop_on_logs(
     logs: list[Path],
     drive: Path,
     out: Path,
-    asked: LoopOptions = LoopOptions(),
+    search: SearchOptions = SearchOptions(),
     *,
     test: Sequence[Path] = (),
     limits: ExperimentLimits | None = None,
@@ -32,7 +32,7 @@ def close_loop_on_logs(
         logs: files.
         drive: drive file.
         out: folder of the report.
-        asked: of the loop.
+        search: how effects are searched for.
         test: files of test data.
         limits: of the next experiment; None where none is asked for.
 
@@ -51,11 +51,11 @@ def close_loop_on_logs(
         from fitting.quasi_static.commands import close_quasi_static_loop
 
         with Spinner() as progress:
-            options = {"max_effects": asked.max_effects, "seed": asked.seed, "progress": progress}
+            options = {"max_effects": search.max_effects, "seed": search.seed, "progress": progress}
             shown = close_quasi_static_loop(read, drive_file, out, **options)
         print(shown)
     else:
-        _close_loop(rig_of(read, drive_file, test=tests), out, asked, limits)
+        _close_loop(rig_of(read, drive_file, test=tests), out, search, limits)
 
 
 def demonstrate(out: Path, seed: int) -> None:
@@ -68,10 +68,10 @@ def demonstrate(out: Path, seed: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     logs, drive = write_demo_logs(out, seed=seed)
     print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
-    _close_loop(read_rig(logs, drive), out, LoopOptions(seed=seed), limits=None)
+    _close_loop(read_rig(logs, drive), out, SearchOptions(seed=seed), limits=None)
 
 
-def _close_loop(rig: Rig, out: Path, asked: LoopOptions, limits: ExperimentLimits | None) -> None:
+def _close_loop(rig: Rig, out: Path, search: SearchOptions, limits: ExperimentLimits | None) -> None:
     stated = None if limits is None else stated_limits(limits, logs_of(rig))
     with Spinner() as progress:
         loop = close_loop(
@@ -79,7 +79,7 @@ def _close_loop(rig: Rig, out: Path, asked: LoopOptions, limits: ExperimentLimit
             rig.experiments,
             test=rig.test,
             hold=rig.hold,
-            search=SearchOptions(**asdict(asked)),
+            search=search,
             progress=progress,
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)

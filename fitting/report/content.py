@@ -106,7 +106,15 @@ def _circumstances(outcome: Outcome) -> dict[str, Any]:
     not_machine_code = outcome.after.not_machine_code
     setting = None
     if isinstance(outcome, Loop):
-        setting = dataclasses.asdict(outcome.setting) | {"substeps": outcome.after_substeps}
+        own = outcome.setting
+        setting = {
+            "horizon": own.segmentation.horizon,
+            "halo": own.segmentation.halo,
+            "substeps": outcome.after_substeps,
+            "count": own.segmentation.count,
+            "least_progress": own.least_progress,
+            "thorough": own.thorough,
+        }
     return {
         "hold": outcome.hold,
         "setting": setting,
