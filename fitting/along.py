@@ -209,9 +209,8 @@ def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
 def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
     """Whether a segment goes on where the one before it ends in time, joined or not."""
     knots = segments.knots
-    step = np.median(np.diff(knots))
     late = knots[1:, 0] - knots[:-1, -1]
-    return np.append(False, np.abs(late) < 0.5 * step)
+    return np.append(False, np.abs(late) < 0.5 * np.median(segments.width))
 
 
 def _at_knots(

@@ -78,11 +78,9 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
 
-    segmentation = Segmentation(horizon, halo=halo, substeps=substeps)
-    fitted = functools.partial(_fitted, training=training, segmentation=segmentation)
+    fitted = functools.partial(_fitted, training=training, segmentation=Segmentation(horizon, None, halo, substeps))
     if len(starts) > 1:
-        states_only = Strategy(20, hold_parameters=True)
-        starts = sorted(starts, key=lambda s: fitted(s, strategy=states_only).objective)
+        starts = sorted(starts, key=lambda s: fitted(s, strategy=Strategy(20, hold_parameters=True)).objective)
     best, begun = fitted(starts[0]), starts[0]
     if len(starts) == 1 or leaves_white_noise(best):
         return best, begun
@@ -117,8 +115,7 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
         return best
     horizon = segment_length(short_horizon(starts[0], training))
     substeps = suggested_substeps(starts[0], training)
-    segmentation = Segmentation(horizon, halo=halo, substeps=substeps)
-    fitted = functools.partial(_fitted, training=training, segmentation=segmentation)
+    fitted = functools.partial(_fitted, training=training, segmentation=Segmentation(horizon, None, halo, substeps))
     reach = drive.N * max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in training)
     loaded = fitted(starts[0].with_effects(SteadyLoad(reach=reach)))
     bare = loaded.model.without_effect(SteadyLoad.name)

@@ -1,8 +1,7 @@
 """The only least squares: parameters, initial states and noise covariance from segments of logs."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -177,24 +176,27 @@ def fit(
     Returns:
         The fit.
     """
-    held = strategy.hold_parameters
     problem, unknowns = pose(
-        model, stretches, paths, segmentation, hold_parameters=held, states=start.states, engine=engine
+        model,
+        stretches,
+        paths,
+        segmentation,
+        hold_parameters=strategy.hold_parameters,
+        states=start.states,
+        engine=engine,
     )
-    outputs = problem.segments.measured.shape[-1]
     swing = float(scales(stretches).x)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
-    scale_matters = outputs > 1 or unknowns.states.shape[1] > len(model.motion_states)
+    scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
     if covariance is None:
         covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[swing**2]])
-    covered = _LONGEST_RETRY * problem.segments.weight.shape[1]
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
         problem = weighed(problem, covariance, swing)
         solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
-        if turn == 0 and segmentation.horizon <= covered:
+        if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
             solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
         unknowns, covariance = solution.unknowns, solution.left_over.covariance
         before, objective = objective, half_log_determinant(covariance)
@@ -352,7 +354,7 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     error, white_by_error = evaluate(problem, found.unknowns).error, np.asarray(problem.whitening)
     count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:
-        better = evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error
+        better = evaluate(replace(problem, substeps=2 * substeps), found.unknowns).error
         white = (better - error) @ white_by_error.T
         mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
         moved = 0.0 if columns is None else _standard_errors_moved(columns, white, _named(found))

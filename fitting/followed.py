@@ -67,10 +67,9 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
 
 def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segments states"]) -> Response:
     segments = problem.segments
-    torque = acting(model, segments)
     beside = {LOAD: segments.load_torque, TEMPERATURE: segments.temperature}
     found = {name: np.asarray(signal.coefficients) for name, signal in beside.items() if signal is not None}
-    own = segments.knots, torque[:, segments.halo :], found
+    own = segments.knots, acting(model, segments)[:, segments.halo :], found
     return response(model, states, *own, int(problem.substeps), problem.solver)
 
 
@@ -169,8 +168,8 @@ def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segment
     time = segments.knots[:, :-1][nodes] + late
     conditions = Conditions(jnp.asarray(time), None if warmth is None else jnp.asarray(at(warmth.coefficients)))
     on_load = np.zeros(late.shape) if load is None else at(load.coefficients)
-    torque = at(acting(model, segments)[:, segments.halo :])
-    return Inputs(jnp.asarray(torque), jnp.asarray(on_load), conditions)
+    torque = jnp.asarray(at(acting(model, segments)[:, segments.halo :]))
+    return Inputs(torque, jnp.asarray(on_load), conditions)
 
 
 def _rates(model: Model, state: Array, inputs: Inputs) -> Array:

@@ -36,8 +36,7 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     if substeps > start.substeps:
         # A corner that is sharper than its steps resolved has moved by then.
         start = _again(start, replace(start.segmentation, substeps=substeps))
-    short = start.segmentation
-    long = _again(start, replace(short, horizon=_longest(start)))
+    long = _again(start, replace(start.segmentation, horizon=_longest(start)))
     # Long horizons know the parameters better, and so ask for finer steps.
     substeps = _fine_enough(long)
     if substeps > long.substeps:
@@ -50,7 +49,7 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
         long.model,
         start.stretches,
         start.free.paths,
-        replace(short, substeps=substeps),
+        replace(start.segmentation, substeps=substeps),
         start=Start(start.covariance),
         strategy=Strategy(_STEPS, hold_parameters=True),
     )

@@ -106,14 +106,13 @@ def _circumstances(outcome: Outcome) -> dict[str, Any]:
     not_machine_code = outcome.after.not_machine_code
     setting = None
     if isinstance(outcome, Loop):
-        own = outcome.setting
         setting = {
-            "horizon": own.segmentation.horizon,
-            "halo": own.segmentation.halo,
+            "horizon": outcome.setting.segmentation.horizon,
+            "halo": outcome.setting.halo,
             "substeps": outcome.after_substeps,
-            "count": own.segmentation.count,
-            "least_progress": own.least_progress,
-            "thorough": own.thorough,
+            "count": outcome.setting.segmentation.count,
+            "least_progress": outcome.setting.least_progress,
+            "thorough": outcome.setting.thorough,
         }
     return {
         "hold": outcome.hold,
