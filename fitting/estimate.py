@@ -123,7 +123,7 @@ class Fit(eqx.Module):
 
     @property
     def white_error(self) -> Float[np.ndarray, "segments samples outputs"]:
-        """Its error in units of what the outputs are weighed by."""
+        """The whitened output error."""
         return np.asarray(self.error) @ np.asarray(self.problem.whitening).T
 
     @property
@@ -137,7 +137,7 @@ class Fit(eqx.Module):
         return [a.reshape(-1, *a.shape[2:])[: len(s)] for s, a in zip(self.stretches, parts, strict=False)]
 
     def with_all_free(self) -> "Fit":
-        """The same, with parameters that were held counted among what the data are asked for."""
+        """The same with fixed parameters counted as free, so that the data are asked what they say of them."""
         return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
 
     @property
@@ -162,7 +162,7 @@ def fit(
     parameters. Longer horizons are cut into joined segments that run side by side; their gaps close as the fit
     converges, so that the result is that of one simulation (multiple shooting). The outputs are weighed by the
     covariance of what is left over, which maximises the likelihood of Gaussian errors of unknown covariance: an output
-    that the model cannot follow loses its say.
+    that the model cannot follow is down-weighted.
 
     Args:
         model: equations and starting values.
@@ -222,7 +222,7 @@ def fit(
 
 
 def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution, strategy: Strategy) -> Solution:
-    """The first pass, begun anew as a whole, or where segments stand out, as far as the strategy asks for it.
+    """Repeat the first pass from other initial states, in all segments or in some, where the strategy says so.
 
     Args:
         problem: what is solved.
