@@ -27,7 +27,7 @@ from fitting.engines import linearise, with_engine
 from fitting.experiment import Stretch, scales
 from fitting.free import base_paths, fitted_paths
 from fitting.machine_code import task
-from fitting.posing import pose, short_horizon
+from fitting.posing import Segmentation, pose, short_horizon
 from fitting.residual import Problem, Unknowns, blocks
 from fitting.solve import _WIDTH as WIDTH
 from hdjax import Model, sampled
@@ -72,18 +72,8 @@ def proposed(form: type[Effect], motion: Scales) -> Effect | None:
 
 def posed(model: Model, stretches: Sequence[Stretch], paths: Sequence[str]) -> tuple[Problem, Unknowns]:
     """What the first iteration of a fit solves: short segments, one step a sample."""
-    problem, unknowns = pose(
-        model,
-        stretches,
-        paths,
-        horizon=short_horizon(model, stretches),
-        length=None,
-        halo=4,
-        substeps=1,
-        hold_parameters=False,
-        count=None,
-        states=None,
-    )
+    segmentation = Segmentation(short_horizon(model, stretches), halo=4, substeps=1)
+    problem, unknowns = pose(model, stretches, paths, segmentation)
     # Posing has made the machine code, which is to be timed.
     _MADE.clear()
     return dataclasses.replace(problem, kernel=None), unknowns

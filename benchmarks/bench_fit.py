@@ -20,10 +20,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fitting.arrow import normal_equations
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Strategy, fit
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
-from fitting.posing import natural_frequency, short_horizon, suggested_substeps
+from fitting.posing import Segmentation, natural_frequency, short_horizon, suggested_substeps
 from fitting.residual import Products, blocks, residual
 from fitting.starting_values import starting_models
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
@@ -205,12 +205,18 @@ class Ours:
 
     def short_from(self, start: Model) -> Fit:
         """From a given start, in short segments."""
-        return fit(start, self.stretches, free_paths(start), horizon=short_horizon(start, self.stretches))
+        return fit(start, self.stretches, free_paths(start), Segmentation(short_horizon(start, self.stretches)))
 
     def whole_from(self, start: Model, *, substeps: int | None = None, reweigh: bool = True) -> Fit:
         """From a given start, the log as one segment: the peer's problem."""
         length = len(self.stretches[0])
-        return fit(start, self.stretches, free_paths(start), horizon=length, substeps=substeps, reweigh=reweigh)
+        return fit(
+            start,
+            self.stretches,
+            free_paths(start),
+            Segmentation(length, substeps=substeps),
+            strategy=Strategy(reweigh=reweigh),
+        )
 
     def both(self) -> Fit:
         """From nothing but the log, to the fit of the whole log."""

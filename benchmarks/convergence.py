@@ -23,6 +23,7 @@ from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
 from fitting.long_fit import long_fit
 from fitting.outliers import left_out
+from fitting.posing import Segmentation
 from fitting.uncertainty import uncertainty
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 
@@ -271,9 +272,7 @@ def fit_from(truth: Model, found: Fit) -> Fit:
         truth,
         found.stretches,
         base_paths(truth),
-        horizon=found.horizon,
-        substeps=found.substeps,
-        count=found.error.shape[0],
+        Segmentation(found.horizon, substeps=found.substeps, count=found.error.shape[0]),
     )
 
 

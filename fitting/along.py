@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.experiment import Segments, Stretch
-from fitting.followed import NODES, WEIGHTS, Followed, acting, polynomial, signals_at
+from fitting.followed import NODES, WEIGHTS, Followed, acting, inputs_at, polynomial
 from fitting.machine_code import actuated
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import (
@@ -76,7 +76,7 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     pieces = -(-samples // length)
     firsts = np.cumsum(pieces) - pieces
     ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
-    _, _, conditions = signals_at(model, segments, PART * _width(segments)[..., None])
+    conditions = inputs_at(model, segments, PART * segments.width[..., None]).conditions
     at_knots = motions(model, followed.states, conditions_at_knots(segments))
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
@@ -86,7 +86,7 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
 
 def conditions_at_knots(segments: Segments) -> Conditions:
     """Time and temperature at each knot, the end of the last interval included."""
-    time = np.asarray(segments.torque.knots)[:, segments.halo :]
+    time = segments.knots
     warmth = segments.temperature
     found = None if warmth is None else jnp.asarray(_at_knots(np.asarray(warmth.coefficients), np.diff(time)))
     return Conditions(jnp.asarray(time), found)
@@ -95,7 +95,7 @@ def conditions_at_knots(segments: Segments) -> Conditions:
 def acting_at_knots(model: Model, segments: Segments) -> Float[np.ndarray, "segments knots"]:
     """The torque that acts on a drive, or the forcing, at each knot; where it jumps the middle, so that a straight line
     from knot to knot is not late."""
-    return _at_knots(acting(model, segments)[:, segments.halo :], _width(segments))
+    return _at_knots(acting(model, segments)[:, segments.halo :], segments.width)
 
 
 def acting_slopes_at_knots(
@@ -110,14 +110,9 @@ def acting_slopes_at_knots(
     if own:
         values = jnp.asarray(np.array([float(model.get(paths[i])) for i in own]))
         _, slopes = actuated(effects, tuple(paths[i] for i in own), values, segments.torque)
-        width = _width(segments)
         for i, slope in zip(own, slopes, strict=True):
-            found[..., i] = _at_knots(np.asarray(slope)[:, segments.halo :], width)
+            found[..., i] = _at_knots(np.asarray(slope)[:, segments.halo :], segments.width)
     return found
-
-
-def _width(segments: Segments) -> Float[np.ndarray, "segments samples"]:
-    return np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
 
 
 def motions(model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions) -> Motion:
@@ -213,10 +208,9 @@ def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
 
 def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
     """Whether a segment goes on where the one before it ends in time, joined or not."""
-    knots = np.asarray(segments.torque.knots)[:, segments.halo :]
-    step = np.median(np.diff(knots))
+    knots = segments.knots
     late = knots[1:, 0] - knots[:-1, -1]
-    return np.append(False, np.abs(late) < 0.5 * step)
+    return np.append(False, np.abs(late) < 0.5 * np.median(segments.width))
 
 
 def _at_knots(

@@ -1,6 +1,5 @@
 """How long the dynamic error that a fit leaves over remembers itself, freed of what the fitting has put into it."""
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtrc
@@ -78,7 +77,7 @@ def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directio
 
     The columns of each chain are orthonormal over its rows and those of the prior of its hidden states.
     """
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     slopes = FirstStates.of(linearise(problem, fit.unknowns), problem.segments.joined).by_first
     chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
     return _orthonormal(slopes, chain)[:, : problem.segments.measured[0].size], chain

@@ -5,20 +5,19 @@ data fully. So each start is fitted over short horizons first, and the best goes
 it has found.
 """
 
-import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
 from fitting.autocorrelation import autocorrelation, left_over, ljung_box
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch, cut
+from fitting.estimate import Fit, Start, Strategy, fit
+from fitting.experiment import Stretch
 from fitting.free import base_paths
 from fitting.outliers import without_glitches, without_lone_errors
-from fitting.posing import initial_states, segment_length, short_horizon, suggested_substeps
+from fitting.posing import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.starting_values import apart, starting_models, starts_blind_to_loads
 from fitting.steady_load import SteadyLoad
 from hdjax import Drive, Model
@@ -67,10 +66,8 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
             best.model,
             cleaned,
             base_paths(best.model),
-            horizon=best.horizon,
-            halo=halo,
-            substeps=best.substeps,
-            states=best.unknowns.states,
+            best.segmentation,
+            start=Start(states=best.unknowns.states),
         )
     return eqx.tree_at(lambda f: f.problem.model, best, start)
 
@@ -81,13 +78,13 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
 
-    fitted = functools.partial(_fitted, training=training, horizon=horizon, halo=halo, substeps=substeps)
+    fitted = functools.partial(_fitted, training=training, segmentation=Segmentation(horizon, None, halo, substeps))
     if len(starts) > 1:
-        starts = sorted(starts, key=lambda s: fitted(s, max_steps=20, hold_parameters=True).objective)
+        starts = sorted(starts, key=lambda s: fitted(s, strategy=Strategy(20, hold_parameters=True)).objective)
     best, begun = fitted(starts[0]), starts[0]
     if len(starts) == 1 or leaves_white_noise(best):
         return best, begun
-    trials = [(fitted(s, max_steps=_TRIAL_STEPS), s) for s in starts[1:]]
+    trials = [(fitted(s, strategy=Strategy(_TRIAL_STEPS)), s) for s in starts[1:]]
     for trial, start in sorted(trials, key=lambda pair: pair[0].objective):
         if trial.objective < best.objective + _HOPELESS:
             other = fitted(trial.model)
@@ -96,9 +93,11 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     return best, begun
 
 
-def _fitted(model: Model, *, training: Sequence[Stretch], **options: Any) -> Fit:
-    """The fit of all that the model has of its own, from where it stands; options as for [`fitting.estimate.fit`][]."""
-    return fit(model, training, base_paths(model), **options)
+def _fitted(
+    model: Model, *, training: Sequence[Stretch], segmentation: Segmentation, strategy: Strategy = Strategy()
+) -> Fit:
+    """Fit all that the model has of its own, from where it stands; arguments as in [`fitting.estimate.fit`][]."""
+    return fit(model, training, base_paths(model), segmentation, strategy=strategy)
 
 
 def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
@@ -116,14 +115,14 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
         return best
     horizon = segment_length(short_horizon(starts[0], training))
     substeps = suggested_substeps(starts[0], training)
-    fitted = functools.partial(_fitted, training=training, horizon=horizon, halo=halo, substeps=substeps)
+    fitted = functools.partial(_fitted, training=training, segmentation=Segmentation(horizon, None, halo, substeps))
     reach = drive.N * max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in training)
     loaded = fitted(starts[0].with_effects(SteadyLoad(reach=reach)))
     bare = loaded.model.without_effect(SteadyLoad.name)
     other = fitted(bare)
     if not loaded.objective < other.objective + np.log(_MUCH):
         return best
-    return other if apart(other.model, bare) < _OFF else fitted(bare, hold_parameters=True)
+    return other if apart(other.model, bare) < _OFF else fitted(bare, strategy=Strategy(hold_parameters=True))
 
 
 def is_held(found: Fit) -> bool:
@@ -133,7 +132,7 @@ def is_held(found: Fit) -> bool:
 
 def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     """The fit over horizons of six natural periods, from one over shorter ones."""
-    paths, length = base_paths(best.model), best.error.shape[1]
+    paths = base_paths(best.model)
     # The reach of a horizon is in inverse proportion to it, so that none may be skipped. Joined segments make a longer
     # one by the same program.
     while 4 * best.horizon <= short_horizon(best.model, training):
@@ -141,24 +140,14 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
             best.model,
             training,
             paths,
-            horizon=2 * best.horizon,
-            length=length,
-            halo=halo,
-            substeps=best.substeps,
-            count=best.error.shape[0],
-            states=best.unknowns.states,
+            replace(best.segmentation, horizon=2 * best.horizon),
+            start=Start(states=best.unknowns.states),
         )
-    horizon = short_horizon(best.model, training)
-    segments = cut(as_followed(best), segment_length(horizon), halo=halo)
-    return fit(
-        best.model,
-        training,
-        paths,
-        horizon=horizon,
-        halo=halo,
-        substeps=suggested_substeps(best.model, training),
-        states=initial_states(best.model, segments),
+    segmentation = Segmentation(
+        short_horizon(best.model, training), halo=halo, substeps=suggested_substeps(best.model, training)
     )
+    states = initial_states(best.model, segmentation.of(as_followed(best)))
+    return fit(best.model, training, paths, segmentation, start=Start(states=states))
 
 
 def leaves_white_noise(found: Fit) -> bool:
@@ -170,13 +159,9 @@ def leaves_white_noise(found: Fit) -> bool:
 
 def as_followed(found: Fit) -> tuple[Stretch, ...]:
     """The stretches with the outputs that a fit gives in place of the measured ones."""
-    length = found.error.shape[1]
-    parts, first = [], 0
-    for stretch in found.stretches:
-        pieces = -(-len(stretch) // length)
-        error = np.asarray(found.error[first : first + pieces]).reshape(pieces * length, -1)[: len(stretch)]
-        first += pieces
+    parts = []
+    for stretch, error in zip(found.stretches, found.by_stretch(np.asarray(found.error)), strict=True):
         measured = stretch.experiment.measured.copy()
         measured[stretch.start : stretch.stop] -= error
-        parts.append(Stretch(dataclasses.replace(stretch.experiment, measured=measured), stretch.start, stretch.stop))
+        parts.append(Stretch(replace(stretch.experiment, measured=measured), stretch.start, stretch.stop))
     return tuple(parts)

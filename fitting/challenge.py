@@ -1,12 +1,11 @@
 """Names challenged by a learned term: where they leave something, one is learned beside them and in their place."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, long_gains
+from fitting.attribution.candidate_fit import Trial, long_gains
 from fitting.attribution.decisions import (
     RULES,
     ChallengeEvidence,
@@ -14,6 +13,7 @@ from fitting.attribution.decisions import (
     names_stand,
     next_question,
 )
+from fitting.attribution.study import Study
 from fitting.attribution.support import (
     Standing,
     is_noise,
@@ -23,6 +23,7 @@ from fitting.attribution.support import (
 )
 from fitting.base_fit import leaves_white_noise
 from fitting.compare import excess
+from fitting.effect_search import refitted_without
 from fitting.estimate import half_log_determinant
 from fitting.measurement_noise import MeasurementNoise
 from fitting.noise_model import NoiseModel
@@ -45,16 +46,7 @@ class Challenge(eqx.Module):
     seen: ChallengeEvidence = eqx.field(static=True)
 
 
-def challenge_names(
-    base: Trial,
-    named: Trial,
-    data: Data,
-    setting: Setting,
-    *,
-    noise: MeasurementNoise,
-    seed: int,
-    progress: Callable[[str], None],
-) -> Challenge:
+def challenge_names(base: Trial, named: Trial, study: Study, *, noise: MeasurementNoise) -> Challenge:
     """Learn what decides whether names can be trusted, as far as the rules ask for it.
 
     Names of which a learned term beside them leaves nothing fall in any case.
@@ -62,11 +54,8 @@ def challenge_names(
     Args:
         base: the model without effects.
         named: the model with those that were found.
-        data: the stretches.
-        setting: how they are cut.
+        study: the data, and how they are cut.
         noise: of the measured outputs, as far as fits have been asked for it.
-        seed: of the surrogates behind the p-values.
-        progress: told what is being done.
     """
 
     def seen_as(trial: Trial) -> ModelEvidence:
@@ -83,17 +72,16 @@ def challenge_names(
         seen = replace(seen, left=noise_evidence(left))
     while (question := next_question(seen)) is not None:
         if question == "instead":
-            instead = _learned(Standing(base, base, noise), data, setting, seed=seed, progress=progress)
+            instead = _learned(Standing(base, base, noise), study)
             if instead is None:
                 seen = seen.answered("instead", None)
                 continue
             come_out = share_of(named.model, instead, named.training) if named.hold == base.hold else 0.0
             seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
         else:
-            finer = setting.with_steps_of(named.training)
-            beside = _learned(standing, data, finer, seed=seed, progress=progress)
+            beside = _learned(standing, study.with_substeps(named.training.substeps))
             if beside is not None:
-                named, beside = _without_superfluous(base, named, beside, data, setting)
+                named, beside = _without_superfluous(base, named, beside, study)
             seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
             seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
     left = left if beside is None and is_noise(left) else None
@@ -101,7 +89,7 @@ def challenge_names(
         return Challenge(base, beside, left, seen)
     if instead is not None:
         rival = named if beside is None else beside.trial
-        gains = long_gains(base, [rival, instead.trial], data, setting)
+        gains = long_gains(base, [rival, instead.trial], study)
         # Where both leave the numbers neither is worse.
         follow = gains is not None and np.isfinite(gains).any()
         seen = replace(seen, longer_worse=gains[0] - gains[1] if gains is not None and follow else 0.0)
@@ -117,11 +105,9 @@ def challenge_names(
     return Challenge(named, beside, left, seen) if stand else Challenge(base, instead, None, seen)
 
 
-def _learned(
-    standing: Standing, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
-) -> Unknown | None:
+def _learned(standing: Standing, study: Study) -> Unknown | None:
     """What can be learned that the data support, beyond noise where that would explain as much."""
-    found = learn_supported(standing.before, data, setting, seed=seed, progress=progress)
+    found = learn_supported(standing.before, study)
     supported = found is not None and standing.over_noise(found.trial) > RULES.noise_gain
     return found if supported else None
 
@@ -150,32 +136,23 @@ def _names(base: Trial, named: Trial) -> set[str]:
     return found | ({"hold"} if named.hold != base.hold else set())
 
 
-def _without_superfluous(
-    base: Trial, named: Trial, beside: Unknown, data: Data, setting: Setting
-) -> tuple[Trial, Unknown]:
+def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Study) -> tuple[Trial, Unknown]:
     """Names, and what was learned beside them, without the effects that this has made superfluous: none of their
     strengths is told from zero any more, and selection data hardly miss them."""
     names = {e.name for e in named.model.effects}
     fallen = names - told_from_zero(beside.trial.training, names)
     if not fallen:
         return named, beside
-    trial = _refitted_without(fallen, beside.trial, data, setting)
+    trial = refitted_without(fallen, beside.trial, base, study)
     missed = trial.held_out.objective - beside.trial.held_out.objective
     if missed >= max(RULES.least_gain, RULES.little * beside.gain):
         return named, beside
     bare = base
     if fallen != names or named.hold != base.hold:
-        bare = _refitted_without(fallen, named, data, setting)
+        bare = refitted_without(fallen, named, base, study)
     states = [n for n in named.model.state_names if n in bare.model.state_names]
     kept = [named.model.state_names.index(n) for n in states]
     gain = bare.held_out.objective - trial.held_out.objective
     return bare, replace(
         beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
     )
-
-
-def _refitted_without(fallen: set[str], trial: Trial, data: Data, setting: Setting) -> Trial:
-    model = trial.model
-    for name in fallen:
-        model = model.without_effect(name)
-    return attempt(model, data, trial.hold, setting.with_steps_of(trial.training), start=trial)

@@ -1,15 +1,16 @@
 """The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 
-from fitting.attribution.candidate_fit import Data, Setting, Trial
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.decisions import CaseEvidence, decide
 from fitting.attribution.effect_evidence import evidence
 from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
 from fitting.attribution.selection_round import Round
+from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
 from fitting.challenge import Challenge, challenge_names
 from fitting.clock import Clock
@@ -22,12 +23,10 @@ from fitting.experiment import Experiment, Stretch, split, whole
 from fitting.free_run import FreeRun, rms_error
 from fitting.long_fit import refitted_on_all
 from fitting.outcome import Finding, Loop
+from fitting.progress import Progress, silent
+from fitting.search_options import SearchOptions
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
-
-
-def _silent(message: str) -> None:
-    pass
 
 
 def close_loop(
@@ -36,11 +35,9 @@ def close_loop(
     *,
     test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
-    max_effects: int = 3,
     catalogue: Sequence[type[Effect]] = CATALOGUE,
-    seed: int = 0,
-    thorough: bool = False,
-    progress: Callable[[str], None] = _silent,
+    search: SearchOptions = SearchOptions(),
+    progress: Progress = silent,
 ) -> Loop:
     """Close the loop between a model and the logs of one drive.
 
@@ -50,10 +47,8 @@ def close_loop(
             model.
         test: likewise of data that only the final figures look at; where there are none, no figures are claimed.
         hold: the assumption that the user states; where None, the one that suits the base model best.
-        max_effects: effects to add at most.
         catalogue: forms to look for.
-        seed: of the surrogates behind the p-values.
-        thorough: whether all forms are refitted in each round, in place of those that the score test finds likely.
+        search: how they are searched for.
         progress: told what is being done.
 
     Returns:
@@ -66,22 +61,23 @@ def close_loop(
         raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
     clock = Clock()
     progress("finding starting values")
-    base, setting, data = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)
-    setting = replace(setting, thorough=thorough)
+    base, read = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)
+    setting = replace(read.setting, thorough=search.thorough)
+    read = replace(read, setting=setting, seed=search.seed, progress=progress)
     clock.lap("base fit")
-    base, clocked = with_clocks_set(base, data, setting, progress=progress)
-    late, data = put_back(data[base.hold][0], clocked[base.hold][0]), clocked
+    base, study = with_clocks_set(base, read)
+    fitted = study.data[base.hold][0]
+    late = put_back(read.data[base.hold][0], fitted)
     clock.lap("clocks")
-    seeds = {"seed": seed, "progress": progress}
-    found = search_effects(base, data, setting, max_effects=max_effects, catalogue=catalogue, **seeds)
+    found = search_effects(base, study, max_effects=search.max_effects, catalogue=catalogue)
     clock.lap("attribution")
-    challenge = challenge_names(base, found.named, data, setting, noise=found.noise, **seeds)
+    challenge = challenge_names(base, found.named, study, noise=found.noise)
     clock.lap("unknown effects")
-    end = draw_conclusion(base, challenge, data, setting, noise=found.noise, **seeds)
+    end = draw_conclusion(base, challenge, study, noise=found.noise)
     clock.lap("final fit")
     progress("free runs")
-    tests = put_back_as(late, {h: whole(e) for h, e in (test or {}).items()}, data[base.hold][0])
-    return _Closed(base, data, setting, found, challenge, end).told(tests, late, clock)
+    tests = put_back_as(late, {h: whole(e) for h, e in (test or {}).items()}, fitted)
+    return _Closed(base, study, found, challenge, end).told(tests, late, clock)
 
 
 @dataclass(frozen=True)
@@ -89,8 +85,7 @@ class _Closed:
     """What each stage has come to."""
 
     base: Trial
-    data: Data
-    setting: Setting
+    study: Study
     found: Search
     challenge: Challenge
     end: Conclusion
@@ -105,7 +100,7 @@ class _Closed:
         seen = evidence(final.training)
         clock.lap("evidence")
         trusted = {e.name for e in end.trusted.model.effects}
-        time_step = self.data[base.hold][0][0].experiment.time_step
+        time_step = self.study.data[base.hold][0][0].experiment.time_step
         return Loop(
             decision=end.outcome,
             checks=decide(case).checks,
@@ -125,9 +120,9 @@ class _Closed:
             residual_before=diagnose(base.training),
             residual_after=diagnose(final.training),
             hold=final.hold,
-            setting=self.setting,
+            setting=self.study.setting,
             after_substeps=end.fitted.substeps,
-            stretches=self.data[final.hold],
+            stretches=self.study.data[final.hold],
             surprise=end.seen.surprise,
             put_back=late,
             seconds=clock.laps,
@@ -140,8 +135,8 @@ class _Closed:
 
         def accounted(trial: Trial, fitted: Fit, runs: tuple[FreeRun, ...]) -> Account:
             both, test = refitted_on_all(fitted, trial.held_out), tests.get(trial.hold, ())
-            known = {"noise": end.noise, "halo": self.setting.halo}
-            return account(both, self.data[trial.hold][0], test, selection=runs, **known)
+            known = {"noise": end.noise, "halo": self.study.setting.halo}
+            return account(both, self.study.data[trial.hold][0], test, selection=runs, **known)
 
         after = accounted(end.final, end.fitted, end.runs)
         if end.final is self.base:
@@ -169,15 +164,14 @@ class _Closed:
         kept = [] if trusted is base else [name for name in without if name not in fallen]
         if len(kept) == 1:
             return {kept[0]: base}
-        finer = self.setting.with_steps_of(trusted.training)
-        return {name: refitted_without(name, trusted, base, self.data, finer) for name in kept}
+        return {name: refitted_without([name], trusted, base, self.study) for name in kept}
 
     def _rmse(self, trial: Trial) -> float:
         """Of a model's free runs along selection data."""
         if trial is self.base:
             return rms_error(self.end.runs_at_first)
-        stretches = self.data[trial.hold][1]
-        return rms_error(free_runs(trial.training, stretches, noise=self.end.noise, halo=self.setting.halo))
+        stretches, halo = self.study.data[trial.hold][1], self.study.setting.halo
+        return rms_error(free_runs(trial.training, stretches, noise=self.end.noise, halo=halo))
 
 
 def _named_findings(

@@ -1,14 +1,14 @@
 """The conclusion: which model is trusted in the end, and what the data say of it."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from fitting.attribution.candidate_fit import Data, Setting, Trial
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
+from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
 from fitting.challenge import Challenge
 from fitting.compare import excess, free_runs
@@ -53,26 +53,14 @@ class Conclusion(eqx.Module):
         return self.trusted if self.unknown is None else self.unknown.trial
 
 
-def draw_conclusion(
-    base: Trial,
-    challenge: Challenge,
-    data: Data,
-    setting: Setting,
-    *,
-    noise: MeasurementNoise,
-    seed: int,
-    progress: Callable[[str], None],
-) -> Conclusion:
+def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: MeasurementNoise) -> Conclusion:
     """Ask of the trusted model what is still open, and conclude.
 
     Args:
         base: the model without effects.
         challenge: of the names that were found.
-        data: the stretches.
-        setting: how they are cut.
+        study: the data, and how they are cut.
         noise: of the measured outputs, as far as fits were asked for it.
-        seed: of the surrogates behind the p-values.
-        progress: told what is being done.
     """
     trusted, unknown = challenge.trusted, challenge.unknown
     covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
@@ -86,20 +74,20 @@ def draw_conclusion(
         unknown, seen = None, replace(seen, learned=False)
 
     def along_selection(fitted: Fit, hold: Hold) -> tuple[FreeRun, ...]:
-        return free_runs(fitted, data[hold][1], noise=covariance, halo=setting.halo)
+        return free_runs(fitted, study.data[hold][1], noise=covariance, halo=study.setting.halo)
 
-    progress("final fit over long horizons")
+    study.progress("final fit over long horizons")
     current = trusted if unknown is None else unknown.trial
     fitted = long_fit(current.training)
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
-        known = {"noise": covariance, "halo": setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
+        known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
         beyond = surprise(fitted, at_first, runs, current.held_out, **known)
         seen = replace(seen, surprise=beyond)
         outcome, _ = conclude(seen)
         if outcome == "unexplained":
             # What follows over long times may be learned in the place of names that do not.
-            instead = learn_supported(base, data, setting, seed=seed, progress=progress)
+            instead = learn_supported(base, study)
             other = None if instead is None else long_fit(instead.trial.training)
             if instead is not None and other is not None:
                 instead_runs = along_selection(other, instead.trial.hold)

@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from fitting.drawn_drives import drawn_from_report, fitted_model, spread_around
-from fitting.model_file import read_model
+from fitting.model_sections import SOURCES, stated_model, stated_range, with_stated_effects
 from fitting.toml_sections import Sections
-from hdjax import PRESETS, TwoInertiaModel
+from hdjax import TwoInertiaModel
 from hdjax.design import MEASURES, Case, Draws, Excitation, Limit, Measure, Replaced, Study, Term, Variable
 from hdjax.design.catalogue_gear import SIZE, CatalogueGear
 from hdjax.design.robustness import CRITERIA
 from hdjax.design.variables import SPACINGS
-from hdjax.effects import BY_NAME
 from hdjax.parameters import ParameterInfo
 
 _SECTIONS = ("drive", "effects", "forcing", "variables", "objective", "limits", "robust", "search")
@@ -54,7 +53,11 @@ def read_design_file(path: Path) -> DesignFile:
         case = Case(_model(file), _excitation(file))
         variables = _variables(file)
         terms = tuple(
-            Term(label, _measure(file, "objective", label, table, ("weight",)), _weight(file, label, table))
+            Term(
+                label,
+                _measure(file, "objective", label, table, ("weight",)),
+                file.number(f"objective.{label}", "weight", table.get("weight", 1.0)),
+            )
             for label, table in _tables(file, "objective")
         )
         limits = tuple(_limit(file, label, table) for label, table in _tables(file, "limits"))
@@ -79,30 +82,17 @@ def read_design_file(path: Path) -> DesignFile:
 
 def _model(file: Sections) -> TwoInertiaModel:
     drive, robust = file.section("drive"), file.section("robust")
-    if "model" in drive:
-        model = read_model(file.path.parent / str(drive["model"])).model
-        if not isinstance(model, TwoInertiaModel):
-            raise file.refuse(
-                "[drive] model is a reduced model, which has no inertias to design; give one of both angles"
-            )
-    elif "report" in robust:
+    if "model" not in drive and "report" in robust:
         model = fitted_model(file.path.parent / str(robust["report"]))
     else:
-        model = TwoInertiaModel(PRESETS[file.one_of("drive", "preset", drive.get("preset", "HDC-40-050"), PRESETS)]())
-    own = {k: v for k, v in drive.items() if k not in ("preset", "model")}
+        model = stated_model(file)
+    if not isinstance(model, TwoInertiaModel):
+        raise file.refuse("[drive] model is a reduced model, which has no inertias to design; give one of both angles")
+    own = {k: v for k, v in drive.items() if k not in SOURCES}
     names = {name: info for name, (_, info) in model.parameters().items() if "." not in name}
-    file.known("drive", own, ("preset", "model", *names))
+    file.known("drive", own, (*SOURCES, *names))
     changed = model.replace({k: _within(file, "drive", k, v, names[k]) for k, v in own.items()})
-    for name, values in file.section("effects").items():
-        if name not in BY_NAME:
-            raise file.refuse(f"[effects.{name}] is no effect; there are {', '.join(BY_NAME)}")
-        table = file.table(f"effects.{name}", values)
-        fields = {
-            f.name: f.metadata["parameter"] for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata
-        }
-        file.known(f"effects.{name}", table, fields)
-        numbers = {k: file.number(f"effects.{name}", k, v) for k, v in table.items()}
-        changed = changed.with_effects(BY_NAME[name](**numbers))
+    changed = with_stated_effects(file, changed)
     assert isinstance(changed, TwoInertiaModel)
     return changed
 
@@ -116,9 +106,8 @@ def _within(file: Sections, section: str, key: str, value: object, info: Paramet
 
 
 def _excitation(file: Sections) -> Excitation:
-    table = file.section("forcing")
-    file.known("forcing", table, [f.name for f in dataclasses.fields(Excitation)])
-    return Excitation(**{k: file.number("forcing", k, v) for k, v in table.items()})
+    names = [f.name for f in dataclasses.fields(Excitation)]
+    return Excitation(**file.numbers("forcing", file.section("forcing"), names))
 
 
 def _variables(file: Sections) -> tuple[Variable, ...]:
@@ -127,11 +116,8 @@ def _variables(file: Sections) -> tuple[Variable, ...]:
         where = f"variables.{name}"
         table = file.table(where, value)
         file.known(where, table, ("from", "to", "spacing"))
-        for key in ("from", "to"):
-            if key not in table:
-                raise file.refuse(f"[{where}] must have `{key}`")
+        low, high = stated_range(file, where, table)
         spacing = file.one_of(where, "spacing", table.get("spacing", "linear"), SPACINGS)
-        low, high = (file.number(where, key, table[key]) for key in ("from", "to"))
         found.append(Variable(name, low, high, spacing))
     if not found:
         raise file.refuse('[variables] must name what may be chosen, such as "B_sp" = { from = 0.1, to = 10.0 }')
@@ -155,9 +141,7 @@ def _measure(file: Sections, section: str, label: str, table: dict[str, Any], be
     fields = {f.name: f for f in dataclasses.fields(kind)}
     given = {k: v for k, v in table.items() if k not in ("measure", *beside)}
     file.known(where, given, (*fields, "measure", *beside))
-    needed = [n for n, f in fields.items() if f.default is dataclasses.MISSING and n not in given]
-    if needed:
-        raise file.refuse(f"[{where}] must have `{needed[0]}`")
+    file.needs(where, given, [n for n, f in fields.items() if f.default is dataclasses.MISSING])
     return kind(**{k: _argument(file, where, k, v, fields[k].default) for k, v in given.items()})
 
 

@@ -177,18 +177,15 @@ def respond(
     warm = any(e.needs_temperature for e in model.effects)
     limits = bench.limits
     units = [limits.speed, limits.travel * float(model.drive.N)] if drive else []
-    found = _respond(
-        model,
-        of.free,
-        signals,
-        jnp.asarray(rest),
-        jnp.asarray(whitening(bench.noise)),
-        jnp.asarray(np.array([*units, limits.twist])),
-        jnp.asarray(np.asarray(bench.temperature if warm and bench.temperature is not None else 0.0)),
-        jnp.asarray(np.concatenate([unknowns, command])),
-        jnp.asarray(np.asarray(bench.substeps)),
-        bench.halo,
+    setup = _Setup(
+        rest=jnp.asarray(rest),
+        white=jnp.asarray(whitening(bench.noise)),
+        units=jnp.asarray(np.array([*units, limits.twist])),
+        temperature=jnp.asarray(np.asarray(bench.temperature if warm and bench.temperature is not None else 0.0)),
+        substeps=jnp.asarray(np.asarray(bench.substeps)),
+        halo=bench.halo,
     )
+    found = _respond(model, of.free, signals, setup, jnp.asarray(np.concatenate([unknowns, command])))
     outputs, motion, columns, motion_columns = (np.asarray(a) for a in found)
     return Response(
         outputs.ravel(),
@@ -199,18 +196,29 @@ def respond(
     )
 
 
+class _Setup(eqx.Module):
+    """A bench as a compiled program takes it.
+
+    Attributes:
+        rest: motion state at the start.
+        white: whitening of the outputs.
+        units: of what has limits.
+        temperature: of the drive [K].
+        substeps: solver steps in a sample interval.
+        halo: intervals of no torque before the start.
+    """
+
+    rest: Array
+    white: Array
+    units: Array
+    temperature: Array
+    substeps: Array
+    halo: int = eqx.field(static=True)
+
+
 @jit_lanes
 def _respond(
-    model: Model,
-    free: FreeParameters,
-    signals: Signals,
-    rest: Array,
-    white: Array,
-    units: Array,
-    temperature: Array,
-    at: Array,
-    substeps: Array,
-    halo: int,
+    model: Model, free: FreeParameters, signals: Signals, setup: _Setup, at: Array
 ) -> tuple[Array, Array, Array, Array]:
     own, motions = len(free.paths), len(model.motion_states)
 
@@ -218,14 +226,14 @@ def _respond(
         drive = free.unpack(model, entries[:own])
         torque = PiecewisePolynomial(signals.knots, signals.shapes @ entries[own + motions :])
         acting = drive.actuate(torque)
-        acting = PiecewisePolynomial(acting.knots[halo:], acting.coefficients[halo:])
-        steady = jnp.broadcast_to(temperature, (acting.coefficients.shape[0], 1))
+        acting = PiecewisePolynomial(acting.knots[setup.halo :], acting.coefficients[setup.halo :])
+        steady = jnp.broadcast_to(setup.temperature, (acting.coefficients.shape[0], 1))
         warmth = PiecewisePolynomial(acting.knots, steady)
-        state = drive.settled(rest + entries[own : own + motions])
-        states, _ = march(drive, acting, None, state, solver=dfx.Tsit5(), substeps=substeps, temperature=warmth)
+        state = drive.settled(setup.rest + entries[own : own + motions])
+        states, _ = march(drive, acting, None, state, solver=dfx.Tsit5(), substeps=setup.substeps, temperature=warmth)
         outputs = jax.vmap(drive.outputs)(states)
-        moved = [states[:, 2], states[:, 0] - rest[0]] if units.size > 1 else []
-        return outputs @ white.T, jnp.stack([*moved, outputs[:, -1]], axis=1) / units[None, :]
+        moved = [states[:, 2], states[:, 0] - setup.rest[0]] if setup.units.size > 1 else []
+        return outputs @ setup.white.T, jnp.stack([*moved, outputs[:, -1]], axis=1) / setup.units[None, :]
 
     def along(tangent: Array):
         return jax.jvp(simulated, (at,), (tangent,))

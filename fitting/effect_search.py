@@ -1,21 +1,21 @@
 """The search for effects: add the best one, refit, look again; then drop what a later one has made superfluous."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, gone_on, halo_for
+from fitting.attribution.candidate_fit import Trial, attempt, gone_on, halo_for
 from fitting.attribution.decisions import RULES
 from fitting.attribution.selection_round import Round, look
+from fitting.attribution.study import Data, Setting, Study
 from fitting.attribution.support import Standing, leaves_imperfection
 from fitting.base_fit import base_fit, is_held
 from fitting.errors import DataError
 from fitting.estimate import lost
-from fitting.experiment import segment_count
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
 from fitting.outliers import with_weights
-from fitting.posing import segment_length
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -41,9 +41,9 @@ class Search(eqx.Module):
     noise: MeasurementNoise
 
 
-def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Setting, Data]:
-    """The base model fitted under the stated hold, or under the one that suits it best, and the data without the
-    samples that its fit does not believe.
+def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Study]:
+    """The base model fitted under the stated hold, or under the one that suits it best, and a study of the data
+    without the samples that its fit does not believe.
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -55,46 +55,31 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Sett
     """
     first = hold if hold is not None else next(iter(data))
     training = data[first][0]
-    halo = halo_for(training)
-    best = base_fit(model, training, halo=halo)
+    best = base_fit(model, training, halo=halo_for(training))
     data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
-    count = segment_count(training, segment_length(best.horizon))
-    setting = Setting(best.horizon, halo, best.substeps, count)
+    study = Study(data, Setting(best.segmentation))
     holds: list[Hold] = list(data) if hold is None else [hold]
-    trials = [attempt(best.model, data, h, setting, hold_parameters=is_held(best)) for h in holds]
+    trials = [attempt(best.model, study, h, hold_parameters=is_held(best)) for h in holds]
     chosen = min(trials, key=lambda t: t.training.objective)
-    finer = setting.fine_enough(chosen.training)
-    if finer is not setting:
-        chosen = attempt(chosen.model, data, chosen.hold, finer, start=chosen, hold_parameters=is_held(best))
-        setting = finer
+    finer = study.fine_enough(chosen.training)
+    if finer is not study:
+        chosen = attempt(chosen.model, finer, chosen.hold, start=chosen, hold_parameters=is_held(best))
     if np.mean(lost(chosen.training)) > _MOST_LOST:
         raise DataError(
             "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
             "drive file, and unit, sign and side of the torque column"
         )
-    return chosen, setting, data
+    return chosen, finer
 
 
-def search_effects(
-    base: Trial,
-    data: Data,
-    setting: Setting,
-    *,
-    max_effects: int,
-    catalogue: Sequence[type[Effect]],
-    seed: int,
-    progress: Callable[[str], None],
-) -> Search:
+def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Sequence[type[Effect]]) -> Search:
     """Look for effects until the data support no further one.
 
     Args:
         base: the model without effects.
-        data: the stretches.
-        setting: how they are cut.
+        study: the data, and how they are cut.
         max_effects: effects to add at most.
         catalogue: forms to look for.
-        seed: of the surrogates behind the p-values.
-        progress: told what is being done.
     """
     current, rounds, noise = base, [], measurement_noise(base.training)
     while len(rounds) < max_effects:
@@ -102,36 +87,33 @@ def search_effects(
             enough, noise = leaves_imperfection(current, base, noise)
             if enough:
                 break
-        turn = seed + len(rounds)
-        options = {"catalogue": catalogue, "seed": turn, "progress": progress}
-        this = look(Standing(current, base, noise), data, setting, **options)
+        turn = replace(study, seed=study.seed + len(rounds))
+        this = look(Standing(current, base, noise), turn, catalogue=catalogue)
         rounds.append(this)
         if not this.accepted:
             break
         assert this.winner.trial is not None
-        setting = setting.with_steps_of(this.winner.trial.training)
+        study = study.with_substeps(this.winner.trial.training.substeps)
         # What a trial has not quite reached the next look would take for a further effect.
-        current = gone_on(this.winner.trial, data, setting)
-        progress(f"found {this.winner.name}")
+        current = gone_on(this.winner.trial, study)
+        study.progress(f"found {this.winner.name}")
     dropped = _holds_given_up(rounds, base.hold, current.hold)
-    current, superfluous, without = _without_superfluous(current, base, data, setting)
+    current, superfluous, without = _without_superfluous(current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
     if kept and not dropped:
         without[kept[-1].winner.name] = kept[-1].before
     for name in (this.winner.name for this in kept if this.winner.name not in without):
-        without[name] = base if len(kept) == 1 else refitted_without(name, current, base, data, setting)
+        without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
     return Search(current, tuple(rounds), tuple(dropped), without, noise)
 
 
-def _without_superfluous(
-    current: Trial, base: Trial, data: Data, setting: Setting
-) -> tuple[Trial, list[str], dict[str, Trial]]:
+def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Trial, list[str], dict[str, Trial]]:
     """The model without effects that selection data hardly miss beside later ones, their names, and the model without
     each of the others but the last."""
     dropped, without = [], {}
     for name in [e.name for e in current.model.effects][:-1]:
-        poorer = refitted_without(name, current, base, data, setting)
+        poorer = refitted_without([name], current, base, study)
         if poorer.held_out.objective - current.held_out.objective < RULES.least_gain:
             dropped.append(name)
             current, without = poorer, {}
@@ -148,16 +130,17 @@ def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[st
     return [this.winner.name for this in holds if last == first or this is not holds[-1]]
 
 
-def refitted_without(name: str, current: Trial, base: Trial, data: Data, setting: Setting) -> Trial:
-    """The model refitted without one of its effects, or under the base model's hold where that is the effect.
+def refitted_without(names: Collection[str], current: Trial, base: Trial, study: Study) -> Trial:
+    """The model refitted without some of what was found, by as many solver steps.
 
     Args:
-        name: of the effect.
+        names: of effects; any other one is that of another hold of the torque, which is taken back.
         current: the model.
         base: the model without effects.
-        data: the stretches.
-        setting: how they are cut.
+        study: the data, and how they are cut.
     """
-    if name in {e.name for e in current.model.effects}:
-        return attempt(current.model.without_effect(name), data, current.hold, setting, start=current)
-    return attempt(current.model, data, base.hold, setting, start=current)
+    model, effects = current.model, {e.name for e in current.model.effects}
+    for name in effects.intersection(names):
+        model = model.without_effect(name)
+    hold = current.hold if effects.issuperset(names) else base.hold
+    return attempt(model, study.with_substeps(current.training.substeps), hold, start=current)

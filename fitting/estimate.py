@@ -1,20 +1,20 @@
 """The only least squares: parameters, initial states and noise covariance from segments of logs."""
 
-import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.engines import linearise
 from fitting.experiment import Stretch, scales
 from fitting.explained import FirstStates
 from fitting.followed import readout
 from fitting.free import FreeParameters
-from fitting.posing import initial_states, on_all_devices, pose
+from fitting.posing import Segmentation, initial_states, on_all_devices, pose
 from fitting.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from hdjax import Model
@@ -31,6 +31,46 @@ _LONGEST_RETRY = 16
 _OUTLIER = 6.0
 # Iterations in each window of samples, of windows that grow.
 _WINDOW_STEPS = 12
+
+
+class Start(eqx.Module):
+    """Where a fit begins, beside the values of its model.
+
+    Attributes:
+        covariance: of the outputs' errors, to start the weighing with; that of the model where not given.
+        states: initial states of the segments; from their first samples where not given.
+    """
+
+    covariance: Float[Array | np.ndarray, "outputs outputs"] | None = None
+    states: Float[Array, "segments states"] | None = None
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How a fit is iterated.
+
+    Attributes:
+        max_steps: iterations of each pass at most; no further pass begins after twice as many in all.
+        least_progress: share of the sum of squares that a few steps must take off it, see [`fitting.solve.solve`][].
+        reweigh: whether to weigh by what is left over; with False the covariance at the start is kept.
+        hold_parameters: fit the initial states only, by the same program that fits the parameters.
+        begin_anew_above: an objective above which a first pass that does not converge is begun anew, from the first
+            samples of each segment: it may have lost its way.
+        retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
+        give_up_above: an objective that the fit must reach in its first pass to be worth another.
+    """
+
+    max_steps: int = 60
+    least_progress: float = 0.0
+    reweigh: bool = True
+    hold_parameters: bool = False
+    begin_anew_above: float = -np.inf
+    retry_states: bool = True
+    give_up_above: float = np.inf
+
+    def solve(self, problem: Problem, begin: Unknowns, damping: float) -> Solution:
+        """One pass: the least squares under fixed weights, by [`fitting.solve.solve`][]."""
+        return solve(problem, begin, self.max_steps, damping, least_progress=self.least_progress)
 
 
 class Fit(eqx.Module):
@@ -71,6 +111,36 @@ class Fit(eqx.Module):
         return int(self.problem.substeps)
 
     @property
+    def segmentation(self) -> Segmentation:
+        """How its data are cut: other fits on segments as long and as many share its compiled program."""
+        count, length = self.problem.segments.weight.shape
+        return Segmentation(self.horizon, length, self.problem.segments.halo, self.substeps, count)
+
+    @property
+    def at_solution(self) -> Problem:
+        """What was solved, at the fitted values."""
+        return eqx.tree_at(lambda p: p.model, self.problem, self.model)
+
+    @property
+    def white_error(self) -> Float[np.ndarray, "segments samples outputs"]:
+        """The whitened output error."""
+        return np.asarray(self.error) @ np.asarray(self.problem.whitening).T
+
+    @property
+    def pieces(self) -> Int[np.ndarray, " stretches"]:
+        """How many segments each stretch was cut into; those that only fill up a program come last."""
+        return np.array([-(-len(s) // self.error.shape[1]) for s in self.stretches])
+
+    def by_stretch(self, values: Shaped[np.ndarray, "segments samples *each"]) -> list[Shaped[np.ndarray, "_ *each"]]:
+        """What belongs to samples of segments, stretch by stretch and without padding."""
+        parts = np.split(values, np.cumsum(self.pieces))
+        return [a.reshape(-1, *a.shape[2:])[: len(s)] for s, a in zip(self.stretches, parts, strict=False)]
+
+    def with_all_free(self) -> "Fit":
+        """The same with fixed parameters counted as free, so that the data are asked what they say of them."""
+        return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
+
+    @property
     def dynamic_error_std(self) -> float:
         """Rms of what is left of the dynamic error [rad]."""
         return float(np.sqrt(self.covariance[-1, -1]))
@@ -80,51 +150,27 @@ def fit(
     model: Model,
     stretches: Sequence[Stretch],
     paths: Sequence[str],
+    segmentation: Segmentation,
     *,
-    horizon: int,
-    length: int | None = None,
-    halo: int = 0,
-    substeps: int | None = None,
-    max_steps: int = 60,
-    covariance: Float[Array | np.ndarray, "outputs outputs"] | None = None,
-    reweigh: bool = True,
-    hold_parameters: bool = False,
-    count: int | None = None,
-    states: Float[Array, "segments states"] | None = None,
-    begin_anew_above: float = -np.inf,
-    retry_states: bool = True,
-    give_up_above: float = np.inf,
-    least_progress: float = 0.0,
+    start: Start = Start(),
+    strategy: Strategy = Strategy(),
     engine: Engine | None = None,
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
-    Simulations start anew every `horizon` samples, and their initial states are fitted with the shared parameters.
-    Longer horizons are cut into joined segments that run side by side; their gaps close as the fit converges, so that
-    the result is that of one simulation (multiple shooting). The outputs are weighed by the covariance of what is left
-    over, which maximises the likelihood of Gaussian errors of unknown covariance: an output that the model cannot
-    follow loses its say.
+    Simulations start anew every so many samples (the horizon), and their initial states are fitted with the shared
+    parameters. Longer horizons are cut into joined segments that run side by side; their gaps close as the fit
+    converges, so that the result is that of one simulation (multiple shooting). The outputs are weighed by the
+    covariance of what is left over, which maximises the likelihood of Gaussian errors of unknown covariance: an output
+    that the model cannot follow is down-weighted.
 
     Args:
         model: equations and starting values.
         stretches: the data.
         paths: dotted paths of what is free; may be empty.
-        horizon: samples until a simulation starts anew. Short ones converge from far away, long ones use the data
-            fully.
-        length: samples in a segment; see [`segment_length`][] where not given.
-        halo: intervals of torque before each segment, for delays.
-        substeps: solver steps in a sample interval; from the natural frequency where not given.
-        max_steps: iterations of each pass at most; no further pass begins after twice as many in all.
-        covariance: of the outputs' errors to start the weighing with.
-        reweigh: whether to weigh by what is left over; with False the given covariance is kept.
-        hold_parameters: fit the initial states only, by the same program that fits the parameters.
-        count: number of segments, see [`fitting.experiment.cut`][].
-        states: initial states of the segments to start from; from their first samples where not given.
-        begin_anew_above: an objective above which a first pass that does not converge is begun anew, from the first
-            samples of each segment: it may have lost its way.
-        retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
-        give_up_above: an objective that the fit must reach in its first pass to be worth another.
-        least_progress: see [`fitting.solve.solve`][].
+        segmentation: how the data are cut.
+        start: where the fit begins.
+        strategy: how it is iterated.
         engine: what evaluates the residual; machine code where not given, or XLA where there can be none.
 
     Returns:
@@ -134,60 +180,63 @@ def fit(
         model,
         stretches,
         paths,
-        horizon=horizon,
-        length=length,
-        halo=halo,
-        substeps=substeps,
-        hold_parameters=hold_parameters,
-        count=count,
-        states=states,
+        segmentation,
+        hold_parameters=strategy.hold_parameters,
+        states=start.states,
         engine=engine,
     )
-    length = problem.segments.weight.shape[1]
-    outputs = problem.segments.measured.shape[-1]
     swing = float(scales(stretches).x)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
-    scale_matters = outputs > 1 or unknowns.states.shape[1] > len(model.motion_states)
+    scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
+    covariance = start.covariance
     if covariance is None:
         covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[swing**2]])
     objective, steps = np.inf, 0
     solution = None
-
-    def solved(begin: Unknowns, damping: float) -> Solution:
-        return solve(problem, begin, max_steps, damping, least_progress=least_progress)
-
-    for turn in range(_MOST_REWEIGHTINGS if reweigh and scale_matters else 1):
+    for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
         problem = weighed(problem, covariance, swing)
-        solution = solved(unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
-        if turn == 0 and horizon <= _LONGEST_RETRY * length:
-            reached = half_log_determinant(solution.left_over.covariance)
-            if reached > begin_anew_above and not (solution.success or hold_parameters):
-                again = solved(_grown(problem, unknowns, least_progress), NEARBY_DAMPING)
-                solution = min(solution, again, key=lambda s: np.sum(s.left_over.squares))
-            mended = _retry_states(problem, solution, least_progress) if retry_states else None
-            if mended is not None:
-                solution = solved(mended, NEARBY_DAMPING)
+        solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
+        if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
+            solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
         unknowns, covariance = solution.unknowns, solution.left_over.covariance
         before, objective = objective, half_log_determinant(covariance)
         steps += solution.steps
-        settled = not np.isfinite(objective) or abs(before - objective) < max(1e-4, 0.5 * least_progress)
-        if settled or objective > give_up_above or steps >= 2 * max_steps:
+        settled = not np.isfinite(objective) or abs(before - objective) < max(1e-4, 0.5 * strategy.least_progress)
+        if settled or objective > strategy.give_up_above or steps >= 2 * strategy.max_steps:
             break
     assert solution is not None
     # By way of the host: what is computed with the model alone need not run on every device.
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=problem.free.unpack(model, values),
-        problem=weighed(problem, covariance, swing) if reweigh else problem,
+        problem=weighed(problem, covariance, swing) if strategy.reweigh else problem,
         unknowns=unknowns,
         error=jnp.asarray(solution.left_over.error),
         covariance=jnp.asarray(covariance),
         objective=objective,
         stretches=tuple(stretches),
-        horizon=horizon,
+        horizon=segmentation.horizon,
         converged=solution.success,
         steps=steps,
     )
+
+
+def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution, strategy: Strategy) -> Solution:
+    """Repeat the first pass from other initial states, in all segments or in some, where the strategy says so.
+
+    Args:
+        problem: what is solved.
+        begin: where the first pass began.
+        found: where it came to.
+        strategy: how the fit is iterated.
+    """
+    reached = half_log_determinant(found.left_over.covariance)
+    if reached > strategy.begin_anew_above and not (found.success or strategy.hold_parameters):
+        grown = _grown(problem, begin, strategy.least_progress)
+        again = strategy.solve(problem, grown, NEARBY_DAMPING)
+        found = min(found, again, key=lambda s: np.sum(s.left_over.squares))
+    mended = _retry_states(problem, found, strategy.least_progress) if strategy.retry_states else None
+    return found if mended is None else strategy.solve(problem, mended, NEARBY_DAMPING)
 
 
 def weighed(problem: Problem, covariance: Array | np.ndarray, swing: float) -> Problem:
@@ -278,15 +327,13 @@ def half_log_determinant(covariance: Array | np.ndarray) -> float:
 
 def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
     """Which segments of a fit are of which of its stretches."""
-    count, length = found.problem.segments.weight.shape
-    number = np.repeat(np.arange(len(found.stretches)), [-(-len(s) // length) for s in found.stretches])
-    return np.pad(number, (0, count - number.size), constant_values=-1) == np.arange(len(found.stretches))[:, None]
+    ends, place = np.cumsum(found.pieces)[:, None], np.arange(len(found.error))
+    return (ends - found.pieces[:, None] <= place) & (place < ends)
 
 
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     """The segments in which the simulation runs away."""
-    white = np.asarray(found.error) @ np.asarray(found.problem.whitening).T
-    return np.logical_not(np.all(np.abs(white) < RUNAWAY, axis=(1, 2)))
+    return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))
 
 
 def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 16) -> int:
@@ -299,8 +346,7 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
             aside. An error too small to be seen in a sample adds up over all of them.
         most: where to stop.
     """
-    problem = eqx.tree_at(lambda p: p.model, found.problem, found.model)
-    substeps = found.substeps
+    problem, substeps = found.at_solution, found.substeps
     columns = None
     if np.isfinite(shift):
         slopes = linearise(problem, found.unknowns)
@@ -308,7 +354,7 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     error, white_by_error = evaluate(problem, found.unknowns).error, np.asarray(problem.whitening)
     count = np.sum(np.asarray(problem.segments.weight))
     while substeps < most:
-        better = evaluate(dataclasses.replace(problem, substeps=2 * substeps), found.unknowns).error
+        better = evaluate(replace(problem, substeps=2 * substeps), found.unknowns).error
         white = (better - error) @ white_by_error.T
         mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
         moved = 0.0 if columns is None else _standard_errors_moved(columns, white, _named(found))

@@ -118,6 +118,16 @@ class Segments(eqx.Module):
         """Number of samples that carry weight."""
         return jnp.sum(self.weight)
 
+    @property
+    def knots(self) -> Float[np.ndarray, "segments knots"]:
+        """Stamps of each segment's own samples, and of its end."""
+        return np.asarray(self.torque.knots)[:, self.halo :]
+
+    @property
+    def width(self) -> Float[np.ndarray, "segments samples"]:
+        """Time from each sample to the next one."""
+        return np.diff(self.knots)
+
 
 def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tuple[Experiment, ...]:
     """The stretches of a log between its gaps, each an experiment of its own; arguments as in

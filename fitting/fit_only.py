@@ -1,6 +1,6 @@
 """A fit without a search for effects, with all that can be said of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from fitting.measurement_noise import measurement_noise
 from fitting.outcome import Finding
 from fitting.posterior import Posterior, posterior
 from fitting.prediction_band import PredictionBand, prediction_bands
+from fitting.progress import Progress, silent
 from fitting.residual_tests import ResidualTests, residual_tests
 from hdjax import Hold, Model
 
@@ -68,10 +69,6 @@ class FitOnly(eqx.Module):
         return self.account
 
 
-def _silent(message: str) -> None:
-    pass
-
-
 def fit_only(
     model: Model,
     experiments: dict[Hold, tuple[Experiment, ...]],
@@ -79,7 +76,7 @@ def fit_only(
     test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
     seed: int | None = None,
-    progress: Callable[[str], None] = _silent,
+    progress: Progress = silent,
 ) -> FitOnly:
     """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.close_loop`][].
 

@@ -67,10 +67,9 @@ def follow(problem: Problem, unknowns: Unknowns) -> Followed:
 
 def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segments states"]) -> Response:
     segments = problem.segments
-    knots, torque = np.asarray(segments.torque.knots), acting(model, segments)
     beside = {LOAD: segments.load_torque, TEMPERATURE: segments.temperature}
     found = {name: np.asarray(signal.coefficients) for name, signal in beside.items() if signal is not None}
-    own = knots[:, segments.halo :], torque[:, segments.halo :], found
+    own = segments.knots, acting(model, segments)[:, segments.halo :], found
     return response(model, states, *own, int(problem.substeps), problem.solver)
 
 
@@ -96,20 +95,20 @@ def _response_by_xla(problem: Problem, unknowns: Unknowns) -> Response:
         own = PiecewisePolynomial(acting.knots[segments.halo :], acting.coefficients[segments.halo :])
         states, end = march(model, own, load_torque, state, temperature=temperature, **options)
 
-        def through(start, steady, rising, begin, width, coefficients, load, warmth):
+        def through(start, steady, rising, pieces):
             pushed = Pushed.of(model, tuple(steady), tuple(rising))
-            interval = jnp.stack([begin, begin + width])
-            piece = PiecewisePolynomial(interval, coefficients[None])
-            on_load, warm = (None if c is None else PiecewisePolynomial(interval, c[None]) for c in (load, warmth))
-            initial = jnp.append(start, jnp.zeros_like(width))
-            return march(pushed, piece, on_load, initial, temperature=warm, **options)[1][:-1]
+            torque, load, warmth = pieces
+            initial = jnp.append(start, 0.0)
+            return march(pushed, torque, load, initial, temperature=warmth, **options)[1][:-1]
 
-        none, width = jnp.zeros_like(state), jnp.diff(own.knots)
-        linear = jax.jacfwd(through, argnums=(0, 1, 2))
-        load, warmth = (None if s is None else s.coefficients for s in (load_torque, temperature))
-        transition, steady, rising = jax.vmap(linear, in_axes=(0, None, None, 0, 0, 0, 0, 0))(
-            states, none, none, own.knots[:-1], width, own.coefficients, load, warmth
+        none, begin, width = jnp.zeros_like(state), own.knots[:-1], jnp.diff(own.knots)
+        intervals = jnp.stack([begin, begin + width], axis=1)
+        pieces = tuple(
+            None if s is None else PiecewisePolynomial(intervals, s.coefficients[:, None])
+            for s in (own, load_torque, temperature)
         )
+        linear = jax.jacfwd(through, argnums=(0, 1, 2))
+        transition, steady, rising = jax.vmap(linear, in_axes=(0, None, None, 0))(states, none, none, pieces)
         return Response.of(jnp.concatenate([states, end[None]]), transition, steady, rising, width)
 
     return jax.vmap(one)(segments.torque, segments.load_torque, segments.temperature, unknowns.states)
@@ -144,36 +143,48 @@ def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray
     return polyval(late, np.moveaxis(coefficients, -1, 0), tensor=False)
 
 
-def signals_at(
-    model: Model, segments: Segments, late: Float[np.ndarray, "segments samples *nodes"]
-) -> tuple[np.ndarray, np.ndarray, Conditions]:
-    """Torque, load torque and conditions so late in each sample interval."""
+class Inputs(eqx.Module):
+    """Inputs of a model at many instants.
+
+    Attributes:
+        torque: that acts on a drive, or the forcing.
+        load_torque: on the output.
+        conditions: time and temperature.
+    """
+
+    torque: Float[Array, "*instants"]
+    load_torque: Float[Array, "*instants"]
+    conditions: Conditions
+
+
+def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segments samples *nodes"]) -> Inputs:
+    """Inputs so late in each sample interval."""
     nodes = (slice(None), slice(None), *[None] * (late.ndim - 2))
 
     def at(coefficients: Array | np.ndarray) -> np.ndarray:
         return polynomial(np.asarray(coefficients)[(*nodes, slice(None))], late)
 
     load, warmth = segments.load_torque, segments.temperature
-    time = np.asarray(segments.torque.knots)[:, segments.halo : -1][nodes] + late
+    time = segments.knots[:, :-1][nodes] + late
     conditions = Conditions(jnp.asarray(time), None if warmth is None else jnp.asarray(at(warmth.coefficients)))
     on_load = np.zeros(late.shape) if load is None else at(load.coefficients)
-    return at(acting(model, segments)[:, segments.halo :]), on_load, conditions
+    torque = jnp.asarray(at(acting(model, segments)[:, segments.halo :]))
+    return Inputs(torque, jnp.asarray(on_load), conditions)
 
 
-def _rates(model: Model, state: Array, torque: Array, load_torque: Array, conditions: Conditions) -> Array:
-    return model.rates(state, torque, load_torque, conditions)
+def _rates(model: Model, state: Array, inputs: Inputs) -> Array:
+    return model.rates(state, inputs.torque, inputs.load_torque, inputs.conditions)
 
 
 def _between(
     model: Model, knots: Float[np.ndarray, "segments knots states"], segments: Segments
 ) -> Float[np.ndarray, "segments samples nodes states"]:
     """States inside the intervals: cubics with the right values and rates at both ends (Hermite)."""
-    width = np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
+    width = segments.width
     y0, y1 = knots[:, :-1], knots[:, 1:]
 
     def rise_at(states: np.ndarray, late: np.ndarray) -> np.ndarray:
-        around = ((a, 2) for a in (states, *signals_at(model, segments, late)))
-        return width[..., None] * at_instants(_rates, (model, 0), *around)
+        return width[..., None] * at_instants(_rates, (model, 0), (states, 2), (inputs_at(model, segments, late), 2))
 
     r0, r1 = (r[:, :, None] for r in (rise_at(y0, np.zeros_like(width)), rise_at(y1, width)))
     y0, y1 = y0[:, :, None], y1[:, :, None]

@@ -1,7 +1,7 @@
 """What a fit may change: parameters by dotted path, on scales where they are of order one."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -35,13 +35,15 @@ class FreeParameters(eqx.Module):
 
     def pack(self, model: Model) -> Float[Array, " parameters"]:
         """The vector that stands for the model's values."""
+        return self._each(model, lambda library, v, positive, s: library.log(v) if positive else v / s)
+
+    def _each(self, model: Model, entry: Callable[..., Any]) -> Float[Array, " parameters"]:
+        """A number for each parameter: of what to calculate with, its value, whether it moves by its logarithm, and its
+        unit."""
         values = [model.get(p) for p in self.paths]
         library, (*values, scale) = _library(*values, self.scale)
         with np.errstate(all="ignore"):
-            entries = [
-                library.log(v) if positive else v / s
-                for v, positive, s in zip(values, self.logarithmic, scale, strict=True)
-            ]
+            entries = [entry(library, *own) for own in zip(values, self.logarithmic, scale, strict=True)]
         return jnp.asarray(library.stack(entries) if entries else np.zeros(0))
 
     def unpack(self, model: Model, vector: Float[Array, " parameters"]) -> Model:
@@ -60,10 +62,7 @@ class FreeParameters(eqx.Module):
 
     def slopes(self, model: Model) -> Float[Array, " parameters"]:
         """Derivative of each physical value with respect to its entry of the vector."""
-        values = [model.get(p) for p in self.paths]
-        library, (*values, scale) = _library(*values, self.scale)
-        entries = [v if positive else s for v, positive, s in zip(values, self.logarithmic, scale, strict=True)]
-        return jnp.asarray(library.stack(entries) if entries else np.zeros(0))
+        return self._each(model, lambda library, v, positive, s: v if positive else s)
 
 
 def _library(*arrays: Array) -> tuple[Any, Sequence[Any]]:

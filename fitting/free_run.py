@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.engines import linearise, simulate
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Start, Strategy, fit
 from fitting.experiment import Stretch, cut
-from fitting.free import free_parameters
-from fitting.posing import suggested_substeps
+from fitting.free import FreeParameters, free_parameters
+from fitting.posing import Segmentation, suggested_substeps
 from fitting.residual import Problem, Unknowns
 from hdjax import Model, TwoInertiaModel
 
@@ -85,10 +85,9 @@ def free_run(
     covariance: Float[Array, "outputs outputs"],
     halo: int = 0,
     substeps: int | None = None,
-    window: int = WINDOW,
     like: Fit | None = None,
 ) -> tuple[FreeRun, ...]:
-    """Simulate each stretch from its first `window` samples on.
+    """Simulate each stretch from its first [`WINDOW`][] samples on.
 
     Args:
         model: the equations with their values.
@@ -96,26 +95,13 @@ def free_run(
         covariance: of the measurement noise of the outputs.
         halo: intervals of torque before the start, for delays.
         substeps: solver steps in a sample interval.
-        window: samples for the initial state.
         like: a fit of the same model, whose compiled program then finds the initial states as well.
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
-    starts = fitted_starts(
-        model, stretches, covariance=covariance, halo=halo, substeps=substeps, window=window, like=like
-    )
+    starts = fitted_starts(model, stretches, covariance=covariance, halo=halo, substeps=substeps, like=like)
     states = _rest_where_at_rest(model, starts, len(stretches))
-    length = max(len(s) for s in stretches)
-    segments = cut(stretches, length, halo=halo, count=len(stretches))
-    problem = Problem(
-        model,
-        free_parameters(model, (), {}),
-        segments,
-        jnp.asarray(np.eye(segments.measured.shape[-1])),
-        jnp.asarray(np.zeros(0)),
-        jnp.asarray(np.ones(states.shape[1])),
-        substeps=substeps,
-    )
+    problem = whole_simulations(model, free_parameters(model, (), {}), stretches, halo, substeps)
     outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
     runs = []
     for stretch, output in zip(stretches, outputs, strict=True):
@@ -139,6 +125,24 @@ def free_run(
     return tuple(runs)
 
 
+def whole_simulations(
+    model: Model, free: FreeParameters, stretches: Sequence[Stretch], halo: int, substeps: int
+) -> Problem:
+    """Each stretch as one simulation, with unit weights.
+
+    Args:
+        model: the equations.
+        free: parameters to differentiate by.
+        stretches: where to run.
+        halo: intervals of torque before the start.
+        substeps: solver steps in a sample interval.
+    """
+    segments = cut(stretches, max(len(s) for s in stretches), halo=halo, count=len(stretches))
+    whitening = jnp.asarray(np.eye(segments.measured.shape[-1]))
+    active, gap_weight = (jnp.asarray(np.ones(len(names))) for names in (free.paths, model.state_names))
+    return Problem(model, free, segments, whitening, active, gap_weight, substeps=substeps)
+
+
 def fitted_starts(
     model: Model,
     stretches: Sequence[Stretch],
@@ -146,26 +150,20 @@ def fitted_starts(
     covariance: Float[Array, "outputs outputs"],
     halo: int,
     substeps: int,
-    window: int = WINDOW,
     like: Fit | None = None,
 ) -> Fit:
-    """Initial states fitted to the first `window` samples of each stretch; arguments as in [`free_run`][]."""
-    windows = [s.beginning(window) for s in stretches]
-    paths, length, count = (), max(window, *(len(w) for w in windows)), len(stretches)
+    """Initial states fitted to the first samples of each stretch; arguments as in [`free_run`][]."""
+    windows = [s.beginning(WINDOW) for s in stretches]
+    paths, length, count = (), max(WINDOW, *(len(w) for w in windows)), len(stretches)
     if like is not None and _holds(like, count, length):
         paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
     return fit(
         model,
         windows,
         paths,
-        horizon=length,
-        length=length,
-        halo=halo,
-        substeps=substeps,
-        covariance=covariance,
-        reweigh=False,
-        hold_parameters=True,
-        count=count,
+        Segmentation(length, length, halo, substeps, count),
+        start=Start(covariance),
+        strategy=Strategy(reweigh=False, hold_parameters=True),
     )
 
 

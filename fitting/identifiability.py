@@ -345,7 +345,7 @@ def _products(fit: Fit, held: tuple[str, ...]) -> Float[np.ndarray, "all all"]:
 
     By central differences through the program that the fit runs anyway.
     """
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     found = linearise(problem, fit.unknowns)
     rows, gaps = [], []
     for path in held:

@@ -1,5 +1,6 @@
 """A learned function as a curve (or a surface) with standard errors, over the range that the data have."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -7,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from fitting.uncertainty import Uncertainty
 from fitting.unknown import Unknown
@@ -117,8 +118,21 @@ def _evaluated(model: Model, name: str, uncertainty: Uncertainty, values: np.nda
         names = [axis.variable for axis in effect.axes]
         return effect.value(replace(Motion(x=zero, v=zero), **dict(zip(names, row, strict=True))))
 
-    parameters = jnp.stack([model.get(path) for path in paths])
-    along = jax.vmap(jax.value_and_grad(at), in_axes=(None, 0))
-    value, slopes = (np.asarray(a) for a in along(parameters, jnp.asarray(values)))
+    return with_errors(at, jnp.stack([model.get(path) for path in paths]), covariance, values)
+
+
+def with_errors(
+    function: Callable[..., Array], parameters: Array, covariance: np.ndarray, at: np.ndarray
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """Values of a function of parameters and a row, and their standard errors to first order.
+
+    Args:
+        function: one number.
+        parameters: estimates.
+        covariance: of them.
+        at: rows.
+    """
+    along = jax.vmap(jax.value_and_grad(function), in_axes=(None, 0))
+    value, slopes = (np.asarray(a) for a in along(parameters, jnp.asarray(at)))
     variance = np.einsum("np,pq,nq->n", slopes, covariance, slopes)
     return value, np.sqrt(np.maximum(variance, 0.0))

@@ -188,11 +188,12 @@ def own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "
 
 def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.ndarray]) -> Sizes:
     """The functions of the axes, and their slopes for an error of the mesh."""
-    raw = _all_products([_evaluated(a, values[a.variable]) for a in axes])
+    along = [(values[axis.variable], axis) for axis in axes]
+    raw = _all_products([at_instants(_functions_along, (value, value.ndim), (axis, 0)) for value, axis in along])
     if not issubclass(form, LearnedMeshError):
         return (raw,)
-    (axis,) = axes
-    return raw, _slopes_evaluated(axis, values[axis.variable])
+    ((value, axis),) = along
+    return raw, slopes_at_instants(_functions_of_one, (value[..., None], value.ndim), (axis, 0))[..., 0]
 
 
 def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -211,14 +212,6 @@ def _ranges(seen: LearnedLook, variables: tuple[str, ...]) -> dict[str, tuple[fl
         reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
         found[variable] = (float(low), float(low + reach))
     return found
-
-
-def _evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
-    return at_instants(_functions_along, (values, values.ndim), (axis, 0))
-
-
-def _slopes_evaluated(axis: Axis, values: np.ndarray) -> np.ndarray:
-    return slopes_at_instants(_functions_of_one, (values[..., None], values.ndim), (axis, 0))[..., 0]
 
 
 def _functions_along(value: Array, axis: Axis) -> Array:

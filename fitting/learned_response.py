@@ -1,13 +1,12 @@
 """A learned torque that lags, as a stiffness over frequency with standard errors."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from fitting.along import place_of
-from fitting.learned_curve import PLACES
+from fitting.learned_curve import PLACES, with_errors
 from fitting.uncertainty import Uncertainty
 from hdjax import Model
 from hdjax.effects.learned_memory import Lagging
@@ -56,8 +55,5 @@ def learned_response(name: str, model: Model, uncertainty: Uncertainty) -> Learn
         assert isinstance(own, Lagging)
         return jnp.log(jnp.abs(own.stiffness(omega, moved.drive)))
 
-    parameters = jnp.stack([model.get(path) for path in paths])
-    found, slopes = jax.vmap(jax.value_and_grad(size), in_axes=(None, 0))(parameters, jnp.asarray(omega))
-    variance = np.einsum("np,pq,nq->n", slopes, covariance, slopes)
-    std = np.sqrt(np.maximum(variance, 0.0))
-    return LearnedResponse(PLACES[place.name], effect.angle, omega / (2 * np.pi), np.exp(np.asarray(found)), std)
+    found, std = with_errors(size, jnp.stack([model.get(path) for path in paths]), covariance, omega)
+    return LearnedResponse(PLACES[place.name], effect.angle, omega / (2 * np.pi), np.exp(found), std)

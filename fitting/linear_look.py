@@ -12,9 +12,10 @@ from fitting.along import acting_at_knots, acting_slopes_at_knots, conditions_at
 from fitting.engines import linearise
 from fitting.estimate import Fit
 from fitting.explained import Answers, solved, without_untold
-from fitting.followed import Followed, Forces, follow
+from fitting.followed import Followed, Forces
 from fitting.residual import Problem
 from fitting.sight import where_it_goes
+from fitting.surrogates import Scores, null_gains
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
 from hdjax.engine.pointwise import slopes_at_instants
@@ -110,25 +111,21 @@ class Products(eqx.Module):
 
 def look_along(fit: Fit) -> Look:
     """Linearise a fit along its motion."""
-    problem = eqx.tree_at(lambda p: (p.model, p.active), fit.problem, (fit.model, jnp.ones(len(fit.free.paths))))
-    kept, followed = where_it_goes(fit, follow(problem, fit.unknowns))
-    error = np.where(kept[:, None, None], np.asarray(fit.error), 0.0)
-    if not kept.all():
-        weight = jnp.asarray(np.where(kept[:, None], np.asarray(problem.segments.weight), 0.0))
-        problem = eqx.tree_at(lambda p: p.segments.weight, problem, weight)
+    problem = fit.with_all_free().at_solution
+    followed, segments, error = where_it_goes(fit, problem, fit.unknowns)
+    problem = replace(problem, segments=segments)
     conditions = conditions_at_knots(problem.segments)
     if isinstance(fit.model, TwoInertiaModel):
         conditions = replace(conditions, T_m=jnp.asarray(acting_at_knots(fit.model, problem.segments)))
     found = without_untold(linearise(problem, fit.unknowns), problem.free)
-    whitening = np.asarray(fit.problem.whitening)
     return Look(
         problem,
         followed,
-        Answers.of(found, followed, problem.segments, whitening),
+        Answers.of(found, followed, segments, np.asarray(problem.whitening)),
         motions(fit.model, followed.states, conditions),
         conditions,
         unit_pushes(fit.model, followed.states, conditions),
-        error @ whitening.T,
+        error,
     )
 
 
@@ -211,24 +208,11 @@ def surrogate_gains(
         sizes: likewise.
         surrogates: residuals of the same colour with random phases, by draw, segment and row.
     """
-    (gram, gradient), (unseen_gram, unseen_gradient) = (
-        _against(look, unit, size, drawn)
+    fitted, unseen = (
+        Scores.of(_columns(look, unit, size), look.answers.weight, look.error, drawn)
         for look, unit, size, drawn in zip(looks, acting, sizes, surrogates, strict=True)
     )
-    known = len(looks[0].problem.free.paths)
-    loss = []
-    for columns in (known, gram.shape[0]):
-        step = np.zeros_like(gradient)
-        step[:columns] = solved(gram[:columns, :columns], gradient[:columns])
-        loss.append(-2 * np.sum(step * unseen_gradient, axis=0) + np.sum(step * (unseen_gram @ step), axis=0))
-    rows = float(np.sum(looks[1].answers.weight)) * looks[1].error.shape[2]
-    return (loss[0] - loss[1]) / (2 * rows)
-
-
-def _against(look: Look, acting: Acting, sizes: Sizes, surrogates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    columns = _columns(look, acting, sizes)
-    rows = columns.reshape(-1, columns.shape[-1])
-    return rows.T @ rows, rows.T @ surrogates.reshape(len(surrogates), -1).T
+    return null_gains(fitted, unseen, len(looks[0].problem.free.paths))
 
 
 def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:

@@ -1,16 +1,17 @@
 """The last fit, over simulations as long as the logs, where small errors of a parameter add up and show."""
 
-from typing import Any
+from dataclasses import replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from fitting.engines import linearise
-from fitting.estimate import Fit, fit, needed_substeps
-from hdjax import Model
+from fitting.estimate import Fit, Start, Strategy, fit, needed_substeps
+from fitting.posing import Segmentation
 
 _STEPS = 20
+# From a solution near by, which has not lost its way.
+_CONTINUED = Strategy(_STEPS, begin_anew_above=np.inf, retry_states=False)
 # By how many standard errors the solver's steps may move the parameters, and how many steps a sample may take.
 _SHIFT = 0.2
 _MOST_SUBSTEPS = 32
@@ -34,17 +35,24 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
     substeps = _fine_enough(start)
     if substeps > start.substeps:
         # A corner that is sharper than its steps resolved has moved by then.
-        start = _again(start, start.model, horizon=start.horizon, substeps=substeps)
-    long = _again(start, start.model, horizon=_longest(start), substeps=substeps)
+        start = _again(start, replace(start.segmentation, substeps=substeps))
+    long = _again(start, replace(start.segmentation, horizon=_longest(start)))
     # Long horizons know the parameters better, and so ask for finer steps.
     substeps = _fine_enough(long)
     if substeps > long.substeps:
-        long = _again(long, long.model, horizon=_longest(start), substeps=substeps)
+        long = _again(long, replace(long.segmentation, substeps=substeps))
     motion = len(start.model.motion_states)
     explains = with_gaps_closed(long) <= start.objective + _freedom_of_states(start, motion) + _LOSS
     if not (follows(long) and (explains or (long.converged and not must_explain))):
         return start
-    check = _again(start, long.model, horizon=start.horizon, substeps=substeps, hold_parameters=True, afresh=True)
+    check = fit(
+        long.model,
+        start.stretches,
+        start.free.paths,
+        replace(start.segmentation, substeps=substeps),
+        start=Start(start.covariance),
+        strategy=Strategy(_STEPS, hold_parameters=True),
+    )
     return long if check.objective < start.objective + _LOSS else start
 
 
@@ -66,34 +74,18 @@ def refitted_on_all(found: Fit, selection: Fit) -> Fit:
 
 
 def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
-    segments = found.problem.segments
-    states = np.concatenate([np.asarray(f.unknowns.states)[: _with_data(f)] for f in (found, selection)])
+    states = np.concatenate([np.asarray(f.unknowns.states)[: f.pieces.sum()] for f in (found, selection)])
     # Parameters that a fit has not moved were held.
     held = all(float(found.model.get(p)) == float(found.problem.model.get(p)) for p in found.free.paths)
     both = fit(
         found.model,
         (*found.stretches, *selection.stretches),
         found.free.paths,
-        horizon=horizon,
-        length=segments.weight.shape[1],
-        halo=segments.halo,
-        substeps=found.substeps,
-        covariance=found.covariance,
-        count=len(states),
-        states=jnp.asarray(states),
-        begin_anew_above=np.inf,
-        retry_states=False,
-        max_steps=_STEPS,
-        hold_parameters=held,
+        replace(found.segmentation, horizon=horizon, count=len(states)),
+        start=Start(found.covariance, jnp.asarray(states)),
+        strategy=replace(_CONTINUED, hold_parameters=held),
     )
-    # What the data say of them is asked all the same.
-    return eqx.tree_at(lambda f: f.problem.active, both, jnp.ones_like(both.problem.active))
-
-
-def _with_data(found: Fit) -> int:
-    """Segments that hold data; those that only fill up a program come last."""
-    length = found.problem.segments.weight.shape[1]
-    return sum(-(-len(s) // length) for s in found.stretches)
+    return both.with_all_free()
 
 
 def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_progress: float = 0.0) -> Fit:
@@ -104,8 +96,8 @@ def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_prog
         hold_parameters: whether only initial states are fitted.
         least_progress: see [`fitting.solve.solve`][].
     """
-    how = {"substeps": found.substeps, "hold_parameters": hold_parameters, "least_progress": least_progress}
-    return _again(found, found.model, horizon=_longest(found), reweigh=False, **how)
+    strategy = replace(_CONTINUED, hold_parameters=hold_parameters, least_progress=least_progress, reweigh=False)
+    return _again(found, replace(found.segmentation, horizon=_longest(found)), strategy)
 
 
 def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_progress: float = 0.0) -> Fit:
@@ -119,11 +111,11 @@ def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_prog
         hold_parameters: whether only initial states are fitted.
         least_progress: see [`fitting.solve.solve`][].
     """
-    how: dict[str, Any] = {"hold_parameters": hold_parameters, "least_progress": least_progress}
-    carried = over_whole_stretches(found, **how)
+    carried = over_whole_stretches(found, hold_parameters=hold_parameters, least_progress=least_progress)
     if not follows(carried):
         return found
-    back = _again(carried, carried.model, horizon=found.horizon, substeps=found.substeps, **how)
+    strategy = replace(_CONTINUED, hold_parameters=hold_parameters, least_progress=least_progress)
+    back = _again(carried, found.segmentation, strategy)
     return min(found, back, key=lambda fit: fit.objective)
 
 
@@ -164,36 +156,7 @@ def _fine_enough(found: Fit) -> int:
     return needed_substeps(found, shift=_SHIFT, most=_MOST_SUBSTEPS)
 
 
-def _again(
-    found: Fit,
-    model: Model,
-    *,
-    horizon: int,
-    substeps: int,
-    hold_parameters: bool = False,
-    afresh: bool = False,
-    least_progress: float = 0.0,
-    reweigh: bool = True,
-) -> Fit:
-    """A fit of the same data on segments of the same length, which share its compiled program; from its states or, for
-    a model that these don't suit, afresh."""
-    segments = found.problem.segments
-    count, length = segments.weight.shape
-    return fit(
-        model,
-        found.stretches,
-        found.free.paths,
-        horizon=horizon,
-        length=length,
-        halo=segments.halo,
-        substeps=substeps,
-        covariance=found.covariance,
-        count=count,
-        states=None if afresh else found.unknowns.states,
-        begin_anew_above=-np.inf if afresh else np.inf,
-        retry_states=afresh,
-        max_steps=_STEPS,
-        hold_parameters=hold_parameters,
-        least_progress=least_progress,
-        reweigh=reweigh,
-    )
+def _again(found: Fit, segmentation: Segmentation, strategy: Strategy = _CONTINUED) -> Fit:
+    """A fit of the same data on segments of the same length, which share its compiled program, from its states."""
+    start = Start(found.covariance, found.unknowns.states)
+    return fit(found.model, found.stretches, found.free.paths, segmentation, start=start, strategy=strategy)

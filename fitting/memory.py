@@ -36,7 +36,7 @@ def own_states(seen: Along, stacked: Effect, proposals: int, before: Memory | No
         proposals: how many.
         before: own states along stretches that these ones continue.
     """
-    width = np.diff(np.asarray(seen.segments.torque.knots)[:, seen.segments.halo :])
+    width = seen.segments.width
     segments, samples = width.shape
     motion = jax.tree.map(np.asarray, seen.at_knots)
     # A segment that starts anew does not start where the motion of the one before it ends.

@@ -4,7 +4,7 @@ Tied explanations, or a drive with a small alpha against one without: both ask w
 search's own criterion, the fit that real logs get says how far apart the two would be on the logs and on the proposal.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -16,14 +16,15 @@ from fitting.attribution.selection_round import Verdict
 from fitting.base_fit import as_followed
 from fitting.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
-from fitting.estimate import Fit, fit, whitening
+from fitting.estimate import Fit, Start, Strategy, fit, whitening
 from fitting.excitation import Excitation, Limits, excitations, reached
 from fitting.experiment import Experiment, Stretch, scales, segment_count, whole
 from fitting.fit_only import FitOnly
 from fitting.free import fitted_paths
 from fitting.normal_law import NORMAL_95
 from fitting.outcome import Loop
-from fitting.posing import segment_length, typical_scales
+from fitting.posing import Segmentation, segment_length, typical_scales
+from fitting.progress import Progress, silent
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000
@@ -113,10 +114,6 @@ class NextExperiment(eqx.Module):
     precision: Precision | None
 
 
-def _silent(message: str) -> None:
-    pass
-
-
 def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
     """What explains selection data about as well as what was found: pairs of found and rival, the closest first."""
     names = {f.name for f in loop.findings}
@@ -132,7 +129,7 @@ def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
 
 
 def experiment_for_ties(
-    loop: Loop, limits: Mapping[str, float] | None = None, *, progress: Callable[[str], None] = _silent
+    loop: Loop, limits: Mapping[str, float] | None = None, *, progress: Progress = silent
 ) -> NextExperiment | None:
     """The experiment that tells what a loop found from what is tied with it.
 
@@ -154,7 +151,7 @@ def experiment_for_ties(
     rivals = [_rival(loop, *pair) for pair in pairs]
     bench = _bench(own, stretches, limits, noise=loop.noise, halo=loop.setting.halo, substeps=loop.after_substeps)
     progress("the next experiment: what the logs can tell")
-    judge = _Judge(bench, segment_length(loop.setting.horizon), loop.setting.count)
+    judge = _Judge(bench, replace(loop.setting.segmentation, substeps=loop.after_substeps))
     told = [_on_logs(judge, found, r, pair) for r, pair in zip(rivals, pairs, strict=True)]
     starts = _starts(bench, own, stretches)
     smooth = [k for k, rival in enumerate(rivals) if is_smooth(rival, starts, bench)]
@@ -187,7 +184,7 @@ def experiment_for_alpha(
     experiments: Sequence[Experiment],
     limits: Mapping[str, float] | None = None,
     *,
-    progress: Callable[[str], None] = _silent,
+    progress: Progress = silent,
 ) -> NextExperiment | None:
     """The experiment that knows alpha best.
 
@@ -248,11 +245,8 @@ def _rival(loop: Loop, winner: Verdict, verdict: Verdict) -> Explanation:
             model.with_effects(*others),
             stretches,
             fitted_paths(model.with_effects(*others)),
-            horizon=training.horizon,
-            halo=loop.setting.halo,
-            substeps=loop.after_substeps,
-            count=loop.setting.count,
-            covariance=training.covariance,
+            replace(loop.setting.segmentation, substeps=loop.after_substeps),
+            start=Start(training.covariance),
         ).model
     return _explanation(verdict.name, model, stretches, hold=trial.hold)
 
@@ -297,8 +291,7 @@ class _Judge(eqx.Module):
     """The fit that tells how far a rival stays from what another model makes, by programs that the loop has used."""
 
     bench: Bench
-    length: int
-    count: int
+    segmentation: Segmentation = eqx.field(static=True)
 
     def ratio(self, rival: Explanation, stretches: Sequence[Stretch]) -> float:
         """The log-likelihood ratio to be expected against a rival, where the measured outputs are another model's."""
@@ -308,18 +301,16 @@ class _Judge(eqx.Module):
 
     def fitted(self, model: Explanation, stretches: Sequence[Stretch], *, hold_parameters: bool = False) -> Fit:
         """A fit of simulations as long as the stretches, under the weights of the measurement noise."""
+        # As many segments as the loop's where these are enough.
+        own, horizon = self.segmentation, max(len(s) for s in stretches)
+        count = max(own.count or 0, segment_count(stretches, own.length or segment_length(own.horizon)))
         return fit(
             model.model,
             stretches,
             model.free.paths,
-            horizon=max(len(s) for s in stretches),
-            length=self.length,
-            halo=self.bench.halo,
-            substeps=self.bench.substeps,
-            covariance=self.bench.noise,
-            reweigh=False,
-            hold_parameters=hold_parameters,
-            count=max(self.count, segment_count(stretches, self.length)),
+            replace(own, horizon=horizon, count=count),
+            start=Start(self.bench.noise),
+            strategy=Strategy(reweigh=False, hold_parameters=hold_parameters),
         )
 
 

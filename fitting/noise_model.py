@@ -136,7 +136,7 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
     References:
         Ljung (1999), System Identification, 2nd edition, sections 7.3 and 16.6.
     """
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
     # Each log on its own: its torque sensor may have been set to another range.
     logs = segments_of_logs(fit)

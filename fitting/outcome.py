@@ -3,10 +3,10 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from fitting.attribution.candidate_fit import Setting
 from fitting.attribution.decisions import CaseEvidence, Check, Outcome
 from fitting.attribution.effect_evidence import Evidence
 from fitting.attribution.selection_round import Round
+from fitting.attribution.study import Setting
 from fitting.compare import Account
 from fitting.diagnostics import ResidualDiagnostics
 from fitting.experiment import Stretch

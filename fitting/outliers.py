@@ -41,19 +41,14 @@ def without_glitches(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
 
 def without_lone_errors(found: Fit) -> tuple[Stretch, ...] | None:
     """The stretches of a fit without the samples whose error stands alone, or None where there are none."""
-    length = found.error.shape[1]
-    white = np.asarray(found.error) @ np.asarray(found.problem.whitening).T
+    white = found.white_error
     weight = np.asarray(found.problem.segments.weight) > 0
     spread = np.array([_spread(output[weight]) for output in np.moveaxis(white, -1, 0)])
     if not (spread > 0).all():
         return None
     size = np.max(np.abs(white) / spread, axis=-1)
     limit = -float(ndtri(0.5 * _FALSE_ALARM / (weight.sum() * spread.size)))
-    masks, first = [], 0
-    for stretch in found.stretches:
-        pieces = -(-len(stretch) // length)
-        masks.append(_alone(size[first : first + pieces].ravel()[: len(stretch)], limit))
-        first += pieces
+    masks = [_alone(part, limit) for part in found.by_stretch(size)]
     count = sum(mask.sum() for mask in masks)
     if not 0 < count <= _MOST * weight.sum():
         return None

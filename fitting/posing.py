@@ -1,6 +1,7 @@
 """What a fit solves, as data and model pose it: segments, where their simulations start, steps, what is free."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -21,24 +22,53 @@ STEP_ANGLE = 0.15
 """A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
 
 
+@dataclass(frozen=True)
+class Segmentation:
+    """How data are cut into segments, and how finely these are simulated.
+
+    Attributes:
+        horizon: samples until a simulation starts anew. Short ones converge from far away, long ones use the data
+            fully.
+        length: samples in a segment; see [`segment_length`][] where not given.
+        halo: intervals of torque before each segment, for delays.
+        substeps: solver steps in a sample interval; from the natural frequency where not given.
+        count: number of segments, see [`fitting.experiment.cut`][].
+    """
+
+    horizon: int
+    length: int | None = None
+    halo: int = 0
+    substeps: int | None = None
+    count: int | None = None
+
+    def of(self, stretches: Sequence[Stretch]) -> Segments:
+        """The segments of some data."""
+        length = segment_length(self.horizon) if self.length is None else self.length
+        return cut(stretches, length, horizon=self.horizon, halo=self.halo, count=self.count)
+
+
 def pose(
     model: Model,
     stretches: Sequence[Stretch],
     paths: Sequence[str],
+    segmentation: Segmentation,
     *,
-    horizon: int,
-    length: int | None,
-    halo: int,
-    substeps: int | None,
-    hold_parameters: bool,
-    count: int | None,
-    states: Float[Array, "segments states"] | None,
+    hold_parameters: bool = False,
+    states: Float[Array, "segments states"] | None = None,
     engine: Engine | None = None,
 ) -> tuple[Problem, Unknowns]:
-    """What is solved, not weighed yet, and where the iteration begins; arguments as in [`fitting.estimate.fit`][]."""
-    if length is None:
-        length = segment_length(horizon)
-    segments = cut(stretches, length, horizon=horizon, halo=halo, count=count)
+    """Pose a fit: what is solved, not weighed yet, and where the iteration begins.
+
+    Args:
+        model: equations and starting values.
+        stretches: the data.
+        paths: dotted paths of what is free.
+        segmentation: how the data are cut.
+        hold_parameters: whether only the initial states are free.
+        states: initial states of the segments; from their first samples where not given.
+        engine: what evaluates the residual, see [`fitting.estimate.fit`][].
+    """
+    segments, substeps = segmentation.of(stretches), segmentation.substeps
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
     free = free_parameters(model, paths, typical_scales(model, stretches))
@@ -70,8 +100,8 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
 
     A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
     """
-    halo, length = segments.halo, segments.measured.shape[1]
-    measured, knots = np.asarray(segments.measured), np.asarray(segments.torque.knots)[:, halo:]
+    length = segments.measured.shape[1]
+    measured, knots = np.asarray(segments.measured), segments.knots
     step = float(np.median(np.diff(knots)))
     quarter = int(min(np.ceil(0.5 * np.pi / float(model.drive.omega_0) / step), _LONGEST_SEGMENT))
     time = knots[:, :-1] - knots[:, :1]

@@ -86,7 +86,7 @@ def posterior(
     if not fit.free.paths:
         raise ValueError("`fit` must have free parameters, but has none")
     sampler()
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     root = np.linalg.cholesky(found.unit_covariance)
     keys = jax.random.split(jax.random.key(seed), chains)
     # The library mixes types and ranks, which a strict user forbids.

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.engines import linearise, with_engine
 from fitting.estimate import Fit, whitening
-from fitting.experiment import Stretch, cut
-from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run
+from fitting.experiment import Stretch
+from fitting.free_run import WINDOW, FreeRun, fitted_starts, free_run, whole_simulations
 from fitting.noise_model import spread_by_torque
 from fitting.normal_law import NORMAL_95
 from fitting.residual import Problem, Unknowns
@@ -75,7 +75,6 @@ def prediction_bands(
     *,
     noise: Float[Array, "outputs outputs"],
     halo: int = 0,
-    window: int = WINDOW,
     runs: Sequence[FreeRun] | None = None,
     torque_noise: float = 0.0,
 ) -> tuple[PredictionBand, ...]:
@@ -84,22 +83,18 @@ def prediction_bands(
     Args:
         fitted: the fitted model.
         found: its uncertainty.
-        stretches: where to run; no other logs than the fit's are needed, and outputs beyond the window are not used.
+        stretches: where to run; no other logs than the fit's are needed, and outputs beyond the window that
+            tells the initial state are not used.
         noise: covariance of the outputs' measurement noise.
         halo: intervals of torque before the start, for delays.
-        window: samples for the initial state.
         runs: the free runs along the stretches, where they are at hand.
         torque_noise: standard deviation of the noise of a torque sample [N m].
     """
     substeps = fitted.substeps
     if runs is None:
-        runs = free_run(
-            fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window, like=fitted
-        )
-    starts = fitted_starts(
-        fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, window=window, like=fitted
-    )
-    whole = _whole(fitted, stretches, halo, substeps)
+        runs = free_run(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
+    starts = fitted_starts(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
+    whole = whole_simulations(fitted.model, fitted.free, stretches, halo, substeps)
     states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
     by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
     white = np.asarray(whitening(noise))
@@ -107,22 +102,8 @@ def prediction_bands(
     if torque_noise > 0.0:
         driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
     return tuple(
-        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance, window)
+        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance)
         for i, (run, n) in enumerate(zip(runs, map(len, stretches), strict=True))
-    )
-
-
-def _whole(fitted: Fit, stretches: Sequence[Stretch], halo: int, substeps: int) -> Problem:
-    """Each stretch as one simulation, with unit weights."""
-    segments = cut(stretches, max(len(s) for s in stretches), halo=halo, count=len(stretches))
-    return Problem(
-        fitted.model,
-        fitted.free,
-        segments,
-        jnp.asarray(np.eye(segments.measured.shape[-1])),
-        jnp.asarray(np.ones(len(fitted.free.paths))),
-        jnp.asarray(np.ones(fitted.unknowns.states.shape[1])),
-        substeps=substeps,
     )
 
 
@@ -145,7 +126,6 @@ def _band(
     driven: np.ndarray,
     white: np.ndarray,
     covariance: np.ndarray,
-    window: int,
 ) -> PredictionBand:
     """The band of one run, from the derivatives of its outputs, and what noise of the torque drives; it has no width
     where they left the numbers."""
@@ -154,8 +134,8 @@ def _band(
     if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
         unknown = np.full(len(by_parameter), np.nan)
         return PredictionBand(run, unknown, unknown, std_noise, driven)
-    seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
-    moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
+    seen = np.einsum("ij,njs->nis", white, by_state[:WINDOW]).reshape(-1, by_state.shape[2])
+    moved = np.einsum("ij,njp->nip", white, by_parameter[:WINDOW]).reshape(-1, by_parameter.shape[2])
     # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
     size = np.linalg.norm(seen, axis=0)
     size = np.where(size > 0, size, 1.0)

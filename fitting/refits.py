@@ -37,7 +37,7 @@ def refits(
         The free vector (see [`fitting.free.FreeParameters`][]) by draw, and how far the last step still moved it, in
         standard errors of the joint estimate.
     """
-    problem = with_engine(eqx.tree_at(lambda p: p.model, found.problem, found.model), values=True)
+    problem = with_engine(found.at_solution, values=True)
     return _refits(problem, found.unknowns, linearise(problem, found.unknowns), jnp.asarray(measured), steps)
 
 

@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.along import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
-from fitting.followed import Forces, acting, polynomial, signals_at, some_at_a_time
+from fitting.followed import Forces, Inputs, acting, inputs_at, polynomial, some_at_a_time
 from fitting.free import strength_paths
 from fitting.memory import Memory, memory_of, own_between, own_states
 from hdjax import Drive, Model, PiecewisePolynomial
 from hdjax.compilation import jit_small
 from hdjax.effects import (
     ActuatorEffect,
-    Conditions,
     Effect,
     MeshGeometryEffect,
     MeshTorqueEffect,
@@ -148,9 +147,8 @@ def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples
     segments = seen.segments
     knots, logged = np.asarray(segments.torque.knots), acting(seen.model, segments)
     found = some_at_a_time(functools.partial(_actuated, stacked), knots, logged)[:, segments.halo :]
-    width = np.diff(knots[:, segments.halo :])
     # By columns, and then by powers.
-    return polynomial(found[:, :, None], (PART * width[..., None])[..., None])
+    return polynomial(found[:, :, None], (PART * segments.width[..., None])[..., None])
 
 
 @jit_small
@@ -176,9 +174,8 @@ def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array
 def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:
     """Of effects that take inertia: what the others do changes with it."""
     model, segments, followed = seen.model, seen.segments, seen.followed
-    width = np.diff(np.asarray(segments.torque.knots)[:, segments.halo :])
-    around = signals_at(model, segments, PART * width[..., None])
-    rates = _by_strength(_rates, stacked, model, followed.between, *around, own=own_between(states))
+    inputs = inputs_at(model, segments, PART * segments.width[..., None])
+    rates = _by_strength(_rates, stacked, model, followed.between, inputs, own=own_between(states))
     own = np.moveaxis(states[:, :-1], 2, 0)
     reading = _by_strength(_outputs, stacked, model, followed.states[:, :-1], own=own)
     # A rate of each state at each node is a part.
@@ -188,18 +185,9 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
     return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
 
 
-def _rates(
-    strengths: Array,
-    effect: Effect,
-    model: Model,
-    state: Array,
-    torque: Array,
-    load_torque: Array,
-    conditions: Conditions,
-    own: Array,
-) -> Array:
-    whole = model.with_effects(_with(effect, strengths))
-    return whole.rates(jnp.concatenate([state, own]), torque, load_torque, conditions)[: state.size]
+def _rates(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
+    whole, states = model.with_effects(_with(effect, strengths)), jnp.concatenate([state, own])
+    return whole.rates(states, inputs.torque, inputs.load_torque, inputs.conditions)[: state.size]
 
 
 def _outputs(strengths: Array, effect: Effect, model: Model, state: Array, own: Array) -> Array:

@@ -1,16 +1,15 @@
 """A torque with a memory of its own, where no function of the present motion explains what is missing."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from fitting.along import place_of
-from fitting.attribution.candidate_fit import Data, Setting, Trial
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.candidate_refit import try_lead
 from fitting.attribution.screening import Lead, Screen, screen
 from fitting.attribution.shortlist import worth_a_refit
+from fitting.attribution.study import Study
 from fitting.learned_look import LearnedLook, own_functions
 from hdjax.effects.learned import LearnedMeshTorque
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY, LearnedMemory
@@ -65,36 +64,26 @@ class Remembering(eqx.Module):
     screen: Screen
 
     def put_inside(
-        self,
-        before: Trial,
-        data: Data,
-        setting: Setting,
-        *,
-        rival: tuple[object, Trial] | None,
-        progress: Callable[[str], None],
+        self, before: Trial, study: Study, *, rival: tuple[object, Trial] | None
     ) -> tuple[Remembered, Trial] | None:
         """The candidate that explains most inside the equations, of the likeliest ones, and the model with it.
 
         Args:
             before: the model that was looked at.
-            data: the stretches.
-            setting: how they are cut.
+            study: the data, and how they are cut.
             rival: what else was learned, and a model that it has to better.
-            progress: told what is being done.
         """
         best: tuple[Remembered, Trial] | None = None
         limit = (before if rival is None else rival[1]).training.objective
         for candidate in self.candidates[:_TRIED]:
-            progress(f"learning a {candidate.form.name.replace('_', ' ')}")
-            trial = try_lead(before, candidate.lead, data, setting, limit)
+            study.progress(f"learning a {candidate.form.name.replace('_', ' ')}")
+            trial = try_lead(before, candidate.lead, study, limit)
             if trial is not None and (best is None or trial.gain_over(before) > best[1].gain_over(before)):
                 best, limit = (candidate, trial), trial.training.objective
         return best
 
 
-def remembering(
-    before: Trial, seen: LearnedLook, *, least: float, seed: int, progress: Callable[[str], None]
-) -> Remembering:
+def remembering(before: Trial, seen: LearnedLook, study: Study, *, least: float) -> Remembering:
     """Look for torques with memory.
 
     Where an effect of the model remembers already, no further memory is looked for: two of the same thing could not be
@@ -103,14 +92,13 @@ def remembering(
     Args:
         before: the model.
         seen: a look at it.
+        study: supplies the seed of the surrogates.
         least: gain to first order that is worth a refit.
-        seed: of the surrogates behind the p-values.
-        progress: told what is being done.
     """
     taken = {place_of(e) for e in before.model.effects if e.states}
     forms = [form for form in LEARNED_WITH_MEMORY if place_of(form) not in taken]
-    progress("looking for a memory")
-    screened = screen(before.training, before.held_out, catalogue=forms, seed=seed)
+    study.progress("looking for a memory")
+    screened = screen(before.training, before.held_out, catalogue=forms, seed=study.seed)
     worth = worth_a_refit(screened, least=least)
     return Remembering(tuple(Remembered(lead, _known(lead, seen)) for lead in worth), screened)
 

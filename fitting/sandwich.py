@@ -8,7 +8,7 @@ smoothing in the presence of nonparametric autocorrelation"). Where leverage is 
 residuals are pooled with those of neighbouring frequencies.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -18,7 +18,6 @@ from scipy.special import fdtri
 
 from fitting.engines import linearise
 from fitting.estimate import Fit
-from fitting.experiment import Segments
 from fitting.explained import FirstStates
 from fitting.posing import natural_frequency
 
@@ -52,6 +51,14 @@ class Record(eqx.Module):
     slopes: Float[np.ndarray, "n outputs parameters"]
     states: tuple[tuple[int, np.ndarray], ...]
     present: float
+
+    def bases(self) -> Iterator[tuple[int, Float[np.ndarray, "samples outputs directions"]]]:
+        """First sample of each simulation, and orthonormal directions of what its initial state can do."""
+        for start, columns in self.states:
+            flat = columns.reshape(-1, columns.shape[2])
+            length = np.linalg.norm(flat, axis=0)
+            basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
+            yield start, basis.reshape(*columns.shape[:2], -1)
 
 
 class Linearised(eqx.Module):
@@ -98,7 +105,7 @@ class Covariance(eqx.Module):
 
 def linearised(fit: Fit) -> Linearised:
     """The regression that a fit is at its solution."""
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     found = linearise(problem, fit.unknowns)
     states = FirstStates.of(found, problem.segments.joined)
     residual, projected = np.asarray(found.residual), states.parameters_without(found)
@@ -110,7 +117,7 @@ def linearised(fit: Fit) -> Linearised:
     period = 2 * np.pi / natural_frequency(fit.model, fit.stretches) / fit.stretches[0].experiment.time_step
     total = sum(len(s) for s in fit.stretches)
     return Linearised(
-        records=_records([len(s) for s in fit.stretches], problem.segments, residual, projected, states.by_first),
+        records=_records(fit, residual, projected, states.by_first),
         information=np.einsum("srp,srq->pq", projected, projected),
         prior=np.einsum("srp,srq->pq", prior, prior),
         chunk=max(1, round(max(_CHUNK_PERIODS * period, total / _CHUNKS))),
@@ -247,13 +254,9 @@ def _leverage(record: Record, inverse: np.ndarray) -> np.ndarray:
     count, outputs = record.residual.shape
     values, vectors = np.linalg.eigh(inverse)
     found = _power(record.slopes @ (vectors * np.sqrt(np.maximum(values, 0.0))))
-    for start, columns in record.states:
-        samples, _, states = columns.shape
-        flat = columns.reshape(-1, states)
-        length = np.linalg.norm(flat, axis=0)
-        basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
-        placed = np.zeros((count, outputs, basis.shape[1]))
-        placed[start : start + samples] = basis.reshape(samples, outputs, -1)
+    for start, basis in record.bases():
+        placed = np.zeros((count, outputs, basis.shape[2]))
+        placed[start : start + len(basis)] = basis
         found += _power(placed)
     return np.minimum(found, 1.0)
 
@@ -266,32 +269,25 @@ def _spectrum(series: np.ndarray) -> np.ndarray:
     return np.fft.rfft(series, axis=0) / np.sqrt(series.shape[0])
 
 
-def _records(
-    lengths: Sequence[int], segments: Segments, residual: np.ndarray, projected: np.ndarray, by_first: np.ndarray
-) -> tuple[Record, ...]:
+def _records(fit: Fit, residual: np.ndarray, projected: np.ndarray, by_first: np.ndarray) -> tuple[Record, ...]:
     """Segments put together again as stretches."""
+    segments = fit.problem.segments
     _, samples, outputs = segments.measured.shape
-    weight, joined = np.asarray(segments.weight), np.asarray(segments.joined)
-    made, at = [], 0
-    for length in lengths:
-        mine = slice(at, at - (-length // samples))
 
-        def in_time(blocks: np.ndarray, mine=mine, length=length) -> np.ndarray:
-            flat = blocks[mine, : samples * outputs].reshape(-1, outputs, *blocks.shape[2:])
-            return flat[:length]
+    def in_time(blocks: np.ndarray) -> list[np.ndarray]:
+        own = blocks[:, : samples * outputs]
+        return fit.by_stretch(own.reshape(len(own), samples, outputs, *blocks.shape[2:]))
 
-        columns = in_time(by_first)
-        starts = [i * samples for i, follows in enumerate(joined[mine]) if i == 0 or not follows]
-        stops = [*starts[1:], length]
-        made.append(
-            Record(
-                residual=in_time(residual),
-                slopes=in_time(projected),
-                states=tuple((a, columns[a:b]) for a, b in zip(starts, stops, strict=True)),
-                present=float(np.mean(weight[mine].ravel()[:length])),
-            )
-        )
-        at = mine.stop
+    joined = np.split(np.asarray(segments.joined), np.cumsum(fit.pieces))
+    weights = fit.by_stretch(np.asarray(segments.weight))
+    made = []
+    for left, slopes, columns, weight, follows in zip(
+        in_time(residual), in_time(projected), in_time(by_first), weights, joined, strict=False
+    ):
+        starts = [i * samples for i, goes_on in enumerate(follows) if i == 0 or not goes_on]
+        stops = [*starts[1:], len(left)]
+        states = tuple((a, columns[a:b]) for a, b in zip(starts, stops, strict=True))
+        made.append(Record(left, slopes, states, float(np.mean(weight))))
     return tuple(made)
 
 

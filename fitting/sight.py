@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fitting.along import Along, along
 from fitting.engines import linearise
 from fitting.estimate import Fit, lost
+from fitting.experiment import Segments
 from fitting.explained import Answers, without_untold
 from fitting.followed import Followed, follow
 from fitting.free import strength_paths
@@ -59,25 +60,37 @@ def sight(fit: Fit, seed: int) -> Sight:
         by_parameter=jnp.asarray(np.asarray(found.by_parameter) / slopes),
         before_by_parameter=jnp.asarray(np.asarray(found.before_by_parameter) / slopes),
     )
-    kept, followed = where_it_goes(fit, follow(problem, unknowns))
-    segments = problem.segments
-    segments = replace(segments, weight=jnp.asarray(np.where(kept[:, None], np.asarray(segments.weight), 0.0)))
-    residual = np.asarray(fit.error)[: len(kept)] @ np.asarray(problem.whitening).T
+    followed, segments, residual = where_it_goes(fit, problem, unknowns)
     return Sight(
         seen=along(fit.model, followed, segments, fit.stretches),
         answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
-        residual=np.where(kept[:, None, None], residual, 0.0),
-        surrogates=surrogates(fit, seed)[:, : len(kept)],
+        residual=residual,
+        surrogates=surrogates(fit, seed)[:, : len(residual)],
     )
 
 
-def where_it_goes(fit: Fit, followed: Followed) -> tuple[Bool[np.ndarray, " segments"], Followed]:
-    """The segments in which a model does not run away, and its motion with zeros in the others: there is none to look
-    along."""
-    kept = ~lost(fit)[: len(followed.states)] & np.isfinite(followed.transition).all(axis=(1, 2, 3))
+def where_it_goes(
+    fit: Fit, problem: Problem, unknowns: Unknowns
+) -> tuple[Followed, Segments, Float[np.ndarray, "segments samples outputs"]]:
+    """A fitted motion, its data, and the whitened residual; zero, and without weight, in segments in which the model
+    runs away: there is no motion to look along.
+
+    Args:
+        fit: the fit.
+        problem: what it has solved, or the first segments of that.
+        unknowns: the solution.
+    """
+    followed, segments = follow(problem, unknowns), problem.segments
+    count = len(followed.states)
+    kept = ~lost(fit)[:count] & np.isfinite(followed.transition).all(axis=(1, 2, 3))
+    residual = fit.white_error[:count]
     if kept.all():
-        return kept, followed
-    return kept, jax.tree.map(lambda a: np.where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0), followed)
+        return followed, segments, residual
+    followed, weight, residual = jax.tree.map(
+        lambda a: np.where(kept.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0),
+        (followed, np.asarray(segments.weight), residual),
+    )
+    return followed, replace(segments, weight=jnp.asarray(weight)), residual
 
 
 def motion_states(fit: Fit) -> Float[np.ndarray, "segments knots states"]:
@@ -145,18 +158,11 @@ def _together(parts: Sequence[Batch]) -> Batch:
 
 def _looked_at(fit: Fit) -> tuple[Problem, Unknowns]:
     """What a fit has solved, and where, at its solution; without segments that only fill up."""
-    length = fit.problem.segments.weight.shape[1]
-    count = sum(-(-len(s) // length) for s in fit.stretches)
+    problem, count = fit.with_all_free().at_solution, fit.pieces.sum()
     segments, states = jax.tree.map(
-        lambda a: jnp.asarray(np.asarray(a)[:count]), (fit.problem.segments, fit.unknowns.states)
+        lambda a: jnp.asarray(np.asarray(a)[:count]), (problem.segments, fit.unknowns.states)
     )
     # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
     # than this; the residual is the fit's own.
-    problem = replace(
-        fit.problem,
-        model=fit.model,
-        segments=segments,
-        active=jnp.asarray(np.ones(len(fit.free.paths))),
-        substeps=suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE),
-    )
-    return problem, replace(fit.unknowns, states=states)
+    substeps = suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE)
+    return replace(problem, segments=segments, substeps=substeps), replace(fit.unknowns, states=states)

@@ -25,7 +25,8 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     # Loaded here, where effects are looked for: a plain fit does without.
     from scipy.signal import find_peaks
 
-    series = _longest(fit)
+    # Along the longest stretch, samples without weight zero.
+    series = max(reversed(fit.by_stretch(fit.white_error)), key=len)
     count = series.shape[0]
     if count < 4 * _NEIGHBOURS:
         return ()
@@ -61,15 +62,3 @@ def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarr
     left, top, right = (np.log(np.maximum(power[inner + k], 1e-300)) for k in (-1, 0, 1))
     curvature = np.minimum(left - 2 * top + right, -1e-12)
     return np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)
-
-
-def _longest(fit: Fit) -> Float[np.ndarray, "samples outputs"]:
-    """The whitened residual along the longest stretch, its samples without weight zero."""
-    error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T
-    length = error.shape[1]
-    first, best = 0, (0, 0, 0)
-    for stretch in fit.stretches:
-        best = max(best, (len(stretch), first, first + -(-len(stretch) // length)))
-        first += -(-len(stretch) // length)
-    samples, start, stop = best
-    return error[start:stop].reshape(-1, error.shape[2])[:samples]

@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from fitting.estimate import Fit
+from fitting.explained import solved
 from fitting.spectral_lines import STANDS_OUT, surroundings
 
 DRAWS = 199
@@ -22,7 +24,7 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
 
     random = np.random.default_rng(seed)
     weight = np.asarray(fit.problem.segments.weight) > 0
-    error = np.asarray(fit.error) @ np.asarray(fit.problem.whitening).T
+    error = fit.white_error
     series = error[weight].T
     samples = series.shape[1]
     length = prev_fast_len(samples, real=True)
@@ -37,3 +39,68 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
         surrogate: Any = irfft(spectrum * turn[None, :], n=length, overwrite_x=True, workers=-1)
         found[draw][weight] = np.pad(surrogate, ((0, 0), (0, samples - length)), mode="wrap").T
     return found.reshape(DRAWS, error.shape[0], -1)
+
+
+class Scores(eqx.Module):
+    """Inner products of sensitivities with each other, with the residual, and with its surrogates.
+
+    Attributes:
+        gram: of the columns: of what was free already, then of strengths.
+        gradient: columns against the residual.
+        surrogate_gradients: columns against each surrogate.
+        rows: number of measured values, at least one.
+    """
+
+    gram: Float[np.ndarray, "columns columns"]
+    gradient: Float[np.ndarray, " columns"]
+    surrogate_gradients: Float[np.ndarray, "columns draws"]
+    rows: float
+
+    @classmethod
+    def of(
+        cls,
+        columns: Float[np.ndarray, "segments samples outputs columns"],
+        weight: Float[np.ndarray, "segments samples"],
+        residual: Float[np.ndarray, "segments samples outputs"],
+        surrogates: Float[np.ndarray, "draws segments rows"],
+    ) -> "Scores":
+        """Of the whitened outputs' derivatives, the weight of each sample, and what is to be explained."""
+        flat = columns.reshape(-1, columns.shape[-1])
+        # Where the model runs away in every segment, nothing is told.
+        rows = max(float(np.sum(weight)) * residual.shape[-1], 1.0)
+        against = (surrogates.reshape(len(surrogates), -1) @ flat).T
+        return cls(flat.T @ flat, flat.T @ residual.reshape(-1), against, rows)
+
+    def columns(self, which: list[int]) -> "Scores":
+        """Those of some columns alone."""
+        own = self.gram[np.ix_(which, which)], self.gradient[which], self.surrogate_gradients[which]
+        return Scores(*own, self.rows)
+
+    def steps(
+        self, gradient: Float[np.ndarray, "columns draws"], chosen: list[int]
+    ) -> Float[np.ndarray, "columns draws"]:
+        """Least squares over the chosen columns, for each column of gradients; zero for the other ones."""
+        found = np.zeros_like(gradient)
+        found[chosen] = solved(self.gram[np.ix_(chosen, chosen)], gradient[chosen])
+        return found
+
+    def loss(
+        self, step: Float[np.ndarray, "columns draws"], gradient: Float[np.ndarray, "columns draws"]
+    ) -> Float[np.ndarray, " draws"]:
+        """Change of the objective by a step, for each column of it."""
+        return (np.sum(step * (self.gram @ step), axis=0) - 2 * np.sum(step * gradient, axis=0)) / (2 * self.rows)
+
+
+def null_gains(fitted: Scores, unseen: Scores, known: int) -> Float[np.ndarray, " draws"]:
+    """What a least-squares step gains on unseen surrogates beyond refitting what was free already, the first columns.
+
+    Args:
+        fitted: scores of the data that are fitted.
+        unseen: likewise of unseen data.
+        known: how many columns were free already.
+    """
+    before, after = (
+        unseen.loss(fitted.steps(fitted.surrogate_gradients, list(range(count))), unseen.surrogate_gradients)
+        for count in (known, len(fitted.gram))
+    )
+    return before - after

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from fitting.errors import InputError
-from fitting.model_file import read_model
+from fitting.model_sections import SOURCES, stated_model, stated_range, with_stated_effects
 from fitting.toml_sections import Sections
-from hdjax import PRESETS, Harmonic, Model, TwoInertiaModel
-from hdjax.effects import BY_NAME
+from hdjax import Harmonic, Model
 from hdjax.sweep import Points, Request, drawn, spread_values
 from hdjax.sweep.points import RULES
 from hdjax.sweep.request import OUTPUTS
@@ -46,7 +45,7 @@ def read_sweep_file(path: Path) -> SweepFile:
     file = Sections(path, _SECTIONS)
     sections = {name: file.section(name) for name in _SECTIONS}
     try:
-        model = _model(file, sections["drive"], sections["effects"])
+        model = _model(file)
         forcing = _forcing(file, sections["forcing"])
         settings = _settings(file, sections["sweep"])
         points = Points(_axes(file, sections["axes"]), _sample(file, sections["sample"]))
@@ -57,35 +56,15 @@ def read_sweep_file(path: Path) -> SweepFile:
         raise file.refuse(f"{error}") from error
 
 
-def _model(file: Sections, drive: dict[str, Any], effects: dict[str, Any]) -> Model:
-    if "model" in drive:
-        model = read_model(file.path.parent / str(drive["model"])).model
-    else:
-        preset = drive.get("preset", "HDC-40-050")
-        if preset not in PRESETS:
-            raise file.refuse(f"[drive] preset must be one of {', '.join(PRESETS)}, but is {preset}")
-        model = TwoInertiaModel(PRESETS[preset]())
-    own = {k: v for k, v in drive.items() if k not in ("preset", "model")}
-    file.known("drive", own, [name for name in model.parameters() if "." not in name])
-    model = model.replace({k: file.number("drive", k, v) for k, v in own.items()})
-    for name, values in effects.items():
-        if name not in BY_NAME:
-            raise file.refuse(f"[effects.{name}] is no effect; there are {', '.join(BY_NAME)}")
-        table = file.table(f"effects.{name}", values)
-        fields = [f for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata]
-        file.known(f"effects.{name}", table, [f.name for f in fields])
-        for f in fields:
-            if f.default is dataclasses.MISSING and f.name not in table:
-                raise file.refuse(f"[effects.{name}] must have `{f.name}`")
-        numbers = {k: file.number(f"effects.{name}", k, v) for k, v in table.items()}
-        model = model.with_effects(BY_NAME[name](**numbers))
-    return model
+def _model(file: Sections) -> Model:
+    model = stated_model(file)
+    own = {k: v for k, v in file.section("drive").items() if k not in SOURCES}
+    numbers = file.numbers("drive", own, [name for name in model.parameters() if "." not in name])
+    return with_stated_effects(file, model.replace(numbers))
 
 
 def _forcing(file: Sections, table: dict[str, Any]) -> Harmonic:
-    file.known("forcing", table, _FORCING)
-    numbers = {k: file.number("forcing", k, v) for k, v in table.items()}
-    return Harmonic(**({"amplitude": 1.0, "omega": 1.0} | numbers))
+    return Harmonic(**({"amplitude": 1.0, "omega": 1.0} | file.numbers("forcing", table, _FORCING)))
 
 
 def _settings(file: Sections, table: dict[str, Any]) -> dict[str, Any]:
@@ -135,13 +114,10 @@ def _sample(file: Sections, table: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _range(file: Sections, section: str, table: Mapping[str, Any]) -> tuple[float, float, Any]:
-    for key in ("from", "to"):
-        if key not in table:
-            raise file.refuse(f"[{section}] must have `{key}`")
+    start, end = stated_range(file, section, table)
     spacing = table.get("spacing", "linear")
     if spacing not in ("linear", "log"):
         raise file.refuse(f"[{section}] spacing must be linear or log, but is {spacing}")
-    start, end = (file.number(section, key, table[key]) for key in ("from", "to"))
     if spacing == "log" and not (start > 0.0 and end > 0.0):
         raise file.refuse(f"[{section}] must run from above zero for spacing log, but runs from {start} to {end}")
     return start, end, spacing

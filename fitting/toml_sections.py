@@ -44,11 +44,22 @@ class Sections:
                 where = f"[{section}] {key}" if section else f"[{key}]"
                 raise self.refuse(f"{where} is not known here; there are {', '.join(names)}")
 
+    def needs(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> None:
+        """Refuse a table that lacks a key."""
+        for key in names:
+            if key not in table:
+                raise self.refuse(f"[{section}] must have `{key}`")
+
     def number(self, section: str, key: str, value: object) -> float:
         """A finite number."""
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
             raise self.refuse(f"[{section}] {key} must be a number, but is {value!r}")
         return float(value)
+
+    def numbers(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> dict[str, float]:
+        """Finite numbers under keys that mean something."""
+        self.known(section, table, names)
+        return {key: self.number(section, key, value) for key, value in table.items()}
 
     def count(self, section: str, key: str, value: object, least: int = 1) -> int:
         """A whole number, at least `least`."""

@@ -10,7 +10,6 @@ them, by one pass against time.
 from collections.abc import Sequence
 from itertools import combinations
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -45,18 +44,18 @@ def torque_noise_covariance(
     Returns:
         The covariance; None where the residual has another colour.
     """
-    problem = eqx.tree_at(lambda p: p.model, fit.problem, fit.model)
+    problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
     random = np.random.default_rng(0)
     noise = random.normal(size=(*problem.segments.weight.shape, _DRAWS))
     answers = _answers(problem, followed, noise)
     records = regression.records
-    in_time = _in_time(records, answers)
+    in_time = fit.by_stretch(answers)
     variances = _variances(records, in_time, inverse)
     if variances is None:
         return None
     *encoders, torque = variances
-    slopes = _by_segment(records, problem)
+    slopes = _by_segment(records, fit)
     middle = torque * _torque_scores(problem, followed, slopes)
     # Noise of the motor's encoder is in both outputs.
     together = _covariance([r.residual[..., None] for r in records]) - torque * _covariance(in_time)
@@ -66,29 +65,11 @@ def torque_noise_covariance(
     return inverse @ middle @ inverse
 
 
-def _in_time(records: Sequence[Record], blocks: np.ndarray) -> list[np.ndarray]:
-    """Rows by segment as stretches."""
-    made, at = [], 0
-    for record in records:
-        count, samples = record.residual.shape[0], blocks.shape[1]
-        mine = slice(at, at - (-count // samples))
-        made.append(blocks[mine].reshape(-1, *blocks.shape[2:])[:count])
-        at = mine.stop
-    return made
-
-
-def _by_segment(
-    records: Sequence[Record], problem: Problem
-) -> Float[np.ndarray, "segments samples outputs parameters"]:
+def _by_segment(records: Sequence[Record], fit: Fit) -> Float[np.ndarray, "segments samples outputs parameters"]:
     """The records' slopes by segment, padded with zeros."""
-    segments, samples = problem.segments.weight.shape
-    found = np.zeros((segments, samples, *records[0].slopes.shape[1:]))
-    at = 0
-    for record in records:
-        count = record.residual.shape[0]
-        stop = at - (-count // samples)
-        found[at:stop].reshape(-1, *found.shape[2:])[:count] = record.slopes
-        at = stop
+    found = np.zeros((*fit.error.shape[:2], *records[0].slopes.shape[1:]))
+    for own, record in zip(np.split(found, np.cumsum(fit.pieces)), records, strict=False):
+        own.reshape(-1, *found.shape[2:])[: len(record.slopes)] = record.slopes
     return found
 
 
@@ -171,13 +152,10 @@ def _unit(record: Record, output: int) -> Float[np.ndarray, "n outputs draws"]:
 def _left_over(record: Record, drawn: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """What a fit would leave of a disturbance: without what initial states and parameters take up."""
     left = drawn - np.einsum("nop,pq,mrq,mrd->nod", record.slopes, inverse, record.slopes, drawn, optimize=True)
-    for start, columns in record.states:
-        samples, _, states = columns.shape
-        flat = columns.reshape(-1, states)
-        length = np.linalg.norm(flat, axis=0)
-        basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
-        part = left[start : start + samples].reshape(flat.shape[0], -1)
-        left[start : start + samples] = (part - basis @ (basis.T @ part)).reshape(samples, *left.shape[1:])
+    for start, basis in record.bases():
+        own, flat = slice(start, start + len(basis)), basis.reshape(-1, basis.shape[2])
+        part = left[own].reshape(len(flat), -1)
+        left[own] = (part - flat @ (flat.T @ part)).reshape(len(basis), *left.shape[1:])
     return left
 
 

@@ -5,7 +5,7 @@ then judge one learned function, like any other effect. What no function of the 
 memory ([`fitting.remembering`][]).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.along import place_of, unit_reading
-from fitting.attribution.candidate_fit import Data, Setting, Trial, challenge
+from fitting.attribution.candidate_fit import Trial, challenge
 from fitting.attribution.decisions import RULES
+from fitting.attribution.study import Study
 from fitting.base_fit import leaves_white_noise
 from fitting.estimate import Fit
 from fitting.learned_look import (
@@ -77,40 +78,37 @@ class Unknown(eqx.Module):
         return jax.vmap(self.before.model.motion)(jnp.asarray(self.states), self.conditions)
 
 
-def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]) -> Unknown | None:
+def learn(before: Trial, study: Study) -> Unknown | None:
     """Learn what a model lacks.
 
     Args:
         before: the model.
-        data: the stretches.
-        setting: how they are cut.
-        seed: of the surrogates behind the p-value.
-        progress: told what is being done.
+        study: the data, and how they are cut.
 
     Returns:
         What was learned; None where nothing brings the training error down.
     """
-    progress("looking for what the missing torque depends on")
+    study.progress("looking for what the missing torque depends on")
     seen = learned_look(before.training)
     least = _LEAST_SHARE_BESIDE if before.model.effects else _LEAST_SHARE
     found = sorted((c for c in candidates(seen) if c.gain > least), key=lambda c: -c.gain)
     alone, pairs = ([c for c in found if (len(c.variables) > 1) == several] for several in (False, True))
 
-    best = _likeliest(alone, None, before, data, setting, progress)
+    best = _likeliest(alone, None, before, study)
     memory: Remembering | None = None
     remembered: tuple[Remembered, Trial] | None = None
     if not _is_enough(best):
-        memory = remembering(before, seen, least=least, seed=seed, progress=progress)
+        memory = remembering(before, seen, study, least=least)
         # A law with memory has fewer parameters than a function of two variables.
         if memory.candidates and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0):
-            remembered = memory.put_inside(before, data, setting, rival=best, progress=progress)
+            remembered = memory.put_inside(before, study, rival=best)
     if not _is_enough(remembered):
         if not _is_enough(best):
             worth = [c for c in pairs if best is None or c.gain >= best[0].gain + RULES.variable]
-            best = _likeliest(worth, best, before, data, setting, progress)
-        best = None if best is None else _refined(best, data, setting, progress)
+            best = _likeliest(worth, best, before, study)
+        best = None if best is None else _refined(best, study)
         if memory is not None and remembered is None and not _is_enough(best):
-            remembered = memory.put_inside(before, data, setting, rival=best, progress=progress)
+            remembered = memory.put_inside(before, study, rival=best)
 
     if remembered is not None and (best is None or _betters(remembered[1], best[1], before)):
         assert memory is not None
@@ -118,7 +116,7 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
         chosen, trial, p_value = *remembered, memory.screen.p_value(gain)
     elif best is not None:
         gain = before.held_out.objective - best[1].held_out.objective
-        chosen, trial, p_value = *best, _p_value(seen, before, best[0], gain, seed)
+        chosen, trial, p_value = *best, _p_value(seen, before, best[0], gain, study.seed)
     else:
         return None
     instants = seen.instants
@@ -132,27 +130,20 @@ def learn(before: Trial, data: Data, setting: Setting, *, seed: int, progress: C
     return Unknown(before, trial, ranked, chosen, instants, states, conditions, acting, gain, p_value)
 
 
-def learn_supported(
-    before: Trial, data: Data, setting: Setting, *, seed: int, progress: Callable[[str], None]
-) -> Unknown | None:
+def learn_supported(before: Trial, study: Study) -> Unknown | None:
     """[`learn`][], None also where the data do not support what was learned."""
-    found = learn(before, data, setting, seed=seed, progress=progress)
+    found = learn(before, study)
     return found if is_supported(found) else None
 
 
 def _likeliest(
-    found: Sequence[Candidate],
-    best: tuple[Candidate, Trial] | None,
-    before: Trial,
-    data: Data,
-    setting: Setting,
-    progress: Callable[[str], None],
+    found: Sequence[Candidate], best: tuple[Candidate, Trial] | None, before: Trial, study: Study
 ) -> tuple[Candidate, Trial] | None:
     """The best of the likeliest candidates and of what was the best so far, inside the equations."""
     for candidate in _rivals(found):
-        progress(f"learning a function of {' and '.join(candidate.variables)}")
+        study.progress(f"learning a function of {' and '.join(candidate.variables)}")
         # A whole step to what the first look found may leave the present model, where it is nothing, far behind.
-        trial = _refitted(before, candidate, data, setting, np.zeros(len(candidate.effect.c)))
+        trial = _refitted(before, candidate, study, np.zeros(len(candidate.effect.c)))
         if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
             best = candidate, trial
     return best
@@ -168,16 +159,14 @@ def _betters(trial: Trial, other: Trial, before: Trial) -> bool:
     return _penalised(trial) < _penalised(other) and trial.gain_over(before) > other.gain_over(before)
 
 
-def _refined(
-    best: tuple[Candidate, Trial], data: Data, setting: Setting, progress: Callable[[str], None]
-) -> tuple[Candidate, Trial]:
+def _refined(best: tuple[Candidate, Trial], study: Study) -> tuple[Candidate, Trial]:
     """The same variables with those functions of them, and as many, that a second look calls for, along the motion that
     the first fit found: the first look is but first order."""
     first, trial = best
     seen = learned_look(trial.training)
     for candidate in looked_again(first, seen):
-        progress("learning its shape more closely")
-        finer = _refitted(trial, candidate, data, setting, _as_before(first, trial, candidate, seen))
+        study.progress("learning its shape more closely")
+        finer = _refitted(trial, candidate, study, _as_before(first, trial, candidate, seen))
         if finer is not None and _penalised(finer) < _penalised(best[1]):
             best = eqx.tree_at(lambda c: c.gain, candidate, first.gain), finer
     return best
@@ -263,13 +252,13 @@ def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
     return [c for c in found[:2] if c.gain > NEARLY * found[0].gain]
 
 
-def _refitted(before: Trial, candidate: Candidate, data: Data, setting: Setting, c: np.ndarray) -> Trial | None:
+def _refitted(before: Trial, candidate: Candidate, study: Study, c: np.ndarray) -> Trial | None:
     """The model with a candidate inside, from given coefficients."""
     name = candidate.effect.name
     effect = eqx.tree_at(lambda e: e.c, candidate.effect, tuple(map(as_scalar, c)))
     bare = before.model.without_effect(name) if name in {e.name for e in before.model.effects} else before.model
-    setting = replace(setting, least_progress=_LEAST_PROGRESS)
-    return challenge([bare.with_effects(effect)], data, before.hold, setting, champion=before)
+    patient = replace(study, setting=replace(study.setting, least_progress=_LEAST_PROGRESS))
+    return challenge([bare.with_effects(effect)], patient, before.hold, champion=before)
 
 
 def _as_before(old: Candidate, trial: Trial, new: Candidate, seen: LearnedLook) -> np.ndarray:

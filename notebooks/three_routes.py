@@ -26,6 +26,7 @@ from fitting.demonstration import write_demo_logs
 from fitting.estimate import fit
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
+from fitting.posing import Segmentation
 from fitting.rig import read_rig
 from fitting.starting_values import starting_models
 from fitting.uncertainty import uncertainty
@@ -46,7 +47,7 @@ start = starting_models(rig.model, data)[0]
 fits = {}
 for engine in (None, "XLA", "diffrax"):
     begun = time.perf_counter()
-    fits[engine] = fit(start, data, fitted_paths(start), horizon=128, substeps=3, engine=engine)
+    fits[engine] = fit(start, data, fitted_paths(start), Segmentation(128, substeps=3), engine=engine)
     print(f"{engine or 'machine code':>12}: {fits[engine].steps} iterations, {time.perf_counter() - begun:.1f} s")
 
 # %% [markdown]

@@ -11,14 +11,15 @@ import rig
 from fitting.attribution import candidate_fit as of_a_trial
 from fitting.attribution import selection_round as attribution
 from fitting.attribution import support
-from fitting.attribution.candidate_fit import Setting, Trial, attempt, halo_for
+from fitting.attribution.candidate_fit import Trial, attempt, halo_for
 from fitting.attribution.selection_round import Verdict, look
+from fitting.attribution.study import Setting, Study
 from fitting.attribution.support import Standing
 from fitting.base_fit import base_fit
-from fitting.experiment import segment_count, split
+from fitting.experiment import split
 from fitting.free import effect_paths
 from fitting.measurement_noise import MeasurementNoise, measurement_noise
-from fitting.posing import segment_length
+from fitting.posing import Segmentation
 from fitting.uncertainty import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects import Effect
@@ -29,7 +30,7 @@ from hdjax.effects.position import PositionDependentMotorFriction
 from hdjax.effects.presliding import DahlMotorFriction
 
 HOLD: Hold = "zero-order"
-SETTING = Setting(horizon=32, halo=4, substeps=2, count=8)
+STUDY = Study({}, Setting(Segmentation(32, halo=4, substeps=2, count=8)))
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +40,10 @@ def verdicts():
     data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
     base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-    count = segment_count(training, segment_length(base.horizon))
-    setting = Setting(base.horizon, halo_for(training), base.substeps, count)
-    before = attempt(base.model, data, HOLD, setting)
+    study = Study(data, Setting(base.segmentation))
+    before = attempt(base.model, study, HOLD)
     standing = Standing(before, before, measurement_noise(before.training))
-    found = look(standing, data, setting, catalogue=(TorqueBias, Creep), seed=0, progress=lambda _: None)
+    found = look(standing, study, catalogue=(TorqueBias, Creep))
     return before, {v.name: v for v in found.verdicts}
 
 
@@ -111,12 +111,12 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
     tied.sort(key=lambda v: -v.gain)
     long = {id(found["torque_bias"].trial): bias_long, id(found["creep"].trial): creep_long}
 
-    def long_gains(before, trials, data, setting):
+    def long_gains(before, trials, study):
         gains = [long[id(trial)] for trial in trials]
         return None if None in gains else gains
 
     monkeypatch.setattr(attribution, "long_gains", long_gains)
-    ordered, _ = attribution._simplest_first(tied, before, {}, SETTING)
+    ordered, _ = attribution._simplest_first(tied, before, STUDY)
     assert ordered[0].name == leader
 
 
@@ -136,15 +136,15 @@ def test_whole_stretches_judge_what_remembers(
         Verdict("torque_bias", bias.family, bias.trial, 0.05, 0.005, True),
     ]
     long = {id(bias.trial): 2.0, id(creep.trial): creep_long}
-    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, data, setting: [long[id(t)] for t in trials])
-    (first, second), rivals = attribution._simplest_first(ordered, before, {}, SETTING)
+    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, study: [long[id(t)] for t in trials])
+    (first, second), rivals = attribution._simplest_first(ordered, before, STUDY)
     assert {r.name: r.long_gain for r in rivals} == {"torque_bias": 2.0, "creep": creep_long}
     assert (first.name, first.separable, second.separable) == (leader, False, True)
 
 
 def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monkeypatch: pytest.MonkeyPatch):
     _, found = verdicts
-    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, data, setting: [1.0] * len(trials))
+    monkeypatch.setattr(attribution, "long_gains", lambda before, trials, study: [1.0] * len(trials))
 
     def verdict(effect: Effect) -> Verdict:
         model = rig.drive_model().with_effects(effect)
@@ -153,7 +153,7 @@ def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monke
 
     dahl, dry = DahlMotorFriction(T_c=0.1, bend=0.1, settling=1e-3), MotorFriction(T_c=0.1, transition=0.1)
     assert len(effect_paths(dahl)) == len(effect_paths(dry))
-    ordered, _ = attribution._simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, {}, SETTING)
+    ordered, _ = attribution._simplest_first([verdict(dahl), verdict(dry)], found["creep"].trial, STUDY)
     assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 

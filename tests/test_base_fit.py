@@ -7,10 +7,11 @@ import pytest
 
 import rig
 from fitting.base_fit import _refined, base_fit, is_held, leaves_white_noise
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Strategy, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
 from fitting.free import base_paths
 from fitting.outliers import left_out
+from fitting.posing import Segmentation
 from fitting.starting_values import starting_models
 from fitting.uncertainty import uncertainty
 
@@ -57,16 +58,15 @@ def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
         rig.reduced_model(omega_0=1.01 * rig.OMEGA_0),
         whole(clean),
         base_paths(PLACEHOLDER),
-        horizon=found.horizon,
-        substeps=found.substeps,
-        hold_parameters=True,
+        Segmentation(found.horizon, substeps=found.substeps),
+        strategy=Strategy(hold_parameters=True),
     )
     assert not leaves_white_noise(off)
 
 
 def test_many_initial_states_leave_white_noise_white(found: Fit, clean):
     """A state every 32 samples follows some of the noise; that is no sign of a wrong minimum."""
-    short = fit(found.model, whole(clean), base_paths(PLACEHOLDER), horizon=32, substeps=found.substeps)
+    short = fit(found.model, whole(clean), base_paths(PLACEHOLDER), Segmentation(32, substeps=found.substeps))
     assert leaves_white_noise(short)
 
 
@@ -74,11 +74,17 @@ def test_horizons_grow_step_by_step(clean):
     far = rig.reduced_model(omega_0=0.5 * rig.OMEGA_0, gain=0.25 * rig.GAIN, alpha=0.0)
     paths = base_paths(far)
     # At once over six periods, a frequency 50 % off ends in a wrong minimum, from which windows that grow lead out.
-    direct = fit(far, whole(clean), paths, horizon=128, substeps=3, begin_anew_above=np.inf, retry_states=False)
+    direct = fit(
+        far,
+        whole(clean),
+        paths,
+        Segmentation(128, substeps=3),
+        strategy=Strategy(begin_anew_above=np.inf, retry_states=False),
+    )
     assert abs(float(direct.model.get("omega_0")) / rig.OMEGA_0 - 1) > 0.1
-    grown = fit(far, whole(clean), paths, horizon=128, substeps=3)
+    grown = fit(far, whole(clean), paths, Segmentation(128, substeps=3))
     assert float(grown.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=1e-3)
-    coarse = fit(far, whole(clean), paths, horizon=32, substeps=3, hold_parameters=True)
+    coarse = fit(far, whole(clean), paths, Segmentation(32, substeps=3), strategy=Strategy(hold_parameters=True))
     refined = _refined(coarse, whole(clean), 0)
     assert refined.horizon == 128
     assert_recovered(refined, TRUTH)
@@ -149,5 +155,5 @@ def test_a_large_load_that_is_not_logged():
     assert float(found.model.get("alpha")) == pytest.approx(rig.ALPHA, rel=0.2)
     assert found.model.effects == ()
     # Set free, they run away.
-    loose = fit(found.model, stretches, base_paths(found.model), horizon=found.horizon, halo=4)
+    loose = fit(found.model, stretches, base_paths(found.model), Segmentation(found.horizon, halo=4))
     assert abs(np.log(float(loose.model.get("K")) / rig.K)) > 1.0

@@ -8,11 +8,13 @@ import pytest
 
 import rig
 from fitting import challenge as module
-from fitting.attribution.candidate_fit import Setting, Trial
+from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.decisions import ChallengeEvidence, ModelEvidence, names_stand, next_question
+from fitting.attribution.study import Setting, Study
 from fitting.effect_search import base_trial
 from fitting.experiment import split
 from fitting.learned_look import Candidate
+from fitting.posing import Segmentation
 from fitting.unknown import Unknown
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
@@ -182,20 +184,20 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
         model = base.model.with_effects(*effects)
         return replace(base, model=model, held_out=replace(base.held_out, objective=objective))
 
-    def refitted_without(fallen, trial, data, setting):
+    def refitted_without(fallen, trial, base, study):
         kept = [e for e in trial.model.effects if e.name not in fallen]
         learned = any(isinstance(e, LearnedMeshTorque) for e in kept)
         return with_effects(*kept, objective=-7.0 + missed_by if learned else -5.0)
 
     monkeypatch.setattr(module, "told_from_zero", lambda fit, names: told)
-    monkeypatch.setattr(module, "_refitted_without", refitted_without)
+    monkeypatch.setattr(module, "refitted_without", refitted_without)
     names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
     chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))
     named, trial = with_effects(*names, objective=-5.0), with_effects(*names, LEARNED, objective=-7.0)
     motion, push = np.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.ones((2, 3))
     instants = np.arange(2)
     beside = Unknown(named, trial, (), chosen, instants, motion, Conditions(time=jnp.zeros(2)), push, 2.0, 0.005)
-    bare, beside = module._without_superfluous(base, named, beside, {}, Setting(32, 4, 1, 8))
+    bare, beside = module._without_superfluous(base, named, beside, Study({}, Setting(Segmentation(32))))
     assert {e.name for e in bare.model.effects} == left
     assert (bare is base) == (left == set()) and beside.before is bare
     assert {e.name for e in beside.trial.model.effects} == left | {LEARNED.name}

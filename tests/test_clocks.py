@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt, halo_for
+from fitting.attribution.candidate_fit import Trial, attempt, halo_for
 from fitting.attribution.log_alignment import Phasors, put_back, with_clocks_set
+from fitting.attribution.study import Data, Setting, Study
 from fitting.base_fit import base_fit
-from fitting.experiment import Experiment, experiment_from_log, segment_count, split
+from fitting.experiment import Experiment, experiment_from_log, split
 from fitting.linear_look import Acting, look_along, products
-from fitting.posing import segment_length
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
 
@@ -36,7 +36,7 @@ def experiment(seed: int, hold: Hold, phase: float | None) -> Experiment:
     return experiment_from_log(replace(log, name=f"log {seed}", time=log.time + 7.0 * seed), hold=hold)
 
 
-Begun = tuple[Trial, Data, Setting]
+Begun = tuple[Trial, Study]
 
 
 @pytest.fixture(scope="module")
@@ -48,47 +48,42 @@ def begun() -> Callable[..., Begun]:
         data: Data = {h: split([experiment(i, h, phase) for i, phase in enumerate(phases)]) for h in HOLDS}
         training = data[HOLDS[0]][0]
         found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-        count = segment_count(training, segment_length(found.horizon))
-        setting = Setting(found.horizon, halo_for(training), found.substeps, count)
-        return attempt(found.model, data, HOLDS[0], setting), data, setting
+        study = Study(data, Setting(found.segmentation))
+        return attempt(found.model, study, HOLDS[0]), study
 
     return fitted
-
-
-def silent(message: str) -> None:
-    pass
 
 
 def test_logs_that_begin_in_other_phases(begun):
     """The second log's clock is put back by what its line comes later than the first one's; parameters stay, and one
     torque then explains both logs to the noise."""
     first, second = 0.4, 2.3
-    base, data, setting = begun(first, second)
+    base, study = begun(first, second)
     told = []
-    after, clocked = with_clocks_set(base, data, setting, progress=told.append)
+    after, clocked = with_clocks_set(base, replace(study, progress=told.append))
     for hold in HOLDS:
-        for old, new in zip(data[hold], clocked[hold], strict=True):
+        for old, new in zip(study.data[hold], clocked.data[hold], strict=True):
             assert put_back(old, new) == (0.0, pytest.approx((first - second) / OMEGA, abs=1e-4))
     assert len(told) == 1
     assert after.training.objective == pytest.approx(base.training.objective, abs=1e-3)
     for path, (value, _) in base.model.parameters().items():
         assert float(after.model.get(path)) == pytest.approx(float(value), rel=1e-9)
 
-    def with_line(d: Data) -> Trial:
+    def with_line(study: Study) -> Trial:
         line = Phasors(LearnedMeshTorque, OMEGA, np.full(2, 1j * LINE), np.ones(2), 1.0).effect
-        return attempt(base.model.with_effects(line), d, HOLDS[0], setting, start=base)
+        return attempt(base.model.with_effects(line), study, HOLDS[0], start=base)
 
     assert with_line(clocked).training.dynamic_error_std == pytest.approx(NOISE, rel=0.05)
-    assert with_line(data).training.dynamic_error_std > 2 * NOISE
+    assert with_line(study).training.dynamic_error_std > 2 * NOISE
 
 
 @pytest.mark.parametrize(("phases", "logs"), [((0.4, 0.4), 2), ((None, None), 2), ((None, 0.4), 2), ((0.4, 2.3), 1)])
 def test_clocks_that_are_right_stay(begun, phases: tuple[float | None, ...], logs: int):
     """In phase already, without a line, with one in a single log, and a log by itself."""
-    base, data, setting = begun(*phases)
-    data = {hold: (training[:logs], selection[:logs]) for hold, (training, selection) in data.items()}
-    after, clocked = with_clocks_set(base, data, setting, progress=silent)
-    assert after is base and clocked is data
+    base, study = begun(*phases)
+    data = {hold: (training[:logs], selection[:logs]) for hold, (training, selection) in study.data.items()}
+    after, clocked = with_clocks_set(base, replace(study, data=data))
+    assert after is base and clocked.data is data
 
 
 def line(*torque: complex) -> Phasors:
@@ -118,7 +113,7 @@ def test_a_line_as_a_torque(place):
 
 def test_a_segment_that_runs_away_tells_nothing(begun):
     """A look along the motion leaves it out, whole, and the line is seen in the others."""
-    base, _, _ = begun(0.4, 2.3)
+    base, _ = begun(0.4, 2.3)
     fit = base.training
     states = np.array(fit.unknowns.states)
     states[2] = np.nan

@@ -16,6 +16,7 @@ from fitting.close_loop import close_loop
 from fitting.effect_search import _holds_given_up
 from fitting.experiment import Experiment, experiment_from_log
 from fitting.outcome import Loop
+from fitting.search_options import SearchOptions
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
@@ -37,12 +38,16 @@ def reduced_loop(experiment: Experiment, *, catalogue: Sequence[type[Effect]] = 
     """With placeholders that are wrong by a factor of about a hundred, and one effect at most: further rounds compile
     as much again."""
     placeholder = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=catalogue, max_effects=1, **options)
+    return close_loop(
+        placeholder, {"zero-order": (experiment,)}, catalogue=catalogue, search=SearchOptions(1), **options
+    )
 
 
 def drive_loop(experiment: Experiment, **options) -> Loop:
     placeholder = rig.drive_model(K=1.0, alpha=0.0, B_sp=0.0)
-    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=CATALOGUE, max_effects=1, **options)
+    return close_loop(
+        placeholder, {"zero-order": (experiment,)}, catalogue=CATALOGUE, search=SearchOptions(1), **options
+    )
 
 
 @pytest.fixture(scope="module")

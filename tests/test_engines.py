@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,7 +12,7 @@ from fitting import engines
 from fitting.estimate import fit
 from fitting.experiment import Stretch
 from fitting.free import fitted_paths
-from fitting.posing import pose
+from fitting.posing import Segmentation, pose
 from fitting.residual import Engine
 from fitting.rig import read_rig
 from fitting.starting_values import starting_models
@@ -45,12 +44,12 @@ def stretches() -> tuple[Stretch, ...]:
     return (Stretch(experiment, 0, len(experiment)),)
 
 
-OPTIONS = {"horizon": 128, "length": None, "halo": 4, "substeps": 1, "hold_parameters": False, "count": None}
+SEGMENTATION = Segmentation(128, halo=4, substeps=1)
 
 
 def test_a_function_that_is_not_known_is_named_and_left_to_xla(stretches: tuple[Stretch, ...]):
     model = TwoInertiaModel(rig.drive_model().drive, (BesselTorque(),))
-    problem, unknowns = pose(model, stretches, fitted_paths(model), states=None, **OPTIONS)
+    problem, unknowns = pose(model, stretches, fitted_paths(model), SEGMENTATION)
     assert problem.kernel is None
     assert "bessel_i0e" in str(engines.why_not(problem))
     assert np.isfinite(np.asarray(engines.linearise(problem, unknowns).residual)).all()
@@ -61,7 +60,7 @@ def test_without_llvmlite_xla_does_it(stretches: tuple[Stretch, ...], monkeypatc
     engines.unusable.cache_clear()
     try:
         model = rig.drive_model()
-        problem, _ = pose(model, stretches, fitted_paths(model), states=None, **OPTIONS)
+        problem, _ = pose(model, stretches, fitted_paths(model), SEGMENTATION)
         assert problem.kernel is None and engines.why_not(problem) == "llvmlite is not installed"
     finally:
         monkeypatch.undo()
@@ -76,10 +75,10 @@ def test_all_routes_give_one_drive(shared: Path, engine: Engine):
     experiment = logs.experiments["zero-order"][0]
     base = [Stretch(experiment, 0, 3000)]
     start = starting_models(logs.model, base)[0]
-    options: dict[str, Any] = {"horizon": 128, "substeps": 3}
-    found = fit(start, base, fitted_paths(start), **options)
+    segmentation = Segmentation(128, substeps=3)
+    found = fit(start, base, fitted_paths(start), segmentation)
     assert found.problem.kernel is not None and found.converged
-    other = fit(start, base, fitted_paths(start), engine=engine, **options)
+    other = fit(start, base, fitted_paths(start), segmentation, engine=engine)
     assert other.problem.kernel is None and other.converged
     estimates = uncertainty(found, torque_noise=False).estimates
     for path in ("K", "alpha", "B_sp"):

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit, lost, needed_substeps, whitening
+from fitting.estimate import Fit, Start, Strategy, fit, lost, needed_substeps, whitening
 from fitting.experiment import Stretch, cut
 from fitting.free import base_paths
+from fitting.posing import Segmentation
 from fitting.uncertainty import uncertainty
 from hdjax.effects.backlash import Backlash
 from hdjax.effects.friction import CoulombFriction
@@ -28,13 +29,13 @@ def whole(*experiments) -> list[Stretch]:
     return [Stretch(e, 0, len(e)) for e in experiments]
 
 
-def drive_fit(start, stretches, **options) -> Fit:
+def drive_fit(model, stretches, **options) -> Fit:
     """All with the same shapes, so that they share one program."""
-    return fit(start, stretches, PATHS, horizon=HORIZON, substeps=1, count=8, **options)
+    return fit(model, stretches, PATHS, Segmentation(HORIZON, substeps=1, count=8), **options)
 
 
-def reduced_fit(start, stretches, **options) -> Fit:
-    return fit(start, stretches, base_paths(start), horizon=REDUCED_HORIZON, substeps=2, count=8, **options)
+def reduced_fit(model, stretches) -> Fit:
+    return fit(model, stretches, base_paths(model), Segmentation(REDUCED_HORIZON, substeps=2, count=8))
 
 
 def assert_recovered(found: Fit, truth: dict[str, float], *, within: float = 4.0):
@@ -93,12 +94,12 @@ def test_error_and_covariance_go_together(found: Fit, stretches):
 
 def test_held_parameters_do_not_move(found: Fit, stretches):
     wrong = rig.drive_model(K=1.02 * rig.K)
-    held = drive_fit(wrong, stretches, hold_parameters=True)
+    held = drive_fit(wrong, stretches, strategy=Strategy(hold_parameters=True))
     for path in PATHS:
         assert float(held.model.get(path)) == pytest.approx(float(wrong.get(path)), rel=1e-14)
     assert held.objective > found.objective + 0.5
     # The states did move: at the truth, they bring the error down to the noise.
-    right = drive_fit(rig.drive_model(), stretches, hold_parameters=True)
+    right = drive_fit(rig.drive_model(), stretches, strategy=Strategy(hold_parameters=True))
     assert right.dynamic_error_std == pytest.approx(found.dynamic_error_std, rel=0.02)
 
 
@@ -118,7 +119,8 @@ def test_a_channel_that_the_model_cannot_follow_loses_its_say():
     weighed = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled)
     assert float(weighed.model.get("K")) == pytest.approx(rig.K, rel=0.01)
     assert float(np.sqrt(weighed.covariance[0, 0])) > 1e3 * rig.MOTOR_NOISE / rig.N
-    trusting = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled, covariance=NOISE, reweigh=False)
+    kept = {"start": Start(NOISE), "strategy": Strategy(reweigh=False)}
+    trusting = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled, **kept)
     off = [abs(float(m.get("K")) / rig.K - 1.0) for m in (weighed.model, trusting.model)]
     assert off[0] < 0.5 * off[1]
 
@@ -154,7 +156,7 @@ def test_steps_follow_a_sharp_friction():
         friction = (150.0, sharpness)
         experiment = rig.reduced_experiment(400, noise=1e-5, friction=friction, substeps=60)
         model = rig.reduced_model().with_effects(CoulombFriction(T_c=150.0, v_0=sharpness))
-        result = fit(model, whole(experiment), (), horizon=64, substeps=2, max_steps=15)
+        result = fit(model, whole(experiment), (), Segmentation(64, substeps=2), strategy=Strategy(max_steps=15))
         needed[name] = needed_substeps(result)
         assert needed_substeps(result, tolerance=1e9) == 2
     assert needed["sharp"] > needed["smooth"] >= 2
@@ -166,7 +168,13 @@ def test_a_dead_zone_is_recovered_from_afar():
     gap = 1.5e-4
     logged = whole(rig.drive_experiment(COUNT, gap=gap))
     start = rig.drive_model(K=0.7 * rig.K, alpha=0.0).with_effects(Backlash(b=jnp.asarray(3e-5)))
-    found = fit(start, logged, (*PATHS, "backlash.b"), horizon=HORIZON, substeps=2, count=8, max_steps=25)
+    found = fit(
+        start,
+        logged,
+        (*PATHS, "backlash.b"),
+        Segmentation(HORIZON, substeps=2, count=8),
+        strategy=Strategy(max_steps=25),
+    )
     assert found.converged
     assert_recovered(found, TRUTH | {"backlash.b": gap})
 
@@ -177,18 +185,21 @@ def test_a_segment_that_stands_out_is_begun_anew():
     gap = 1.5e-4
     logged = whole(rig.drive_experiment(COUNT, gap=gap))
     model = rig.drive_model().with_effects(Backlash(b=jnp.asarray(gap)))
-    options = {"horizon": HORIZON, "substeps": 2, "count": 8, "max_steps": 25}
-    right = fit(model, logged, (*PATHS, "backlash.b"), **options)
-    options |= {"states": right.unknowns.states.at[3, 2].add(-200.0), "begin_anew_above": np.inf}
-    astray = fit(right.model, logged, right.free.paths, **options, retry_states=False)
-    mended = fit(right.model, logged, right.free.paths, **options)
+    segmentation = Segmentation(HORIZON, substeps=2, count=8)
+    right = fit(model, logged, (*PATHS, "backlash.b"), segmentation, strategy=Strategy(25))
+    start = Start(states=right.unknowns.states.at[3, 2].add(-200.0))
+    astray, mended = (
+        fit(right.model, logged, right.free.paths, segmentation, start=start, strategy=strategy)
+        for strategy in (Strategy(25, begin_anew_above=np.inf, retry_states=r) for r in (False, True))
+    )
     assert astray.objective > right.objective + 1.0
     assert mended.objective == pytest.approx(right.objective, abs=1e-3)
 
 
 def test_a_start_that_is_no_number_explains_nothing(found: Fit, stretches):
     nowhere = found.unknowns.states * np.nan
-    got = drive_fit(found.model, stretches, states=nowhere, begin_anew_above=np.inf, retry_states=False)
+    strategy = Strategy(begin_anew_above=np.inf, retry_states=False)
+    got = drive_fit(found.model, stretches, start=Start(states=nowhere), strategy=strategy)
     assert not got.converged and got.objective > found.objective + 3.0
 
 

@@ -5,8 +5,9 @@ import pytest
 
 import rig
 from fitting.attribution.effect_evidence import Evidence, evidence
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Strategy, fit
 from fitting.experiment import Stretch
+from fitting.posing import Segmentation
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
@@ -21,9 +22,8 @@ def fitted(effect: Effect, *, hold_parameters: bool = False) -> Fit:
         rig.reduced_model().with_effects(effect),
         [Stretch(experiment, 0, 1600)],
         paths,
-        horizon=128,
-        substeps=4,
-        hold_parameters=hold_parameters,
+        Segmentation(128, substeps=4),
+        strategy=Strategy(hold_parameters=hold_parameters),
     )
 
 

@@ -13,6 +13,7 @@ from fitting.estimate import Fit, fit
 from fitting.experiment import split
 from fitting.followed import Followed, follow, respond
 from fitting.free import base_paths, strength_paths
+from fitting.posing import Segmentation
 from fitting.regressors import regressors
 from fitting.residual import simulate_segments
 from hdjax import PiecewisePolynomial
@@ -35,7 +36,7 @@ def found() -> Fit:
     """Two segments, of which the second is joined to the first where the horizon says so."""
     training, _ = split([rig.drive_experiment(COUNT)], held_out=0.02)
     model = rig.drive_model()
-    return fit(model, training, base_paths(model), horizon=64, substeps=3, halo=4)
+    return fit(model, training, base_paths(model), Segmentation(64, halo=4, substeps=3))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +108,7 @@ def test_own_states_follow_the_motion_and_go_on():
     creep = Creep(tau=tau, span=1e-3)
     model = rig.drive_model()
     parts = split([rig.drive_experiment(COUNT)], held_out=0.3)
-    fits = [fit(model, part, base_paths(model), horizon=64, substeps=3, halo=4, count=3) for part in parts]
+    fits = [fit(model, part, base_paths(model), Segmentation(64, halo=4, substeps=3, count=3)) for part in parts]
     first, second = (
         along(f.model, follow(replace(f.problem, model=f.model), f.unknowns), f.problem.segments, f.stretches)
         for f in fits

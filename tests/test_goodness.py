@@ -16,6 +16,7 @@ from fitting.free import base_paths
 from fitting.free_run import FreeRun
 from fitting.goodness import Goodness, fit_percent, goodness
 from fitting.identifiability import Identifiability
+from fitting.posing import Segmentation
 from fitting.residual_tests import residual_tests
 from fitting.uncertainty import Uncertainty
 
@@ -30,7 +31,7 @@ def fitted() -> Fit:
     log = dataclasses.replace(log, load_torque=1e-9 * np.random.default_rng(0).normal(size=3000))
     training, _ = split([experiment_from_log(log, hold="zero-order", N=rig.N)])
     model = rig.drive_model()
-    return fit(model, training, base_paths(model), horizon=256)
+    return fit(model, training, base_paths(model), Segmentation(256))
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Start, Strategy, fit
 from fitting.experiment import Experiment, Stretch, experiment_from_log
 from fitting.identifiability import _held_one, at_bound, identifiability, needed_samples, needed_twist, reason
+from fitting.posing import Segmentation
 from fitting.uncertainty import Estimate, uncertainty
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.parameters import ParameterInfo
@@ -20,12 +21,12 @@ DRIVE_COUNT, DRIVE_HORIZON = 2000, 256
 
 def reduced_fit(experiment: Experiment, paths=("mu", "omega_0", "alpha", "gain"), **start) -> Fit:
     stretches = [Stretch(experiment, 0, len(experiment))]
-    return fit(rig.reduced_model(**start), stretches, paths, horizon=HORIZON, substeps=2, count=8)
+    return fit(rig.reduced_model(**start), stretches, paths, Segmentation(HORIZON, substeps=2, count=8))
 
 
 def drive_fit(model, paths=("K", "alpha", "B_sp"), **options) -> Fit:
     stretches = [Stretch(rig.drive_experiment(DRIVE_COUNT), 0, DRIVE_COUNT)]
-    return fit(model, stretches, paths, horizon=DRIVE_HORIZON, substeps=1, count=8, **options)
+    return fit(model, stretches, paths, Segmentation(DRIVE_HORIZON, substeps=1, count=8), **options)
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +101,8 @@ def test_what_an_error_of_an_inertia_does(drive: Fit):
     assert [h.path for h in result.held] == ["J_m", "J_l"]
     for held in result.held:
         # A step small enough to be linear, at the same weights.
-        wrong = drive_fit(
-            drive.model.replace({held.path: (1 + 1e-4) * held.value}), covariance=drive.covariance, reweigh=False
-        )
+        moved = drive.model.replace({held.path: (1 + 1e-4) * held.value})
+        wrong = drive_fit(moved, start=Start(drive.covariance), strategy=Strategy(reweigh=False))
         for path in ("K", "alpha", "B_sp"):
             value = found.estimates[path].value
             change = float(wrong.model.get(path)) / value - 1.0
@@ -138,7 +138,13 @@ def test_a_parameter_that_ran_to_zero(drive: Fit):
 def test_bounds_in_si_units_say_nothing_of_a_reduced_log():
     stretches = [Stretch(rig.reduced_experiment(COUNT, noise=NOISE), 0, COUNT)]
     model = rig.reduced_model().with_effects(BoucWen(k=0.01, memory_twist=0.2))
-    found = fit(model, stretches, ["bouc_wen.k", "bouc_wen.memory_twist"], horizon=HORIZON, hold_parameters=True)
+    found = fit(
+        model,
+        stretches,
+        ["bouc_wen.k", "bouc_wen.memory_twist"],
+        Segmentation(HORIZON),
+        strategy=Strategy(hold_parameters=True),
+    )
     assert (
         float(found.model.get("bouc_wen.memory_twist")) > found.model.parameters()["bouc_wen.memory_twist"][1].bounds[1]
     )

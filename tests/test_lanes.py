@@ -14,6 +14,7 @@ jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[2])
 import rig
 from fitting.estimate import fit
+from fitting.posing import Segmentation
 from fitting.experiment import Stretch
 from fitting.free import base_paths
 
@@ -21,7 +22,7 @@ experiment = rig.reduced_experiment(2048, noise=1e-5)
 model = rig.reduced_model()
 start = model.replace({"omega_0": 1.02 * model.drive.omega_0})
 # Machine code shares lanes among threads; the devices are XLA's.
-found = fit(start, [Stretch(experiment, 0, 2048)], base_paths(model), horizon=128, engine="XLA")
+found = fit(start, [Stretch(experiment, 0, 2048)], base_paths(model), Segmentation(128), engine="XLA")
 devices = len(found.problem.segments.measured.sharding.device_set)
 print(json.dumps([devices, found.unknowns.parameters.tolist(), float(found.dynamic_error_std)]))
 """

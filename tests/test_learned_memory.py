@@ -24,6 +24,7 @@ from fitting.outcome import Loop
 from fitting.plots import response_plot
 from fitting.remembering import remembering
 from fitting.report import write_report
+from fitting.search_options import SearchOptions
 from fitting.uncertainty import Estimate, Uncertainty
 from fitting.unknown import share_of
 from hdjax import Model
@@ -179,10 +180,10 @@ def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: p
 
     monkeypatch.setattr("fitting.remembering.screen", screen)
     data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
-    before = base_trial(rig.reduced_model(), data, "zero-order")[0]
+    before, study = base_trial(rig.reduced_model(), data, "zero-order")
     seen = learned_look(before.training)
     before = replace(before, model=before.model.with_effects(KNOWN["Dahl"][0]))
-    remembering(before, seen, least=0.1, seed=0, progress=lambda message: None)
+    remembering(before, seen, study, least=0.1)
     assert set(asked) == {form for form in LEARNED_WITH_MEMORY if place_of(form) is not LearnedMeshTorque}
 
 
@@ -200,7 +201,7 @@ def yielding_log() -> Loop:
     log = replace(rig.reduced_log(motion[:, 0], forcing, noise=NOISE), name="yielding")
     experiment = experiment_from_log(log, hold="zero-order")
     placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    return close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", max_effects=0)
+    return close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", search=SearchOptions(0))
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
 from fitting.long_fit import long_fit
+from fitting.posing import Segmentation
 from fitting.uncertainty import uncertainty
 from hdjax.effects.backlash import Backlash
 
@@ -23,7 +24,7 @@ def found(request: pytest.FixtureRequest) -> Fit:
     """A drive with a dead zone: its motion is chaotic."""
     logged = rig.drive_experiment(COUNT, gap=GAP, rms=request.param)
     start = rig.drive_model().with_effects(Backlash(b=jnp.asarray(GAP)))
-    return fit(start, [Stretch(logged, 0, COUNT)], PATHS, horizon=HORIZON, substeps=2)
+    return fit(start, [Stretch(logged, 0, COUNT)], PATHS, Segmentation(HORIZON, substeps=2))
 
 
 def test_a_chaotic_motion_keeps_the_fit_of_short_segments(found: Fit):
@@ -36,7 +37,7 @@ def test_a_chaotic_motion_keeps_the_fit_of_short_segments(found: Fit):
 
 def test_a_long_simulation_tells_more_of_a_smooth_motion():
     logged = rig.drive_experiment(COUNT)
-    short = fit(rig.drive_model(), [Stretch(logged, 0, COUNT)], PATHS[:3], horizon=HORIZON, substeps=1)
+    short = fit(rig.drive_model(), [Stretch(logged, 0, COUNT)], PATHS[:3], Segmentation(HORIZON, substeps=1))
     long = long_fit(short)
     before, after = (uncertainty(f).estimates["K"] for f in (short, long))
     assert after.std < 0.2 * before.std

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Strategy, fit
 from fitting.experiment import Stretch
 from fitting.free import base_paths
 from fitting.measurement_noise import _MOTION, measurement_noise
+from fitting.posing import Segmentation
 
 COUNT = 1000
 NOISE = 1e-3
@@ -20,7 +21,13 @@ def held(*, noise: float = NOISE, omega_0: float = rig.OMEGA_0, **physics) -> Fi
     experiment = rig.reduced_experiment(COUNT, noise=noise, **physics)
     model = rig.reduced_model(omega_0=omega_0)
     stretches = [Stretch(experiment, 0, len(experiment))]
-    return fit(model, stretches, base_paths(model), horizon=128, substeps=2, count=8, hold_parameters=True)
+    return fit(
+        model,
+        stretches,
+        base_paths(model),
+        Segmentation(128, substeps=2, count=8),
+        strategy=Strategy(hold_parameters=True),
+    )
 
 
 def rms(first: Fit, *others: Fit) -> float:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import fit
+from fitting.estimate import Strategy, fit
 from fitting.experiment import Stretch, experiment_from_log
 from fitting.long_fit import with_memory_carried
+from fitting.posing import Segmentation
 from hdjax.effects.hysteresis import MaxwellSlip
 
 COUNT, HORIZON, NOISE = 6000, 64, 1e-4
@@ -47,7 +48,9 @@ def test_what_springs_remember_comes_from_the_whole_motion():
     guess = MaxwellSlip(**wrong, yield_twist=0.05, settling=0.5 * rig.REDUCED_STEP)
     paths = ("omega_0", "alpha", "mu", *(f"{guess.name}.{name}" for name in truth))
     model = rig.reduced_model().with_effects(guess)
-    short = fit(model, [Stretch(logged, 0, COUNT)], paths, horizon=HORIZON, substeps=4, max_steps=25)
+    short = fit(
+        model, [Stretch(logged, 0, COUNT)], paths, Segmentation(HORIZON, substeps=4), strategy=Strategy(max_steps=25)
+    )
     carried = with_memory_carried(short)
     assert carried.horizon == HORIZON and carried.dynamic_error_std < 0.75 * short.dynamic_error_std
     assert carried.dynamic_error_std < 1.6 * NOISE

@@ -16,7 +16,7 @@ from fitting import command_search, discrimination
 from fitting.close_loop import close_loop
 from fitting.command_search import Candidate, search
 from fitting.discrimination import Bench, Explanation, explanation, refit, respond, signals, start
-from fitting.estimate import fit
+from fitting.estimate import Start, Strategy, fit
 from fitting.excitation import Limits, excitations, reached
 from fitting.experiment import Experiment, Stretch, experiment_from_log, split
 from fitting.fit_only import fit_only
@@ -29,8 +29,10 @@ from fitting.next_experiment import (
     tied,
 )
 from fitting.plots import next_experiment_plot
+from fitting.posing import Segmentation
 from fitting.report import write_report
 from fitting.report.proposal import command_table, proposal_dict
+from fitting.search_options import SearchOptions
 from fitting.uncertainty import uncertainty
 from hdjax import Hold, sampled, simulate
 from hdjax.effects.friction import MotorFriction, StribeckMotorFriction
@@ -205,10 +207,9 @@ def test_the_promised_ratio_is_what_the_fit_of_logs_finds(rivals: tuple[Explanat
             r.model,
             data,
             r.free.paths,
-            horizon=LIMITS.samples,
-            covariance=NOISE,
-            reweigh=False,
-            substeps=2,
+            Segmentation(LIMITS.samples, substeps=2),
+            start=Start(covariance=NOISE),
+            strategy=Strategy(reweigh=False),
         )
         squares.append(float(np.sum((np.asarray(found.error) / NOISE_STD) ** 2)))
     promised = 0.5 * proposal.evaluation.forward[0].squares
@@ -334,7 +335,7 @@ def test_a_fit_proposes_what_tells_alpha():
         rig.reduced_model(alpha=0.0),
         [Stretch(again, 0, len(again))],
         ("mu", "omega_0", "gain", "alpha"),
-        horizon=len(again),
+        Segmentation(len(again)),
     )
     estimate = uncertainty(refitted, torque_noise=False).estimates["alpha"]
     assert estimate.std_classical == pytest.approx(found.precision.proposed, rel=0.2)
@@ -346,9 +347,8 @@ def test_a_loop_proposes_what_tells_ties_apart(tmp_path: Path):
     log = rig.drive_experiment(2000, motor_friction=(0.01, 1.0), noise=3.0)
     start_model = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (log,)}
-    loop = close_loop(
-        start_model, data, hold="zero-order", max_effects=1, catalogue=(MotorFriction, StribeckMotorFriction)
-    )
+    forms = (MotorFriction, StribeckMotorFriction)
+    loop = close_loop(start_model, data, hold="zero-order", catalogue=forms, search=SearchOptions(1))
     assert [rival.name for _, rival in tied(loop)] == ["stribeck_motor_friction"]
     found = experiment_for_ties(loop)
     assert found is not None

@@ -20,6 +20,7 @@ from fitting.experiment import Experiment, experiment_from_log, whole
 from fitting.free import base_paths
 from fitting.measurement_noise import measurement_noise
 from fitting.noise_model import NoiseModel, SensorNoise, _filtered, _Steps, noise_model, spread_by_torque
+from fitting.posing import Segmentation
 from fitting.prediction_band import prediction_bands
 from fitting.residual import Unknowns
 from fitting.uncertainty import uncertainty
@@ -54,7 +55,7 @@ def slow_noise(correlation: float, count: int) -> Float[np.ndarray, "samples enc
 
 def fitted(experiment: Experiment) -> Fit:
     model = rig.drive_model()
-    return fit(model, whole([experiment]), base_paths(model), horizon=128)
+    return fit(model, whole([experiment]), base_paths(model), Segmentation(128))
 
 
 def left(found: Fit) -> NoiseModel:
@@ -146,7 +147,7 @@ def test_the_spread_is_that_of_simulations(noisy: Fit):
     scatter = np.std([(m - silent)[:, 0] / rig.N - (m - silent)[:, 1] for m in moved], axis=0)
     experiment = rig.drive_experiment(count)
     model = rig.drive_model()
-    problem = fit(model, whole([experiment]), (), horizon=count, length=count, substeps=4).problem
+    problem = fit(model, whole([experiment]), (), Segmentation(count, length=count, substeps=4)).problem
     states = jnp.asarray(silent[:1, :4])
     found = spread_by_torque(with_engine(problem), Unknowns(jnp.zeros(0), states), STD)[0]
     # 60 draws know a standard deviation to 9 %; over all samples the ratio's median is known better.

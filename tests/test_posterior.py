@@ -12,6 +12,7 @@ import rig
 from fitting.engines import linearise
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
+from fitting.posing import Segmentation
 from fitting.posterior import Posterior, posterior
 from fitting.residual import Unknowns
 from fitting.uncertainty import Uncertainty, uncertainty
@@ -25,7 +26,7 @@ needs_blackjax = pytest.mark.skipif(
 
 def reduced_fit(paths: tuple[str, ...], noise: float) -> Fit:
     experiment = rig.reduced_experiment(COUNT, noise=noise)
-    return fit(rig.reduced_model(), [Stretch(experiment, 0, COUNT)], paths, horizon=HORIZON, substeps=2, count=4)
+    return fit(rig.reduced_model(), [Stretch(experiment, 0, COUNT)], paths, Segmentation(HORIZON, substeps=2, count=4))
 
 
 @pytest.fixture(scope="module")

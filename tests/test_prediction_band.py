@@ -11,6 +11,7 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
 from fitting.free_run import free_run
+from fitting.posing import Segmentation
 from fitting.prediction_band import PredictionBand, prediction_bands
 from fitting.uncertainty import Uncertainty, uncertainty
 
@@ -24,7 +25,7 @@ PATHS = ("mu", "omega_0", "alpha", "gain")
 @pytest.fixture(scope="module")
 def fitted() -> tuple[Fit, Uncertainty]:
     experiment = rig.reduced_experiment(COUNT, noise=NOISE)
-    found = fit(rig.reduced_model(), [Stretch(experiment, 0, COUNT)], PATHS, horizon=HORIZON, substeps=2, count=8)
+    found = fit(rig.reduced_model(), [Stretch(experiment, 0, COUNT)], PATHS, Segmentation(HORIZON, substeps=2, count=8))
     return found, uncertainty(found)
 
 
@@ -97,7 +98,7 @@ def test_several_stretches_are_taken_apart(bands: tuple[PredictionBand, ...]):
 @pytest.mark.slow
 def test_a_drive_has_two_outputs():
     experiment = rig.drive_experiment(512)
-    found = fit(rig.drive_model(), [Stretch(experiment, 0, 512)], ("K", "B_sp"), horizon=256, substeps=1, count=2)
+    found = fit(rig.drive_model(), [Stretch(experiment, 0, 512)], ("K", "B_sp"), Segmentation(256, substeps=1, count=2))
     known = uncertainty(found)
     (result,) = prediction_bands(found, known, [Stretch(experiment, 0, 512)], noise=found.covariance)
     assert result.std_noise == pytest.approx(found.dynamic_error_std, rel=1e-9)

@@ -10,6 +10,7 @@ from scipy.stats import t
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
+from fitting.posing import Segmentation
 from fitting.profile import profile, with_profiles
 from fitting.uncertainty import Uncertainty, uncertainty
 
@@ -23,9 +24,7 @@ def reduced_fit(*, noise: float = NOISE, rms: float = 10.0, physics: dict | None
         model,
         [Stretch(experiment, 0, COUNT)],
         ("mu", "omega_0", "alpha", "gain"),
-        horizon=SHORT,
-        substeps=2,
-        count=4,
+        Segmentation(SHORT, substeps=2, count=4),
     )
 
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Start, Strategy, fit
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths
+from fitting.posing import Segmentation
 from fitting.refits import refits
 from fitting.uncertainty import uncertainty
 
@@ -21,8 +22,9 @@ def whole(experiment: Experiment) -> list[Stretch]:
 
 def fitted(experiment: Experiment) -> Fit:
     model = rig.reduced_model()
-    options = {"horizon": HORIZON, "length": 128, "substeps": 2, "count": 8, "reweigh": False}
-    return fit(model, whole(experiment), base_paths(model), covariance=jnp.asarray([[NOISE**2]]), **options)
+    segmentation, start = Segmentation(HORIZON, 128, substeps=2, count=8), Start(jnp.asarray([[NOISE**2]]))
+    strategy = Strategy(reweigh=False)
+    return fit(model, whole(experiment), base_paths(model), segmentation, start=start, strategy=strategy)
 
 
 @pytest.fixture(scope="module")

@@ -40,6 +40,7 @@ from fitting.report import (
 from fitting.report.intervals import say_what_intervals_hold
 from fitting.report.limits import limits, parameter_note
 from fitting.report.summary import _change, _remembering
+from fitting.search_options import SearchOptions
 from fitting.starting_values import starting_models
 from fitting.uncertainty import Estimate, Uncertainty
 from fitting.web_page import environment
@@ -66,7 +67,7 @@ def loop() -> Loop:
     data: dict[Hold, tuple[Experiment, ...]] = {HOLD: (known,)}
     start = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     forms = (MotorFriction, TorqueBias)
-    return close_loop(start, data, test={HOLD: (test,)}, hold=HOLD, max_effects=1, catalogue=forms)
+    return close_loop(start, data, test={HOLD: (test,)}, hold=HOLD, catalogue=forms, search=SearchOptions(1))
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +164,7 @@ def test_each_step_with_its_error_on_selection_data(loop: Loop):
     base, last = report_dict(loop)["steps"]
     assert base["added"] is None and last["added"] == loop.findings[0].name
     assert last["selection_segments_rmse"] < 0.5 * base["selection_segments_rmse"]
-    assert base["segment_seconds"] == pytest.approx(loop.setting.horizon * rig.STEP)
+    assert base["segment_seconds"] == pytest.approx(loop.setting.segmentation.horizon * rig.STEP)
 
 
 def test_free_runs_that_leave_a_right_model_are_told(loop: Loop):

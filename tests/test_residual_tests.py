@@ -11,6 +11,7 @@ from fitting.diagnostics import diagnose
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch
 from fitting.free import base_paths
+from fitting.posing import Segmentation
 from fitting.residual_tests import LAGS, independence, normality, residual_tests, whiteness, zero_mean
 
 REPETITIONS = 300
@@ -142,7 +143,7 @@ def short_fit(seed: int, **physics) -> Fit:
     """A fit whose simulations start anew every 32 samples."""
     experiment = rig.reduced_experiment(1600, noise=1e-3, seed=seed, **physics)
     model = rig.reduced_model()
-    return fit(model, [Stretch(experiment, 0, 1600)], base_paths(model), horizon=32)
+    return fit(model, [Stretch(experiment, 0, 1600)], base_paths(model), Segmentation(32))
 
 
 def test_fitted_initial_states_leave_no_memory_behind():

@@ -12,6 +12,7 @@ from scipy.stats import binom, t
 import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Stretch, experiment_from_log
+from fitting.posing import Segmentation
 from fitting.sandwich import Linearised, Record, covariance, linearised
 from fitting.uncertainty import uncertainty
 
@@ -214,7 +215,7 @@ PATHS = ("K", "alpha", "B_sp")
 
 def drive_fit(experiment, horizon: int) -> Fit:
     stretch = Stretch(experiment, 0, len(experiment))
-    return fit(rig.drive_model(), [stretch], PATHS, horizon=horizon, substeps=1)
+    return fit(rig.drive_model(), [stretch], PATHS, Segmentation(horizon, substeps=1))
 
 
 @pytest.mark.slow

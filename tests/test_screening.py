@@ -7,10 +7,11 @@ import pytest
 
 import rig
 from fitting.attribution.screening import Screen, screen
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Start, Strategy, fit
 from fitting.experiment import split
 from fitting.explained import solved, without_untold
 from fitting.free import FreeParameters, base_paths
+from fitting.posing import Segmentation
 from fitting.residual import Blocks
 from fitting.surrogates import DRAWS, surrogates
 from hdjax.effects import CATALOGUE, Effect
@@ -29,15 +30,15 @@ def fits(seed: int = 0, model=None, **physics) -> tuple[Fit, Fit]:
     """The base model on the training part, and with its parameters held on the rest."""
     experiment = rig.reduced_experiment(COUNT, noise=NOISE, seed=seed, **physics)
     training, held_out = split([experiment])
-    options = {"horizon": HORIZON, "substeps": 2, "halo": 4, "count": 8}
-    found = fit(model or rig.reduced_model(), training, base_paths(rig.reduced_model()), **options)
+    segmentation = Segmentation(HORIZON, halo=4, substeps=2, count=8)
+    found = fit(model or rig.reduced_model(), training, base_paths(rig.reduced_model()), segmentation)
     unseen = fit(
         found.model,
         held_out,
         base_paths(found.model),
-        covariance=found.covariance,
-        hold_parameters=True,
-        **options,
+        segmentation,
+        start=Start(found.covariance),
+        strategy=Strategy(hold_parameters=True),
     )
     return found, unseen
 

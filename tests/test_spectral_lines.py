@@ -7,6 +7,7 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import experiment_from_log, split
 from fitting.free import base_paths
+from fitting.posing import Segmentation
 from fitting.spectral_lines import spectral_lines
 
 
@@ -15,7 +16,7 @@ def found(forcing: np.ndarray, hidden: np.ndarray) -> Fit:
     motion = rig.reduced_motion(forcing + hidden)
     experiment = experiment_from_log(rig.reduced_log(motion[:, 0], forcing, noise=1e-3), hold="zero-order")
     model = rig.reduced_model()
-    return fit(model, split([experiment])[0], base_paths(model), horizon=128, substeps=2)
+    return fit(model, split([experiment])[0], base_paths(model), Segmentation(128, substeps=2))
 
 
 @pytest.mark.parametrize("omega", [7.0, 62.0, 141.0])

@@ -10,10 +10,11 @@ from scipy.signal import lfilter
 
 import rig
 from fitting.compare import Account, account
-from fitting.estimate import Fit, fit
+from fitting.estimate import Fit, Strategy, fit
 from fitting.experiment import experiment_from_log, split
 from fitting.free_run import FreeRun
 from fitting.measurement_noise import measurement_noise
+from fitting.posing import Segmentation
 from fitting.prediction_band import PredictionBand
 from fitting.surprise import over_bands, surprise
 
@@ -36,7 +37,7 @@ def band(of: FreeRun, std_parameters: float = 0.0, std_state: float = 0.0) -> Pr
 def fitted() -> tuple[Fit, Account]:
     """A model and its account, whose free runs are put in by hand."""
     training, selection = split((rig.reduced_experiment(600, noise=2e-3),))
-    found = fit(rig.reduced_model(), training, PATHS, horizon=128, substeps=2, count=8)
+    found = fit(rig.reduced_model(), training, PATHS, Segmentation(128, substeps=2, count=8))
     return found, account(found, training, selection, noise=found.covariance, halo=0)
 
 
@@ -108,8 +109,10 @@ def test_nor_does_it_where_the_noise_has_a_memory():
     noise = 2e-3 * np.asarray(lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.normal(size=4000)))
     log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0] + noise, forcing)
     training, selection = split((experiment_from_log(log, hold="zero-order"),))
-    found = fit(rig.reduced_model(), training, PATHS, horizon=256, substeps=2, count=16)
-    held_out = fit(found.model, selection, PATHS, horizon=256, substeps=2, count=16, hold_parameters=True)
+    found = fit(rig.reduced_model(), training, PATHS, Segmentation(256, substeps=2, count=16))
+    held_out = fit(
+        found.model, selection, PATHS, Segmentation(256, substeps=2, count=16), strategy=Strategy(hold_parameters=True)
+    )
     of_pieces = measurement_noise(found).covariance
     known = account(found, training, selection, noise=of_pieces, halo=0)
     assert known.rmse["test"] > 1.3 * np.sqrt(of_pieces[0, 0])

@@ -49,7 +49,7 @@ def test_a_sweep_file_is_a_model_a_forcing_and_points(tmp_path):
     ("old", "new", "words"),
     [
         ("[drive]", "[drives]", r"\[drives\] is not known here"),
-        ("alpha = 50.0", 'preset = "X"', "preset must be one of HDC-40-050, but is X"),
+        ("alpha = 50.0", 'preset = "X"', "preset must be one of HDC-40-050, but is 'X'"),
         ("alpha = 50.0", "alpha = true", r"\[drive\] alpha must be a number, but is True"),
         ("alpha = 50.0", "mass = 1.0", r"\[drive\] mass is not known here"),
         ("amplitude = 2.0", "torque = 2.0", r"\[forcing\] torque is not known here"),

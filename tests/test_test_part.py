@@ -8,9 +8,10 @@ import polars as pl
 import pytest
 
 import rig
-from fitting.commands.run_close_loop import Asked, close_loop_on_logs
+from fitting.commands.run_close_loop import close_loop_on_logs
 from fitting.drive_file import read_drive_file
 from fitting.logs import read_log
+from fitting.search_options import SearchOptions
 from fitting.test_part import parted
 
 COUNT, TEST = 1500, 300
@@ -57,7 +58,7 @@ def test_scrambled_test_data_change_nothing_but_the_test_figures(tmp_path: Path)
         folder = tmp_path / str(scrambled)
         folder.mkdir()
         path, drive = write_logs(folder, scrambled)
-        close_loop_on_logs([path], drive, folder / "out", Asked(max_effects=1))
+        close_loop_on_logs([path], drive, folder / "out", SearchOptions(max_effects=1))
         found.append(json.loads((folder / "out" / "report.json").read_text()))
     plain, scrambled = found
     assert plain["judged_on"] == "test" and plain["logs"][0]["test"] == TEST
@@ -90,7 +91,7 @@ def test_another_log_is_test_data_from_beginning_to_end(tmp_path: Path):
         (tmp_path / name).mkdir()
     path, drive = write_logs(tmp_path / "one", False)
     other, _ = write_logs(tmp_path / "two", False)
-    close_loop_on_logs([path], drive, tmp_path / "out", Asked(max_effects=0), test=[other])
+    close_loop_on_logs([path], drive, tmp_path / "out", SearchOptions(max_effects=0), test=[other])
     found = json.loads((tmp_path / "out" / "report.json").read_text())
     counted = {log["name"]: (log["training"] + log["selection"], log["test"]) for log in found["logs"]}
     assert counted == {"one/log": (COUNT, 0), "two/log": (0, COUNT)}

@@ -9,6 +9,7 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import experiment_from_log, split
 from fitting.free import base_paths
+from fitting.posing import Segmentation
 from fitting.sandwich import covariance, linearised
 from fitting.torque_noise import nonnegative, torque_noise_covariance, uniformity
 
@@ -25,7 +26,7 @@ def fitted(*, torque: float = 0.0, output: float = 0.0, seed: int = 0, count: in
     log = rig.reduced_log(motion[:, 0], logged, noise=output, seed=seed)
     model = rig.reduced_model(**PHYSICS)
     training, _ = split([experiment_from_log(log, hold="zero-order")], held_out=0.01)
-    return fit(model, training, base_paths(model), horizon=1 << 20, substeps=3)
+    return fit(model, training, base_paths(model), Segmentation(1 << 20, substeps=3))
 
 
 def standard_errors(found: Fit) -> np.ndarray | None:

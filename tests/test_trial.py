@@ -3,10 +3,10 @@
 import pytest
 
 import rig
-from fitting.attribution.candidate_fit import Data, Setting, attempt, challenge, halo_for
+from fitting.attribution.candidate_fit import attempt, challenge, halo_for
+from fitting.attribution.study import Data, Setting, Study
 from fitting.base_fit import base_fit
-from fitting.experiment import segment_count, split
-from fitting.posing import segment_length
+from fitting.experiment import split
 from hdjax import Hold
 from hdjax.effects.friction import CoulombFriction
 
@@ -22,9 +22,8 @@ def begun():
     data: Data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
     base = base_fit(rig.reduced_model(), training, halo=halo_for(training))
-    count = segment_count(training, segment_length(base.horizon))
-    setting = Setting(base.horizon, halo_for(training), base.substeps, count)
-    return attempt(base.model, data, HOLD, setting), data, setting
+    study = Study(data, Setting(base.segmentation))
+    return attempt(base.model, study, HOLD), study
 
 
 def with_friction(model, T_c: float, v_0: float):
@@ -34,16 +33,16 @@ def with_friction(model, T_c: float, v_0: float):
 @pytest.mark.slow
 def test_a_sharp_corner_takes_finer_steps(begun):
     """The base model has no corner and keeps its steps; with friction in it the trial finds out what it needs."""
-    before, data, setting = begun
-    assert setting.fine_enough(before.training) is setting
-    found = challenge([with_friction(before.model, 50.0, 0.3)], data, HOLD, setting, champion=before)
+    before, study = begun
+    assert study.fine_enough(before.training) is study
+    found = challenge([with_friction(before.model, 50.0, 0.3)], study, HOLD, champion=before)
     assert found is not None
-    assert found.training.substeps == found.held_out.substeps > setting.substeps
+    assert found.training.substeps == found.held_out.substeps > study.setting.segmentation.substeps
     assert float(found.model.effects[0].T_c) == pytest.approx(SHARP[0], rel=0.02)
 
 
 def test_a_champion_stays_where_nothing_explains_more(begun):
-    before, data, setting = begun
+    before, study = begun
     limit = before.training.objective - 20.0
     start = with_friction(before.model, 50.0, 0.3)
-    assert challenge([start], data, HOLD, setting, champion=before, give_up_above=limit) is None
+    assert challenge([start], study, HOLD, champion=before, give_up_above=limit) is None

@@ -9,6 +9,7 @@ import rig
 from fitting.estimate import Fit, fit
 from fitting.experiment import Experiment, Stretch
 from fitting.free import base_paths, free_parameters
+from fitting.posing import Segmentation
 from fitting.uncertainty import Uncertainty, uncertainty
 
 COUNT, HORIZON, NOISE = 1000, 128, 2e-3
@@ -28,7 +29,7 @@ def noisy(clean: Experiment, noise: np.ndarray) -> list[Stretch]:
 
 def reduced_fit(stretches: list[Stretch], **start) -> Fit:
     model = rig.reduced_model(**start)
-    return fit(model, stretches, base_paths(model), horizon=HORIZON, substeps=2, count=8)
+    return fit(model, stretches, base_paths(model), Segmentation(HORIZON, substeps=2, count=8))
 
 
 def white(seed: int) -> np.ndarray:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.attribution.candidate_fit import Setting, Trial, attempt
+from fitting.attribution.candidate_fit import Trial, attempt
+from fitting.attribution.study import Setting, Study
 from fitting.close_loop import close_loop
 from fitting.experiment import Stretch, experiment_from_log, split
 from fitting.free_run import free_run
@@ -18,7 +19,9 @@ from fitting.learned_curve import LearnedCurve, learned_curve
 from fitting.model_file import StoredModel, read_model, to_json
 from fitting.outcome import Loop
 from fitting.plots import learned_plot
+from fitting.posing import Segmentation
 from fitting.report import report_dict, write_report
+from fitting.search_options import SearchOptions
 from fitting.shapes import shapes
 from fitting.uncertainty import uncertainty
 from fitting.unknown import Unknown, is_supported, learn, share_of
@@ -35,7 +38,7 @@ from hdjax.effects.stiffness import QuadraticStiffness
 COUNT, STEP = 1600, 4e-3
 NOISE = 1e-3
 FRICTION = (10.0, 0.3)
-SETTING = Setting(horizon=128, halo=4, substeps=2, count=16)
+SETTING = Setting(Segmentation(128, halo=4, substeps=2, count=16))
 TRUTH = rig.reduced_model()
 TIME = STEP * np.arange(COUNT)
 WARMTH = 300.0 + 4.0 * np.sin(4.0 * np.pi * TIME / TIME[-1])
@@ -52,23 +55,18 @@ def hidden_motion(forcing: np.ndarray, torque) -> np.ndarray:
     return rig.rk4(rates, (0.0, 0.0), forcing, STEP, 10)[:, 0]
 
 
-def silent(message: str) -> None:
-    pass
-
-
-def base_trial(torque, seed: int = 0, *, drift: np.ndarray | None = None) -> tuple[Trial, dict]:
+def base_trial(torque, seed: int = 0, *, drift: np.ndarray | None = None) -> tuple[Trial, Study]:
     """The base model's fit of a motion with a hidden torque, from the truth of everything else."""
     forcing = rig.reduced_forcing(COUNT, seed=seed)
     felt = forcing if drift is None else forcing - drift / rig.GAIN
     log = rig.reduced_log(hidden_motion(felt, torque), forcing, noise=NOISE, seed=seed)
     log = replace(log, temperature=WARMTH)
-    data = {"zero-order": split([experiment_from_log(log, hold="zero-order")])}
-    return attempt(TRUTH, data, "zero-order", SETTING), data
+    study = Study({"zero-order": split([experiment_from_log(log, hold="zero-order")])}, SETTING, seed)
+    return attempt(TRUTH, study, "zero-order"), study
 
 
 def found_of(torque, **drifting) -> Unknown:
-    trial, data = base_trial(torque, **drifting)
-    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    found = learn(*base_trial(torque, **drifting))
     assert found is not None
     return found
 
@@ -158,8 +156,8 @@ def test_powers_go_on_beyond_the_data():
     assert error(found.before) > 5 * NOISE
     assert error(found.trial) < 2 * NOISE
     # Most of what is left is how well any fit knows its parameters.
-    _, data = base_trial(lopsided)
-    true_form = attempt(TRUTH.with_effects(QuadraticStiffness(k2=0.1)), data, "zero-order", SETTING)
+    _, study = base_trial(lopsided)
+    true_form = attempt(TRUTH.with_effects(QuadraticStiffness(k2=0.1)), study, "zero-order")
     assert error(found.trial) < 1.1 * error(true_form)
 
 
@@ -213,8 +211,9 @@ def test_an_error_of_the_mesh_is_told_from_a_torque():
     amplitude = 3e-4
     experiment = rig.drive_experiment(COUNT, kinematic=(amplitude, 0.0))
     data = {"zero-order": split([experiment])}
-    trial = attempt(rig.drive_model(), data, "zero-order", SETTING)
-    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    study = Study(data, SETTING)
+    trial = attempt(rig.drive_model(), study, "zero-order")
+    found = learn(trial, study)
     assert found is not None and is_supported(found)
     assert found.chosen.form is LearnedMeshError and found.chosen.variables == ("theta_m",)
     assert found.trial.held_out.dynamic_error_std < 0.1 * trial.held_out.dynamic_error_std
@@ -251,8 +250,9 @@ def test_an_error_of_an_encoder_is_told_from_what_moves_the_drive(
     read[:, 1] += load_amplitude * np.cos(3 * states[:, 1])
     log = rig.drive_log(read, torque, noise=1.0, seed=0)
     data = {"zero-order": split([experiment_from_log(log, hold="zero-order", N=rig.N)])}
-    trial = attempt(rig.drive_model(), data, "zero-order", SETTING)
-    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    study = Study(data, SETTING)
+    trial = attempt(rig.drive_model(), study, "zero-order")
+    found = learn(trial, study)
     assert found is not None and is_supported(found)
     assert found.chosen.of == (form, (angle,))
     noise = np.log(rig.MOTOR_NOISE / rig.N) + np.log(rig.LOAD_NOISE)
@@ -282,8 +282,9 @@ def test_an_amplifier_that_saturates_is_a_function_of_its_torque():
     missing = torque / np.sqrt(1.0 + (0.5 * torque) ** 2) - torque
     log = rig.drive_log(rig.drive_motion(torque + missing), torque)
     data = {"zero-order": split([experiment_from_log(log, hold="zero-order", N=rig.N)])}
-    trial = attempt(rig.drive_model(), data, "zero-order", SETTING)
-    found = learn(trial, data, SETTING, seed=0, progress=silent)
+    study = Study(data, SETTING)
+    trial = attempt(rig.drive_model(), study, "zero-order")
+    found = learn(trial, study)
     assert found is not None and is_supported(found)
     assert found.chosen.of == (LearnedMotorTorque, ("T_m",))
     before, after = (t.held_out.objective for t in (trial, found.trial))
@@ -328,8 +329,7 @@ def test_a_function_of_two_variables_is_found():
 @pytest.mark.slow
 def test_nothing_is_learned_from_noise():
     for seed in range(3):
-        trial, data = base_trial(lambda x, v: 0.0, seed)
-        assert not is_supported(learn(trial, data, SETTING, seed=seed, progress=silent))
+        assert not is_supported(learn(*base_trial(lambda x, v: 0.0, seed)))
 
 
 @pytest.fixture(scope="module")
@@ -338,7 +338,8 @@ def loop() -> Loop:
     experiment = rig.reduced_experiment(COUNT, noise=NOISE, friction=FRICTION)
     catalogue = (QuadraticStiffness, QuadraticDamping)
     placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    return close_loop(placeholder, {"zero-order": (experiment,)}, catalogue=catalogue, hold="zero-order", max_effects=1)
+    options = {"catalogue": catalogue, "search": SearchOptions(1)}
+    return close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", **options)
 
 
 def test_what_the_catalogue_lacks_is_unexplained(loop: Loop):
@@ -377,9 +378,8 @@ def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     be anything, explains no more than friction does, and a function of the twist beside it all of the rest."""
     experiment = rig.reduced_experiment(COUNT, noise=NOISE, friction=(25.0, 0.3), quadratic=0.15)
     placeholder: Model = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
-    loop = close_loop(
-        placeholder, {"zero-order": (experiment,)}, catalogue=(CoulombFriction,), hold="zero-order", max_effects=1
-    )
+    options = {"catalogue": (CoulombFriction,), "search": SearchOptions(1)}
+    loop = close_loop(placeholder, {"zero-order": (experiment,)}, hold="zero-order", **options)
     assert loop.decision == "effect_found" and not loop.doubted
     assert [f.name for f in loop.findings] == ["coulomb_friction", "learned_mesh_torque"]
     assert loop.unknown is not None and loop.unknown.chosen.variables == ("x",)

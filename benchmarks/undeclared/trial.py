@@ -17,6 +17,7 @@ from fitting.free_run import WINDOW, free_run
 from fitting.outcome import Loop
 from fitting.report import report_dict
 from fitting.rig import Rig, experiments, read_rig, ready_log
+from fitting.search_options import SearchOptions
 from hdjax import Model, SimulationError
 from hdjax.effects import CATALOGUE
 from undeclared.black_box import black_box_error
@@ -101,7 +102,8 @@ def _close(rig: Rig, without: frozenset[str], seed: int, thorough: bool) -> Loop
         # Another hold of the torque is a form of this family too.
         offered = {hold: e for hold, e in offered.items() if hold == rig.hold}
     catalogue = tuple(form for form in CATALOGUE if form.family not in without)
-    return close_loop(rig.model, offered, hold=rig.hold, catalogue=catalogue, seed=seed, thorough=thorough)
+    search = SearchOptions(seed=seed, thorough=thorough)
+    return close_loop(rig.model, offered, hold=rig.hold, catalogue=catalogue, search=search)
 
 
 def held_out_error(loop: Loop, model: Model, folder: Path, drive_file: DriveFile) -> float:

@@ -1,7 +1,7 @@
 """The clocks of several logs, set by a line in what a fit leaves over: a disturbance of its own frequency does not wait
 for a log to start, so that it begins each one in another phase."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from fitting.along import place_of
-from fitting.attribution.candidate_fit import Data, Setting, Trial, attempt
+from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.decisions import RULES
+from fitting.attribution.study import Data, Study
 from fitting.estimate import Fit, segments_of_logs
 from fitting.experiment import Stretch
 from fitting.explained import solved
@@ -84,9 +85,7 @@ class Phasors(eqx.Module):
         return replace(self, torque=np.where(self.told > RULES.line_errors, turned, self.torque))
 
 
-def with_clocks_set(
-    base: Trial, data: Data, setting: Setting, *, progress: Callable[[str], None]
-) -> tuple[Trial, Data]:
+def with_clocks_set(base: Trial, study: Study) -> tuple[Trial, Study]:
     """The logs with their clocks set so that a line that stands out of what the base model leaves over is in phase; as
     they are where there is no such line, or where it is in phase already.
 
@@ -94,22 +93,20 @@ def with_clocks_set(
 
     Args:
         base: the base model.
-        data: the stretches.
-        setting: how they are cut.
-        progress: told what is being done.
+        study: the data, and how they are cut.
     """
-    if len(data[base.hold][0]) < 2:
-        return base, data
+    if len(study.data[base.hold][0]) < 2:
+        return base, study
     seen = max(_lines(base.training), key=lambda line: line.share, default=None)
     if seen is None or seen.share < RULES.line_share or np.sum(seen.told > RULES.line_errors) < 2:
-        return base, data
+        return base, study
     if abs(seen.mean) >= RULES.line_in_phase * abs(seen.in_phase.mean):
-        return base, data
-    progress("setting the logs' clocks by a line")
-    clocked = _set_by(seen, base, data, setting)
+        return base, study
+    study.progress("setting the logs' clocks by a line")
+    clocked = _set_by(seen, base, study)
     if clocked is None:
-        return base, data
-    return attempt(base.model, clocked, base.hold, setting, start=base, hold_parameters=True), clocked
+        return base, study
+    return attempt(base.model, clocked, base.hold, start=base, hold_parameters=True), clocked
 
 
 def put_back(before: Sequence[Stretch], after: Sequence[Stretch]) -> tuple[float, ...]:
@@ -130,18 +127,18 @@ def _put_back(stretch: Stretch, by: float) -> Stretch:
     return replace(stretch, experiment=replace(experiment, origin=experiment.origin + float(by)))
 
 
-def _set_by(seen: Phasors, base: Trial, data: Data, setting: Setting) -> Data | None:
+def _set_by(seen: Phasors, base: Trial, study: Study) -> Study | None:
     """The data with their clocks set by a line, refined by refits with it; None where these do not explain more."""
     near = base
     for _ in range(_REFITS):
-        data = _with_clocks_put_back(data, seen.late)
-        near = attempt(base.model.with_effects(seen.in_phase.effect), data, base.hold, setting, start=near)
+        study = replace(study, data=_with_clocks_put_back(study.data, seen.late))
+        near = attempt(base.model.with_effects(seen.in_phase.effect), study, base.hold, start=near)
         if not near.training.objective < base.training.objective - RULES.least_gain:
             return None
         seen = _fitted(near.training)
         if np.all(np.abs(seen.late) * seen.omega * seen.told < _SETTLED):
             break
-    return data
+    return study
 
 
 def _with_clocks_put_back(data: Data, late: Float[np.ndarray, " logs"]) -> Data:

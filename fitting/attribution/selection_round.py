@@ -1,17 +1,18 @@
 """Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Data, Setting, Trial, long_gains
+from fitting.attribution.candidate_fit import Trial, long_gains
 from fitting.attribution.candidate_refit import begin, go_on, try_hold
 from fitting.attribution.decisions import RULES, EffectEvidence, Rival, RoundEvidence, compete, leader, support, tie
 from fitting.attribution.score import block_scores
 from fitting.attribution.screening import Lead, Screen, screen
 from fitting.attribution.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit
+from fitting.attribution.study import Study
 from fitting.attribution.support import (
     Standing,
     imperfection,
@@ -95,37 +96,26 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
     )
 
 
-def look(
-    standing: Standing,
-    data: Data,
-    setting: Setting,
-    *,
-    catalogue: Sequence[type[Effect]],
-    seed: int,
-    progress: Callable[[str], None],
-) -> Round:
+def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]]) -> Round:
     """Look for the effect that explains most of what a model leaves over.
 
     Args:
         standing: the current model.
-        data: the stretches; every hold that is here competes with the present one.
-        setting: how they are cut, and whether all forms are refitted.
+        study: the data, of which every hold competes with the present one, and whether all forms are refitted.
         catalogue: forms to consider.
-        seed: of the surrogates.
-        progress: told what is being done.
     """
     before = standing.before
-    progress("looking through the catalogue")
-    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=seed)
-    refits = _Refits(before, data, setting, progress)
-    refits.of_all(screened) if setting.thorough else refits.in_proportion(screened)
+    study.progress("looking through the catalogue")
+    screened = screen(before.training, before.held_out, catalogue=catalogue, seed=study.seed)
+    refits = _Refits(before, study)
+    refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
     found = [*refits.forms(screened), *refits.holds(screened)]
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     found, behind = _with_ties(found)
     rivals: tuple[Rival, ...] = ()
     verdicts, asked, accepted = _supported_first(found, standing)
     if accepted:
-        found, rivals = _simplest_first(found, before, data, setting)
+        found, rivals = _simplest_first(found, before, study)
         verdicts, asked, accepted = _supported_first(found, standing)
     return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
 
@@ -133,13 +123,13 @@ def look(
 class _Refits:
     """Forms that are put inside the equations and refitted, one after the other."""
 
-    def __init__(self, before: Trial, data: Data, setting: Setting, progress: Callable[[str], None]) -> None:
-        self.before, self.data, self.setting, self.progress = before, data, setting, progress
+    def __init__(self, before: Trial, study: Study) -> None:
+        self.before, self.study = before, study
         self.done: dict[str, Trial] = {}
 
     def of_all(self, screened: Screen) -> None:
         """Every form, to the end."""
-        self._refit(screened.leads, self.setting, 0.0)
+        self._refit(screened.leads, self.study, 0.0)
 
     def in_proportion(self, screened: Screen) -> None:
         """The likeliest form of each family, and further forms near the best one."""
@@ -149,34 +139,34 @@ class _Refits:
         behind = [lead for lead in screened.leads if lead.effect.imitated(before.model.drive, swing)]
         suspects = [lead for lead in behind if lead not in worth]
         first = first_of_each_family(worth, suspects)
-        self._refit(first[:1], self.setting)
+        self._refit(first[:1], self.study)
         leader = self.done.get(first[0].effect.name) if first else None
         if leader is not None and leaves_white_noise(leader.training):
             self._beside(leader, [*possible_ties(worth, first), *(lead for lead in suspects if lead in first[1:])])
             return
-        self._refit(first[1:], self.setting)
+        self._refit(first[1:], self.study)
         if self.done:
             best = max(self.done.values(), key=lambda trial: trial.gain_over(before))
             near = _on_the_way(before, best.training.objective, _MAY_DO_BETTER)
             families = [a.effect.family for a in first if _reaches(self.done.get(a.effect.name), near)]
             self._beside(best, further_forms([*worth, *suspects], families, first))
 
-    def _refit(self, leads: Sequence[Lead], setting: Setting, share: float = _HOPELESS) -> None:
+    def _refit(self, leads: Sequence[Lead], study: Study, share: float = _HOPELESS) -> None:
         begun = []
         for lead in leads:
-            self.progress(f"refitting with {lead.effect.name}")
-            begun.append((lead, begin(self.before, lead, self.data, setting)))
+            study.progress(f"refitting with {lead.effect.name}")
+            begun.append((lead, begin(self.before, lead, study)))
         # The one that has come farthest goes on first: beside it most others need not.
         for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
             best = min((t.training.objective for t in self.done.values()), default=np.inf)
             limit = _on_the_way(self.before, best, share)
-            trial = go_on(self.before, lead, found, self.data, setting, limit)
+            trial = go_on(self.before, lead, found, study, limit)
             if trial is not None and np.isfinite(trial.held_out.objective):
                 self.done[lead.effect.name] = trial
 
     def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
         # What is to come near it in its first pass needs its steps.
-        self._refit(leads, self.setting.with_steps_of(best.training), 1.0 - _NEAR_TIE)
+        self._refit(leads, self.study.with_substeps(best.training.substeps), 1.0 - _NEAR_TIE)
 
     def forms(self, screened: Screen) -> list[Verdict]:
         """All forms; a first-order gain stands for those that were not refitted."""
@@ -191,11 +181,11 @@ class _Refits:
     def holds(self, screened: Screen) -> list[Verdict]:
         """Other assumptions about the torque between samples."""
         found = []
-        for hold in self.data:
+        for hold in self.study.data:
             if hold == self.before.hold:
                 continue
-            self.progress(f"refitting with a {hold} torque")
-            trial = try_hold(self.before, self.data, hold, self.setting)
+            self.study.progress(f"refitting with a {hold} torque")
+            trial = try_hold(self.before, hold, self.study)
             gain = -np.inf if trial is None else trial.gain_over(self.before)
             found.append(Verdict(f"{hold} hold", "input_delay", trial, gain, screened.p_value(gain), True))
         return found
@@ -242,9 +232,7 @@ def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], dict[str, tuple[
     return marked, {name: tuple(map(float, blocks)) for name, blocks in behind.items()}
 
 
-def _simplest_first(
-    verdicts: list[Verdict], before: Trial, data: Data, setting: Setting
-) -> tuple[list[Verdict], tuple[Rival, ...]]:
+def _simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:
     """The competitors with the one first that is taken where several can't be told apart, and what those are like.
 
     Over short segments what adds up slowly is hidden, and what an effect remembers starts where it suits; whole
@@ -257,7 +245,7 @@ def _simplest_first(
         return verdicts, ()
     competing = [v for v in refitted if v.name in near]
     trials = [v.trial for v in competing if v.trial is not None]
-    gains = long_gains(before, trials, data, setting) or [v.gain for v in competing]
+    gains = long_gains(before, trials, study) or [v.gain for v in competing]
     rivals = tuple(replace(_rival(v, before), long_gain=g) for v, g in zip(competing, gains, strict=True))
     first, close = leader(rivals)
     if not first.tied:

@@ -2,9 +2,18 @@
 
 from pathlib import Path
 
-from fitting.commands.options import DriveFileOption, ExperimentLimits, Logs, TestLogs, wanted
+from fitting.commands.options import (
+    DriveFileOption,
+    ExperimentLimits,
+    FleetOptions,
+    Logs,
+    Search,
+    TestLogs,
+    wanted,
+)
 from fitting.commands.start import start_jax
 from fitting.errors import InputError
+from fitting.search_options import SearchOptions
 
 
 def fit(
@@ -17,8 +26,7 @@ def fit(
     seed: int = 0,
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
-    workers: int = 0,
-    scheduler: str | None = None,
+    fleet: FleetOptions = FleetOptions(),
 ) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
@@ -39,17 +47,13 @@ def fit(
     next_experiment
         Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
         and write it to next_experiment.csv.
-    workers
-        Of a folder: processes on this machine that share its logs; threads where 0.
-    scheduler
-        Of a folder: address of a Dask scheduler whose workers do it, for instance tcp://10.0.0.1:8786.
     """
     asked = wanted(limits, next_experiment)
     folder = next((path for path in logs if path.is_dir()), None)
-    if (workers or scheduler) and folder is None:
+    if (fleet.workers or fleet.scheduler) and folder is None:
         raise InputError(f"{logs[0]}: --workers and --scheduler are for a folder of logs; give the folder")
-    if workers < 0:
-        raise InputError(f"--workers must be 0 or more, but is {workers}")
+    if fleet.workers < 0:
+        raise InputError(f"--workers must be 0 or more, but is {fleet.workers}")
     if asked is not None and folder is not None:
         raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
     if posterior and folder is not None:
@@ -58,7 +62,7 @@ def fit(
     if folder is not None:
         from fitting.commands.run_fleet import fit_folder
 
-        fit_folder(logs, drive, out, workers, scheduler)
+        fit_folder(logs, drive, out, fleet)
         return
     from fitting.commands.run_fit import fit_logs
 
@@ -72,9 +76,7 @@ def close_loop(
     drive: DriveFileOption,
     out: Path,
     test: TestLogs = (),
-    max_effects: int = 3,
-    seed: int = 0,
-    thorough: bool = False,
+    search: Search = SearchOptions(),
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
 ) -> None:
@@ -88,24 +90,17 @@ def close_loop(
     ----------
     out
         Folder for report.html, report.json and, but for quasi-static logs, model.json.
-    max_effects
-        Effects to add at most.
-    seed
-        Of the surrogates behind the p-values.
-    thorough
-        Refit every form of the catalogue in each round, in place of those that a first-order look finds likely
-        (minutes).
     next_experiment
         Where explanations are tied, look for the motor torque that would tell them apart within limits (minutes), and
         write it to next_experiment.csv.
     """
-    if max_effects < 0:
-        raise InputError(f"--max-effects must be 0 or more, but is {max_effects}")
+    if search.max_effects < 0:
+        raise InputError(f"--max-effects must be 0 or more, but is {search.max_effects}")
     asked = wanted(limits, next_experiment)
     start_jax()
-    from fitting.commands.run_close_loop import Asked, close_loop_on_logs
+    from fitting.commands.run_close_loop import close_loop_on_logs
 
-    close_loop_on_logs(logs, drive, out, Asked(max_effects, seed, thorough), test=test, limits=asked)
+    close_loop_on_logs(logs, drive, out, search, test=test, limits=asked)
 
 
 def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:

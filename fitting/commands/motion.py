@@ -1,9 +1,8 @@
 """The commands that run a model: `hdjax predict | simulate`."""
 
 from pathlib import Path
-from typing import Literal
 
-from fitting.commands.options import DriveFileOption
+from fitting.commands.options import DriveFileOption, ForcingOptions
 from fitting.commands.start import start_jax
 from fitting.errors import InputError
 
@@ -33,12 +32,7 @@ def simulate(
     out: Path,
     model: Path | None = None,
     preset: str = "HDC-40-050",
-    forcing: Literal["harmonic", "chirp", "multisine"] = "multisine",
-    amplitude: float = 0.5,
-    frequency: float = 10.0,
-    frequency_end: float = 100.0,
-    duration: float = 4.0,
-    rate: float = 2000.0,
+    torque: ForcingOptions = ForcingOptions(),
     noise: float = 0.0,
     seed: int = 0,
 ) -> None:
@@ -52,28 +46,15 @@ def simulate(
         model.json of a report; a preset where not given.
     preset
         Name of a drive with published parameters.
-    forcing
-        Shape of the motor torque.
-    amplitude
-        Its peak (multisine: rms) [N m].
-    frequency
-        Its frequency, or where a chirp or multisine begins [Hz].
-    frequency_end
-        Where a chirp or multisine ends [Hz].
-    duration
-        Length of the log [s].
-    rate
-        Sampling rate [Hz].
     noise
         Rms noise of each angle [rad at the output].
     seed
         Of phases and noise.
     """
-    for name, value in {"duration": duration, "rate": rate, "frequency": frequency}.items():
+    for name, value in {"duration": torque.duration, "rate": torque.rate, "frequency": torque.frequency}.items():
         if not value > 0:
             raise InputError(f"--{name} must be positive, but is {value}")
     start_jax()
-    from fitting.commands.run_simulate import Forcing, write_simulation
+    from fitting.commands.run_simulate import write_simulation
 
-    torque = Forcing(forcing, amplitude, frequency, frequency_end, duration, rate)
     write_simulation(out, torque, model=model, preset=preset, noise=noise, seed=seed)

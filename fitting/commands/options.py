@@ -4,11 +4,12 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from fitting.errors import InputError
+from fitting.search_options import SearchOptions
 
 Logs = Annotated[
     list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
@@ -17,6 +18,7 @@ TestLogs = Annotated[
     tuple[Path, ...],
     Parameter(help="Logs of the same drive that are test data, in place of the last fifth of each log.", negative=""),
 ]
+Search = Annotated[SearchOptions, Parameter(name="*")]
 DriveFileOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, inertias, columns and units.")]
 
 
@@ -54,6 +56,42 @@ class DriveOptions:
     K: Annotated[float | None, Parameter(name="--K")] = None
     alpha: Annotated[float | None, Parameter(name="--alpha")] = None
     B_sp: Annotated[float | None, Parameter(name="--B_sp")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FleetOptions:
+    """Who fits the logs of a folder.
+
+    Attributes:
+        workers: Of a folder: processes on this machine that share its logs; threads where 0.
+        scheduler: Of a folder: address of a Dask scheduler whose workers do it, for instance tcp://10.0.0.1:8786.
+    """
+
+    workers: int = 0
+    scheduler: str | None = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ForcingOptions:
+    """A motor torque, and how it is sampled.
+
+    Attributes:
+        forcing: Shape of the motor torque.
+        amplitude: Its peak (multisine: rms) [N m].
+        frequency: Its frequency, or where a chirp or multisine begins [Hz].
+        frequency_end: Where a chirp or multisine ends [Hz].
+        duration: Length of the log [s].
+        rate: Sampling rate [Hz].
+    """
+
+    forcing: Literal["harmonic", "chirp", "multisine"] = "multisine"
+    amplitude: float = 0.5
+    frequency: float = 10.0
+    frequency_end: float = 100.0
+    duration: float = 4.0
+    rate: float = 2000.0
 
 
 def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits | None:

@@ -1,7 +1,6 @@
 """What `hdjax close-loop` and `hdjax demo` do."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from fitting.close_loop import close_loop
@@ -13,30 +12,16 @@ from fitting.drive_file import read_drive_file
 from fitting.errors import InputError
 from fitting.model_file import StoredModel, to_json
 from fitting.next_experiment import experiment_for_ties
-from fitting.report import loop_text, write_loop_report
+from fitting.report import rig_text, write_rig_report
 from fitting.rig import Rig, read_logs, read_rig, rig_of
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is asked of the loop.
-
-    Attributes:
-        max_effects: effects to add at most.
-        seed: of the surrogates.
-        thorough: whether all forms are refitted in each round.
-    """
-
-    max_effects: int = 3
-    seed: int = 0
-    thorough: bool = False
+from fitting.search_options import SearchOptions
 
 
 def close_loop_on_logs(
     logs: list[Path],
     drive: Path,
     out: Path,
-    asked: Asked = Asked(),
+    search: SearchOptions = SearchOptions(),
     *,
     test: Sequence[Path] = (),
     limits: ExperimentLimits | None = None,
@@ -47,7 +32,7 @@ def close_loop_on_logs(
         logs: files.
         drive: drive file.
         out: folder of the report.
-        asked: of the loop.
+        search: how effects are searched for.
         test: files of test data.
         limits: of the next experiment; None where none is asked for.
 
@@ -66,11 +51,11 @@ def close_loop_on_logs(
         from fitting.quasi_static.commands import close_quasi_static_loop
 
         with Spinner() as progress:
-            options = {"max_effects": asked.max_effects, "seed": asked.seed, "progress": progress}
+            options = {"max_effects": search.max_effects, "seed": search.seed, "progress": progress}
             shown = close_quasi_static_loop(read, drive_file, out, **options)
         print(shown)
     else:
-        _close_loop(rig_of(read, drive_file, test=tests), out, asked, limits)
+        _close_loop(rig_of(read, drive_file, test=tests), out, search, limits)
 
 
 def demonstrate(out: Path, seed: int) -> None:
@@ -83,10 +68,10 @@ def demonstrate(out: Path, seed: int) -> None:
     out.mkdir(parents=True, exist_ok=True)
     logs, drive = write_demo_logs(out, seed=seed)
     print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
-    _close_loop(read_rig(logs, drive), out, Asked(seed=seed), limits=None)
+    _close_loop(read_rig(logs, drive), out, SearchOptions(seed=seed), limits=None)
 
 
-def _close_loop(rig: Rig, out: Path, asked: Asked, limits: ExperimentLimits | None) -> None:
+def _close_loop(rig: Rig, out: Path, search: SearchOptions, limits: ExperimentLimits | None) -> None:
     stated = None if limits is None else stated_limits(limits, logs_of(rig))
     with Spinner() as progress:
         loop = close_loop(
@@ -94,11 +79,11 @@ def _close_loop(rig: Rig, out: Path, asked: Asked, limits: ExperimentLimits | No
             rig.experiments,
             test=rig.test,
             hold=rig.hold,
+            search=search,
             progress=progress,
-            **asdict(asked),
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
     stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
-    paths = write_loop_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
-    print(loop_text(loop, rig=rig, next_experiment=proposed))
+    paths = write_rig_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(rig_text(loop, rig=rig, next_experiment=proposed))
     print(f"Report: {paths['report.html']}")

@@ -9,7 +9,7 @@ from fitting.drive_file import read_drive_file
 from fitting.errors import InputError
 from fitting.fit_only import fit_only
 from fitting.model_file import StoredModel, to_json
-from fitting.report import fit_text, write_fit_report
+from fitting.report import rig_text, write_rig_report
 from fitting.rig import Rig, read_logs, rig_of
 
 
@@ -62,8 +62,8 @@ def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits |
 
             proposed = experiment_for_alpha(fitted, rig.experiments[fitted.hold], stated, progress=progress)
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
-    paths = write_fit_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
-    print(fit_text(fitted, rig=rig, next_experiment=proposed))
+    paths = write_rig_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    print(rig_text(fitted, rig=rig, next_experiment=proposed))
     if limits is not None and proposed is None:
         print(
             "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."

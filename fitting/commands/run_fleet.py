@@ -2,23 +2,21 @@
 
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
-
+from fitting.commands.options import FleetOptions
+from fitting.commands.spinner import counting
 from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
 from fitting.fleet import fit_fleet, fleet_text
 
 
-def fit_folder(folders: list[Path], drive: Path, out: Path, workers: int, scheduler: str | None) -> None:
+def fit_folder(folders: list[Path], drive: Path, out: Path, fleet: FleetOptions) -> None:
     """Fit each log of a folder on its own, into one table, and show it.
 
     Args:
         folders: one.
         drive: drive file.
         out: folder of the table.
-        workers: processes on this machine; threads where 0.
-        scheduler: address of a Dask scheduler, or None.
+        fleet: who does it.
 
     Raises:
         InputError: for several folders, or a bad drive file.
@@ -27,17 +25,14 @@ def fit_folder(folders: list[Path], drive: Path, out: Path, workers: int, schedu
     if len(folders) > 1:
         raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
     read_drive_file(drive)
-    console = Console(stderr=True)
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("logs", total=None)
+    with counting("logs") as progress:
         table = fit_fleet(
             folders[0],
             drive,
             out,
-            workers=workers,
-            scheduler=scheduler,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            workers=fleet.workers,
+            scheduler=fleet.scheduler,
+            progress=progress,
         )
     print(fleet_text(table))
     print(f"Table: {out / 'fleet.parquet'}")

@@ -1,41 +1,21 @@
 """What `hdjax simulate` does."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import jax
 import numpy as np
 
+from fitting.commands.options import ForcingOptions
 from fitting.commands.table import write_table
 from fitting.errors import InputError
 from fitting.model_file import read_model
 from hdjax import PRESETS, Chirp, Harmonic, TwoInertiaModel, random_phase_multisine, sampled, simulate
 
 
-@dataclass(frozen=True)
-class Forcing:
-    """A motor torque, and how it is sampled.
-
-    Attributes:
-        shape: of the torque.
-        amplitude: peak, or rms of a multisine [N m].
-        frequency: its own, or where it begins [Hz].
-        frequency_end: where it ends [Hz].
-        duration: of the log [s].
-        rate: of its samples [Hz].
-    """
-
-    shape: Literal["harmonic", "chirp", "multisine"]
-    amplitude: float
-    frequency: float
-    frequency_end: float
-    duration: float
-    rate: float
-
-
-def write_simulation(out: Path, torque: Forcing, *, model: Path | None, preset: str, noise: float, seed: int) -> None:
+def write_simulation(
+    out: Path, torque: ForcingOptions, *, model: Path | None, preset: str, noise: float, seed: int
+) -> None:
     """Simulate a drive and write its log.
 
     Args:
@@ -68,11 +48,11 @@ def write_simulation(out: Path, torque: Forcing, *, model: Path | None, preset: 
     print(f"Log: {out}")
 
 
-def _function(torque: Forcing, seed: int) -> Callable:
+def _function(torque: ForcingOptions, seed: int) -> Callable:
     first, last = 2 * np.pi * torque.frequency, 2 * np.pi * torque.frequency_end
-    if torque.shape == "harmonic":
+    if torque.forcing == "harmonic":
         return Harmonic(torque.amplitude, first)
-    if torque.shape == "chirp":
+    if torque.forcing == "chirp":
         return Chirp(torque.amplitude, first, last, torque.duration)
     try:
         return random_phase_multisine(

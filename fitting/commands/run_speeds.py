@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from fitting.files import write_whole
 from hdjax import Drive, TwoInertiaModel
 from hdjax.effects.kinematic import KinematicError
 from hdjax.response.coexisting import from_both_ends
-from hdjax.response.critical_speeds import can_persist, critical_speeds, speeds_to_avoid
+from hdjax.response.critical_speeds import SpeedBand, can_persist, critical_speeds, speeds_to_avoid
 from hdjax.response.plots import speed_plot
 
 _RPM = 30.0 / math.pi
@@ -73,17 +74,7 @@ def show_speeds(
     both = None if len(branches) == 1 else (float(ranges[1].min()), float(ranges[0].max()))
     files: dict[Path, str | bytes] = {}
     if out is not None:
-        rows = [
-            {
-                "start_rpm": b.start * _RPM,
-                "end_rpm": b.end * _RPM,
-                "peak_rpm": b.speed_at_peak * _RPM,
-                "swing": b.amplitude,
-                "order": b.order,
-            }
-            for b in bands
-        ]
-        document = {"schema": "hdjax-speeds/1", "limit": limit, "avoid": rows, "two_motions_rpm": both}
+        document = {"schema": "hdjax-speeds/1", "limit": limit, "avoid": _rows(bands), "two_motions_rpm": both}
         figure = speed_plot(*branches, bands=bands, limit=limit)
         files = {
             out / "speeds.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
@@ -103,6 +94,20 @@ def show_speeds(
     if both is not None:
         print(f"From {both[0]:.1f} to {both[1]:.1f} rpm two motions exist; a drive keeps the one that it comes with.")
     show_files(files)
+
+
+def _rows(bands: Sequence[SpeedBand]) -> list[dict[str, float]]:
+    """The bands as JSON has them."""
+    return [
+        {
+            "start_rpm": b.start * _RPM,
+            "end_rpm": b.end * _RPM,
+            "peak_rpm": b.speed_at_peak * _RPM,
+            "swing": b.amplitude,
+            "order": b.order,
+        }
+        for b in bands
+    ]
 
 
 def _cycles(order: int) -> str:

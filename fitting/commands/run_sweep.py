@@ -4,9 +4,8 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
 
+from fitting.commands.spinner import counting
 from fitting.errors import InputError
 from fitting.files import write_whole
 from fitting.sweep_file import read_sweep_file
@@ -30,15 +29,8 @@ def sweep_file(spec: Path, out: Path, *, workers: int, scheduler: str | None, me
         InputError: for a bad file, or without the extra `sweep`.
     """
     asked = read_sweep_file(spec)
-    console = Console(stderr=True)
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     try:
-        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-            task = bar.add_task("choosing the route", total=None)
-
-            def told(done: int, total: int) -> None:
-                bar.update(task, description="points", completed=done, total=total)
-
+        with counting("points", first="choosing the route") as progress:
             result = sweep(
                 asked.model,
                 asked.forcing,
@@ -47,7 +39,7 @@ def sweep_file(spec: Path, out: Path, *, workers: int, scheduler: str | None, me
                 workers=workers,
                 scheduler=scheduler,
                 memory=memory * _MEBIBYTE,
-                progress=told,
+                progress=progress,
             )
     except (ValueError, ImportError) as error:
         raise InputError(f"{spec}: {error}") from error

@@ -86,13 +86,7 @@ def report_dict(
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
         "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
-        "hold": outcome.hold,
-        "setting": _setting(outcome),
-        "engine": _engine(outcome.after.not_machine_code),
-        "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
-        "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),
-        "seconds": dict(outcome.seconds),
-        "logs": _logs(outcome),
+        **_circumstances(outcome),
         "health": [{"log": log} | dataclasses.asdict(f) for log, f in health],
         "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
     }
@@ -107,6 +101,30 @@ def report_dict(
     return with_old_names(report)
 
 
+def _circumstances(outcome: Outcome) -> dict[str, Any]:
+    """What the outcome was computed from, and how."""
+    not_machine_code = outcome.after.not_machine_code
+    setting = None
+    if isinstance(outcome, Loop):
+        setting = {
+            "horizon": outcome.setting.segmentation.horizon,
+            "halo": outcome.setting.halo,
+            "substeps": outcome.after_substeps,
+            "count": outcome.setting.segmentation.count,
+            "least_progress": outcome.setting.least_progress,
+            "thorough": outcome.setting.thorough,
+        }
+    return {
+        "hold": outcome.hold,
+        "setting": setting,
+        "engine": {"name": "machine code" if not_machine_code is None else "XLA", "reason": not_machine_code},
+        "forms_tried": max((len(r.verdicts) for r in outcome.rounds), default=0),
+        "surrogates": max((int(r.screen.null_gains.size) for r in outcome.rounds), default=0),
+        "seconds": dict(outcome.seconds),
+        "logs": _logs(outcome),
+    }
+
+
 def _logs(outcome: Outcome) -> list[dict[str, Any]]:
     """Of each log, or test log, how many samples serve what."""
     found: dict[str, dict[str, Any]] = {}
@@ -119,15 +137,3 @@ def _logs(outcome: Outcome) -> list[dict[str, Any]]:
     late = outcome.put_back if isinstance(outcome, Loop) else ()
     put_back = dict(zip((run.name for run in outcome.after.training), late, strict=False))
     return [log | {"clock_put_back": put_back.get(name, 0.0)} for name, log in found.items()]
-
-
-def _engine(not_machine_code: str | None) -> dict[str, str | None]:
-    """What evaluated the residual, and why it was not machine code."""
-    return {"name": "machine code" if not_machine_code is None else "XLA", "reason": not_machine_code}
-
-
-def _setting(outcome: Outcome) -> dict[str, int] | None:
-    """How the logs were cut, and the solver's steps in the end."""
-    if not isinstance(outcome, Loop):
-        return None
-    return dataclasses.asdict(outcome.setting) | {"substeps": outcome.after_substeps}

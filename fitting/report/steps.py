@@ -17,7 +17,7 @@ def steps(outcome: Outcome) -> list[dict[str, Any]]:
     whose initial states are fitted; empty for a fit alone."""
     if not isinstance(outcome, Loop) or not outcome.rounds:
         return []
-    seconds = outcome.setting.horizon * outcome.stretches[0][0].experiment.time_step
+    seconds = outcome.setting.segmentation.horizon * outcome.stretches[0][0].experiment.time_step
     found = [_step(None, outcome.rounds[0].before, seconds)]
     for this in outcome.rounds:
         if this.accepted and this.winner.trial is not None:

@@ -64,38 +64,21 @@ def write_report(
     return paths
 
 
-def write_loop_report(
+def write_rig_report(
     out_dir: str | os.PathLike[str],
-    loop: Loop,
+    outcome: Outcome,
     *,
     rig: Rig,
     model_json: str,
     next_experiment: NextExperiment | None = None,
 ) -> dict[str, Path]:
-    """[`write_report`][] of a loop on a rig's logs."""
-    return write_report(out_dir, loop, model_json=model_json, next_experiment=next_experiment, **_of_rig(rig))
+    """[`write_report`][] of a rig's logs."""
+    return write_report(out_dir, outcome, model_json=model_json, next_experiment=next_experiment, **_of_rig(rig))
 
 
-def write_fit_report(
-    out_dir: str | os.PathLike[str],
-    fitted: FitOnly,
-    *,
-    rig: Rig,
-    model_json: str,
-    next_experiment: NextExperiment | None = None,
-) -> dict[str, Path]:
-    """[`write_report`][] of a fit of a rig's logs."""
-    return write_report(out_dir, fitted, model_json=model_json, next_experiment=next_experiment, **_of_rig(rig))
-
-
-def loop_text(loop: Loop, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
-    """[`report_text`][] of a loop on a rig's logs."""
-    return report_text(report_dict(loop, next_experiment=next_experiment, **_of_rig(rig)))
-
-
-def fit_text(fitted: FitOnly, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
-    """[`report_text`][] of a fit of a rig's logs."""
-    return report_text(report_dict(fitted, next_experiment=next_experiment, **_of_rig(rig)))
+def rig_text(outcome: Outcome, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
+    """[`report_text`][] of a rig's logs."""
+    return report_text(report_dict(outcome, next_experiment=next_experiment, **_of_rig(rig)))
 
 
 def _of_rig(rig: Rig) -> dict[str, Any]:
