@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Shape, remembered
+from fitting.quasi_static.differences import slopes
+from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Shape, branch
 
 # Both signs of torque must reach this share of the largest before the curve's symmetry can show its centre.
 _BOTH_SIGNS = 0.3
@@ -117,9 +118,7 @@ def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
     columns = _zero_columns(blocks, curve)
     tried = []
     for reach in reaches:
-        path = []
-        if reach is not None and curve.memory is not None:
-            path = [_path(blocks, curve, reach)]
+        path = [branch(curve.memory, blocks, reach, (0.0,) * curve.logs)] if curve.memory and reach else []
         for bias in {0.0, middle} if curve.biased else {0.0}:
             for knee in knees:
                 basis = _basis(curve.shape, blocks.torque - bias, [share * size for share in knee])
@@ -130,12 +129,6 @@ def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
     tried.sort(key=lambda t: t[0])
     best, other = tried[0], next((t for t in tried if t[3] != tried[0][3]), None)
     return [_parameters(blocks, curve, *t[1:]) for t in (best, other) if t is not None]
-
-
-def _path(blocks: Blocks, curve: Curve, reach: float) -> np.ndarray:
-    assert curve.memory is not None
-    each = [remembered(curve.memory, blocks.path[blocks.path_log == i], reach, 0.0) for i in range(curve.logs)]
-    return np.concatenate(each)[blocks.seat]
 
 
 def _zero_columns(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
@@ -194,17 +187,15 @@ def polish(
     blocks = replace(blocks, twist_noise=math.hypot(blocks.twist_noise, excess))
 
     def residual(parameters: np.ndarray) -> np.ndarray:
-        return weights * _residual(blocks, curve, parameters, curve.branch(parameters, blocks))
-
-    def jacobian(parameters: np.ndarray) -> np.ndarray:
-        return weights[:, None] * _jacobian(blocks, curve, parameters, steps)
+        misfit, slope = _misfit(blocks, curve, parameters)
+        return weights * misfit / np.hypot(blocks.twist_noise, slope * blocks.torque_noise)
 
     low, high = _bounds(blocks, curve)
     inside = np.clip(start, low + 10 * steps, high - 10 * steps)
     found = least_squares(
         residual,
         inside,
-        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        jac=lambda at: slopes(residual, at, steps),  # pyright: ignore[reportArgumentType]
         bounds=(low, high),
         x_scale=1e5 * steps,
         xtol=1e-7,
@@ -213,33 +204,6 @@ def polish(
     )
     misfit, _ = _misfit(blocks, curve, found.x)
     return CurveFit(curve, found.x, found.fun, found.jac, misfit, excess)
-
-
-def _residual(blocks: Blocks, curve: Curve, parameters: np.ndarray, branch: np.ndarray) -> np.ndarray:
-    x, slope = curve.predict(parameters, blocks, branch)
-    return (blocks.twist - x) / np.hypot(blocks.twist_noise, slope * blocks.torque_noise)
-
-
-def _jacobian(blocks: Blocks, curve: Curve, parameters: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Central differences; the branch is followed anew only for what moves it."""
-    held = curve.branch(parameters, blocks)
-    _, slope = curve.predict(parameters, blocks, held)
-    weight = 1.0 / np.hypot(blocks.twist_noise, slope * blocks.torque_noise)
-    columns = []
-    for i, (name, step) in enumerate(zip(curve.names, steps, strict=True)):
-        word, _, number = name.partition(" ")
-        if word in ("offset", "drift"):
-            own = weight * (blocks.log == int(number))
-            columns.append(-own if word == "offset" else -own * blocks.centred_time)
-            continue
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = parameters.copy()
-            moved[i] += sign * step
-            branch = curve.branch(moved, blocks) if word == "start" or name == "log reach" else held
-            ends.append(_residual(blocks, curve, moved, branch))
-        columns.append((ends[0] - ends[1]) / (2.0 * step))
-    return np.column_stack(columns)
 
 
 def scales(blocks: Blocks, curve: Curve) -> np.ndarray:

@@ -156,8 +156,7 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
 
 
 def _centred(fit: CurveFit, blocks: Blocks) -> np.ndarray:
-    bias = fit.parameters[fit.curve.places["torque_bias"]] if fit.curve.biased else 0.0
-    return blocks.torque - bias
+    return blocks.torque - fit.curve.value("torque_bias", fit.parameters)
 
 
 def _largest_torque(fit: CurveFit, blocks: Blocks) -> float:
@@ -321,10 +320,10 @@ def _with_memory(fit: CurveFit, blocks: Blocks, memory: Memory, reach: float) ->
     moved = fit.parameters.copy()
     moved[curve.places["log reach"]] = math.log(reach)
     changed = replace(curve, memory=memory).branch(moved, blocks)
-    branch = curve.branch(fit.parameters, blocks)
-    _, slope = curve.predict(fit.parameters, blocks, branch)
+    _, slope = curve.predict(fit.parameters, blocks)
     weighed = slope / np.hypot(math.hypot(blocks.twist_noise, fit.excess), slope * blocks.torque_noise)
     matrix = np.column_stack([fit.jacobian[:, kept], weighed * changed])
-    without = fit.residual - fit.parameters[curve.places["friction"]] * weighed * branch
+    friction = curve.value("friction", fit.parameters)
+    without = fit.residual - friction * weighed * curve.branch(fit.parameters, blocks)
     solution, *_ = np.linalg.lstsq(matrix, -without, rcond=None)
     return replace(fit, parameters=solution, residual=without + matrix @ solution, jacobian=matrix)
