@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from fitting.quasi_static.form import Form
-from fitting.quasi_static.intervals import Known, Scatter, known_figure, scatter
+from fitting.quasi_static.intervals import Figure, Known, scatter
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import stretches
 from fitting.quasi_static.twist_model import TwistModel
@@ -41,19 +41,10 @@ def contribution(points: Points, model: TwistModel, forms: tuple[Form, ...]) -> 
 def _known(points: Points, model: TwistModel, figures: list[_Figure]) -> dict[str, Known]:
     fitted = np.concatenate([model.coefficients, *model.shapes])
     found = scatter(model.jacobian, model.misfit, stretches(model.misfit, points.log, each=2))
-    return {
-        name: known_figure(float(formula(fitted)), _slope(formula, fitted, found), found, unit, description, positive)
-        for name, formula, unit, description, positive in figures
-    }
-
-
-def _slope(formula: Formula, fitted: np.ndarray, found: Scatter) -> np.ndarray:
-    """Derivatives over steps of a thousandth of each parameter's scatter."""
+    # A thousandth of each parameter's scatter; without noise nothing scatters.
     steps = 1e-3 * np.sqrt(np.maximum(np.diag(found.classical), 0.0))
-    # Without noise nothing scatters.
     steps = np.maximum(steps, 1e-9 * np.maximum(np.abs(fitted), 1e-12))
-    moves = np.diag(steps)
-    return np.array([(formula(fitted + m) - formula(fitted - m)) / (2.0 * np.sum(m)) for m in moves])
+    return {figure[0]: Figure(*figure).known(fitted, steps, found) for figure in figures}
 
 
 def _figures(points: Points, model: TwistModel, form: Form) -> Iterator[_Figure]:
