@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 
 START = "start"
@@ -26,6 +27,7 @@ class Form:
         columns: Columns (n, strengths) at points, for given shape parameters.
         strengths: Names of the strengths.
         equation: What it adds to the twist.
+        figures: What a reader wants to know of it, from compliance, strengths and shape parameters in a row.
         shapes: Values of the shape parameters to begin with, in rows of a grid, (grid, shape parameters).
         shape_names: Names of the shape parameters; those that begin with "log " are logarithms.
         low: Least value of each shape parameter.
@@ -39,6 +41,7 @@ class Form:
     columns: Columns
     strengths: tuple[str, ...]
     equation: str
+    figures: tuple[Figure, ...] = ()
     shapes: np.ndarray = field(default_factory=lambda: np.zeros((1, 0)))
     shape_names: tuple[str, ...] = ()
     low: tuple[float, ...] = ()
@@ -49,8 +52,7 @@ class Form:
     @property
     def size(self) -> int:
         """Number of strengths and shape parameters; where a log begins is none of them."""
-        own = [n for n in (*self.strengths, *self.shape_names) if not n.startswith(START)]
-        return len(own)
+        return sum(not name.startswith(START) for name in (*self.strengths, *self.shape_names))
 
 
 def base_columns(points: Points) -> np.ndarray:

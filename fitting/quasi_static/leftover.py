@@ -57,7 +57,7 @@ def leftover(held: Held, trial: Trial, base: Trial, seed: int) -> Leftover | Non
 
 
 def _smooth_functions(points: Points) -> list[Form]:
-    quantities = {"joint torque": points.torque, "rate of the joint torque": _rate(points)}
+    quantities = {"joint torque": points.torque, "rate of the joint torque": points.torque_rate}
     if points.temperature is not None and np.ptp(points.temperature) > 0:
         quantities["temperature"] = points.temperature
     found = []
@@ -75,10 +75,6 @@ def _form(name: str, columns: np.ndarray) -> Form:
 
 def _given(columns: np.ndarray, points: Points, shape: np.ndarray) -> np.ndarray:
     return columns
-
-
-def _rate(points: Points) -> np.ndarray:
-    return points.in_each_log(lambda own: np.gradient(points.torque[own], points.time[own]))
 
 
 def _waves(angle: np.ndarray) -> np.ndarray:

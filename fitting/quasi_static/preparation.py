@@ -16,6 +16,7 @@ from fitting.pieces import SHORTEST
 from fitting.quasi_static.blocks import means
 
 Motion = Literal["held", "one way", "both ways", "unknown"]
+MOVES: tuple[Motion, ...] = ("one way", "both ways")
 
 # More than any gear bears: vendors' drives twist by less than 0.01 rad at their peak torque.
 LARGEST_TWIST = 0.1
@@ -63,7 +64,7 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
         refuse_unfit(seen, log)
         known = _measured(log)
         motion, speed = _motion(known, drive_file.reduction_ratio)
-        _refuse_mix_ups(log, must_follow=not (at_rest and motion in ("one way", "both ways")))
+        _refuse_mix_ups(log, must_follow=not (at_rest and motion in MOVES))
         kept, more = (known, ()) if speed is None or at_rest else _steady(known, speed)
         ready.append(kept)
         motions.append(motion)
@@ -71,9 +72,14 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
     return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
 
 
+def torque_of(log: Log) -> np.ndarray:
+    """Joint torque of a quasi-static log, which always has one [N m], (n,)."""
+    assert log.joint_torque is not None
+    return log.joint_torque
+
+
 def _refuse_mix_ups(log: Log, *, must_follow: bool) -> None:
-    torque, twist = log.joint_torque, log.dynamic_error
-    assert torque is not None
+    torque, twist = torque_of(log), log.dynamic_error
     span = float(np.ptp(twist))
     if span > LARGEST_TWIST:
         moved = log.motor_angle is not None

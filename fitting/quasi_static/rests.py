@@ -19,6 +19,7 @@ import numpy as np
 from fitting.attribution.decisions import RULES
 from fitting.quasi_static.attribution import Held, Round, Trial, look
 from fitting.quasi_static.form import START, Form
+from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.strengths import stiffness_of
 from fitting.quasi_static.stretches import stretches
@@ -146,12 +147,15 @@ def _relaxation(step: float, rests: _Rests, initial: str = "") -> Form:
             the other points of a log know nothing of.
     """
     low, high = math.log(_POINTS_IN_CONSTANT * step), math.log(float(np.max(rests.since)))
+    text = "of the relaxation at the stop before rest"
+    amplitudes = (Figure(f"amplitude_{i}", lambda own, i=i: own[i], "rad", f"{text} {i}") for i in range(1, rests.count + 1))
     return Form(
         "creep",
         "relaxation after a stop",
         partial(_fading, rests),
         tuple(f"{initial}amplitude {i + 1}" for i in range(rests.count)),
         "at rest: twist = tau/K + level of the rest + a exp(-t/T), t from the stop on",
+        (Figure("time_constant", lambda own: math.exp(own[-1]), "s", "of the relaxation", True), *amplitudes),
         np.linspace(low, high, _CONSTANTS)[:, None],
         (f"{initial}log time constant",),
         (low,),
@@ -208,7 +212,6 @@ def _as_logs(points: Points, rests: _Rests, rows: np.ndarray, compliance: float)
         temperature=None if points.temperature is None else points.temperature[rows],
         motion=("held",) * rests.count,
         names=tuple(f"rest {i + 1}" for i in range(rests.count)),
-        paths=("",) * rests.count,
         rows=(1,) * rests.count,
         reversals=(0,) * rests.count,
     )
