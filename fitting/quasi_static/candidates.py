@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.motion_forms import motion_forms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.torque_forms import torque_forms
+from fitting.quasi_static.twist_model import TwistModel
 
 # Some times the 3 ms that actuators show.
 _LARGEST_DELAY = 0.01
@@ -38,12 +37,17 @@ def choices(forms: Sequence[Form], families: int) -> list[tuple[Form, ...]]:
     return alone + [(loop, bend) for loop in loops for bend in bends]
 
 
-def is_possible(form: Form, strengths: np.ndarray, compliance: float | np.floating) -> bool:
-    """Whether a drive can show such a strength: what creeps is a part of the twist that was there at once."""
-    return bool(form.family != "creep" or abs(strengths[0]) <= _LARGEST_CREEP * abs(compliance))
+def is_possible(model: TwistModel, forms: Sequence[Form]) -> bool:
+    """Whether drives can show such strengths: what creeps is a part of the twist that was there at once."""
+    return _largest(model, forms, "creep") <= _LARGEST_CREEP
 
 
-def is_usual(form: Form, strengths: np.ndarray, compliance: float | np.floating, points: Points) -> bool:
-    """Whether logs mostly show such a strength: a channel is late by milliseconds or samples."""
-    longest = max(_LARGEST_DELAY, 2.0 * points.step)
-    return bool(form.family != "input_delay" or abs(strengths[0]) <= longest * abs(compliance))
+def is_usual(model: TwistModel, forms: Sequence[Form], points: Points) -> bool:
+    """Whether logs mostly show such strengths: a channel is late by milliseconds or samples."""
+    return _largest(model, forms, "input_delay") <= max(_LARGEST_DELAY, 2.0 * points.step)
+
+
+def _largest(model: TwistModel, forms: Sequence[Form], family: str) -> float:
+    """The first strength of a form of that family, over the compliance; the largest where there are several."""
+    own = [model.coefficients[model.own(form)[0].start] for form in forms if form.family == family]
+    return max(map(abs, own), default=0.0) / max(abs(model.coefficients[0]), 1e-300)

@@ -1,76 +1,45 @@
-"""What the pictures of quasi-static logs are drawn with: plotly figures in plain dictionaries."""
-
-from dataclasses import dataclass
-from typing import Any
+"""What the pictures of quasi-static logs have in common."""
 
 import numpy as np
 
-Figure = dict[str, Any]
+from fitting.formatting import axis_label, scaled_unit
+from fitting.plots.look import AFTER, BEFORE, INK, axis, figure, numbers
+from fitting.plots.plot import Figure
+from fitting.quasi_static.points import Points
+from fitting.quasi_static.torque_twist import Blocks
 
-# Okabe and Ito's blue and vermillion, which colour-blind readers tell apart.
-RISING, FALLING, CURVE = "#0072B2", "#D55E00", "#222222"
-_DIGITS = 6
 
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure with its words.
-
-    Attributes:
-        key: Word for an element's id.
-        title: What it shows.
-        caption: How to read it.
-        figure: For plotly.js, finite numbers only.
-    """
-
-    key: str
-    title: str
-    caption: str
-    figure: Figure
+def scaled(values: np.ndarray, name: str) -> tuple[float, str]:
+    """The factor that makes angles [rad] read well, and the label of their axis."""
+    factor, unit = scaled_unit(float(np.max(np.abs(values))), "rad")
+    return factor, axis_label(name, unit)
 
 
 def drawn(x: np.ndarray, y: np.ndarray, *, mode: str, color: str | None, name: str) -> Figure:
     """Points or a line; the colour is plotly's next where None."""
-    look: Figure = {"marker": {"size": 5, "opacity": 0.6}} if mode == "markers" else {"line": {"width": 1.6}}
-    if color is not None:
-        next(iter(look.values()))["color"] = color
-    return {"type": "scatter", "mode": mode, "name": name, "x": numbers(x), "y": numbers(y)} | look
+    own: Figure = {} if color is None else {"color": color}
+    look = {"marker": {"size": 5, "opacity": 0.6} | own} if mode == "markers" else {"line": {"width": 1.6} | own}
+    return {"type": "scatter", "mode": mode, "name": name, "x": numbers(x, 9), "y": numbers(y)} | look
 
 
-def by_direction(torque: np.ndarray, values: np.ndarray, rising: np.ndarray, *, name: str) -> list[Figure]:
-    """Values against torque, in two colours.
-
-    Args:
-        torque: [N m], (n,).
-        values: Likewise.
-        rising: Whether the torque rises there, likewise.
-        name: What they are.
-    """
-    ways = ((rising, RISING, "rising"), (~rising, FALLING, "falling"))
+def by_direction(data: Blocks | Points, values: np.ndarray, *, name: str) -> list[Figure]:
+    """Values against torque, in two colours: where it rises and where it falls."""
+    rising = np.gradient(data.torque) >= 0
     return [
-        drawn(torque[own], values[own], mode="markers", color=color, name=f"{name}, torque {way}")
-        for own, color, way in ways
+        drawn(data.torque[own], values[own], mode="markers", color=color, name=f"{name}, torque {way}")
+        for own, color, way in ((rising, AFTER, "rising"), (~rising, BEFORE, "falling"))
     ]
 
 
-def numbers(values: np.ndarray) -> list[float]:
-    """Values to as many digits as a screen shows."""
-    return [float(f"{v:.{_DIGITS}g}") for v in values]
+def fitted_lines(data: Blocks | Points, x: np.ndarray, values: np.ndarray) -> list[Figure]:
+    """What was fitted, log by log."""
+    several = len(data.names) > 1
+    return [
+        drawn(x[own], values[own], mode="lines", color=INK, name=f"fitted, {name}" if several else "fitted")
+        for name, own in ((name, data.log == i) for i, name in enumerate(data.names))
+    ]
 
 
-def figure(traces: list[Figure], height: int, x_title: str, y_title: str) -> Figure:
+def against(traces: list[Figure], height: int, x: str, y: str) -> Figure:
     """Traces with the axes' titles."""
-    axis = {"gridcolor": "#e8e8e8", "zerolinecolor": "#bdbdbd", "linecolor": "#bdbdbd", "ticks": "outside"}
-    layout = {
-        "height": height,
-        "margin": {"l": 70, "r": 20, "t": 40, "b": 50},
-        "font": {"family": "system-ui, -apple-system, 'Segoe UI', sans-serif", "size": 13, "color": CURVE},
-        "paper_bgcolor": "#ffffff",
-        "plot_bgcolor": "#ffffff",
-        "hovermode": "closest",
-        "modebar": {"orientation": "v"},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom", "xanchor": "left"},
-        "xaxis": axis | {"title": {"text": x_title}},
-        "yaxis": axis | {"title": {"text": y_title}},
-    }
-    return {"data": traces, "layout": layout}
+    return figure(traces, height, xaxis=axis(x), yaxis=axis(y), modebar={"orientation": "v"})

@@ -7,8 +7,8 @@ import numpy as np
 
 from fitting.logs import Log
 from fitting.quasi_static.blocks import average
-from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish
 from fitting.quasi_static.curve_figures import figures
+from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.stretches import FOLDS, folds, stretches, worse
 from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape

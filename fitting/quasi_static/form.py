@@ -30,8 +30,7 @@ class Form:
         figures: What a reader wants to know of it, from compliance, strengths and shape parameters in a row.
         shapes: Values of the shape parameters to begin with, in rows of a grid, (grid, shape parameters).
         shape_names: Names of the shape parameters; those that begin with "log " are logarithms.
-        low: Least value of each shape parameter.
-        high: Largest.
+        range: Least and largest value of each shape parameter, (2, shape parameters).
         sign: Sign that physics asks of the first strength; zero for either.
         of_torque: Whether its columns follow the torque, so that an error of the torque may pass for it.
     """
@@ -44,8 +43,7 @@ class Form:
     figures: tuple[Figure, ...] = ()
     shapes: np.ndarray = field(default_factory=lambda: np.zeros((1, 0)))
     shape_names: tuple[str, ...] = ()
-    low: tuple[float, ...] = ()
-    high: tuple[float, ...] = ()
+    range: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
     sign: int = 0
     of_torque: bool = True
 
@@ -53,6 +51,10 @@ class Form:
     def size(self) -> int:
         """Number of strengths and shape parameters; where a log begins is none of them."""
         return sum(not name.startswith(START) for name in (*self.strengths, *self.shape_names))
+
+
+Terms = tuple[tuple[Form, np.ndarray], ...]
+"""Forms of an equation, each with its shape parameters."""
 
 
 def base_columns(points: Points) -> np.ndarray:

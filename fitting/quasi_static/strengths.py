@@ -22,7 +22,7 @@ def stiffness_of(points: Points, model: TwistModel) -> dict[str, Known]:
 
 def strengths_of(points: Points, model: TwistModel, form: Form) -> dict[str, Known]:
     """The figures of one effect, by name."""
-    strengths, shapes = model.own(form, len(points.names))
+    strengths, shapes = model.own(form)
     own = np.r_[0, strengths, shapes]
     figures = (replace(one, formula=lambda fitted, of=one.formula: of(fitted[own])) for one in form.figures)
     return _known(points, model, figures)
@@ -32,13 +32,13 @@ def contribution(points: Points, model: TwistModel, forms: tuple[Form, ...]) -> 
     """What effects add to the twist [rad], (n,), less its mean."""
     total = np.zeros_like(points.twist)
     for form in forms:
-        strengths, _ = model.own(form, len(points.names))
+        strengths, _ = model.own(form)
         total += model.jacobian[:, strengths] @ model.coefficients[strengths]
     return total - np.mean(total)
 
 
 def _known(points: Points, model: TwistModel, figures: Iterable[Figure]) -> dict[str, Known]:
-    fitted = np.concatenate([model.coefficients, *model.shapes])
+    fitted = np.concatenate([model.coefficients, *(shape for _, shape in model.terms)])
     found = scatter(model.jacobian, model.misfit, stretches(model.misfit, points.log, each=2))
     # A thousandth of each parameter's scatter; without noise nothing scatters.
     steps = 1e-3 * np.sqrt(np.maximum(np.diag(found.classical), 0.0))

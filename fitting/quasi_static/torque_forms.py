@@ -41,8 +41,7 @@ def _begun(name: str, low: float, high: float, logs: int) -> dict[str, Any]:
     return {
         "shapes": np.array([[at, *[start] * logs] for at in values for start in (-1.0, 0.0, 1.0)]),
         "shape_names": (f"log {name}", *(f"start {i}" for i in range(logs))),
-        "low": (math.log(low), *[-1.0] * logs),
-        "high": (math.log(high), *[1.0] * logs),
+        "range": np.array([[math.log(low), *[-1.0] * logs], [math.log(high), *[1.0] * logs]]),
     }
 
 
@@ -50,9 +49,7 @@ def _hysteresis(points: Points) -> Iterator[Form]:
     figures = (
         Figure("friction", lambda own: -own[1] / own[0], "N m", "friction behind the loop, half its width in torque"),
         Figure("width", lambda own: -2.0 * own[1], "rad", "width of the developed loop"),
-        Figure(
-            "reach", lambda own: math.exp(own[2]), "N m", "torque over which the branch changes, half way", True
-        ),
+        Figure("reach", lambda own: math.exp(own[2]), "N m", "torque over which the branch changes, half way", True),
     )
     low, high = (share * points.reach for share in _REACHES)
     for memory, law in zip(MEMORIES, ("(spring beside a slider)", "(Dahl)"), strict=True):
@@ -91,8 +88,8 @@ def _stiffness_shapes(points: Points) -> Iterator[Form]:
         Figure("K2", lambda own: 1.0 / (own[0] + own[1]), "N m/rad", "stiffness beyond the knee", True),
         Figure("T1", lambda own: math.exp(own[2]), "N m", "torque at the knee", True),
     )
-    law, ends = "twist = tau/K1 up to T1, with slope 1/K2 beyond", ((knees[0],), (knees[-1],))
-    yield Form(family, "two slopes", _beyond, ("beyond knee",), law, figures, knees[:, None], ("log knee",), *ends)
+    law, ends = "twist = tau/K1 up to T1, with slope 1/K2 beyond", knees[[0, -1], None]
+    yield Form(family, "two slopes", _beyond, ("beyond knee",), law, figures, knees[:, None], ("log knee",), ends)
     if points.centre == 0.0:
         figures = (Figure("half_width", lambda own: own[1], "rad", "half of the dead zone", True),)
         law = "twist = tau/K + b sgn(tau)"
