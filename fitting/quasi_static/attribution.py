@@ -10,7 +10,6 @@ from fitting.attribution.decisions import RULES, EffectEvidence, support
 from fitting.attribution.screening import Screen
 from fitting.attribution.selection_round import Round, Verdict
 from fitting.attribution.shortlist import NEARLY
-from fitting.quasi_static.candidates import is_possible, is_usual
 from fitting.quasi_static.form import Form, Terms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import Lead, screen
@@ -21,6 +20,8 @@ from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out
 _RIVAL = 0.25
 # A form of a strength that drives can show leads where it explains this share of what the best one does.
 _PLAUSIBLE = 0.5
+# Some times the percents of the twist that drives creep by.
+_LARGEST_CREEP = 0.5
 # Forms of one family that are refitted.
 _FORMS = 3
 
@@ -165,8 +166,7 @@ def _simplest_first(
 
     Forms are tied where the one does not predict held-out stretches clearly worse, and where the better one has nothing
     left to explain beside it. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more
-    usual, and an unusual strength comes last. One that no drive can show stands back where another form explains half
-    as much.
+    usual. One that no drive can show stands back where another form explains half as much.
     """
     forms = {verdict.name: verdict.trial.beyond(before) for verdict in verdicts}
 
@@ -180,10 +180,15 @@ def _simplest_first(
         return sum(form.size for form in forms[verdict.name])
 
     able = [v for v in verdicts if v.p_value <= RULES.significance and v.gain >= _PLAUSIBLE * verdicts[0].gain]
-    leader = next((v for v in able if is_possible(v.trial.model, forms[v.name])), verdicts[0])
+    leader = next((v for v in able if _is_possible(v.trial.model)), verdicts[0])
     tied = [leader, *(v for v in verdicts if v is not leader and is_tied(v))]
-    usual = [v for v in tied if is_usual(v.trial.model, forms[v.name], held.points)] or tied
-    small = [v for v in usual if size(v) == min(map(size, usual))]
+    small = [v for v in tied if size(v) == min(map(size, tied))]
     near = [v for v in small if v.gain >= NEARLY * max(v.gain for v in small)]
     winner = min(near, key=lambda v: choices.index(forms[v.name]))
     return [winner, *(replace(v, separable=v not in tied) for v in verdicts if v is not winner)]
+
+
+def _is_possible(model: TwistModel) -> bool:
+    """Whether drives can show such strengths: what creeps is a part of the twist that was there at once."""
+    creeps = [model.coefficients[model.own(form)[0].start] for form in model.forms if form.family == "creep"]
+    return max(map(abs, creeps), default=0.0) <= _LARGEST_CREEP * abs(model.coefficients[0])

@@ -9,12 +9,10 @@ from fitting.quasi_static.content import report_dict
 from fitting.quasi_static.fit import fit_quasi_static
 from fitting.quasi_static.loop import close_loop
 from fitting.quasi_static.loop_content import loop_report
-from fitting.quasi_static.loop_plots import loop_pictures
-from fitting.quasi_static.plots import pictures
+from fitting.quasi_static.plots import fit_pictures, loop_pictures
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import prepare
-from fitting.quasi_static.report import write_report
-from fitting.quasi_static.text import report_text
+from fitting.quasi_static.report import report_text, write_report
 
 
 def fit_quasi_static_logs(
@@ -35,7 +33,7 @@ def fit_quasi_static_logs(
     data = prepare(logs, drive_file)
     found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
     report = report_dict(data, found)
-    return f"{report_text(report)}\nReport: {write_report(out, report, pictures(found))}"
+    return f"{report_text(report)}\nReport: {write_report(out, report, fit_pictures(found))}"
 
 
 def close_quasi_static_loop(

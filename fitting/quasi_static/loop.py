@@ -1,15 +1,16 @@
 """The whole story for quasi-static logs: fit the line, look at what it leaves over, add the effect behind it, refit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
 from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
-from fitting.quasi_static.candidates import catalogue, choices
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
+from fitting.quasi_static.motion_forms import motion_forms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.rests import RestLook, look_at_rests
+from fitting.quasi_static.torque_forms import torque_forms
 from fitting.quasi_static.twist_model import TwistModel
 
 # Forms of one family in a model: orders of an angle, sliders side by side.
@@ -75,6 +76,29 @@ class QuasiStaticLoop:
         found = [(this.winner.name, this.winner.trial) for this in self.rounds if this.accepted]
         rested = () if self.at_rest is None else self.at_rest.terms
         return [(None, self.before), *found, *((form.name, self.after) for form, _ in rested)]
+
+
+def catalogue(points: Points) -> tuple[Form, ...]:
+    """The forms that the logs can tell something about, the more usual ones first.
+
+    A loop may run either way: friction on the motor's side turns it round, where the torque is a motor's current.
+    """
+    return (*torque_forms(points), *motion_forms(points))
+
+
+def choices(forms: Sequence[Form], families: int) -> list[tuple[Form, ...]]:
+    """Forms to look at: each alone, and each bend together with each loop, of which either hides the other.
+
+    Args:
+        forms: That may be added.
+        families: Number of families that may be added.
+    """
+    alone = [(form,) for form in forms]
+    if families < 2:
+        return alone
+    loops = [form for form in forms if form.family == "hysteresis"]
+    bends = [form for form in forms if form.family == "stiffness_shape" and not form.shape_names]
+    return alone + [(loop, bend) for loop in loops for bend in bends]
 
 
 def _silent(message: str) -> None:

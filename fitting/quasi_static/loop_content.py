@@ -25,8 +25,8 @@ from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.noise_colour import DRAWS
 from fitting.quasi_static.preparation import QuasiStaticData
-from fitting.quasi_static.strengths import stiffness_of, strengths_of
 from fitting.quasi_static.stretches import FOLDS, stretches
+from fitting.quasi_static.twist_model import stiffness_of, strengths_of
 
 # A residual this much larger than the noise of neighbouring points is slower than they are.
 _NOISE = 2.0

@@ -21,8 +21,8 @@ from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
 from fitting.quasi_static.form import START, Form, Terms
 from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
-from fitting.quasi_static.strengths import stiffness_of
 from fitting.quasi_static.torque_forms import delay
+from fitting.quasi_static.twist_model import stiffness_of
 
 # Assumed: a stop rings for a tenth of a rest, or a quarter of a second [s] where that is less.
 _RINGING, _LONGEST_RINGING = 0.1, 0.25
