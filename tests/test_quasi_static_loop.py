@@ -177,7 +177,7 @@ def test_a_held_fold_has_no_say_in_its_own_prediction() -> None:
     fold = np.arange(len(points.twist)) * 5 // len(points.twist)
     changed = points.twist + np.where(fold == 2, 1e-3, 0.0)
     other = Points(**{**vars_of(points), "twist": changed})
-    before, after = (hold_out(p, fit_twist(points, (form,), (form.shapes[4],)), fold) for p in (points, other))
+    before, after = (hold_out(p, fit_twist(points, ((form, form.shapes[4]),)), fold) for p in (points, other))
     np.testing.assert_allclose((after - before)[fold == 2], 1e-3, rtol=1e-6)
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import stdtrit
@@ -10,12 +11,18 @@ from scipy.special import stdtrit
 from fitting.quasi_static.curve_fit import CurveFit, ranges
 from fitting.quasi_static.intervals import Figure, Known, scatter
 from fitting.quasi_static.stretches import correlation_length, stretches
-from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Memory, loop
+from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Memory, Shape, loop
 
 LOST_MOTION_SHARE = 0.04
 # Reaches that are tried for the width, over the torque's amplitude.
 _REACHES = (0.02, 0.04, 0.08, 0.16, 0.32)
-_KNEE_LEAST = 5
+_STIFFNESSES: dict[Shape, tuple[str, ...]] = {
+    "linear": ("stiffness",),
+    "cubic": ("stiffness at zero twist",),
+    "two slopes": ("stiffness up to T1", "stiffness from T1 on"),
+    "three slopes": ("stiffness up to T1", "stiffness from T1 on to T2", "stiffness beyond T2"),
+}
+_LOST_MOTION = (("lost_motion", "middle of the loop"), ("lost_motion_outer", "outer branches of the loop"))
 
 
 def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[str, Known]:
@@ -34,12 +41,6 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
     steps = 1e-4 * ranges(blocks, fit.curve)[2]
     formulas = (*_slopes(fit.curve), *_shifts(fit.curve, blocks), *_loop(fit.curve, blocks, rated_torque))
     known = {one.name: one.known(fit.parameters, steps, found) for one in formulas}
-    size = np.abs(blocks.torque - fit.curve.value("torque_bias", fit.parameters))
-    for knee, beyond in (("T1", "K2"), ("T2", "K3")):
-        if knee in known and np.sum(size > (known[knee].value or 0.0)) < _KNEE_LEAST:
-            why = f"the torque reaches {np.max(size):.3g} N m, hardly beyond the knee {knee}"
-            known[beyond] = replace(known[beyond], value=None, std=None, ci95=None, identifiable=False, reason=why)
-            known[knee] = replace(known[knee], identifiable=False, reason=why)
     if fit.curve.memory is not None:
         known["hysteresis_width"] = _width(fit, blocks, known["hysteresis_width"])
     return known
@@ -47,24 +48,19 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
 
 def _slopes(curve: Curve) -> Iterator[Figure]:
     """Stiffnesses and knees."""
-    at = curve.places
-    if curve.shape in ("linear", "cubic"):
-        text = "stiffness" + (" at zero twist" if curve.shape == "cubic" else "")
-        yield Figure("K", lambda p: math.exp(p[0]), "N m/rad", text, True)
-    else:
-        texts = (
-            "stiffness up to T1",
-            "stiffness from T1 on" + (" to T2" if "log K3" in at else ""),
-            "stiffness beyond T2",
-        )
-        for i, text in enumerate(texts[: 3 if "log K3" in at else 2]):
-            yield Figure(f"K{i + 1}", lambda p, i=i: math.exp(p[i]), "N m/rad", text, True)
-        yield Figure("T1", lambda p: math.exp(p[at["log T1"]]), "N m", "torque at the first knee", True)
-    if "log gap" in at:
-        knees = [at["log T1"], at["log gap"]]
-        yield Figure("T2", lambda p: float(np.sum(np.exp(p[knees]))), "N m", "torque at the second knee", True)
+    at, lines = curve.places, "slopes" in curve.shape
+    for i, text in enumerate(_STIFFNESSES[curve.shape]):
+        yield Figure(f"K{i + 1}" if lines else "K", lambda p, i=i: math.exp(p[i]), "N m/rad", text, True)
+    knees = [at[name] for name in ("log T1", "log gap") if name in at]
+    for i, text in zip(range(len(knees)), ("first", "second"), strict=False):
+        formula = partial(_knee, knees[: i + 1])
+        yield Figure(f"T{i + 1}", formula, "N m", f"torque at the {text} knee", True)
     if curve.shape == "cubic":
         yield Figure("alpha", lambda p: p[1], "rad^-2", "cubic coefficient, tau = K (x + alpha x^3)")
+
+
+def _knee(gaps: list[int], parameters: np.ndarray) -> float:
+    return float(np.sum(np.exp(parameters[gaps])))
 
 
 def _shifts(curve: Curve, blocks: Blocks) -> Iterator[Figure]:
@@ -85,13 +81,10 @@ def _loop(curve: Curve, blocks: Blocks, rated_torque: float | None) -> Iterator[
         text = f"width of the loop at zero torque, for torque cycles of +-{size:.3g} N m"
         yield Figure("hysteresis_width", lambda p: _open(curve, p, size), "rad", text)
     small = LOST_MOTION_SHARE * (rated_torque or math.inf)
-    if small <= size:
-        text = f"twist between -{small:.3g} and +{small:.3g} N m (4 % of rated torque)"
-        name, middle = "lost_motion", f"{text}, middle of the loop"
-        yield Figure(name, lambda p: _between(curve, p, size, small)[0], "rad", middle, True)
-        if looped:
-            name, outer = "lost_motion_outer", f"{text}, outer branches of the loop"
-            yield Figure(name, lambda p: _between(curve, p, size, small)[1], "rad", outer, True)
+    text = f"twist between -{small:.3g} and +{small:.3g} N m (4 % of rated torque)"
+    for i, (name, where) in enumerate(_LOST_MOTION[: 1 + looped] if small <= size else ()):
+        lost = partial(_between, curve, size, small, i > 0)
+        yield Figure(name, lost, "rad", f"{text}, {where}", True)
     if looped and rated_torque and size >= 0.9 * rated_torque:
         text = "width of the loop at zero torque, for cycles of rated torque"
         yield Figure("hysteresis_loss", lambda p: _open(curve, p, rated_torque), "rad", text)
@@ -104,11 +97,11 @@ def _open(curve: Curve, parameters: np.ndarray, amplitude: float) -> float:
     return float(falling[middle] - rising[middle])
 
 
-def _between(curve: Curve, parameters: np.ndarray, amplitude: float, torque: float) -> tuple[float, float]:
-    """Twist from -torque to +torque [rad], along the middle of the loop and between its outer branches."""
+def _between(curve: Curve, amplitude: float, torque: float, outer: bool, parameters: np.ndarray) -> float:
+    """Twist from -torque to +torque [rad], along the middle of the loop or between its outer branches."""
     at, rising, falling = loop(curve, parameters, amplitude)
     up, down = (np.interp([-torque, torque], at, branch) for branch in (rising, falling))
-    return float(np.diff(0.5 * (up + down))[0]), float(down[1] - up[0])
+    return float(down[1] - up[0] if outer else 0.5 * np.sum(np.diff([up, down])))
 
 
 def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:

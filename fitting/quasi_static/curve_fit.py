@@ -7,7 +7,6 @@ local slope (effective variance; York 1966, Fuller 1987 section 3.2).
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,36 +51,21 @@ class CurveFit:
     excess: float
 
 
-def candidates(blocks: Blocks, shape: Shape, hysteresis: bool) -> list[Curve]:
-    """The forms of one shape that the logs can tell something about; they differ in their memory."""
+def best_fit(blocks: Blocks, shape: Shape, hysteresis: bool) -> CurveFit:
+    """The best fit among the forms of one shape that the logs can tell something about, from several starting points.
+
+    Args:
+        blocks: To be fitted.
+        shape: Of the curve; its forms differ in their memory.
+        hysteresis: Whether the way there and back may differ.
+    """
     low, high = float(np.min(blocks.torque)), float(np.max(blocks.torque))
     biased = shape != "linear" and min(-low, high) > _BOTH_SIGNS * max(-low, high)
     drifting = min(blocks.reversals) >= 2 * _CYCLES_FOR_DRIFT
     memories = MEMORIES if hysteresis and max(blocks.reversals) > 0 else (None,)
-    return [Curve(shape, memory, biased, drifting, len(blocks.names)) for memory in memories]
-
-
-def best_of(blocks: Blocks, curves: Sequence[Curve], simpler: CurveFit | None = None) -> CurveFit:
-    """The best fit among several forms, from several starting points.
-
-    Args:
-        blocks: To be fitted.
-        curves: The forms.
-        simpler: A fit that one of the forms contains; it is a starting point, so that more freedom never fits worse.
-    """
+    curves = [Curve(shape, memory, biased, drifting, len(blocks.names)) for memory in memories]
     found = [fit_curve(blocks, curve, start) for curve in curves for start in starts(blocks, curve)]
-    if simpler is not None:
-        same = [curve for curve in curves if curve.memory == simpler.curve.memory]
-        found += [fit_curve(blocks, curve, _grown(simpler, curve, blocks)) for curve in same]
     return min(found, key=lambda fit: float(np.mean(fit.misfit**2)))
-
-
-def _grown(fit: CurveFit, curve: Curve, blocks: Blocks) -> np.ndarray:
-    """Parameters with which a more flexible curve equals a fitted one."""
-    known = dict(zip(fit.curve.names, fit.parameters, strict=True))
-    stiffest, knee = known.get("log K2", known["log K1"]), math.log(0.35 * blocks.amplitude)
-    known = {"log K2": stiffest, "log K3": stiffest, "log T1": knee, "log gap": knee} | known
-    return np.array([known.get(name, 0.0) for name in curve.names])
 
 
 def fit_curve(blocks: Blocks, curve: Curve, start: np.ndarray) -> CurveFit:

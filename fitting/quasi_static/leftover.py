@@ -42,8 +42,6 @@ def leftover(held: Held, trial: TwistTrial, base: TwistTrial, seed: int) -> Left
         seed: Of the surrogates.
     """
     found = screen(held.points, trial.model, [(form,) for form in _smooth_functions(held.points)], held.fold, seed)
-    if not found.leads:
-        return None
     best = found.leads[0]
     p_value = found.p_value(best.gain)
     share = 1.0 - math.exp(-2.0 * best.gain)

@@ -1,6 +1,6 @@
 """The whole story for quasi-static logs: fit the line, look at what it leaves over, add the effect behind it, refit."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
@@ -86,27 +86,8 @@ def catalogue(points: Points) -> tuple[Form, ...]:
     return (*torque_forms(points), *motion_forms(points))
 
 
-def choices(forms: Sequence[Form], families: int) -> list[tuple[Form, ...]]:
-    """Forms to look at: each alone, and each bend together with each loop, of which either hides the other.
-
-    Args:
-        forms: That may be added.
-        families: Number of families that may be added.
-    """
-    alone = [(form,) for form in forms]
-    if families < 2:
-        return alone
-    loops = [form for form in forms if form.family == "hysteresis"]
-    bends = [form for form in forms if form.family == "stiffness_shape" and not form.shape_names]
-    return alone + [(loop, bend) for loop in loops for bend in bends]
-
-
-def _silent(message: str) -> None:
-    pass
-
-
 def close_loop(
-    points: Points, *, max_effects: int = 3, seed: int = 0, progress: Callable[[str], None] = _silent
+    points: Points, *, max_effects: int = 3, seed: int = 0, progress: Callable[[str], None] = lambda message: None
 ) -> QuasiStaticLoop:
     """Close the loop between the torque-twist equation and quasi-static logs of one drive.
 
@@ -161,7 +142,13 @@ def _still_open(forms: tuple[Form, ...], current: TwistTrial, max_effects: int) 
         and (form.family in present or free > 0)
         and present.count(form.family) < _MOST_OF_A_FAMILY
     ]
-    return choices(left, 0 if present else free)
+    alone = [(form,) for form in left]
+    if present or free < 2:
+        return alone
+    # Each bend together with each loop as well, of which either hides the other.
+    loops = [form for form in left if form.family == "hysteresis"]
+    bends = [form for form in left if form.family == "stiffness_shape" and not form.shape_names]
+    return alone + [(loop, bend) for loop in loops for bend in bends]
 
 
 def _without_superfluous(held: Held, trial: TwistTrial, base: TwistTrial) -> tuple[TwistTrial, tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fitting.diagnostics import order_amplitude
 from fitting.formatting import axis_label, scaled_unit
 from fitting.plots import Plot
 from fitting.plots.look import AFTER, BEFORE, INK, axis, figure, numbers
@@ -117,7 +118,7 @@ def _evidence(loop: QuasiStaticLoop, finding: Finding) -> Plot:
     if finding.family in _ORDERS:
         return _spectrum(loop, finding)
     points, model, forms = loop.told_by(finding)
-    own = contribution(points, model, forms)
+    own = contribution(model, forms)
     factor, label = _scaled(own + model.misfit, "twist")
     if finding.family in _IN_TIME:
         at, x = points.time, f"time from the start of the {'log' if finding.at_rest is None else 'rest'} [s]"
@@ -141,8 +142,9 @@ def _spectrum(loop: QuasiStaticLoop, finding: Finding) -> Plot:
     orders = np.arange(0.25, HIGHEST_ORDER + 0.5, 0.125)
     # At rest every order is a constant.
     moves = points.direction != 0
-    angle, own = getattr(points, f"{side}_angle")[moves], contribution(points, model, finding.forms)
-    before, after = (_amplitudes(angle, v[moves], orders) for v in (model.misfit + own, model.misfit))
+    angle, own = getattr(points, f"{side}_angle")[moves], contribution(model, finding.forms)
+    misfits = (misfit[moves] - np.mean(misfit[moves]) for misfit in (model.misfit + own, model.misfit))
+    before, after = (order_amplitude(misfit, angle, orders) for misfit in misfits)
     factor, label = _scaled(before, "amplitude")
     traces = [
         _drawn(orders, factor * before, mode="lines", color=BEFORE, name="without the effect"),
@@ -156,15 +158,6 @@ def _spectrum(loop: QuasiStaticLoop, finding: Finding) -> Plot:
         "the effect in the equation, while the joint moves.",
         _against(traces, 360, f"order of the {side}'s revolution", label),
     )
-
-
-def _amplitudes(angle: np.ndarray, values: np.ndarray, orders: np.ndarray) -> np.ndarray:
-    found = []
-    for order in orders:
-        waves = np.column_stack([np.cos(order * angle), np.sin(order * angle), np.ones(len(angle))])
-        solution, *_ = np.linalg.lstsq(waves, values, rcond=None)
-        found.append(float(np.hypot(*solution[:2])))
-    return np.array(found)
 
 
 def _scaled(values: np.ndarray, name: str) -> tuple[float, str]:

@@ -152,8 +152,7 @@ def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[st
         "temperature": log.temperature,
     }
     found = {key: means(values, size) for key, values in columns.items() if values is not None}
-    speed = speed_of(log, ratio) if motion in MOVES else None
-    speed = np.zeros_like(twist) if speed is None else means(speed, size)
+    speed = means(speed_of(log, ratio), size) if motion in MOVES else np.zeros_like(twist)
     return found | {
         "twist": twist - np.mean(twist),
         "direction": np.sign(speed) * (np.abs(speed) > _AT_REST * np.percentile(np.abs(speed), 90)),

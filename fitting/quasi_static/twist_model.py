@@ -92,12 +92,10 @@ def strengths_of(points: Points, model: TwistModel, form: Form) -> dict[str, Kno
     return _known(points, model, figures)
 
 
-def contribution(points: Points, model: TwistModel, forms: tuple[Form, ...]) -> np.ndarray:
+def contribution(model: TwistModel, forms: tuple[Form, ...]) -> np.ndarray:
     """What effects add to the twist [rad], (n,), less its mean."""
-    total = np.zeros_like(points.twist)
-    for form in forms:
-        strengths, _ = model.own(form)
-        total += model.jacobian[:, strengths] @ model.coefficients[strengths]
+    own = [model.own(form)[0] for form in forms]
+    total = sum(model.jacobian[:, strengths] @ model.coefficients[strengths] for strengths in own)
     return total - np.mean(total)
 
 
