@@ -97,7 +97,7 @@ class Held:
 
     def is_worse(self, one: TwistTrial, other: TwistTrial) -> bool:
         """Whether the first predicts held-out stretches clearly worse."""
-        return worse(one.held_out, other.held_out, self.stretch)
+        return worse(one.held_out, other.held_out, self.stretch, self.points.twist_noise)
 
 
 def look(

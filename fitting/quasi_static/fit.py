@@ -64,7 +64,7 @@ class QuasiStaticFit:
 
     def is_worse(self, one: Shape, other: Shape) -> bool:
         """Whether the first shape predicts held-out stretches clearly worse than the second."""
-        return worse(self.held_out[one], self.held_out[other], self.stretch)
+        return worse(self.held_out[one], self.held_out[other], self.stretch, self.blocks.twist_noise)
 
 
 def fit_quasi_static(

@@ -51,6 +51,10 @@ def folds(stretch: np.ndarray) -> np.ndarray:
     return np.random.default_rng(0).permutation(np.arange(count) % FOLDS)[stretch]
 
 
-def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray) -> bool:
-    """Whether the first held-out misfit is clearly above the second, paired over stretches."""
-    return not tie("", np.bincount(stretch, one**2 - other**2)).holds
+def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float) -> bool:
+    """Whether the first held-out misfit is clearly above the second, paired over stretches.
+
+    A difference of less than a hundredth of the noise's variance is none, or rounding would choose among exact fits.
+    """
+    excess = np.bincount(stretch, one**2 - other**2)
+    return not tie("", excess).holds and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

@@ -95,7 +95,7 @@ def strengths_of(points: Points, model: TwistModel, form: Form) -> dict[str, Kno
 def contribution(model: TwistModel, forms: tuple[Form, ...]) -> np.ndarray:
     """What effects add to the twist [rad], (n,), less its mean."""
     own = [model.own(form)[0] for form in forms]
-    total = sum(model.jacobian[:, strengths] @ model.coefficients[strengths] for strengths in own)
+    total = np.sum([model.jacobian[:, strengths] @ model.coefficients[strengths] for strengths in own], axis=0)
     return total - np.mean(total)
 
 
