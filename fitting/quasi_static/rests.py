@@ -64,23 +64,6 @@ class RestLook:
         return 1.0 - self.after.rmse / self.round.before.rmse
 
 
-@dataclass(frozen=True, eq=False)
-class _Rests:
-    """Where points stand in the rests that are looked at.
-
-    Attributes:
-        number: Of the rest, once its stop has rung out; -1 elsewhere, (n,).
-        since: Time from its stop [s], (n,).
-    """
-
-    number: np.ndarray
-    since: np.ndarray
-
-    @property
-    def count(self) -> int:
-        return int(self.number.max()) + 1
-
-
 def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None:
     """Look at the rests of joints that moved; None where no rest is long enough.
 
@@ -89,12 +72,13 @@ def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None
         current: Their model so far, for its compliance.
         seed: Of the surrogates.
     """
-    rests = _settled(held.points)
-    if not rests.count:
+    rest, since = _settled(held.points)
+    rows = np.flatnonzero(rest >= 0)
+    if not rows.size:
         return None
-    rows = np.flatnonzero(rests.number >= 0)
-    points = _as_logs(held.points, rests, rows, float(abs(current.model.coefficients[0])))
-    form = _relaxation(points.step, _Rests(rests.number[rows], rests.since[rows]))
+    compliance = float(abs(current.model.coefficients[0]))
+    points = _as_logs(replace(held.points, time=since, log=rest), rows, compliance)
+    form = _relaxation(points.step, points.log, points.time)
     this = _look(points, form, seed)
     p_value, own_stiffness = _chance(this), None
     if np.ptp(points.torque) > 0:
@@ -112,8 +96,8 @@ def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None
         own_stiffness = slope if follows and _chance(free) > _SIGNIFICANCE else None
     terms: Terms = ()
     if this.accepted and p_value <= _SIGNIFICANCE:
-        whole, ((_, shape),) = _relaxation(points.step, rests, initial=f"{START} "), this.winner.trial.model.terms
-        terms = ((whole, shape),)
+        ((_, shape),) = this.winner.trial.model.terms
+        terms = ((_relaxation(points.step, rest, since, initial=f"{START} "), shape),)
     return RestLook(points, this, p_value, own_stiffness, terms)
 
 
@@ -128,7 +112,7 @@ def _chance(this: TwistRound) -> float:
     return this.winner.p_value if this.verdicts and this.winner.family == "creep" else 1.0
 
 
-def _relaxation(step: float, rests: _Rests, initial: str = "") -> Form:
+def _relaxation(step: float, rest: np.ndarray, since: np.ndarray, initial: str = "") -> Form:
     """The twist relaxes after a stop, in each rest from a state of its own, with one time constant.
 
     At rest the torque of a gear that bears a load hardly changes, so that a standard linear solid fades exponentially;
@@ -137,17 +121,18 @@ def _relaxation(step: float, rests: _Rests, initial: str = "") -> Form:
 
     Args:
         step: Time between points [s].
-        rests: Where points stand in them.
+        rest: Number of the rest of each point, -1 elsewhere, (n,).
+        since: Time from its stop [s], (n,).
         initial: What its parameters' names begin with: `START` where they count as initial states of the rests, which
             the other points of a log know nothing of.
     """
-    low, high = math.log(_POINTS_IN_CONSTANT * step), math.log(float(np.max(rests.since)))
-    text, numbers = "of the relaxation at the stop before rest", range(1, rests.count + 1)
+    low, high = math.log(_POINTS_IN_CONSTANT * step), math.log(float(np.max(since[rest >= 0])))
+    text, numbers = "of the relaxation at the stop before rest", range(1, int(rest.max()) + 2)
     amplitudes = (Figure(f"amplitude_{i}", lambda own, i=i: own[i], "rad", f"{text} {i}") for i in numbers)
     return Form(
         "creep",
         "relaxation after a stop",
-        partial(_fading, rests),
+        partial(_fading, rest, since),
         tuple(f"{initial}amplitude {i}" for i in numbers),
         "at rest: twist = tau/K + level of the rest + a exp(-t/T), t from the stop on",
         (Figure("time_constant", lambda own: math.exp(own[-1]), "s", "of the relaxation", True), *amplitudes),
@@ -158,14 +143,17 @@ def _relaxation(step: float, rests: _Rests, initial: str = "") -> Form:
     )
 
 
-def _fading(rests: _Rests, points: Points, shape: np.ndarray) -> np.ndarray:
-    own = rests.number[:, None] == np.arange(rests.count)
-    fading = own * np.exp(-rests.since / math.exp(shape[0]))[:, None]
+def _fading(rest: np.ndarray, since: np.ndarray, points: Points, shape: np.ndarray) -> np.ndarray:
+    own = rest[:, None] == np.arange(int(rest.max()) + 1)
+    fading = own * np.exp(-since / math.exp(shape[0]))[:, None]
     return fading - own * (np.sum(fading, axis=0) / np.sum(own, axis=0))
 
 
-def _settled(points: Points) -> _Rests:
-    """The longest rests, less the time in which their stops ring."""
+def _settled(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Of each point the number of its rest, -1 elsewhere, and the time from the stop [s].
+
+    Only the longest rests count, less the time in which their stops ring.
+    """
     since, found = np.zeros(len(points.twist)), []
     for i in range(int(points.rest.max()) + 1):
         own = np.flatnonzero(points.rest == i)
@@ -175,14 +163,14 @@ def _settled(points: Points) -> _Rests:
     number = np.full(len(points.twist), -1)
     for i, own in enumerate(sorted(longest, key=lambda own: own[0])):
         number[own] = i
-    return _Rests(number, since)
+    return number, since
 
 
-def _as_logs(points: Points, rests: _Rests, rows: np.ndarray, compliance: float) -> Points:
+def _as_logs(points: Points, rows: np.ndarray, compliance: float) -> Points:
     """The points at rest, each rest as a log; the torque is a constant where its changes could not be seen."""
-    log, names = rests.number[rows], ("torque", "logged_torque", "twist")
-    columns = np.column_stack([getattr(points, name)[rows] for name in names])
-    for i in range(rests.count):
+    log, count = points.log[rows], int(points.log.max()) + 1
+    columns = np.column_stack([points.torque, points.logged_torque, points.twist])[rows]
+    for i in range(count):
         columns[log == i] -= np.mean(columns[log == i], axis=0)
     torque, logged, twist = columns.T
     return replace(
@@ -190,15 +178,15 @@ def _as_logs(points: Points, rests: _Rests, rows: np.ndarray, compliance: float)
         torque=torque * (compliance * float(np.ptp(torque)) >= points.twist_noise),
         logged_torque=logged,
         twist=twist,
-        time=rests.since[rows],
+        time=points.time[rows],
         log=log,
         motor_angle=None,
         load_angle=None,
         direction=None,
         rest=np.full(len(rows), -1),
         temperature=None if points.temperature is None else points.temperature[rows],
-        motion=("held",) * rests.count,
-        names=tuple(f"rest {i + 1}" for i in range(rests.count)),
-        rows=(1,) * rests.count,
-        reversals=(0,) * rests.count,
+        motion=("held",) * count,
+        names=tuple(f"rest {i + 1}" for i in range(count)),
+        rows=(1,) * count,
+        reversals=(0,) * count,
     )

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fitting.attribution.screening import Screen
-from fitting.explained import solved
 from fitting.quasi_static.form import Form, Terms
 from fitting.quasi_static.noise_colour import noise_of_the_same_colour
 from fitting.quasi_static.points import Points
@@ -20,6 +19,7 @@ from fitting.quasi_static.twist_model import TwistModel
 
 # Columns of which so little is beside those that the model has already can't be seen.
 _BLIND = 1e-3
+_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +106,13 @@ class _Products:
         """Sum of squares on held-out folds of each series with some columns, (series,), and the strengths that all
         folds together give, (columns, series)."""
         gram, against = self.gram[:, own][:, :, own], self.against[:, own]
-        without = solved(gram.sum(axis=0) - gram, against.sum(axis=0) - against)
+        without = _solve(gram.sum(axis=0) - gram, against.sum(axis=0) - against)
         loss = self.squares + np.sum(without * (gram @ without - 2.0 * against), axis=1)
-        return loss.sum(axis=0), solved(gram.sum(axis=0), against.sum(axis=0))
+        return loss.sum(axis=0), _solve(gram.sum(axis=0), against.sum(axis=0))
+
+
+def _solve(gram: np.ndarray, against: np.ndarray) -> np.ndarray:
+    return np.linalg.pinv(gram, rcond=_RANK, hermitian=True) @ against
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:
