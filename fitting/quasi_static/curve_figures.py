@@ -53,8 +53,7 @@ def _slopes(curve: Curve) -> Iterator[Figure]:
         yield Figure(f"K{i + 1}" if lines else "K", lambda p, i=i: math.exp(p[i]), "N m/rad", text, True)
     knees = [at[name] for name in ("log T1", "log gap") if name in at]
     for i, text in zip(range(len(knees)), ("first", "second"), strict=False):
-        formula = partial(_knee, knees[: i + 1])
-        yield Figure(f"T{i + 1}", formula, "N m", f"torque at the {text} knee", True)
+        yield Figure(f"T{i + 1}", partial(_knee, knees[: i + 1]), "N m", f"torque at the {text} knee", True)
     if curve.shape == "cubic":
         yield Figure("alpha", lambda p: p[1], "rad^-2", "cubic coefficient, tau = K (x + alpha x^3)")
 
@@ -83,8 +82,7 @@ def _loop(curve: Curve, blocks: Blocks, rated_torque: float | None) -> Iterator[
     small = LOST_MOTION_SHARE * (rated_torque or math.inf)
     text = f"twist between -{small:.3g} and +{small:.3g} N m (4 % of rated torque)"
     for i, (name, where) in enumerate(_LOST_MOTION[: 1 + looped] if small <= size else ()):
-        lost = partial(_between, curve, size, small, i > 0)
-        yield Figure(name, lost, "rad", f"{text}, {where}", True)
+        yield Figure(name, partial(_between, curve, size, small, i > 0), "rad", f"{text}, {where}", True)
     if looped and rated_torque and size >= 0.9 * rated_torque:
         text = "width of the loop at zero torque, for cycles of rated torque"
         yield Figure("hysteresis_loss", lambda p: _open(curve, p, rated_torque), "rad", text)

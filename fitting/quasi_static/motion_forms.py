@@ -48,14 +48,26 @@ def _of_the_motor_angle(points: Points) -> Iterator[Form]:
             _of_a_wave(n, "kinematic error"),
             of_torque=False,
         )
-        relative = Figure(f"amplitude_{n}", _share, "1", "of the stiffness, as a share of it", True)
-        phase = Figure(f"phase_{n}", _phase, "rad", "of the stiffness at theta_m = 0")
-        name, law = f"stiffness ripple of order {n}", f"twist = (1 + {wave}) tau/K"
-        yield Form("position_dependent_stiffness", name, partial(waves, "torque"), names, law, (relative, phase))
+        yield Form(
+            "position_dependent_stiffness",
+            f"stiffness ripple of order {n}",
+            partial(waves, "torque"),
+            names,
+            f"twist = (1 + {wave}) tau/K",
+            (
+                Figure(f"amplitude_{n}", _share, "1", "of the stiffness, as a share of it", True),
+                Figure(f"phase_{n}", _phase, "rad", "of the stiffness at theta_m = 0"),
+            ),
+        )
         if "both ways" in points.motion:
-            torque = Figure(f"amplitude_{n}", _share, "N m", "of the friction", True)
-            name, law = f"friction ripple of order {n}", f"twist = (tau - F sgn(speed) ({wave}))/K"
-            yield Form("position_dependent_friction", name, partial(waves, "direction"), names, law, (torque,))
+            yield Form(
+                "position_dependent_friction",
+                f"friction ripple of order {n}",
+                partial(waves, "direction"),
+                names,
+                f"twist = (tau - F sgn(speed) ({wave}))/K",
+                (Figure(f"amplitude_{n}", _share, "N m", "of the friction", True),),
+            )
 
 
 def _eccentricity(points: Points) -> Iterator[Form]:
@@ -76,8 +88,12 @@ def _waves(angle: str, order: int, factor: str | None, points: Points, shape: np
     return np.hstack([np.cos(phase), np.sin(phase)]) * (1.0 if factor is None else getattr(points, factor)[:, None])
 
 
+def _amplitude(own: np.ndarray) -> float:
+    return math.hypot(own[1], own[2])
+
+
 def _share(own: np.ndarray) -> float:
-    return math.hypot(own[1], own[2]) / abs(own[0])
+    return _amplitude(own) / abs(own[0])
 
 
 def _phase(own: np.ndarray) -> float:
@@ -85,24 +101,36 @@ def _phase(own: np.ndarray) -> float:
 
 
 def _of_a_wave(order: int, what: str) -> tuple[Figure, Figure]:
-    size, text = f"of the {what}, zero to peak", f"psi in A cos({order} theta + psi)"
-    amplitude = Figure(f"amplitude_{order}", lambda own: math.hypot(own[1], own[2]), "rad", size, True)
-    return amplitude, Figure(f"phase_{order}", _phase, "rad", text)
+    return (
+        Figure(f"amplitude_{order}", _amplitude, "rad", f"of the {what}, zero to peak", True),
+        Figure(f"phase_{order}", _phase, "rad", f"psi in A cos({order} theta + psi)"),
+    )
 
 
 def _friction(points: Points) -> Iterator[Form]:
     rests = tuple(f"rest {i}" for i in range(int(points.rest.max()) + 1))
     if "both ways" not in points.motion and not rests:
         return
-    text = "friction while the joint moves, at its output"
-    friction = Figure("friction", lambda own: -own[1] / own[0], "N m", text)
-    text = "by which the friction grows with the torque"
-    share = Figure("share_of_load", lambda own: -own[2] / own[0], "1", text)
-    law, name = "twist = (tau - F sgn(speed))/K, and at rest a level of its own", "Coulomb friction"
-    yield Form("motor_friction", name, partial(_direction, False), ("friction", *rests), law, (friction,))
-    law = "twist = (tau - (F + m |tau|) sgn(speed))/K, and at rest a level of its own"
-    name, strengths = "Coulomb friction that grows with the load", ("friction", "share of load", *rests)
-    yield Form("motor_friction", name, partial(_direction, True), strengths, law, (friction, share))
+    friction = Figure("friction", lambda own: -own[1] / own[0], "N m", "friction while the joint moves, at its output")
+    yield Form(
+        "motor_friction",
+        "Coulomb friction",
+        partial(_direction, False),
+        ("friction", *rests),
+        "twist = (tau - F sgn(speed))/K, and at rest a level of its own",
+        (friction,),
+    )
+    yield Form(
+        "motor_friction",
+        "Coulomb friction that grows with the load",
+        partial(_direction, True),
+        ("friction", "share of load", *rests),
+        "twist = (tau - (F + m |tau|) sgn(speed))/K, and at rest a level of its own",
+        (
+            friction,
+            Figure("share_of_load", lambda own: -own[2] / own[0], "1", "by which the friction grows with the torque"),
+        ),
+    )
 
 
 def _direction(grows: bool, points: Points, shape: np.ndarray) -> np.ndarray:

@@ -71,29 +71,49 @@ def _branch(memory: Memory, points: Points, shape: np.ndarray) -> np.ndarray:
 
 
 def _stiffness_shapes(points: Points) -> Iterator[Form]:
-    family, terms = "stiffness_shape", {"quadratic": "q tau^2", "cubic": "c tau^3"}
-    for names in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
-        powers, law = tuple(2 + list(terms).index(name) for name in names), " + ".join(terms[name] for name in names)
-        figures = [
-            Figure(name, lambda own, i=i: own[i], f"rad/(N m)^{power}", f"{name} term of the twist in the torque")
-            for i, (name, power) in enumerate(zip(names, powers, strict=True), start=1)
-        ]
-        if "cubic" in names:
-            text = "cubic coefficient in tau = K (x + alpha x^3), to first order"
-            figures.append(Figure("alpha", lambda own: -own[-1] / own[0] ** 3, "rad^-2", text))
-        columns, law = partial(_powers, powers), f"twist = tau/K + {law}"
-        yield Form(family, " and ".join(names), columns, names, law, tuple(figures))
-    knees = np.log(np.quantile(np.abs(points.torque - points.centre), _KNEES))
-    figures = (
-        Figure("K2", lambda own: 1.0 / (own[0] + own[1]), "N m/rad", "stiffness beyond the knee", True),
-        Figure("T1", lambda own: math.exp(own[2]), "N m", "torque at the knee", True),
+    alpha = Figure(
+        "alpha",
+        lambda own: -own[-1] / own[0] ** 3,
+        "rad^-2",
+        "cubic coefficient in tau = K (x + alpha x^3), to first order",
     )
-    law, ends = "twist = tau/K1 up to T1, with slope 1/K2 beyond", knees[[0, -1], None]
-    yield Form(family, "two slopes", _beyond, ("beyond knee",), law, figures, knees[:, None], ("log knee",), ends)
+    terms = {"quadratic": "q tau^2", "cubic": "c tau^3"}
+    for names in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
+        powers = tuple(2 if name == "quadratic" else 3 for name in names)
+        yield Form(
+            "stiffness_shape",
+            " and ".join(names),
+            partial(_powers, powers),
+            names,
+            " + ".join(["twist = tau/K", *(terms[name] for name in names)]),
+            (
+                *(_of_a_power(i, name, power) for i, (name, power) in enumerate(zip(names, powers, strict=True), 1)),
+                *((alpha,) if "cubic" in names else ()),
+            ),
+        )
+    knees = np.log(np.quantile(np.abs(points.torque - points.centre), _KNEES))
+    yield Form(
+        "stiffness_shape",
+        "two slopes",
+        _beyond,
+        ("beyond knee",),
+        "twist = tau/K1 up to T1, with slope 1/K2 beyond",
+        (
+            Figure("K2", lambda own: 1.0 / (own[0] + own[1]), "N m/rad", "stiffness beyond the knee", True),
+            Figure("T1", lambda own: math.exp(own[2]), "N m", "torque at the knee", True),
+        ),
+        knees[:, None],
+        ("log knee",),
+        knees[[0, -1], None],
+    )
     if points.centre == 0.0:
-        figures = (Figure("half_width", lambda own: own[1], "rad", "half of the dead zone", True),)
+        half = Figure("half_width", lambda own: own[1], "rad", "half of the dead zone", True)
         law = "twist = tau/K + b sgn(tau)"
-        yield Form("backlash", "dead zone", _dead_zone, ("half-width",), law, figures, sign=1)
+        yield Form("backlash", "dead zone", _dead_zone, ("half-width",), law, (half,), sign=1)
+
+
+def _of_a_power(at: int, name: str, power: int) -> Figure:
+    return Figure(name, lambda own: own[at], f"rad/(N m)^{power}", f"{name} term of the twist in the torque")
 
 
 def _powers(powers: tuple[int, ...], points: Points, shape: np.ndarray) -> np.ndarray:
@@ -112,14 +132,20 @@ def _dead_zone(points: Points, shape: np.ndarray) -> np.ndarray:
 
 
 def _creep(points: Points) -> Form:
-    figures = (
-        Figure("time_constant", lambda own: math.exp(own[2]), "s", "of the relaxation", True),
-        Figure("share", lambda own: own[1] / own[0], "1", "delayed twist over immediate twist", True),
-    )
     ends = _POINTS_IN_CONSTANT * points.step, points.duration / _CONSTANTS_IN_LOG
-    law, name = "twist = tau/K + k z, where T z' = tau - z", "standard linear solid"
-    begun = _begun("time constant", *ends, len(points.names))
-    return Form("creep", name, _lagging, ("delayed compliance",), law, figures, sign=1, **begun)
+    return Form(
+        "creep",
+        "standard linear solid",
+        _lagging,
+        ("delayed compliance",),
+        "twist = tau/K + k z, where T z' = tau - z",
+        (
+            Figure("time_constant", lambda own: math.exp(own[2]), "s", "of the relaxation", True),
+            Figure("share", lambda own: own[1] / own[0], "1", "delayed twist over immediate twist", True),
+        ),
+        sign=1,
+        **_begun("time constant", *ends, len(points.names)),
+    )
 
 
 def _lagging(points: Points, shape: np.ndarray) -> np.ndarray:
@@ -154,12 +180,23 @@ def _temperature(points: Points) -> Iterator[Form]:
     warmed = points.temperature is not None and np.ptp(points.temperature) > 0
     drift = Figure("drift", lambda own: own[1], "rad/K" if warmed else "rad/s", "drift of the twist")
     if warmed:
-        text = "share by which the stiffness changes with temperature"
-        figure = Figure("coefficient", lambda own: -own[1] / own[0], "1/K", text)
-        law, name = "twist = (1 - k (T - T0)) tau/K", "stiffness that falls with temperature"
-        yield Form("temperature", name, _warm_compliance, ("compliance",), law, (figure,))
-        law, name = "twist = tau/K + d (T - T0)", "thermal drift of the twist"
-        yield Form("temperature", name, _warm_drift, ("drift",), law, (drift,))
+        yield Form(
+            "temperature",
+            "stiffness that falls with temperature",
+            _warm_compliance,
+            ("compliance",),
+            "twist = (1 - k (T - T0)) tau/K",
+            (
+                Figure(
+                    "coefficient",
+                    lambda own: -own[1] / own[0],
+                    "1/K",
+                    "share by which the stiffness changes with temperature",
+                ),
+            ),
+        )
+        law = "twist = tau/K + d (T - T0)"
+        yield Form("temperature", "thermal drift of the twist", _warm_drift, ("drift",), law, (drift,))
     elif min(points.reversals) >= _REVERSALS_FOR_DRIFT:
         yield Form("temperature", "drift of the twist", _drift, ("drift",), "twist = tau/K + d t", (drift,))
 
