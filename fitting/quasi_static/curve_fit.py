@@ -100,21 +100,17 @@ def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
     for reach, bias, knee in itertools.product(reaches, {0.0, middle} if curve.biased else {0.0}, _KNEES[curve.shape]):
         knees = [share * size for share in knee]
         path = [branch(curve.memory, blocks, reach, (0.0,) * curve.logs)] if curve.memory and reach else []
-        matrix = np.column_stack([*_basis(curve.shape, blocks.torque - bias, knees), *zeros, *path])
+        torque = blocks.torque - bias
+        edges = [np.zeros_like(torque), *(np.clip(torque, -one, one) for one in knees), torque]
+        # Columns whose combination is the curve, to first order for the cubic.
+        basis = [torque, torque**3] if curve.shape == "cubic" else np.diff(edges, axis=0)
+        matrix = np.column_stack([*basis, *zeros, *path])
         solution, *_ = np.linalg.lstsq(matrix, blocks.twist, rcond=None)
         cost = float(np.sum((blocks.twist - matrix @ solution) ** 2))
         tried.append((cost, knees, _parameters(blocks, curve, solution, bias, knees, reach)))
     tried.sort(key=lambda t: t[0])
     other = next(([t] for t in tried if t[1] != tried[0][1]), [])
     return [start for *_, start in (tried[0], *other)]
-
-
-def _basis(shape: Shape, torque: np.ndarray, knees: list[float]) -> list[np.ndarray]:
-    """Columns whose combination is the curve, to first order for the cubic."""
-    if shape == "cubic":
-        return [torque, torque**3]
-    edges = [np.zeros_like(torque), *(np.clip(torque, -knee, knee) for knee in knees), torque]
-    return list(np.diff(edges, axis=0))
 
 
 def _parameters(

@@ -55,8 +55,3 @@ class Form:
 
 Terms = tuple[tuple[Form, np.ndarray], ...]
 """Forms of an equation, each with its shape parameters."""
-
-
-def base_columns(points: Points) -> np.ndarray:
-    """Columns of the straight line: torque, and one for each log's zero, (n, 1 + logs)."""
-    return np.column_stack([points.torque - points.centre, *(points.log == i for i in range(len(points.names)))])

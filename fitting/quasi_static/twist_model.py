@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from fitting.quasi_static.differences import slopes
-from fitting.quasi_static.form import START, Form, Terms, base_columns
+from fitting.quasi_static.form import START, Form, Terms
 from fitting.quasi_static.intervals import Figure, Known, scatter
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS, stretches
@@ -110,7 +110,9 @@ def _known(points: Points, model: TwistModel, figures: Iterable[Figure]) -> dict
 
 def design(points: Points, terms: Terms) -> np.ndarray:
     """All columns: the straight line's, then each form's, (n, coefficients)."""
-    return np.column_stack([base_columns(points), *(form.columns(points, shape) for form, shape in terms)])
+    zeros = (points.log == i for i in range(len(points.names)))
+    added = (form.columns(points, shape) for form, shape in terms)
+    return np.column_stack([points.torque - points.centre, *zeros, *added])
 
 
 def _sizes(terms: Terms) -> tuple[list[int], list[int]]:
