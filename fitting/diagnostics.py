@@ -69,7 +69,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         speed = np.clip(speed, *np.quantile(speed, [0.001, 0.999]))
         quantities |= {"motor angle": np.mod(theta_m, 2 * np.pi), "motor speed": speed}
         if np.ptp(theta_m) > 4 * np.pi:
-            order, amplitude = _ORDERS, _order_amplitude(residual, theta_m)
+            order, amplitude = _ORDERS, order_amplitude(residual, theta_m, _ORDERS)
     quantities["v"] = np.clip(quantities["v"], *np.quantile(quantities["v"], [0.001, 0.999]))
     return ResidualDiagnostics(
         frequency=frequency,
@@ -83,11 +83,17 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     )
 
 
-def _order_amplitude(residual: np.ndarray, theta_m: np.ndarray) -> np.ndarray:
-    """Amplitude of the least-squares harmonic at each order."""
-    amplitude = np.empty(_ORDERS.size)
-    for i, order in enumerate(_ORDERS):
-        basis = np.stack([np.cos(order * theta_m), np.sin(order * theta_m)])
+def order_amplitude(residual: np.ndarray, angle: np.ndarray, orders: np.ndarray) -> np.ndarray:
+    """Amplitude of the least-squares harmonic of an angle at each order.
+
+    Args:
+        residual: of samples.
+        angle: at the same samples [rad].
+        orders: cycles per revolution.
+    """
+    amplitude = np.empty(orders.size)
+    for i, order in enumerate(orders):
+        basis = np.stack([np.cos(order * angle), np.sin(order * angle)])
         amplitude[i] = np.hypot(*np.linalg.pinv(basis @ basis.T, hermitian=True) @ (basis @ residual))
     return amplitude
 

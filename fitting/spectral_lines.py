@@ -55,6 +55,18 @@ def surroundings(power: Float[np.ndarray, " n"], *, neighbours: int = _NEIGHBOUR
     return np.maximum(median_filter(power, size=2 * neighbours, mode="nearest"), 1e-300)
 
 
+def without_lines(spectrum: np.ndarray) -> np.ndarray:
+    """A spectrum whose lines are cut down to what noise of the colour around them may reach.
+
+    A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave.
+
+    Args:
+        spectrum: of one series or of several, (n,) or (series, n); their lines are looked for in the sum of powers.
+    """
+    power = np.sum(np.abs(np.atleast_2d(spectrum)) ** 2, axis=0)
+    return spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
+
+
 def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarray:
     """How far from its highest point each line is: the vertex of the parabola through the logarithms. Unseen data come
     later, where an error of frequency has become one of phase."""

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from fitting.estimate import Fit
 from fitting.explained import solved
-from fitting.spectral_lines import STANDS_OUT, surroundings
+from fitting.spectral_lines import without_lines
 
 DRAWS = 199
 """Surrogate residuals; the smallest p-value that they can show is 1/200."""
@@ -28,9 +28,7 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     series = error[weight].T
     samples = series.shape[1]
     length = prev_fast_len(samples, real=True)
-    spectrum = np.fft.rfft(series[:, :length])
-    power = np.sum(np.abs(spectrum) ** 2, axis=0)
-    spectrum = spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
+    spectrum = without_lines(np.fft.rfft(series[:, :length]))
     found = np.zeros((DRAWS, *error.shape))
     for draw in range(DRAWS):
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))

@@ -9,9 +9,10 @@ from scipy.stats import binom
 from torque_cycles import FRICTION, K1, K2, K3, T1, T2, cycles
 
 from fitting.quasi_static.blocks import average, noise, turns
+from fitting.quasi_static.curve_figures import figures
 from fitting.quasi_static.curve_fit import CurveFit, fit_curve, starts
 from fitting.quasi_static.fit import QuasiStaticFit, fit_quasi_static
-from fitting.quasi_static.intervals import Known, figures
+from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.stretches import correlation_length, stretches
 from fitting.quasi_static.torque_twist import Blocks, Curve
 
@@ -196,8 +197,8 @@ def test_blocks_stop_at_reversals_and_keep_the_extremes() -> None:
     # Between the last point before a reversal and the first after it stand two blocks and the extreme.
     extremes = blocks.seat[:-1][np.diff(blocks.seat) == 4] + 2
     assert len(extremes) == 4
-    np.testing.assert_allclose(np.abs(blocks.path[extremes]), 2.2e-3 * K1, rtol=0.005)
-    np.testing.assert_array_equal(blocks.path[blocks.seat], blocks.torque)
+    np.testing.assert_allclose(np.abs(blocks.paths[0][extremes]), 2.2e-3 * K1, rtol=0.005)
+    np.testing.assert_array_equal(blocks.paths[0][blocks.seat], blocks.torque)
 
 
 def test_noise_is_measured_beside_a_course() -> None:

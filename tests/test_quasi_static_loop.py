@@ -11,16 +11,15 @@ from test_quasi_static_command import lara_drive
 from fitting.drive_file import read_drive_file
 from fitting.logs import read_log
 from fitting.quasi_static.attribution import Held
-from fitting.quasi_static.candidates import catalogue
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.lookalikes import lookalikes
-from fitting.quasi_static.loop import QuasiStaticLoop, close_loop
+from fitting.quasi_static.loop import QuasiStaticLoop, catalogue, close_loop
 from fitting.quasi_static.noise_colour import DRAWS, autoregression, noise_of_the_same_colour
 from fitting.quasi_static.points import Points, points_of, without_noise
 from fitting.quasi_static.preparation import prepare
 from fitting.quasi_static.screening import screen
-from fitting.quasi_static.strengths import stiffness_of, strengths_of
-from fitting.quasi_static.twist_model import fit_twist, hold_out
+from fitting.quasi_static.stretches import folds
+from fitting.quasi_static.twist_model import fit_twist, hold_out, stiffness_of, strengths_of
 
 RIPPLE, WIDTH = 3e-5, 1e-4
 
@@ -108,7 +107,7 @@ def test_intervals_of_a_ripple_cover_its_amplitude() -> None:
         log = slow_joint([slow_joints.ripple(RIPPLE, 2)], moves="one way", colour=0.9, twist_noise=2e-5, seed=seed)
         points = points_of([log[0]], [log[1]], slow_joints.RATIO)
         (form,) = (f for f in catalogue(points) if f.name == "order 2 of the motor")
-        known = strengths_of(points, fit_twist(points, (form,), (np.zeros(0),)), form)["amplitude_2"]
+        known = strengths_of(points, fit_twist(points, ((form, np.zeros(0)),)), form)["amplitude_2"]
         assert known.ci95 is not None
         hits += known.ci95[0] <= RIPPLE <= known.ci95[1]
     # Two binomial standard deviations below 0.95.
@@ -178,7 +177,7 @@ def test_a_held_fold_has_no_say_in_its_own_prediction() -> None:
     fold = np.arange(len(points.twist)) * 5 // len(points.twist)
     changed = points.twist + np.where(fold == 2, 1e-3, 0.0)
     other = Points(**{**vars_of(points), "twist": changed})
-    before, after = (hold_out(p, fit_twist(points, (form,), (form.shapes[4],)), fold) for p in (points, other))
+    before, after = (hold_out(p, fit_twist(points, ((form, form.shapes[4]),)), fold) for p in (points, other))
     np.testing.assert_allclose((after - before)[fold == 2], 1e-3, rtol=1e-6)
 
 
@@ -190,11 +189,12 @@ def test_screened_gains_are_those_of_refits() -> None:
     """The inner products give what fitting without each fold gives."""
     log, how = slow_joint([slow_joints.hardening(1e5)])
     points = points_of([log], [how], None)
-    held = Held.of(points, np.arange(len(points.twist)) * 7 // len(points.twist))
-    base = held.attempt((), ())
+    stretch = np.arange(len(points.twist)) * 7 // len(points.twist)
+    held = Held(points, stretch, folds(stretch))
+    base = held.attempt()
     (cubic,) = (f for f in catalogue(points) if f.name == "cubic")
     found = screen(points, base.model, [(cubic,)], held.fold, 0)
-    refitted = held.attempt((cubic,), (np.zeros(0),))
+    refitted = held.attempt(((cubic, np.zeros(0)),))
     assert found.leads[0].gain == pytest.approx(refitted.gain_over(base), rel=1e-6)
 
 

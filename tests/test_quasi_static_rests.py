@@ -13,14 +13,12 @@ from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import QuasiStaticLoop, close_loop
 from fitting.quasi_static.loop_content import loop_report
-from fitting.quasi_static.loop_plots import loop_pictures
+from fitting.quasi_static.plots import loop_pictures
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.report import report_page
 from fitting.quasi_static.rests import RestLook, look_at_rests
-from fitting.quasi_static.strengths import strengths_of
-from fitting.quasi_static.stretches import stretches
-from fitting.quasi_static.twist_model import fit_twist
+from fitting.quasi_static.twist_model import strengths_of
 
 AMPLITUDE, CONSTANT = -5e-5, 0.5
 # A joint that carries a weight round, and stops for the last third of its log.
@@ -32,8 +30,8 @@ def at_rest(effects: list[Effect], **options) -> RestLook:
     """The look at rests beside the straight line, of a joint that goes one way and stops."""
     log, how = slow_joint(effects, **STOPS | options)
     points = points_of([log], [how], RATIO)
-    held = Held.of(points, stretches(fit_twist(points, (), ()).misfit, points.log, each=2))
-    found = look_at_rests(held, held.attempt((), ()), seed=0)
+    held = Held.of(points)
+    found = look_at_rests(held, held.attempt(), seed=0)
     assert found is not None
     return found
 
@@ -63,7 +61,7 @@ def test_intervals_of_a_relaxation_cover_it() -> None:
     hits, draws = 0, 100
     for seed in range(draws):
         found = at_rest([slow_joints.relaxing_rests(AMPLITUDE, CONSTANT)], seed=seed)
-        known = strengths_of(found.held.points, found.after.model, found.after.model.forms[0])["time_constant"]
+        known = strengths_of(found.points, found.after.model, found.after.model.forms[0])["time_constant"]
         assert known.ci95 is not None
         hits += known.ci95[0] <= CONSTANT <= known.ci95[1]
     # Two binomial standard deviations below 0.95.
@@ -79,7 +77,7 @@ FOLLOWS = [
 
 
 def refuse_relaxations(draws: int, most: int, options: dict) -> None:
-    alarms = [seed for seed in range(draws) if at_rest([], seed=seed, **options).form is not None]
+    alarms = [seed for seed in range(draws) if at_rest([], seed=seed, **options).terms]
     assert len(alarms) <= most, alarms
 
 
@@ -100,7 +98,7 @@ def test_noise_of_the_torque_alone_would_pass_for_a_relaxation() -> None:
     """Why the torque is asked as well: beside a smoothed torque the twist's own look finds something."""
     looks = [at_rest([], seed=seed, **SLOWLY_ON) for seed in range(4)]
     assert sum(look.round.accepted for look in looks) > 1
-    assert not any(look.form is not None for look in looks)
+    assert not any(look.terms for look in looks)
 
 
 def test_without_a_rest_there_is_no_look() -> None:

@@ -8,10 +8,12 @@ surrogates of the residual gives the law of the best gain where there is nothing
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Generic
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from typing_extensions import TypeVar
 
 from fitting.estimate import Fit
 from fitting.experiment import scales
@@ -40,7 +42,11 @@ class Lead(eqx.Module):
     own_states: Float[np.ndarray, "segments own"] | None = None
 
 
-class Screen(eqx.Module):
+# What a look at the catalogue says of a form; of quasi-static logs likewise.
+LeadT = TypeVar("LeadT", default=Lead)
+
+
+class Screen(eqx.Module, Generic[LeadT]):
     """The first look at the whole catalogue.
 
     Attributes:
@@ -48,7 +54,7 @@ class Screen(eqx.Module):
         null_gains: the best gain over the catalogue in each of the surrogates.
     """
 
-    leads: tuple[Lead, ...]
+    leads: tuple[LeadT, ...]
     null_gains: Float[np.ndarray, " draws"]
 
     def p_value(self, gain: float) -> float:

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, Generic
 
 import equinox as eqx
 import numpy as np
+from typing_extensions import TypeVar
 
 from fitting.attribution.candidate_fit import Trial, long_gains
 from fitting.attribution.candidate_refit import begin, go_on, try_hold
@@ -34,7 +36,12 @@ _MAY_DO_BETTER = 0.75
 _HOPELESS = 0.3
 
 
-class Verdict(eqx.Module):
+# A fitted model, and one where a competitor may not have been refitted; quasi-static logs have fits of their own.
+Fitted = TypeVar("Fitted", default=Trial)
+Refitted = TypeVar("Refitted", default=Trial | None)
+
+
+class Verdict(eqx.Module, Generic[Refitted]):
     """One competitor of a round.
 
     Attributes:
@@ -49,13 +56,13 @@ class Verdict(eqx.Module):
 
     name: str = eqx.field(static=True)
     family: str = eqx.field(static=True)
-    trial: Trial | None
+    trial: Refitted
     gain: float
     p_value: float
     separable: bool
 
 
-class Round(eqx.Module):
+class Round(eqx.Module, Generic[Fitted, Refitted]):
     """One look at the catalogue under one model.
 
     Attributes:
@@ -66,14 +73,14 @@ class Round(eqx.Module):
         evidence: what that rests on.
     """
 
-    before: Trial
-    screen: Screen
-    verdicts: tuple[Verdict, ...]
+    before: Fitted
+    screen: Screen[Any]
+    verdicts: tuple[Verdict[Refitted], ...]
     accepted: bool
     evidence: RoundEvidence = eqx.field(static=True, default=RoundEvidence((), {}, ()))
 
     @property
-    def winner(self) -> Verdict:
+    def winner(self) -> Verdict[Refitted]:
         """The best competitor."""
         return self.verdicts[0]
 

@@ -2,30 +2,33 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.decisions import RULES, EffectEvidence, support
+from fitting.attribution.screening import Screen
+from fitting.attribution.selection_round import Round, Verdict
 from fitting.attribution.shortlist import NEARLY
-from fitting.quasi_static.candidates import is_possible, is_usual
-from fitting.quasi_static.form import Form
+from fitting.quasi_static.form import Form, Terms
 from fitting.quasi_static.points import Points
-from fitting.quasi_static.screening import Lead, Screen, screen
-from fitting.quasi_static.stretches import folds, worse
+from fitting.quasi_static.screening import Lead, screen
+from fitting.quasi_static.stretches import folds, stretches, worse
 from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out
 
 # A form that explains less than this share of what the best one does is no rival, and is not refitted.
 _RIVAL = 0.25
 # A form of a strength that drives can show leads where it explains this share of what the best one does.
 _PLAUSIBLE = 0.5
+# Some times the percents of the twist that drives creep by.
+_LARGEST_CREEP = 0.5
 # Forms of one family that are refitted.
 _FORMS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
-    """A model with its errors on stretches that its fit has not seen.
+class TwistTrial:
+    """An equation with its errors on stretches that its fit has not seen.
 
     Attributes:
         model: Fitted to all points.
@@ -45,9 +48,17 @@ class Trial:
         """Held-out [rad]."""
         return math.sqrt(self.mean_square)
 
-    def gain_over(self, other: "Trial") -> float:
+    def gain_over(self, other: "TwistTrial") -> float:
         """Half the logarithm of the other's held-out mean square over this one's."""
         return 0.5 * math.log(max(other.mean_square, 1e-300) / max(self.mean_square, 1e-300))
+
+    def beyond(self, other: "TwistTrial") -> tuple[Form, ...]:
+        """The forms that the other one lacks."""
+        return tuple(form for form in self.model.forms if form not in other.model.forms)
+
+
+TwistVerdict = Verdict[TwistTrial]
+TwistRound = Round[TwistTrial, TwistTrial]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,72 +76,33 @@ class Held:
     fold: np.ndarray
 
     @classmethod
-    def of(cls, points: Points, stretch: np.ndarray) -> "Held":
-        """Points parted into folds of whole stretches."""
+    def of(cls, points: Points) -> "Held":
+        """Points parted into folds of whole stretches of the straight line's misfit."""
+        # Two stretches in each log at least, so that its zero is known where one is held out.
+        stretch = stretches(fit_twist(points).misfit, points.log, each=2)
         return cls(points, stretch, folds(stretch))
 
-    def attempt(self, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ...]) -> Trial:
+    def attempt(self, terms: Terms = ()) -> TwistTrial:
         """A fit with its held-out errors."""
-        model = fit_twist(self.points, forms, shapes)
-        return Trial(model, hold_out(self.points, model, self.fold))
+        model = fit_twist(self.points, terms)
+        return TwistTrial(model, hold_out(self.points, model, self.fold))
 
-    def beside(self, trial: Trial, lead: Lead) -> Trial:
-        """The model with what it lacks of a lead."""
-        new = [i for i, form in enumerate(lead.forms) if form not in trial.model.forms]
-        return self.attempt(
-            (*trial.model.forms, *(lead.forms[i] for i in new)), (*trial.model.shapes, *(lead.shapes[i] for i in new))
-        )
+    def beside(self, trial: TwistTrial, terms: Terms) -> TwistTrial:
+        """The model with those of some terms that it lacks."""
+        return self.attempt((*trial.model.terms, *(term for term in terms if term[0] not in trial.model.forms)))
 
-    def without(self, trial: Trial, forms: Sequence[Form]) -> Trial:
+    def without(self, trial: TwistTrial, forms: Sequence[Form]) -> TwistTrial:
         """The model without some of its forms."""
-        model = trial.model
-        kept = [i for i, form in enumerate(model.forms) if form not in forms]
-        return self.attempt(tuple(model.forms[i] for i in kept), tuple(model.shapes[i] for i in kept))
+        return self.attempt(tuple(term for term in trial.model.terms if term[0] not in forms))
 
-    def is_worse(self, one: Trial, other: Trial) -> bool:
+    def is_worse(self, one: TwistTrial, other: TwistTrial) -> bool:
         """Whether the first predicts held-out stretches clearly worse."""
         return worse(one.held_out, other.held_out, self.stretch, self.points.twist_noise)
 
 
-@dataclass(frozen=True, eq=False)
-class Rival:
-    """A form, or two, refitted inside the equation.
-
-    Attributes:
-        lead: The forms, where its refit began.
-        trial: The refit.
-        gain: Over the model without it, on held-out stretches.
-        p_value: Chance that the best of the catalogue gains as much on noise.
-        separable: Whether the logs tell it from the round's winner.
-    """
-
-    lead: Lead
-    trial: Trial
-    gain: float
-    p_value: float
-    separable: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class Round:
-    """One look at the catalogue beside one model.
-
-    Attributes:
-        before: The model that was looked at.
-        screen: What each form would gain, and the law of chance.
-        rivals: Forms that were refitted, the winner first; empty where none was worth it.
-        accepted: Whether the winner is supported.
-    """
-
-    before: Trial
-    screen: Screen
-    rivals: tuple[Rival, ...]
-    accepted: bool
-
-
 def look(
-    held: Held, before: Trial, base: Trial, choices: Sequence[tuple[Form, ...]], seed: int, imperfection: float
-) -> Round:
+    held: Held, before: TwistTrial, base: TwistTrial, choices: Sequence[tuple[Form, ...]], seed: int
+) -> TwistRound:
     """Look for the effect that explains most of what a model leaves over.
 
     Args:
@@ -139,85 +111,84 @@ def look(
         base: The model without any effect.
         choices: Forms, or two together, to consider, the more usual ones first.
         seed: Of the surrogates.
-        imperfection: Share (rms) of what earlier effects removed that a further one must remove at least.
     """
     screened = screen(held.points, before.model, choices, held.fold, seed)
-    leads = _worth_a_refit(screened)
-    rivals = []
-    for lead in leads:
-        trial = held.beside(before, lead)
+    verdicts = []
+    for lead in _worth_a_refit(screened):
+        trial = held.beside(before, lead.terms)
         gain = trial.gain_over(before)
         # The law of chance holds for the grid of shapes; what a search between its points gains has to count as chance.
-        rivals.append(Rival(lead, trial, gain, screened.p_value(min(gain, lead.gain))))
-    rivals.sort(key=lambda rival: -rival.gain)
-    if not rivals or rivals[0].p_value > RULES.significance or rivals[0].gain < RULES.least_gain:
-        return Round(before, screened, tuple(rivals), accepted=False)
-    winner, told = _compared(held, rivals, screened, list(choices))
-    removed = before.mean_square - winner.trial.mean_square
-    enough = removed > imperfection**2 * (base.mean_square - before.mean_square)
-    if any(form.of_torque for form in winner.lead.forms):
-        enough = enough and removed > torque_error(held.points, base)
-    return Round(before, screened, (winner, *told), accepted=enough)
+        p_value = screened.p_value(min(gain, lead.gain))
+        name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
+        verdicts.append(Verdict(name, family, trial, gain, p_value, True))
+    verdicts.sort(key=lambda verdict: -verdict.gain)
+    if not verdicts or not _is_supported(verdicts[0].gain, verdicts[0].p_value):
+        return Round(before, screened, tuple(verdicts), False)
+    verdicts = _simplest_first(held, verdicts, screened, before, choices)
+    winner = verdicts[0]
+    removed, earlier = before.mean_square - winner.trial.mean_square, base.mean_square - before.mean_square
+    share = math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf
+    accepted = _is_supported(winner.gain, winner.p_value, share)
+    if any(form.of_torque for form in winner.trial.beyond(before)):
+        accepted = accepted and removed > torque_error(held.points, base)
+    return Round(before, screened, tuple(verdicts), accepted)
 
 
-def torque_error(points: Points, base: Trial) -> float:
+def _is_supported(gain: float, p_value: float, removed: float = math.inf) -> bool:
+    """Whether an effect gains enough, more than chance, and more than earlier effects may get wrong."""
+    seen = EffectEvidence("", gain, p_value, removed, RULES.quasi_static_imperfection)
+    return all(check.holds for check in support(seen))
+
+
+def torque_error(points: Points, base: TwistTrial) -> float:
     """Mean square of the twist that the torque's own error may account for [rad^2]; less than this shows no effect."""
     # Stein's estimate of a single log scatters, and the error stands together at the torque's corners.
     return 2.0 * float(base.model.coefficients[0] * points.torque_error) ** 2
 
 
-def _worth_a_refit(screened: Screen) -> list[Lead]:
+def _worth_a_refit(screened: Screen[Lead]) -> list[Lead]:
     """The best forms of each family that come near the best of all, or none where that one is no more than chance."""
     best = screened.leads[0].gain if screened.leads else 0.0
-    if best < RULES.least_gain or screened.p_value(best) > RULES.significance:
+    if not _is_supported(best, screened.p_value(best)):
         return []
     near = [lead for lead in screened.leads if lead.gain >= _RIVAL * best]
     return [lead for i, lead in enumerate(near) if sum(other.families == lead.families for other in near[:i]) < _FORMS]
 
 
-def _compared(
-    held: Held, rivals: list[Rival], screened: Screen, order: list[tuple[Form, ...]]
-) -> tuple[Rival, list[Rival]]:
-    """The winner, and the other rivals with whether the logs tell them from it.
+def _simplest_first(
+    held: Held,
+    verdicts: list[TwistVerdict],
+    screened: Screen[Lead],
+    before: TwistTrial,
+    choices: Sequence[tuple[Form, ...]],
+) -> list[TwistVerdict]:
+    """The competitors with the one first that is taken, each of the others with whether the logs tell it from the best.
 
     Forms are tied where the one does not predict held-out stretches clearly worse, and where the better one has nothing
     left to explain beside it. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more
-    usual, and an unusual strength comes last. One that no drive can show stands back where another form explains half
-    as much.
+    usual. One that no drive can show stands back where another form explains half as much.
     """
-    supported = [
-        rival for rival in rivals if rival.p_value <= RULES.significance and rival.gain >= _PLAUSIBLE * rivals[0].gain
-    ]
-    leader = next((rival for rival in supported if _is_possible(held.points, rival)), rivals[0])
-    others = [rival for rival in rivals if rival is not leader]
-    tied = [leader, *(rival for rival in others if _is_tied(held, rival, leader, screened))]
-    able = [rival for rival in tied if _is_usual(held.points, rival)] or tied
-    fewest = min(rival.lead.size for rival in able)
-    small = [rival for rival in able if rival.lead.size == fewest]
-    most = max(rival.gain for rival in small)
-    winner = min((r for r in small if r.gain >= NEARLY * most), key=lambda r: order.index(r.lead.forms))
-    told = [Rival(r.lead, r.trial, r.gain, r.p_value, separable=r not in tied) for r in rivals if r is not winner]
-    return winner, told
+    forms = {verdict.name: verdict.trial.beyond(before) for verdict in verdicts}
+
+    def is_tied(verdict: TwistVerdict) -> bool:
+        if verdict.p_value > RULES.significance or held.is_worse(verdict.trial, leader.trial):
+            return False
+        both = held.beside(verdict.trial, leader.trial.model.terms)
+        return screened.p_value(both.gain_over(verdict.trial)) > RULES.significance
+
+    def size(verdict: TwistVerdict) -> int:
+        return sum(form.size for form in forms[verdict.name])
+
+    able = [v for v in verdicts if v.p_value <= RULES.significance and v.gain >= _PLAUSIBLE * verdicts[0].gain]
+    leader = next((v for v in able if _is_possible(v.trial.model)), verdicts[0])
+    tied = [leader, *(v for v in verdicts if v is not leader and is_tied(v))]
+    small = [v for v in tied if size(v) == min(map(size, tied))]
+    near = [v for v in small if v.gain >= NEARLY * max(v.gain for v in small)]
+    winner = min(near, key=lambda v: choices.index(forms[v.name]))
+    return [winner, *(replace(v, separable=v not in tied) for v in verdicts if v is not winner)]
 
 
-def _is_possible(points: Points, rival: Rival) -> bool:
-    return all(is_possible(form, own, compliance) for form, own, compliance in _strengths(points, rival))
-
-
-def _is_usual(points: Points, rival: Rival) -> bool:
-    return all(is_usual(form, own, compliance, points) for form, own, compliance in _strengths(points, rival))
-
-
-def _strengths(points: Points, rival: Rival) -> list[tuple[Form, np.ndarray, np.floating]]:
-    """Each form with its strengths and the compliance beside them."""
-    model = rival.trial.model
-    return [
-        (f, model.coefficients[model.own(f, len(points.names))[0]], model.coefficients[0]) for f in rival.lead.forms
-    ]
-
-
-def _is_tied(held: Held, rival: Rival, leader: Rival, screened: Screen) -> bool:
-    if rival.p_value > RULES.significance or held.is_worse(rival.trial, leader.trial):
-        return False
-    both = held.beside(rival.trial, leader.lead)
-    return screened.p_value(both.gain_over(rival.trial)) > RULES.significance
+def _is_possible(model: TwistModel) -> bool:
+    """Whether drives can show such strengths: what creeps is a part of the twist that was there at once."""
+    creeps = [model.coefficients[model.own(form)[0].start] for form in model.forms if form.family == "creep"]
+    return max(map(abs, creeps), default=0.0) <= _LARGEST_CREEP * abs(model.coefficients[0])

@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import find_peaks
 
 from fitting.logs import Log
 from fitting.quasi_static.torque_twist import Blocks
@@ -30,27 +32,25 @@ def average(logs: Sequence[Log]) -> Blocks:
     """
     parts = [_average(log, MOST_BLOCKS // len(logs)) for log in logs]
     sizes = [len(part["torque"]) for part in parts]
-    lengths = [len(part["path"]) for part in parts]
-    before = np.repeat(np.cumsum([0, *lengths[:-1]]), sizes)
-    whole = {key: np.concatenate([part[key] for part in parts]) for key in ("torque", "twist", "time", "path", "seat")}
-    torque_noise = float(np.mean([part["noise"][0] for part in parts]))
+    before = np.repeat(np.cumsum([0, *(len(part["path"]) for part in parts[:-1])]), sizes)
+    whole = {key: np.concatenate([part[key] for part in parts]) for key in ("torque", "twist", "time", "seat")}
+    torque_noise, twist_noise = np.mean([part["noise"] for part in parts], axis=0).tolist()
     course = float(np.median(np.abs(np.diff(whole["torque"]))))
     return Blocks(
         torque=whole["torque"],
         twist=whole["twist"],
         time=whole["time"],
         log=np.repeat(np.arange(len(logs)), sizes),
-        path=whole["path"],
-        path_log=np.repeat(np.arange(len(logs)), lengths),
+        paths=tuple(part["path"] for part in parts),
         seat=whole["seat"] + before,
         names=tuple(log.name for log in logs),
         torque_noise=torque_noise,
         # Even exact numbers have rounding; without a floor their weights would be infinite.
-        twist_noise=max(float(np.mean([part["noise"][1] for part in parts])), 1e-7 * float(np.ptp(whole["twist"]))),
+        twist_noise=max(twist_noise, 1e-7 * float(np.ptp(whole["twist"]))),
         # The rows of a block are spread evenly over its course.
         blur=math.hypot(torque_noise, course / math.sqrt(12.0)),
         rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
-        reversals=tuple(int(part["reversals"]) for part in parts),
+        reversals=tuple(len(part["path"]) - len(part["blocks"]) for part in parts),
     )
 
 
@@ -67,25 +67,20 @@ def _average(log: Log, most: int) -> dict[str, np.ndarray]:
     edges = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(branches, branches[1:], counts, strict=False)]
     edge = np.append(np.rint(np.concatenate(edges)), len(log)).astype(int)
     columns = {"torque": torque, "twist": log.dynamic_error, "time": log.time}
-    found: dict[str, np.ndarray] = {key: np.add.reduceat(v, edge[:-1]) / np.diff(edge) for key, v in columns.items()}
-    # Blocks of one size, whose centres are evenly spaced as third differences want them.
-    found["noise"] = np.array([noise(means(values, size)) for values in (torque, log.dynamic_error)])
-    firsts = np.cumsum(counts)[:-1]
-    found["reversals"] = np.array(len(firsts))
-    extremes = [_extreme(found["torque"], int(first)) for first in firsts]
-    found["path"] = np.insert(found["torque"], firsts, extremes)
-    number = np.arange(len(edge) - 1)
-    found["seat"] = number + np.searchsorted(firsts, number, side="right")
+    found = {key: np.add.reduceat(values, edge[:-1]) / np.diff(edge) for key, values in columns.items()}
+    firsts, blocks = np.cumsum(counts)[:-1], np.arange(len(edge) - 1)
+    # The torque between the two blocks beside a reversal, from the courses on both sides.
+    edged = np.pad(found["torque"], 1, mode="edge")
+    extremes = 0.75 * (edged[firsts] + edged[firsts + 1]) - 0.25 * (edged[firsts - 1] + edged[firsts + 2])
     # Beside a reversal the branch changes within a block, so that its mean is not on the curve.
-    beside = np.concatenate([firsts, firsts - 1])
-    kept = ~np.isin(number, beside) if np.min(counts) >= _LONG_BRANCH else np.full(len(number), True)
-    return found | {key: found[key][kept] for key in (*columns, "seat")}
-
-
-def _extreme(torque: np.ndarray, first: int) -> float:
-    """The torque at the edge between two blocks of which the later is `first`, from the courses on both sides."""
-    ends = [torque[max(first - 2, 0) : first], torque[first : first + 2][::-1]]
-    return float(np.mean([end[-1] + 0.5 * (end[-1] - end[0]) for end in ends]))
+    kept = ~np.isin(blocks, [firsts, firsts - 1]) if np.min(counts) >= _LONG_BRANCH else blocks >= 0
+    seat = blocks + np.searchsorted(firsts, blocks, side="right")
+    return {key: values[kept] for key, values in (found | {"seat": seat}).items()} | {
+        "path": np.insert(found["torque"], firsts, extremes),
+        "blocks": blocks,
+        # Blocks of one size, whose centres are evenly spaced as third differences want them.
+        "noise": np.array([noise(means(values, size)) for values in (torque, log.dynamic_error)]),
+    }
 
 
 def means(values: np.ndarray, size: int) -> np.ndarray:
@@ -115,26 +110,11 @@ def turns(torque: np.ndarray, size: int) -> list[int]:
     """
     smooth = means(torque, size)
     least = max(_REVERSAL * float(np.ptp(smooth)), 8.0 * noise(smooth))
-    values = smooth.tolist()
-    low = high = 0
-    direction, found = 0, []
-    for i, value in enumerate(values):
-        low, high = (i if value < values[low] else low), (i if value > values[high] else high)
-        if direction >= 0 and value < values[high] - least:
-            found += [high] if direction else []
-            direction, low = -1, i
-        elif direction <= 0 and value > values[low] + least:
-            found += [low] if direction else []
-            direction, high = 1, i
-    return [_refined(torque, size, i) for i in found]
-
-
-def _refined(torque: np.ndarray, size: int, i: int) -> int:
-    """The row of an extreme from the averages around the one that is most extreme."""
-    at = np.arange(max(0, (i - 1) * size), max(1, min(len(torque) - size, (i + 1) * size)) + 1)
-    running = np.concatenate([[0.0], np.cumsum(torque[at[0] : at[-1] + size])])
-    averages = running[size:] - running[:-size]
-    inner = torque[i * size : (i + 1) * size].mean()
-    outer = np.mean([torque[at[0] : at[0] + size].mean(), torque[at[-1] : at[-1] + size].mean()])
-    best = np.argmax(averages) if inner >= outer else np.argmin(averages)
-    return int(at[0] + best + size // 2)
+    found = sorted((int(i), sign) for sign in (1, -1) for i in find_peaks(sign * smooth, prominence=least)[0])
+    running, rows = uniform_filter1d(torque, size, mode="nearest"), []
+    for (_, before), (i, sign) in zip([(0, 0), *found], found, strict=False):
+        # Of equal tops in a row, as quantised channels have them, the first one counts.
+        if sign != before:
+            first = max(0, (i - 1) * size) + size // 2
+            rows.append(first + int(np.argmax(sign * running[first : (i + 1) * size + size // 2 + 1])))
+    return rows

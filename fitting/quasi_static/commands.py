@@ -9,9 +9,7 @@ from fitting.quasi_static.content import report_dict
 from fitting.quasi_static.fit import fit_quasi_static
 from fitting.quasi_static.loop import close_loop
 from fitting.quasi_static.loop_content import loop_report
-from fitting.quasi_static.loop_plots import loop_pictures
-from fitting.quasi_static.loop_text import loop_text
-from fitting.quasi_static.plots import pictures
+from fitting.quasi_static.plots import fit_pictures, loop_pictures
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import prepare
 from fitting.quasi_static.report import report_text, write_report
@@ -35,8 +33,7 @@ def fit_quasi_static_logs(
     data = prepare(logs, drive_file)
     found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
     report = report_dict(data, found)
-    paths = write_report(out, report, pictures(found))
-    return f"{report_text(report)}\nReport: {paths['report.html']}"
+    return f"{report_text(report)}\nReport: {write_report(out, report, fit_pictures(found))}"
 
 
 def close_quasi_static_loop(
@@ -65,5 +62,4 @@ def close_quasi_static_loop(
     points = points_of(data.logs, data.motion, drive_file.reduction_ratio)
     loop = close_loop(points, max_effects=max_effects, seed=seed, progress=progress)
     report = loop_report(data, loop)
-    paths = write_report(out, report, loop_pictures(loop))
-    return f"{loop_text(report)}\nReport: {paths['report.html']}"
+    return f"{report_text(report)}\nReport: {write_report(out, report, loop_pictures(loop))}"

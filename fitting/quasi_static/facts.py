@@ -3,10 +3,14 @@
 import dataclasses
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
+from fitting import formatting
+from fitting.files import finite
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.preparation import QuasiStaticData
 
@@ -24,19 +28,9 @@ ABOUT_SCALE = (
 )
 
 
-def rmse_dict(training: float | None, selection: float | None) -> dict[str, float | None]:
-    """Rms errors by part of the data. Folds of whole stretches select the model; there are no test data yet.
-
-    Args:
-        training: On what was fitted [rad].
-        selection: On the folds that were left out [rad]; schema 1 called them validation.
-    """
-    return {"training": training, "selection": selection, "test": None, "validation": selection}
-
-
-def heading(data: QuasiStaticData) -> dict[str, Any]:
-    """What a report begins with."""
-    return {
+def framed(data: QuasiStaticData, content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content between what every report begins and ends with, with finite numbers and nulls only."""
+    heading = {
         "schema": SCHEMA,
         "version": version("hdjax"),
         "name": data.drive_file.name,
@@ -45,47 +39,75 @@ def heading(data: QuasiStaticData) -> dict[str, Any]:
         "summary": "",
         "units": {"dynamic_error": "rad", "joint_torque": "N m"},
     }
+    health = [{"log": name} | dataclasses.asdict(one) for name, found in data.findings.items() for one in found]
+    versions = {"python": platform.python_version()} | {library: version(library) for library in _LIBRARIES}
+    return finite(heading | dict(content) | {"health": health, "versions": versions})
 
 
-def ending(data: QuasiStaticData) -> dict[str, Any]:
-    """What a report ends with."""
-    return {
-        "health": [
-            {"log": name} | dataclasses.asdict(finding) for name, found in data.findings.items() for finding in found
-        ],
-        "versions": {"python": platform.python_version()} | {library: version(library) for library in _LIBRARIES},
-    }
+def log_dicts(data: QuasiStaticData, rows: Sequence[int], reversals: Sequence[int]) -> list[dict[str, Any]]:
+    """The logs; each of their rows is held out once.
+
+    Args:
+        data: The logs.
+        rows: In a block, by log.
+        reversals: Of the torque, by log.
+    """
+    return [
+        {
+            "name": log.name,
+            "samples": len(log),
+            "held_out": len(log),
+            "seconds": float(log.time[-1] - log.time[0]),
+            "rows_per_block": size,
+            "reversals": count,
+            "motion": motion,
+        }
+        for log, motion, size, count in zip(data.logs, data.motion, rows, reversals, strict=True)
+    ]
 
 
-def log_dict(data: QuasiStaticData, i: int, rows: int, reversals: int) -> dict[str, Any]:
-    """One log; each of its rows is held out once."""
-    log = data.logs[i]
-    return {
-        "name": log.name,
-        "samples": len(log),
-        "held_out": len(log),
-        "seconds": float(log.time[-1] - log.time[0]),
-        "rows_per_block": rows,
-        "reversals": reversals,
-        "motion": data.motion[i],
-    }
+def account(known: Mapping[str, Known], training: np.ndarray, selection: np.ndarray) -> dict[str, Any]:
+    """A fitted equation: figures, and rms errors by part of the data.
+
+    Folds of whole stretches select the model; there are no test data yet.
+
+    Args:
+        known: Figures, by name.
+        training: Misfit of what was fitted [rad], (n,).
+        selection: Likewise of the folds that were left out; schema 1 called them validation.
+    """
+    return no_account() | {"parameters": estimates(known), "rmse": rmse_dict(training, selection)}
 
 
-def estimate(known: Known) -> dict[str, Any]:
-    """A figure."""
-    return dataclasses.asdict(known) | {"ci95": list(known.ci95 or (None, None))}
+def no_account() -> dict[str, Any]:
+    """Likewise where nothing was fitted."""
+    return {"effects": [], "parameters": {}, "derived": {}, "rmse": rmse_dict(None, None)}
+
+
+def rmse_dict(training: np.ndarray | None, selection: np.ndarray | None) -> dict[str, float | None]:
+    """Rms errors by part of the data; arguments as in [`account`][]."""
+    fitted, left_out = (None if part is None else float(np.sqrt(np.mean(part**2))) for part in (training, selection))
+    return {"training": fitted, "selection": left_out, "test": None, "validation": left_out}
 
 
 def estimates(known: Mapping[str, Known]) -> dict[str, Any]:
     """Figures, by name."""
-    return {name: estimate(one) for name, one in known.items()}
+    return {name: dataclasses.asdict(one) | {"ci95": list(one.ci95 or (None, None))} for name, one in known.items()}
 
 
-def few_stretches(count: int) -> list[str]:
+def not_identifiable(names: list[str]) -> str:
+    """The beginning of a sentence that says so of some figures."""
+    return f"{formatting.words(names)} {'is' if len(names) == 1 else 'are'} not identifiable from these logs"
+
+
+def those_that_hold(notes: Sequence[tuple[Any, str]]) -> list[str]:
+    """The sentences whose condition holds."""
+    return [sentence for holds, sentence in notes if holds]
+
+
+def few_stretches(count: int) -> tuple[bool, str]:
     """What is said where the logs hold few independent stretches."""
-    if count >= FEW_STRETCHES:
-        return []
-    return [
+    return count < FEW_STRETCHES, (
         f"What the curve leaves over is so correlated that the logs hold only {count} independent stretches: the "
         "intervals are wide, and rest on little. Record more torque cycles."
-    ]
+    )

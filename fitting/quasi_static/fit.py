@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from fitting.logs import Log
 from fitting.quasi_static.blocks import average
-from fitting.quasi_static.curve_fit import CurveFit, best_of, candidates, polish
-from fitting.quasi_static.intervals import Known, figures
+from fitting.quasi_static.curve_figures import figures
+from fitting.quasi_static.curve_fit import CurveFit, best_fit, polish
+from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.stretches import FOLDS, folds, stretches, worse
 from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape
-
-_CONTAINED: dict[Shape, Shape] = {"cubic": "linear", "two slopes": "linear", "three slopes": "two slopes"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,6 @@ class QuasiStaticFit:
         known: Figures with intervals, by shape.
         held_out: Held-out misfit [rad] of each block, by shape.
         stretch: Number of the stretch that each block was held out with, (n,).
-        chosen: The simplest shape that predicts held-out stretches about as well as the best one, among those whose own
-            figures the logs determine.
     """
 
     blocks: Blocks
@@ -34,7 +32,24 @@ class QuasiStaticFit:
     known: dict[Shape, dict[str, Known]]
     held_out: dict[Shape, np.ndarray]
     stretch: np.ndarray
-    chosen: Shape
+
+    @cached_property
+    def chosen(self) -> Shape:
+        """The simplest shape that predicts held-out stretches about as well as the best one, among those whose own
+        figures the logs determine.
+
+        A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
+        """
+        able: list[Shape] = [shape for shape in SHAPES if shape == "linear" or self._is_determined(shape)]
+        least = min(able, key=self._mean_square)
+        return next(shape for shape in able if shape == least or not self.is_worse(shape, least))
+
+    def _is_determined(self, shape: Shape) -> bool:
+        own = [one for name, one in self.known[shape].items() if name[0] in "KT" or name == "alpha"]
+        return all(one.identifiable for one in own)
+
+    def _mean_square(self, shape: Shape) -> float:
+        return float(np.mean(self.held_out[shape] ** 2))
 
     @property
     def best(self) -> CurveFit:
@@ -44,7 +59,7 @@ class QuasiStaticFit:
     @property
     def undetermined(self) -> Shape | None:
         """A shape that predicts held-out stretches clearly better, but whose figures the logs do not determine."""
-        least = min(SHAPES, key=lambda shape: float(np.mean(self.held_out[shape] ** 2)))
+        least = min(SHAPES, key=self._mean_square)
         return least if self.is_worse(self.chosen, least) else None
 
     def is_worse(self, one: Shape, other: Shape) -> bool:
@@ -68,14 +83,11 @@ def fit_quasi_static(
         The fits.
     """
     blocks = average(logs)
-    fits: dict[Shape, CurveFit] = {}
-    for shape in SHAPES:
-        forms = candidates(blocks, shape, hysteresis)
-        fits[shape] = best_of(blocks, forms, fits.get(_CONTAINED[shape]) if shape in _CONTAINED else None)
+    fits: dict[Shape, CurveFit] = {shape: best_fit(blocks, shape, hysteresis) for shape in SHAPES}
     known: dict[Shape, dict[str, Known]] = {shape: figures(fit, blocks, rated_torque) for shape, fit in fits.items()}
     stretch = stretches(fits["three slopes"].residual, blocks.log)
     held_out: dict[Shape, np.ndarray] = {shape: hold_out(blocks, fit, stretch) for shape, fit in fits.items()}
-    return QuasiStaticFit(blocks, fits, known, held_out, stretch, _choice(known, held_out, stretch, blocks.twist_noise))
+    return QuasiStaticFit(blocks, fits, known, held_out, stretch)
 
 
 def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
@@ -89,22 +101,3 @@ def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
         kept = polish(blocks, fit.curve, fit.parameters, fit.excess, (fold != i).astype(float), most=20)
         misfit[fold == i] = kept.misfit[fold == i]
     return misfit
-
-
-def _choice(
-    known: dict[Shape, dict[str, Known]], held_out: dict[Shape, np.ndarray], stretch: np.ndarray, noise: float
-) -> Shape:
-    """The first shape whose held-out error is not clearly above the least, in the order from simple to flexible.
-
-    A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
-    """
-    able: list[Shape] = ["linear"]
-    for shape in SHAPES[1:]:
-        if all(one.identifiable for name, one in known[shape].items() if _is_of_shape(name)):
-            able.append(shape)
-    least = min(able, key=lambda shape: float(np.mean(held_out[shape] ** 2)))
-    return next(s for s in able if s == least or not worse(held_out[s], held_out[least], stretch, noise))
-
-
-def _is_of_shape(name: str) -> bool:
-    return name[0] in "KT" or name == "alpha"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 
 START = "start"
@@ -26,10 +27,10 @@ class Form:
         columns: Columns (n, strengths) at points, for given shape parameters.
         strengths: Names of the strengths.
         equation: What it adds to the twist.
+        figures: What a reader wants to know of it, from compliance, strengths and shape parameters in a row.
         shapes: Values of the shape parameters to begin with, in rows of a grid, (grid, shape parameters).
         shape_names: Names of the shape parameters; those that begin with "log " are logarithms.
-        low: Least value of each shape parameter.
-        high: Largest.
+        range: Least and largest value of each shape parameter, (2, shape parameters).
         sign: Sign that physics asks of the first strength; zero for either.
         of_torque: Whether its columns follow the torque, so that an error of the torque may pass for it.
     """
@@ -39,20 +40,18 @@ class Form:
     columns: Columns
     strengths: tuple[str, ...]
     equation: str
+    figures: tuple[Figure, ...] = ()
     shapes: np.ndarray = field(default_factory=lambda: np.zeros((1, 0)))
     shape_names: tuple[str, ...] = ()
-    low: tuple[float, ...] = ()
-    high: tuple[float, ...] = ()
+    range: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
     sign: int = 0
     of_torque: bool = True
 
     @property
     def size(self) -> int:
         """Number of strengths and shape parameters; where a log begins is none of them."""
-        own = [n for n in (*self.strengths, *self.shape_names) if not n.startswith(START)]
-        return len(own)
+        return sum(not name.startswith(START) for name in (*self.strengths, *self.shape_names))
 
 
-def base_columns(points: Points) -> np.ndarray:
-    """Columns of the straight line: torque, and one for each log's zero, (n, 1 + logs)."""
-    return np.column_stack([points.torque - points.centre, *(points.log == i for i in range(len(points.names)))])
+Terms = tuple[tuple[Form, np.ndarray], ...]
+"""Forms of an equation, each with its shape parameters."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from fitting.attribution.decisions import RULES
-from fitting.quasi_static.attribution import Held, Trial, torque_error
+from fitting.quasi_static.attribution import Held, TwistTrial, torque_error
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import screen
@@ -32,7 +32,7 @@ class Leftover:
     p_value: float
 
 
-def leftover(held: Held, trial: Trial, base: Trial, seed: int) -> Leftover | None:
+def leftover(held: Held, trial: TwistTrial, base: TwistTrial, seed: int) -> Leftover | None:
     """The quantity of which a smooth function predicts the residual on unseen stretches; None where none does.
 
     Args:
@@ -42,8 +42,6 @@ def leftover(held: Held, trial: Trial, base: Trial, seed: int) -> Leftover | Non
         seed: Of the surrogates.
     """
     found = screen(held.points, trial.model, [(form,) for form in _smooth_functions(held.points)], held.fold, seed)
-    if not found.leads:
-        return None
     best = found.leads[0]
     p_value = found.p_value(best.gain)
     share = 1.0 - math.exp(-2.0 * best.gain)
@@ -53,37 +51,24 @@ def leftover(held: Held, trial: Trial, base: Trial, seed: int) -> Leftover | Non
         or share * trial.mean_square < torque_error(held.points, base)
     ):
         return None
-    return Leftover(best.name, share, p_value)
+    return Leftover(best.forms[0].name, share, p_value)
 
 
 def _smooth_functions(points: Points) -> list[Form]:
-    quantities = {"joint torque": points.torque, "rate of the joint torque": _rate(points)}
+    quantities = {"joint torque": points.torque, "rate of the joint torque": points.torque_rate}
     if points.temperature is not None and np.ptp(points.temperature) > 0:
         quantities["temperature"] = points.temperature
-    found = []
-    if points.direction is not None:
-        if points.load_angle is not None:
-            quantities["load angle"] = points.load_angle
-        if points.motor_angle is not None:
-            found.append(_form("motor angle", _waves(points.motor_angle)))
-    return found + [_form(name, _splines(values)) for name, values in quantities.items()]
-
-
-def _form(name: str, columns: np.ndarray) -> Form:
-    return Form("unknown", name, partial(_given, columns), ("",) * columns.shape[1], f"a function of the {name}")
+    if points.direction is not None and points.load_angle is not None:
+        quantities["load angle"] = points.load_angle
+    columns = {name: _splines(values) for name, values in quantities.items()}
+    if points.direction is not None and points.motor_angle is not None:
+        phases = np.outer(points.motor_angle, np.arange(1, _HARMONICS + 1))
+        columns["motor angle"] = np.hstack([np.cos(phases), np.sin(phases)])
+    return [Form("unknown", name, partial(_given, own), ("",) * own.shape[1], "") for name, own in columns.items()]
 
 
 def _given(columns: np.ndarray, points: Points, shape: np.ndarray) -> np.ndarray:
     return columns
-
-
-def _rate(points: Points) -> np.ndarray:
-    return points.in_each_log(lambda own: np.gradient(points.torque[own], points.time[own]))
-
-
-def _waves(angle: np.ndarray) -> np.ndarray:
-    phases = angle[:, None] * np.arange(1, _HARMONICS + 1)
-    return np.column_stack([np.cos(phases), np.sin(phases)])
 
 
 def _splines(values: np.ndarray) -> np.ndarray:

@@ -1,16 +1,74 @@
 """What the torque-twist equation can't tell from a found effect whatever the fit, and the experiment that would."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from fitting.quasi_static.points import Points
 
 _CONSTANT = "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
 _BOTH_WAYS = "Run the same path both ways: friction changes its sign, {} does not."
+_ALWAYS: dict[str, tuple[tuple[str, str], ...]] = {
+    "kinematic_error": (
+        (
+            "cogging",
+            "Measure the torque at the output instead of by the motor's current: an error of the gear's geometry stays "
+            "in the twist, a torque on the motor's side does not.",
+        ),
+        (
+            "encoder_eccentricity",
+            "Pass through the speed at which the order meets the natural frequency: a kinematic error is amplified "
+            "there, an error of the motor's encoder is not.",
+        ),
+    ),
+    "hysteresis": (
+        (
+            "motor_friction",
+            "Measure the torque at the output: friction on the motor's side is then out of the loop, hysteresis of the "
+            "gear stays.",
+        ),
+        (
+            "coulomb_friction",
+            "Cycle the torque with small loops inside large ones: hysteresis has a slope before it slides.",
+        ),
+    ),
+    "motor_friction": (("load_friction", "Drive one side at a time, the other one uncoupled."),),
+    "creep": (("temperature", _CONSTANT),),
+    "input_delay": (
+        (
+            "nonlinear_damping",
+            "Record a step of another quantity on both channels: a delay of the log is there as well, damping of the "
+            "mesh is not.",
+        ),
+    ),
+    "temperature": (("creep", _CONSTANT),),
+    "encoder_eccentricity": (
+        ("kinematic_error", "Turn the load's encoder on its shaft: its own error turns along, the gear's stays."),
+    ),
+}
+_ONE_WAY = {
+    "kinematic_error": (("position_dependent_friction", _BOTH_WAYS.format("a kinematic error")),),
+    "motor_friction": (("torque_sensor", _BOTH_WAYS.format("an error of the torque sensor")),),
+}
+_AT_REST = {
+    "creep": (
+        (
+            "load_friction",
+            "Measure the torque at the output during the rest: gears creep under a constant torque, friction that "
+            "gives way slowly makes it change.",
+        ),
+    )
+}
+_ON_POSITION = {
+    "stiffness_shape": (
+        (
+            "encoder_eccentricity",
+            "Run the same path under another load: a bent stiffness follows the torque, an error of an encoder follows "
+            "the angle.",
+        ),
+    )
+}
 
 
-def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> Iterator[tuple[str, str]]:
+def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> list[tuple[str, str]]:
     """Families whose columns are the same as a found one's on these logs, each with the experiment that separates.
 
     Args:
@@ -18,55 +76,13 @@ def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> Iterato
         points: Of the logs.
         at_rest: Whether it was found while the joint rests.
     """
-    moved = points.direction is not None
-    if family == "kinematic_error":
-        torque_ripple = "an error of the gear's geometry stays in the twist, a torque on the motor's side does not."
-        yield "cogging", f"Measure the torque at the output instead of by the motor's current: {torque_ripple}"
-        yield (
-            "encoder_eccentricity",
-            "Pass through the speed at which the order meets the natural frequency: a kinematic error is amplified "
-            "there, an error of the motor's encoder is not.",
-        )
-        if "both ways" not in points.motion:
-            yield "position_dependent_friction", _BOTH_WAYS.format("a kinematic error")
-    elif family == "hysteresis":
-        yield (
-            "motor_friction",
-            "Measure the torque at the output: friction on the motor's side is then out of the loop, hysteresis of the "
-            "gear stays.",
-        )
-        yield (
-            "coulomb_friction",
-            "Cycle the torque with small loops inside large ones: hysteresis has a slope before it slides.",
-        )
-    elif family == "motor_friction":
-        yield "load_friction", "Drive one side at a time, the other one uncoupled."
-        if "both ways" not in points.motion:
-            yield "torque_sensor", _BOTH_WAYS.format("an error of the torque sensor")
-    elif family == "creep":
-        yield "temperature", _CONSTANT
-        if at_rest:
-            yield (
-                "load_friction",
-                "Measure the torque at the output during the rest: gears creep under a constant torque, friction that "
-                "gives way slowly makes it change.",
-            )
-    elif family == "input_delay":
-        yield (
-            "nonlinear_damping",
-            "Record a step of another quantity on both channels: a delay of the log is there as well, damping of the "
-            "mesh is not.",
-        )
-    elif family == "temperature":
-        yield "creep", _CONSTANT
-    elif family == "encoder_eccentricity":
-        yield "kinematic_error", "Turn the load's encoder on its shaft: its own error turns along, the gear's stays."
-    elif family == "stiffness_shape" and moved and _hangs_on_position(points):
-        yield (
-            "encoder_eccentricity",
-            "Run the same path under another load: a bent stiffness follows the torque, an error of an encoder follows "
-            "the angle.",
-        )
+    told = (
+        (True, _ALWAYS),
+        ("both ways" not in points.motion, _ONE_WAY),
+        (at_rest, _AT_REST),
+        (points.direction is not None and _hangs_on_position(points), _ON_POSITION),
+    )
+    return [pair for holds, alike in told if holds for pair in alike.get(family, ())]
 
 
 def _hangs_on_position(points: Points) -> bool:

@@ -1,20 +1,17 @@
 """The whole story for quasi-static logs: fit the line, look at what it leaves over, add the effect behind it, refit."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
-from fitting.attribution.decisions import RULES
-from fitting.quasi_static.attribution import Held, Round, Trial, look
-from fitting.quasi_static.candidates import catalogue, choices
+from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
+from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
+from fitting.quasi_static.motion_forms import motion_forms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.rests import RestLook, look_at_rests
-from fitting.quasi_static.stretches import stretches
-from fitting.quasi_static.twist_model import TwistModel, fit_twist
-
-Decision = Literal["effect_found", "model_sufficient", "unexplained"]
+from fitting.quasi_static.torque_forms import torque_forms
+from fitting.quasi_static.twist_model import TwistModel
 
 # Forms of one family in a model: orders of an angle, sliders side by side.
 _MOST_OF_A_FAMILY = 4
@@ -56,12 +53,12 @@ class QuasiStaticLoop:
         forms_tried: Number of forms in the catalogue.
     """
 
-    decision: Decision
+    decision: Outcome
     held: Held
-    before: Trial
-    after: Trial
+    before: TwistTrial
+    after: TwistTrial
     findings: tuple[Finding, ...]
-    rounds: tuple[Round, ...]
+    rounds: tuple[TwistRound, ...]
     at_rest: RestLook | None
     dropped: tuple[str, ...]
     left: Leftover | None
@@ -71,15 +68,26 @@ class QuasiStaticLoop:
         """The points and the equation that tell a finding's figures, and its forms there."""
         if finding.at_rest is None:
             return self.held.points, self.after.model, finding.forms
-        return finding.at_rest.held.points, finding.at_rest.after.model, finding.at_rest.after.model.forms
+        return finding.at_rest.points, finding.at_rest.after.model, finding.at_rest.after.model.forms
+
+    @property
+    def steps(self) -> list[tuple[str | None, TwistTrial]]:
+        """The straight line, then what each round has added to it."""
+        found = [(this.winner.name, this.winner.trial) for this in self.rounds if this.accepted]
+        rested = () if self.at_rest is None else self.at_rest.terms
+        return [(None, self.before), *found, *((form.name, self.after) for form, _ in rested)]
 
 
-def _silent(message: str) -> None:
-    pass
+def catalogue(points: Points) -> tuple[Form, ...]:
+    """The forms that the logs can tell something about, the more usual ones first.
+
+    A loop may run either way: friction on the motor's side turns it round, where the torque is a motor's current.
+    """
+    return (*torque_forms(points), *motion_forms(points))
 
 
 def close_loop(
-    points: Points, *, max_effects: int = 3, seed: int = 0, progress: Callable[[str], None] = _silent
+    points: Points, *, max_effects: int = 3, seed: int = 0, progress: Callable[[str], None] = lambda message: None
 ) -> QuasiStaticLoop:
     """Close the loop between the torque-twist equation and quasi-static logs of one drive.
 
@@ -89,29 +97,25 @@ def close_loop(
         seed: Of the surrogates behind the p-values.
         progress: Told what is being done.
     """
-    line = fit_twist(points, (), ())
-    # Two stretches in each log at least, so that its zero is known where one is held out.
-    held = Held.of(points, stretches(line.misfit, points.log, each=2))
-    base = held.attempt((), ())
-    forms = catalogue(points)
-    current, rounds = base, []
+    held, forms = Held.of(points), catalogue(points)
+    base = current = held.attempt()
+    rounds: list[TwistRound] = []
     while still_open := _still_open(forms, current, max_effects):
         progress("looking through the catalogue")
-        this = look(held, current, base, still_open, seed + len(rounds), RULES.quasi_static_imperfection)
-        rounds.append(this)
-        if not this.accepted:
+        rounds.append(look(held, current, base, still_open, seed + len(rounds)))
+        if not rounds[-1].accepted:
             break
-        current = this.rivals[0].trial
-        progress(f"found {this.rivals[0].lead.name}")
+        current = rounds[-1].winner.trial
+        progress(f"found {rounds[-1].winner.name}")
     current, dropped = _without_superfluous(held, current, base)
     at_rest = None
     families = {form.family for form in current.model.forms}
     if "creep" not in families and len(families) < max_effects:
         progress("looking at the rests")
         at_rest = look_at_rests(held, current, seed)
-        if at_rest is not None and at_rest.form is not None:
-            current = held.attempt((*current.model.forms, at_rest.form), (*current.model.shapes, at_rest.shape))
-            progress(f"found {at_rest.form.name}")
+        if at_rest is not None and at_rest.terms:
+            current = held.beside(current, at_rest.terms)
+            progress(f"found {at_rest.terms[0][0].name}")
     left = leftover(held, current, base, seed)
     return QuasiStaticLoop(
         decision=_decide(base, current, left, points.twist_noise),
@@ -127,7 +131,7 @@ def close_loop(
     )
 
 
-def _still_open(forms: tuple[Form, ...], current: Trial, max_effects: int) -> list[tuple[Form, ...]]:
+def _still_open(forms: tuple[Form, ...], current: TwistTrial, max_effects: int) -> list[tuple[Form, ...]]:
     """What may be added: new families up to the most that are wanted, and further forms of those found."""
     present = [form.family for form in current.model.forms]
     free = max_effects - len(set(present))
@@ -138,10 +142,16 @@ def _still_open(forms: tuple[Form, ...], current: Trial, max_effects: int) -> li
         and (form.family in present or free > 0)
         and present.count(form.family) < _MOST_OF_A_FAMILY
     ]
-    return choices(left, 0 if present else free)
+    alone = [(form,) for form in left]
+    if present or free < 2:
+        return alone
+    # Each bend together with each loop as well, of which either hides the other.
+    loops = [form for form in left if form.family == "hysteresis"]
+    bends = [form for form in left if form.family == "stiffness_shape" and not form.shape_names]
+    return alone + [(loop, bend) for loop in loops for bend in bends]
 
 
-def _without_superfluous(held: Held, trial: Trial, base: Trial) -> tuple[Trial, tuple[str, ...]]:
+def _without_superfluous(held: Held, trial: TwistTrial, base: TwistTrial) -> tuple[TwistTrial, tuple[str, ...]]:
     """The model without forms that hardly matter beside the others."""
     dropped = []
     for form in trial.model.forms if len(trial.model.forms) > 1 else ():
@@ -153,25 +163,22 @@ def _without_superfluous(held: Held, trial: Trial, base: Trial) -> tuple[Trial, 
     return trial, tuple(dropped)
 
 
-def _findings(held: Held, after: Trial, rounds: list[Round], at_rest: RestLook | None) -> tuple[Finding, ...]:
+def _findings(held: Held, after: TwistTrial, rounds: list[TwistRound], at_rest: RestLook | None) -> tuple[Finding, ...]:
+    chances = [(form, r.winner.p_value) for r in rounds if r.accepted for form in r.winner.trial.beyond(r.before)]
     found = []
     for family in dict.fromkeys(form.family for form in after.model.forms):
         own = tuple(form for form in after.model.forms if form.family == family)
         gain = 1.0 - after.rmse / held.without(after, own).rmse
-        if at_rest is not None and at_rest.form in own:
+        if at_rest is not None and own[0] in dict(at_rest.terms):
             found.append(Finding(family, own, gain, at_rest.p_value, at_rest))
         else:
-            chance = min(r.rivals[0].p_value for r in rounds if r.accepted and set(r.rivals[0].lead.forms) & set(own))
-            found.append(Finding(family, own, gain, chance))
+            found.append(Finding(family, own, gain, min(chance for form, chance in chances if form in own)))
     return tuple(sorted(found, key=lambda one: -one.validation_gain))
 
 
-def _decide(base: Trial, after: Trial, left: Leftover | None, noise: float) -> Decision:
+def _decide(base: TwistTrial, after: TwistTrial, left: Leftover | None, noise: float) -> Outcome:
     """Something unexplained is what predictably depends on something, or what is too large for noise of any colour."""
-    if after is base and left is None:
-        return "unexplained" if base.rmse > RULES.wander * noise else "model_sufficient"
-    if left is None or after.rmse < RULES.excess * noise:
-        return "effect_found" if after is not base else "model_sufficient"
-    before, behind = (max(t.mean_square - noise**2, 0.0) for t in (base, after))
-    explained = 1.0 - behind / before if before > 0 else 0.0
-    return "effect_found" if after is not base and explained >= RULES.quasi_static_explained else "unexplained"
+    names = tuple(form.name for form in after.model.forms)
+    explained = left is None and (bool(names) or base.rmse <= RULES.wander * noise)
+    seen = FinalEvidence(names, False, (after.rmse / noise,), (base.rmse / noise,), noise_explains=explained)
+    return conclude(seen, replace(RULES, explained=RULES.quasi_static_explained))[0]

@@ -7,30 +7,48 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.files import finite
-from fitting.quasi_static.attribution import Rival, Trial
+from fitting.quasi_static.attribution import TwistRound, TwistTrial, TwistVerdict
 from fitting.quasi_static.facts import (
     ABOUT_SCALE,
     ARCMIN,
-    ending,
+    account,
     estimates,
     few_stretches,
-    heading,
-    log_dict,
+    framed,
+    log_dicts,
+    no_account,
+    not_identifiable,
     rmse_dict,
+    those_that_hold,
 )
 from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.noise_colour import DRAWS
 from fitting.quasi_static.preparation import QuasiStaticData
-from fitting.quasi_static.rests import RestLook
-from fitting.quasi_static.strengths import stiffness_of, strengths_of
 from fitting.quasi_static.stretches import FOLDS, stretches
+from fitting.quasi_static.twist_model import stiffness_of, strengths_of
 
 # A residual this much larger than the noise of neighbouring points is slower than they are.
 _NOISE = 2.0
 _TOLD_APART = "None is needed: the held-out stretches tell the two apart."
 _TIED = "Log more: several slow cycles at several loads, both ways, and a rest under load at the end."
+_WRONG_WAY = (
+    "The loop runs the wrong way round, as if the gear gave out energy. Hysteresis of the gear alone can't do that; "
+    "friction on the motor's side does where the torque is a motor's current, since it bears a part of the torque that "
+    "the gear passes on, and so does a torque channel that lags behind."
+)
+_ALL_FRICTION = (
+    "The loop contains all friction between torque and twist: a torque measured on the motor's side, by its current "
+    "above all, counts friction of motor and bearings as hysteresis of the gear."
+)
+_SLOWER = (
+    "What is left over is slower than the twist's noise, and follows nothing that was logged, as far as held-out "
+    "stretches can tell: noise of that colour, an error of the torque, or too few cycles to tell an effect."
+)
+_ONE_WAY = (
+    "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is a part "
+    "of the zero, and friction that depends on load or position is a part of the stiffness."
+)
 
 
 def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
@@ -40,45 +58,33 @@ def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
         data: The logs.
         loop: On these logs.
     """
-    points, nothing = loop.held.points, loop.after is loop.before
-    after = {"effects": [], "parameters": {}, "derived": {}, "rmse": rmse_dict(None, None)}
-    if not nothing:
+    points, after = loop.held.points, no_account()
+    if loop.after is not loop.before:
         after = _account(loop, loop.after) | {"effects": [_effect(loop, one) for one in loop.findings]}
-    report = heading(data) | {
+    content = {
         "decision": loop.decision,
         "noise": {"dynamic_error": points.twist_noise, "joint_torque": points.torque_noise},
         "torque_range": [float(np.min(points.torque)), float(np.max(points.torque))],
         "before": _account(loop, loop.before),
         "after": after,
-        "steps": _steps(loop),
+        "steps": [{"added": added, "held_out_rmse": trial.rmse} for added, trial in loop.steps],
         "alternatives": _alternatives(loop),
         "dropped": list(loop.dropped),
-        "unexplained": _unexplained(loop),
+        "unexplained": _unexplained(loop) if loop.decision == "unexplained" else None,
         "unknown": None,
         "cannot_tell": [],
         "next_experiment": None,
         "setting": {"stretches": int(loop.held.stretch[-1]) + 1, "folds": FOLDS},
         "forms_tried": loop.forms_tried,
         "surrogates": DRAWS,
-        "logs": [log_dict(data, i, points.rows[i], points.reversals[i]) for i in range(len(data.logs))],
+        "logs": log_dicts(data, points.rows, points.reversals),
     }
-    report = finite(report | ending(data))
-    report["summary"] = _summary(report)
-    report["cannot_tell"] = _limits(report, loop)
-    return report
+    report = framed(data, content)
+    return report | {"summary": _summary(report), "cannot_tell": _limits(report, loop)}
 
 
-def _account(loop: QuasiStaticLoop, trial: Trial) -> dict[str, Any]:
-    return {
-        "effects": [],
-        "parameters": estimates(stiffness_of(loop.held.points, trial.model)),
-        "derived": {},
-        "rmse": _rmse(trial),
-    }
-
-
-def _rmse(trial: Trial) -> dict[str, float | None]:
-    return rmse_dict(float(np.sqrt(np.mean(trial.model.misfit**2))), trial.rmse)
+def _account(loop: QuasiStaticLoop, trial: TwistTrial) -> dict[str, Any]:
+    return account(stiffness_of(loop.held.points, trial.model), trial.model.misfit, trial.held_out)
 
 
 def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
@@ -89,6 +95,11 @@ def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
             path = f"{finding.family}.{name}"
             number = sum(other == path or other.startswith(f"{path} (") for other in parameters)
             parameters[f"{path} ({number + 1})" if number else path] = known | _in_arcmin(name, known)
+    at_rest = None
+    if finding.at_rest is not None:
+        trials = {"before": finding.at_rest.round.before, "after": finding.at_rest.after}
+        rmse = {name: {"rmse": rmse_dict(trial.model.misfit, trial.held_out)} for name, trial in trials.items()}
+        at_rest = {"rests": len(points.names), **rmse, "gain": finding.at_rest.gain}
     return {
         "family": finding.family,
         "name": " and ".join(form.name for form in finding.forms),
@@ -96,17 +107,7 @@ def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
         "parameters": parameters,
         "validation_gain": finding.validation_gain,
         "p_value": finding.p_value,
-        "at_rest": None if finding.at_rest is None else _at_rest(finding.at_rest),
-    }
-
-
-def _at_rest(found: RestLook) -> dict[str, Any]:
-    before, after = found.round.before, found.after
-    return {
-        "rests": len(found.held.points.names),
-        "before": {"rmse": _rmse(before)},
-        "after": {"rmse": _rmse(after)},
-        "gain": found.gain,
+        "at_rest": at_rest,
     }
 
 
@@ -120,44 +121,25 @@ def _in_arcmin(name: str, known: Mapping[str, Any]) -> dict[str, Any]:
     return {"arcmin": {"value": ARCMIN * known["value"], "ci95": ends}}
 
 
-def _steps(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
-    found = [{"added": None, "held_out_rmse": loop.before.rmse}]
-    for this in loop.rounds:
-        if this.accepted:
-            found.append({"added": this.rivals[0].lead.name, "held_out_rmse": this.rivals[0].trial.rmse})
-    if loop.at_rest is not None and loop.at_rest.form is not None:
-        found.append({"added": loop.at_rest.form.name, "held_out_rmse": loop.after.rmse})
-    return found
-
-
 def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
     """What the equation can't tell from an effect whatever the fit, then what was refitted in its place."""
-    points = loop.held.points
-    kept = {form for one in loop.findings for form in one.forms}
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for one in loop.findings:
-        for family, experiment in lookalikes(one.family, points, at_rest=one.at_rest is not None):
+        for family, experiment in lookalikes(one.family, loop.held.points, at_rest=one.at_rest is not None):
             if family == "coulomb_friction" and _slides_late(loop, one):
                 continue
-            found[family, one.family] = {
-                "family": family,
-                "name": f"{family.replace('_', ' ')} instead of {one.family.replace('_', ' ')}",
-                "validation_rmse": loop.after.rmse,
-                "separable": False,
-                "separating_experiment": experiment,
-                "instead_of": one.family,
-                "validation_rmse_of_found": loop.after.rmse,
-            }
+            name = f"{family.replace('_', ' ')} instead of {one.family.replace('_', ' ')}"
+            pair, rmse = (family, one.family), (loop.after.rmse, loop.after.rmse)
+            found[pair] = _alternative(pair, name, rmse, False, experiment)
+    kept = {form for one in loop.findings for form in one.forms}
     for this in loop.rounds:
-        if not this.accepted or not kept & set(this.rivals[0].lead.forms):
-            continue
-        winner = this.rivals[0]
-        for rival in this.rivals[1:]:
-            families = set(rival.lead.families)
-            same = families <= set(winner.lead.families)
-            if len(families) > 1 or (same and rival.separable):
-                continue
-            found.setdefault((rival.lead.name, winner.lead.name), _refitted(rival, winner))
+        if this.accepted and kept & set(this.winner.trial.beyond(this.before)):
+            for rival in this.verdicts[1:]:
+                if _is_told(rival, this):
+                    pair, rmse = (rival.family, this.winner.name), (rival.trial.rmse, this.winner.trial.rmse)
+                    experiment = _TOLD_APART if rival.separable else _TIED
+                    entry = _alternative(pair, rival.name, rmse, rival.separable, experiment)
+                    found.setdefault((rival.name, this.winner.name), entry)
     return sorted(found.values(), key=lambda one: (one["separable"], one["validation_rmse"]))
 
 
@@ -166,60 +148,44 @@ def _slides_late(loop: QuasiStaticLoop, finding: Finding) -> bool:
     return any(strengths_of(loop.held.points, loop.after.model, form)["reach"].identifiable for form in finding.forms)
 
 
-def _refitted(rival: Rival, winner: Rival) -> dict[str, Any]:
+def _is_told(rival: TwistVerdict, this: TwistRound) -> bool:
+    """Whether a competitor is one form, and of another family than the winner or tied with it."""
+    forms, taken = (verdict.trial.beyond(this.before) for verdict in (rival, this.winner))
+    same = forms[0].family in {form.family for form in taken}
+    return len(forms) == 1 and not (same and rival.separable)
+
+
+def _alternative(
+    families: tuple[str, str], name: str, rmse: tuple[float, float], separable: bool, experiment: str
+) -> dict[str, Any]:
     return {
-        "family": rival.lead.families[0],
-        "name": rival.lead.name,
-        "validation_rmse": rival.trial.rmse,
-        "separable": rival.separable,
-        "separating_experiment": _TOLD_APART if rival.separable else _TIED,
-        "instead_of": winner.lead.name,
-        "validation_rmse_of_found": winner.trial.rmse,
+        "family": families[0],
+        "name": name,
+        "validation_rmse": rmse[0],
+        "separable": separable,
+        "separating_experiment": experiment,
+        "instead_of": families[1],
+        "validation_rmse_of_found": rmse[1],
     }
 
 
-def _unexplained(loop: QuasiStaticLoop) -> dict[str, Any] | None:
-    if loop.decision != "unexplained":
-        return None
+def _unexplained(loop: QuasiStaticLoop) -> dict[str, Any]:
     left: dict[str, Any] = dict.fromkeys(("depends_on", "explained_share", "p_value"))
-    return {
-        "rms": loop.after.rmse,
-        "times_noise": loop.after.rmse / loop.held.points.twist_noise,
-        **(left if loop.left is None else dataclasses.asdict(loop.left)),
-    }
+    size = {"rms": loop.after.rmse, "times_noise": loop.after.rmse / loop.held.points.twist_noise}
+    return size | (left if loop.left is None else dataclasses.asdict(loop.left))
 
 
 def _summary(report: Mapping[str, Any]) -> str:
     """The decision in plain words."""
-    before, after = (report[key]["rmse"]["validation"] for key in ("before", "after"))
-    noise = report["noise"]["dynamic_error"]
-    families = [one["family"].replace("_", " ") for one in report["after"]["effects"]]
-    said = f"{formatting.quantity(before, 'rad')} rms ({formatting.number(before / noise)} times the twist's noise)"
+    effects, before = report["after"]["effects"], report["before"]["rmse"]["validation"]
+    families = [one["family"].replace("_", " ") for one in effects]
     if report["decision"] == "model_sufficient":
-        tried = (
-            f"none of the {report['forms_tried']} forms of missing physics that were tried gains more than chance would"
-        )
-        if before < _NOISE * noise:
-            return f"The straight line suffices: on held-out stretches it errs by {said}, and {tried}."
-        return (
-            f"Nothing more than a straight line is supported: on held-out stretches it errs by {said}, but {tried}, "
-            "and what is left over depends on nothing that was logged."
-        )
-    change = (
-        ""
-        if after is None
-        else (
-            f" The held-out error falls from {formatting.quantity(before, 'rad')} to "
-            f"{formatting.quantity(after, 'rad', like=before)} rms."
-        )
-    )
-    resting = next((one["at_rest"] for one in report["after"]["effects"] if one["at_rest"]), None)
-    if resting is not None:
-        start, end = (resting[key]["rmse"]["validation"] for key in ("before", "after"))
-        change += (
-            f" While the joint rests it falls from {formatting.quantity(start, 'rad')} to "
-            f"{formatting.quantity(end, 'rad', like=start)}."
-        )
+        return _nothing_found(report, before)
+    change = ""
+    if effects:
+        change = f" The held-out error falls {_from_to(report)} rms."
+    for resting in [one["at_rest"] for one in effects if one["at_rest"]][:1]:
+        change += f" While the joint rests it falls {_from_to(resting)}."
     if report["decision"] == "effect_found":
         count = "A missing effect was" if len(families) == 1 else f"{len(families)} missing effects were"
         return f"{count} found: {formatting.words(families)}.{change}"
@@ -235,56 +201,56 @@ def _summary(report: Mapping[str, Any]) -> str:
     )
 
 
+def _nothing_found(report: Mapping[str, Any], before: float) -> str:
+    noise = report["noise"]["dynamic_error"]
+    errs = (
+        f"on held-out stretches it errs by {formatting.quantity(before, 'rad')} rms "
+        f"({formatting.number(before / noise)} times the twist's noise)"
+    )
+    tried = f"none of the {report['forms_tried']} forms of missing physics that were tried gains more than chance would"
+    if before < _NOISE * noise:
+        return f"The straight line suffices: {errs}, and {tried}."
+    return (
+        f"Nothing more than a straight line is supported: {errs}, but {tried}, "
+        "and what is left over depends on nothing that was logged."
+    )
+
+
+def _from_to(accounts: Mapping[str, Any]) -> str:
+    start, end = (accounts[key]["rmse"]["validation"] for key in ("before", "after"))
+    return f"from {formatting.quantity(start, 'rad')} to {formatting.quantity(end, 'rad', like=start)}"
+
+
 def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
     points, model = loop.held.points, loop.after.model
-    parameters = dict((report["after"]["parameters"] or report["before"]["parameters"]).items())
+    parameters = dict(report["after"]["parameters"] or report["before"]["parameters"])
     for one in report["after"]["effects"]:
         parameters |= one["parameters"]
     vague = [name for name, known in parameters.items() if not known["identifiable"] and "phase" not in name]
-    notes = (
-        [f"{formatting.words(vague)} {'is' if len(vague) == 1 else 'are'} not identifiable from these logs."]
-        if vague
-        else []
-    )
-    friction = parameters.get("hysteresis.friction")
-    if friction is not None:
-        notes += _about_loops(friction["value"])
-    if loop.decision == "model_sufficient" and loop.after.rmse > _NOISE * points.twist_noise:
-        notes.append(
-            "What is left over is slower than the twist's noise, and follows nothing that was logged, as far as "
-            "held-out stretches can tell: noise of that colour, an error of the torque, or too few cycles to tell an "
-            "effect."
-        )
+    friction = parameters.get("hysteresis.friction", {"value": 0.0})["value"]
+    slower = loop.decision == "model_sufficient" and loop.after.rmse > _NOISE * points.twist_noise
     error = formatting.quantity(float(abs(loop.before.model.coefficients[0])) * points.torque_error, "rad")
-    notes.append(
-        f"The torque is still off by {formatting.quantity(points.torque_error, 'N m')} rms when its noise is taken "
-        f"off, which is {error} of twist: an effect that follows the torque and is smaller than that can't be seen."
-    )
-    if "one way" in points.motion:
-        notes.append(
-            "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is "
-            "a part of the zero, and friction that depends on load or position is a part of the stiffness."
-        )
-    own_stiffness = next((one.at_rest.own_stiffness for one in loop.findings if one.at_rest is not None), None)
-    if own_stiffness is not None:
-        notes.append(
+    own = next((one.at_rest.own_stiffness for one in loop.findings if one.at_rest is not None), None)
+    notes = [
+        (vague, f"{not_identifiable(vague)}." if vague else ""),
+        (friction < 0, _WRONG_WAY),
+        (friction > 0, _ALL_FRICTION),
+        (slower, _SLOWER),
+        (
+            True,
+            f"The torque is still off by {formatting.quantity(points.torque_error, 'N m')} rms when its noise is taken "
+            f"off, which is {error} of twist: an effect that follows the torque and is smaller than that can't be "
+            "seen.",
+        ),
+        ("one way" in points.motion, _ONE_WAY),
+        (
+            own is not None,
             "At rest the twist may as well follow the torque as logged, with a stiffness of "
-            f"{formatting.quantity(own_stiffness, 'N m/rad')}, which the logs as a whole rule out. Where the stiffness "
-            "of the whole logs is none of the gear alone, since it holds friction or an encoder's error, that would be "
-            "no creep."
-        )
-    count = int(stretches(model.misfit, points.log, each=2)[-1]) + 1
-    return [*notes, *few_stretches(count), ABOUT_SCALE]
-
-
-def _about_loops(friction: float) -> list[str]:
-    if friction < 0:
-        return [
-            "The loop runs the wrong way round, as if the gear gave out energy. Hysteresis of the gear alone can't do "
-            "that; friction on the motor's side does where the torque is a motor's current, since it bears a part of "
-            "the torque that the gear passes on, and so does a torque channel that lags behind."
-        ]
-    return [
-        "The loop contains all friction between torque and twist: a torque measured on the motor's side, by its "
-        "current above all, counts friction of motor and bearings as hysteresis of the gear."
+            f"{formatting.quantity(own, 'N m/rad')}, which the logs as a whole rule out. Where the stiffness of the "
+            "whole logs is none of the gear alone, since it holds friction or an encoder's error, that would be no "
+            "creep.",
+        ),
+        few_stretches(int(stretches(model.misfit, points.log, each=2)[-1]) + 1),
+        (True, ABOUT_SCALE),
     ]
+    return those_that_hold(notes)

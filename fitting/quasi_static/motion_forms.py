@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from fitting.quasi_static.form import Form
+from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 
 HIGHEST_ORDER = 12
@@ -16,13 +17,16 @@ _POINTS_IN_PERIOD = 6
 
 def motion_forms(points: Points) -> Iterator[Form]:
     """The forms that the logs can tell something about, the more usual ones first; none where no joint moved."""
-    yield from _of_the_motor_angle(points)
-    yield from _eccentricity(points)
-    yield from _friction(points)
+    if points.direction is not None:
+        yield from _of_the_motor_angle(points)
+        yield from _eccentricity(points)
+        yield from _friction(points)
 
 
-def orders_seen(angle: np.ndarray, points: Points, highest: int) -> list[int]:
-    """Orders of an angle of which the logs hold a full period, with enough points in it."""
+def orders_seen(angle: np.ndarray | None, points: Points, highest: int) -> list[int]:
+    """Orders of an angle of which the logs hold a full period, with enough points in it; none where it is unknown."""
+    if angle is None:
+        return []
     travel = max(float(np.ptp(angle[own])) for own in points.logs)
     steps = np.abs(np.concatenate([np.diff(angle[own]) for own in points.logs]))
     step = float(np.median(steps[steps >= 0.1 * np.percentile(steps, 90)]))
@@ -32,75 +36,100 @@ def orders_seen(angle: np.ndarray, points: Points, highest: int) -> list[int]:
 
 
 def _of_the_motor_angle(points: Points) -> Iterator[Form]:
-    if points.motor_angle is None or points.direction is None:
-        return
     for n in orders_seen(points.motor_angle, points, HIGHEST_ORDER):
-        names = (f"cosine {n}", f"sine {n}")
+        waves, names = partial(_waves, "motor_angle", n), (f"cosine {n}", f"sine {n}")
+        wave = f"a cos({n} theta_m) + b sin({n} theta_m)"
         yield Form(
             "kinematic_error",
             f"order {n} of the motor",
-            partial(_order, n, None),
+            partial(waves, None),
             names,
-            f"twist = tau/K + a cos({n} theta_m) + b sin({n} theta_m)",
+            f"twist = tau/K + {wave}",
+            _of_a_wave(n, "kinematic error"),
             of_torque=False,
         )
         yield Form(
             "position_dependent_stiffness",
             f"stiffness ripple of order {n}",
-            partial(_order, n, "torque"),
+            partial(waves, "torque"),
             names,
-            f"twist = (1 + a cos({n} theta_m) + b sin({n} theta_m)) tau/K",
+            f"twist = (1 + {wave}) tau/K",
+            (
+                Figure(f"amplitude_{n}", _share, "1", "of the stiffness, as a share of it", True),
+                Figure(f"phase_{n}", _phase, "rad", "of the stiffness at theta_m = 0"),
+            ),
         )
         if "both ways" in points.motion:
             yield Form(
                 "position_dependent_friction",
                 f"friction ripple of order {n}",
-                partial(_order, n, "direction"),
+                partial(waves, "direction"),
                 names,
-                f"twist = (tau - F sgn(speed) (a cos({n} theta_m) + b sin({n} theta_m)))/K",
+                f"twist = (tau - F sgn(speed) ({wave}))/K",
+                (Figure(f"amplitude_{n}", _share, "N m", "of the friction", True),),
             )
 
 
-def _order(order: int, factor: str | None, points: Points, shape: np.ndarray) -> np.ndarray:
-    assert points.motor_angle is not None
-    phase = order * points.motor_angle
-    waves = np.column_stack([np.cos(phase), np.sin(phase)])
-    return waves if factor is None else waves * getattr(points, factor)[:, None]
-
-
 def _eccentricity(points: Points) -> Iterator[Form]:
-    if points.load_angle is None or points.direction is None:
-        return
     for n in orders_seen(points.load_angle, points, 2):
         yield Form(
             "encoder_eccentricity",
             f"order {n} of the load",
-            partial(_load_order, n),
+            partial(_waves, "load_angle", n, None),
             (f"cosine {n}", f"sine {n}"),
             f"reading of theta_l = theta_l - a cos({n} theta_l) - b sin({n} theta_l)",
+            _of_a_wave(n, "reading"),
             of_torque=False,
         )
 
 
-def _load_order(order: int, points: Points, shape: np.ndarray) -> np.ndarray:
-    assert points.load_angle is not None
-    return np.column_stack([np.cos(order * points.load_angle), np.sin(order * points.load_angle)])
+def _waves(angle: str, order: int, factor: str | None, points: Points, shape: np.ndarray) -> np.ndarray:
+    phase = order * getattr(points, angle)[:, None]
+    return np.hstack([np.cos(phase), np.sin(phase)]) * (1.0 if factor is None else getattr(points, factor)[:, None])
+
+
+def _amplitude(own: np.ndarray) -> float:
+    return math.hypot(own[1], own[2])
+
+
+def _share(own: np.ndarray) -> float:
+    return _amplitude(own) / abs(own[0])
+
+
+def _phase(own: np.ndarray) -> float:
+    return math.atan2(own[2], -own[1])
+
+
+def _of_a_wave(order: int, what: str) -> tuple[Figure, Figure]:
+    return (
+        Figure(f"amplitude_{order}", _amplitude, "rad", f"of the {what}, zero to peak", True),
+        Figure(f"phase_{order}", _phase, "rad", f"psi in A cos({order} theta + psi)"),
+    )
 
 
 def _friction(points: Points) -> Iterator[Form]:
-    if points.direction is None:
-        return
     rests = tuple(f"rest {i}" for i in range(int(points.rest.max()) + 1))
     if "both ways" not in points.motion and not rests:
         return
-    law = "twist = (tau - F sgn(speed))/K, and at rest a level of its own"
-    yield Form("motor_friction", "Coulomb friction", partial(_direction, False), ("friction", *rests), law)
+    friction = Figure("friction", lambda own: -own[1] / own[0], "N m", "friction while the joint moves, at its output")
+    yield Form(
+        "motor_friction",
+        "Coulomb friction",
+        partial(_direction, False),
+        ("friction", *rests),
+        "twist = (tau - F sgn(speed))/K, and at rest a level of its own",
+        (friction,),
+    )
     yield Form(
         "motor_friction",
         "Coulomb friction that grows with the load",
         partial(_direction, True),
         ("friction", "share of load", *rests),
         "twist = (tau - (F + m |tau|) sgn(speed))/K, and at rest a level of its own",
+        (
+            friction,
+            Figure("share_of_load", lambda own: -own[2] / own[0], "1", "by which the friction grows with the torque"),
+        ),
     )
 
 

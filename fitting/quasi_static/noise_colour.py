@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import prev_fast_len
 from scipy.signal import lfilter
 
-from fitting.spectral_lines import STANDS_OUT, surroundings
+from fitting.spectral_lines import without_lines
 
 DRAWS = 999
 """Draws: cheap here, and with fewer a chance of one in a hundred would itself be a matter of chance."""
@@ -28,18 +28,11 @@ def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) 
         residual: In order of time, evenly spaced or nearly, (n,).
         random: Generator.
     """
-    series = _without_lines(residual - np.mean(residual))
+    length = prev_fast_len(len(residual), real=True)
+    series = np.fft.irfft(without_lines(np.fft.rfft((residual - np.mean(residual))[:length])), n=length)
     coefficients, variance = autoregression(series)
     innovations = random.normal(size=(DRAWS, _WARM_UP + len(residual))) * np.sqrt(variance)
     return np.asarray(lfilter([1.0], coefficients, innovations, axis=1))[:, _WARM_UP:]
-
-
-def _without_lines(series: np.ndarray) -> np.ndarray:
-    length = prev_fast_len(len(series), real=True)
-    spectrum = np.fft.rfft(series[:length])
-    power = np.abs(spectrum) ** 2
-    cut = np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
-    return np.fft.irfft(spectrum / cut, n=length)
 
 
 def autoregression(series: np.ndarray) -> tuple[np.ndarray, float]:

@@ -10,13 +10,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from fitting.logs import Log
 from fitting.quasi_static.blocks import means, noise, turns
-from fitting.quasi_static.preparation import Motion, speed_of
+from fitting.quasi_static.preparation import MOVES, Motion, speed_of, torque_of
 
 MOST_POINTS = 2000
 # Of local cubics, in rows; even the widest keeps ten of them in a log.
@@ -44,7 +45,6 @@ class Points:
         temperature: [K], (n,), or None.
         motion: How the joint moved, by log.
         names: Of the logs.
-        paths: Of the logs' files.
         torque_noise: Standard deviation of the noise of one row's torque [N m].
         torque_error: Root mean square error of `torque` [N m]: what noise is left, and what smoothing has rounded off.
         twist_noise: Of a point's twist [rad].
@@ -64,7 +64,6 @@ class Points:
     temperature: np.ndarray | None
     motion: tuple[Motion, ...]
     names: tuple[str, ...]
-    paths: tuple[str, ...]
     torque_noise: float
     torque_error: float
     twist_noise: float
@@ -79,6 +78,11 @@ class Points:
     def in_each_log(self, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """What a function of the points of one log gives, over all logs, (n,)."""
         return np.concatenate([of(own) for own in self.logs])
+
+    @cached_property
+    def torque_rate(self) -> np.ndarray:
+        """Rate of the joint torque [N m/s], (n,)."""
+        return self.in_each_log(lambda own: np.gradient(self.torque[own], self.time[own]))
 
     @cached_property
     def duration(self) -> float:
@@ -111,64 +115,49 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
         ratio: Reduction ratio, or None.
     """
     parts = [_points(log, how, ratio, MOST_POINTS // len(logs)) for log, how in zip(logs, motion, strict=True)]
-    sizes = [len(part["torque"]) for part in parts]
-
-    def together(key: str) -> np.ndarray | None:
-        return np.concatenate([p[key] for p in parts]) if all(key in p for p in parts) else None
-
-    def every(key: str) -> np.ndarray:
-        return np.concatenate([p[key] for p in parts])
-
-    torque_noise, torque_error, twist_noise = (float(np.mean([p["noise"][i] for p in parts])) for i in range(3))
+    shared = [key for key in parts[0] if all(key in part for part in parts)]
+    columns: dict[str, Any] = {key: np.concatenate([part[key] for part in parts]) for key in shared}
+    sizes, moved = [len(part["torque"]) for part in parts], [how in MOVES for how in motion]
+    log, noises = np.repeat(np.arange(len(logs)), sizes), columns.pop("noises").reshape(len(logs), 3)
+    torque_noise, torque_error, twist_noise = np.mean(noises, axis=0).tolist()
+    at_rest = (columns["direction"] == 0) & np.repeat(moved, sizes)
+    columns = dict.fromkeys(("motor_angle", "load_angle", "temperature")) | columns
+    if not any(moved):
+        columns["direction"] = None
     return Points(
-        torque=every("torque"),
-        logged_torque=every("logged_torque"),
-        twist=every("twist"),
-        time=every("time"),
-        log=np.repeat(np.arange(len(logs)), sizes),
-        motor_angle=together("motor_angle"),
-        load_angle=together("load_angle"),
-        direction=every("direction") if any(how in ("one way", "both ways") for how in motion) else None,
-        rest=_rests(every("direction"), np.repeat([how in ("one way", "both ways") for how in motion], sizes), sizes),
-        temperature=together("temperature"),
+        **columns,
+        log=log,
+        rest=_rests(at_rest, log),
         motion=tuple(motion),
-        names=tuple(log.name for log in logs),
-        paths=tuple(str(log.path) for log in logs),
+        names=tuple(one.name for one in logs),
         torque_noise=torque_noise,
         torque_error=torque_error,
-        twist_noise=max(twist_noise, 1e-7 * max(float(np.ptp(p["twist"])) for p in parts)),
-        rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
-        reversals=tuple(int(p["reversals"]) for p in parts),
+        twist_noise=max(twist_noise, 1e-7 * max(float(np.ptp(part["twist"])) for part in parts)),
+        rows=tuple(round(len(one) / size) for one, size in zip(logs, sizes, strict=True)),
+        # As coarse as it takes for turns to stand out of the torque's noise.
+        reversals=tuple(len(turns(torque_of(one), max(1, len(one) // 200))) for one in logs),
     )
 
 
 def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[str, np.ndarray]:
-    torque = log.joint_torque
-    assert torque is not None
     size = math.ceil(len(log) / most)
-    smooth, error = without_noise(torque)
-    found = {
-        "torque": means(smooth, size),
-        "logged_torque": means(torque, size),
-        "twist": means(log.dynamic_error - np.mean(log.dynamic_error), size),
-        "time": means(log.time - log.time[0], size),
-        "noise": np.array([noise(torque), error, noise(means(log.dynamic_error, size))]),
+    smooth, error = without_noise(torque_of(log))
+    twist = means(log.dynamic_error - np.mean(log.dynamic_error), size)
+    columns = {
+        "torque": smooth,
+        "logged_torque": torque_of(log),
+        "time": log.time - log.time[0],
+        "motor_angle": log.motor_angle,
+        "load_angle": log.load_angle,
+        "temperature": log.temperature,
     }
-    found["twist"] = found["twist"] - np.mean(found["twist"])
-    # As coarse as it takes for turns to stand out of the torque's noise.
-    found["reversals"] = np.array(len(turns(torque, max(1, len(torque) // 200))))
-    for name in ("motor_angle", "load_angle", "temperature"):
-        values = getattr(log, name)
-        if values is not None:
-            found[name] = means(values, size)
-    speed = speed_of(log, ratio) if motion in ("one way", "both ways") else None
-    if speed is None:
-        found["direction"] = np.zeros_like(found["torque"])
-    else:
-        speed = means(speed, size)
-        moves = np.abs(speed) > _AT_REST * np.percentile(np.abs(speed), 90)
-        found["direction"] = np.sign(speed) * moves
-    return found
+    found = {key: means(values, size) for key, values in columns.items() if values is not None}
+    speed = means(speed_of(log, ratio), size) if motion in MOVES else np.zeros_like(twist)
+    return found | {
+        "twist": twist - np.mean(twist),
+        "direction": np.sign(speed) * (np.abs(speed) > _AT_REST * np.percentile(np.abs(speed), 90)),
+        "noises": np.array([noise(torque_of(log)), error, noise(twist)]),
+    }
 
 
 def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
@@ -193,12 +182,8 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
     return best, math.sqrt(least)
 
 
-def _rests(direction: np.ndarray, moving_log: np.ndarray, sizes: Sequence[int]) -> np.ndarray:
-    """Number of the rest of each point; short ones are reversals of the motion."""
-    at_rest = (direction == 0) & moving_log
-    firsts = np.isin(np.arange(len(direction)), np.cumsum([0, *sizes]))
-    begins = at_rest & (firsts | ~np.roll(at_rest, 1))
-    number = np.where(at_rest, np.cumsum(begins) - 1, -1)
-    lasting = [i for i in range(int(number.max(initial=-1)) + 1) if np.sum(number == i) >= _SHORTEST_REST]
-    renamed = {old: new for new, old in enumerate(lasting)}
-    return np.array([renamed.get(int(i), -1) for i in number])
+def _rests(at_rest: np.ndarray, log: np.ndarray) -> np.ndarray:
+    """Number of the rest of each point, -1 elsewhere; short ones are reversals of the motion."""
+    run = np.cumsum((np.diff(log, prepend=0) != 0) | np.diff(at_rest, prepend=at_rest[0]))
+    lasting = np.flatnonzero(np.bincount(run, at_rest) >= _SHORTEST_REST)
+    return np.where(np.isin(run, lasting), np.searchsorted(lasting, run), -1)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from fitting.drive_file import DriveFile
 from fitting.errors import DataError
@@ -16,6 +17,7 @@ from fitting.pieces import SHORTEST
 from fitting.quasi_static.blocks import means
 
 Motion = Literal["held", "one way", "both ways", "unknown"]
+MOVES: tuple[Motion, ...] = ("one way", "both ways")
 
 # More than any gear bears: vendors' drives twist by less than 0.01 rad at their peak torque.
 LARGEST_TWIST = 0.1
@@ -61,19 +63,29 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
     for log in logs:
         seen = examine(log, drive_file)
         refuse_unfit(seen, log)
-        known = _measured(log)
-        motion, speed = _motion(known, drive_file.reduction_ratio)
-        _refuse_mix_ups(log, must_follow=not (at_rest and motion in ("one way", "both ways")))
-        kept, more = (known, ()) if speed is None or at_rest else _steady(known, speed)
+        # The findings of the reader tell of the rows in which torque or angles were not measured.
+        masks = [mask for mask in (log.trusted, log.input_known) if mask is not None]
+        known = replace(
+            _rows(log, np.logical_and.reduce([np.isfinite(log.time), *masks])), trusted=None, input_known=None
+        )
+        speed = speed_of(known, drive_file.reduction_ratio)
+        motion = _motion(known, speed)
+        _refuse_mix_ups(log, must_follow=not (at_rest and motion in MOVES))
+        kept, more = _steady(known, speed) if motion in MOVES and not at_rest else (known, ())
         ready.append(kept)
         motions.append(motion)
         findings[log.name] = (*seen, *more)
     return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
 
 
+def torque_of(log: Log) -> np.ndarray:
+    """Joint torque of a quasi-static log, which always has one [N m], (n,)."""
+    assert log.joint_torque is not None
+    return log.joint_torque
+
+
 def _refuse_mix_ups(log: Log, *, must_follow: bool) -> None:
-    torque, twist = log.joint_torque, log.dynamic_error
-    assert torque is not None
+    torque, twist = torque_of(log), log.dynamic_error
     span = float(np.ptp(twist))
     if span > LARGEST_TWIST:
         moved = log.motor_angle is not None
@@ -102,8 +114,8 @@ def _refuse_mix_ups(log: Log, *, must_follow: bool) -> None:
         )
 
 
-def speed_of(log: Log, ratio: float | None) -> np.ndarray | None:
-    """Speed of the joint [rad/s], smoothed over a few rows; None where nothing tells it.
+def speed_of(log: Log, ratio: float | None) -> np.ndarray:
+    """Speed of the joint [rad/s], smoothed over a few rows; not a number where nothing tells it.
 
     Args:
         log: The log.
@@ -111,31 +123,26 @@ def speed_of(log: Log, ratio: float | None) -> np.ndarray | None:
     """
     rows = max(3, len(log) // 200)
     if log.motor_angle is not None and ratio is not None:
-        angle = log.motor_angle / ratio
-        lag = np.minimum(np.arange(len(log)) + rows, len(log) - 1)
-        lead = np.maximum(np.arange(len(log)) - rows, 0)
-        return (angle[lag] - angle[lead]) / (log.time[lag] - log.time[lead])
-    if log.motor_velocity is not None:
-        return np.convolve(log.motor_velocity / (ratio or 1.0), np.ones(rows) / rows, mode="same")
-    return None
+        at = np.arange(len(log))
+        ends = np.minimum(at + rows, len(log) - 1), np.maximum(at - rows, 0)
+        angle, time = (values[ends[0]] - values[ends[1]] for values in (log.motor_angle / ratio, log.time))
+        return angle / time
+    velocity = np.full(len(log), np.nan) if log.motor_velocity is None else log.motor_velocity
+    return np.convolve(velocity / (ratio or 1.0), np.ones(rows) / rows, mode="same")
 
 
-def _motion(log: Log, ratio: float | None) -> tuple[Motion, np.ndarray | None]:
-    """How the joint moved, and its speed where it did."""
-    speed = speed_of(log, ratio)
-    if speed is None or not np.all(np.isfinite(speed)):
-        return "unknown", None
+def _motion(log: Log, speed: np.ndarray) -> Motion:
+    if not np.all(np.isfinite(speed)):
+        return "unknown"
     if _travel(log, speed) < FREE_MOTION:
-        return "held", None
-    steady = _is_steady(speed)
-    forwards, backwards = np.mean(speed[steady] > 0), np.mean(speed[steady] < 0)
-    return ("both ways" if min(forwards, backwards) > 0.05 else "one way"), speed
+        return "held"
+    steady = speed[_is_steady(speed)]
+    return "both ways" if min(np.mean(steady > 0), np.mean(steady < 0)) > 0.05 else "one way"
 
 
 def _travel(log: Log, speed: np.ndarray) -> float:
     """How far the joint got [rad]."""
-    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(log.time))])
-    return float(np.ptp(path))
+    return float(np.ptp(cumulative_trapezoid(speed, log.time, initial=0)))
 
 
 def _is_steady(speed: np.ndarray) -> np.ndarray:
@@ -167,16 +174,5 @@ def _steady(log: Log, speed: np.ndarray) -> tuple[Log, tuple[Finding, ...]]:
     return _rows(log, steady), (told,)
 
 
-def _measured(log: Log) -> Log:
-    """The rows in which torque and angles were measured; the findings of the reader tell of the others."""
-    kept = np.ones(len(log), dtype=bool)
-    for known in (log.trusted, log.input_known):
-        if known is not None:
-            kept &= known
-    return log if kept.all() else replace(_rows(log, kept), trusted=None, input_known=None)
-
-
 def _rows(log: Log, kept: np.ndarray) -> Log:
-    names = ("time", "motor_angle", "load_angle", "load_torque", "temperature", "dynamic_error", "motor_velocity")
-    held = {name: getattr(log, name) for name in (*names, "joint_torque")}
-    return replace(log, **{name: values[kept] for name, values in held.items() if values is not None})
+    return replace(log, **{name: v[kept] for name, v in vars(log).items() if isinstance(v, np.ndarray)})

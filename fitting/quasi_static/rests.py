@@ -17,13 +17,12 @@ from functools import partial
 import numpy as np
 
 from fitting.attribution.decisions import RULES
-from fitting.quasi_static.attribution import Held, Round, Trial, look
-from fitting.quasi_static.form import START, Form
+from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
+from fitting.quasi_static.form import START, Form, Terms
+from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
-from fitting.quasi_static.strengths import stiffness_of
-from fitting.quasi_static.stretches import stretches
 from fitting.quasi_static.torque_forms import delay
-from fitting.quasi_static.twist_model import fit_twist
+from fitting.quasi_static.twist_model import stiffness_of
 
 # Assumed: a stop rings for a tenth of a rest, or a quarter of a second [s] where that is less.
 _RINGING, _LONGEST_RINGING = 0.1, 0.25
@@ -40,26 +39,24 @@ class RestLook:
     """A look at what the twist does at rest.
 
     Attributes:
-        held: The points at rest, each rest as a log.
+        points: At rest, each rest as a log.
         round: The look at what may explain them.
         p_value: Chance that noise asks for as much, be it the twist's or the torque's.
         own_stiffness: Stiffness with which the twist may follow the torque at rest instead, though the whole logs rule
             it out [N m/rad]; None where no stiffness would do.
-        form: The effect that was found, beside the equation of the whole logs; None where nothing was.
-        shape: Its shape parameters.
+        terms: The effect that was found, beside the equation of the whole logs; none where nothing was.
     """
 
-    held: Held
-    round: Round
+    points: Points
+    round: TwistRound
     p_value: float
     own_stiffness: float | None
-    form: Form | None
-    shape: np.ndarray
+    terms: Terms
 
     @property
-    def after(self) -> Trial:
+    def after(self) -> TwistTrial:
         """The equation at rest with the effect."""
-        return self.round.rivals[0].trial
+        return self.round.winner.trial
 
     @property
     def gain(self) -> float:
@@ -67,24 +64,7 @@ class RestLook:
         return 1.0 - self.after.rmse / self.round.before.rmse
 
 
-@dataclass(frozen=True, eq=False)
-class _Rests:
-    """Where points stand in the rests that are looked at.
-
-    Attributes:
-        number: Of the rest, once its stop has rung out; -1 elsewhere, (n,).
-        since: Time from its stop [s], (n,).
-    """
-
-    number: np.ndarray
-    since: np.ndarray
-
-    @property
-    def count(self) -> int:
-        return int(self.number.max()) + 1
-
-
-def look_at_rests(held: Held, current: Trial, seed: int) -> RestLook | None:
+def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None:
     """Look at the rests of joints that moved; None where no rest is long enough.
 
     Args:
@@ -92,47 +72,47 @@ def look_at_rests(held: Held, current: Trial, seed: int) -> RestLook | None:
         current: Their model so far, for its compliance.
         seed: Of the surrogates.
     """
-    rests = _settled(held.points)
-    if not rests.count:
+    rest, since = _settled(held.points)
+    rows = np.flatnonzero(rest >= 0)
+    if not rows.size:
         return None
-    rows = np.flatnonzero(rests.number >= 0)
-    points = _as_logs(held.points, rests, rows, float(abs(current.model.coefficients[0])))
-    form = _relaxation(points.step, _Rests(rests.number[rows], rests.since[rows]))
-    resting, this = _look(points, form, seed)
+    compliance = float(abs(current.model.coefficients[0]))
+    points = _as_logs(replace(held.points, time=since, log=rest), rows, compliance)
+    form = _relaxation(points.step, points.log, points.time)
+    this = _look(points, form, seed)
     p_value, own_stiffness = _chance(this), None
     if np.ptp(points.torque) > 0:
         allowed = stiffness_of(held.points, current.model)["K"].ci95 or (0.0, math.inf)
         turned = replace(points, torque=points.twist, twist=points.logged_torque)
-        free = in_return = _look(turned, form, seed)[1]
+        free = in_return = _look(turned, form, seed)
         slope = float(free.before.model.coefficients[0])
-        if not allowed[0] <= slope <= allowed[1]:
-            nearest = min(allowed, key=lambda end: abs(end - slope))
+        nearest = float(np.clip(slope, *allowed))
+        if slope != nearest:
             left = points.logged_torque - nearest * points.twist
-            in_return = _look(replace(points, torque=np.zeros_like(left), twist=left), form, seed)[1]
+            in_return = _look(replace(points, torque=np.zeros_like(left), twist=left), form, seed)
         p_value = max(p_value, _chance(in_return))
         # Turned round, the line's compliance is the stiffness; where the torque stays as it is, that is not known.
         follows = stiffness_of(turned, free.before.model)["K"].identifiable
         own_stiffness = slope if follows and _chance(free) > _SIGNIFICANCE else None
-    if not this.accepted or p_value > _SIGNIFICANCE:
-        return RestLook(resting, this, p_value, own_stiffness, None, np.zeros(0))
-    whole = _relaxation(points.step, rests, initial=f"{START} ")
-    return RestLook(resting, this, p_value, own_stiffness, whole, this.rivals[0].trial.model.shapes[0])
+    terms: Terms = ()
+    if this.accepted and p_value <= _SIGNIFICANCE:
+        ((_, shape),) = this.winner.trial.model.terms
+        terms = ((_relaxation(points.step, rest, since, initial=f"{START} "), shape),)
+    return RestLook(points, this, p_value, own_stiffness, terms)
 
 
-def _look(points: Points, form: Form, seed: int) -> tuple[Held, Round]:
-    line = fit_twist(points, (), ())
-    held = Held.of(points, stretches(line.misfit, points.log, each=2))
-    base = held.attempt((), ())
-    return held, look(held, base, base, [(form,), (delay(),)], seed, 0.0)
+def _look(points: Points, form: Form, seed: int) -> TwistRound:
+    held = Held.of(points)
+    base = held.attempt()
+    return look(held, base, base, [(form,), (delay(),)], seed)
 
 
-def _chance(this: Round) -> float:
+def _chance(this: TwistRound) -> float:
     """The p-value of a relaxation; where another form does better, or none is worth a refit, there is none."""
-    best = this.rivals[0] if this.rivals else None
-    return best.p_value if best is not None and best.lead.families == ("creep",) else 1.0
+    return this.winner.p_value if this.verdicts and this.winner.family == "creep" else 1.0
 
 
-def _relaxation(step: float, rests: _Rests, initial: str = "") -> Form:
+def _relaxation(step: float, rest: np.ndarray, since: np.ndarray, initial: str = "") -> Form:
     """The twist relaxes after a stop, in each rest from a state of its own, with one time constant.
 
     At rest the torque of a gear that bears a load hardly changes, so that a standard linear solid fades exponentially;
@@ -141,74 +121,72 @@ def _relaxation(step: float, rests: _Rests, initial: str = "") -> Form:
 
     Args:
         step: Time between points [s].
-        rests: Where points stand in them.
+        rest: Number of the rest of each point, -1 elsewhere, (n,).
+        since: Time from its stop [s], (n,).
         initial: What its parameters' names begin with: `START` where they count as initial states of the rests, which
             the other points of a log know nothing of.
     """
-    low, high = math.log(_POINTS_IN_CONSTANT * step), math.log(float(np.max(rests.since)))
+    low, high = math.log(_POINTS_IN_CONSTANT * step), math.log(float(np.max(since[rest >= 0])))
+    text, numbers = "of the relaxation at the stop before rest", range(1, int(rest.max()) + 2)
+    amplitudes = (Figure(f"amplitude_{i}", lambda own, i=i: own[i], "rad", f"{text} {i}") for i in numbers)
     return Form(
         "creep",
         "relaxation after a stop",
-        partial(_fading, rests),
-        tuple(f"{initial}amplitude {i + 1}" for i in range(rests.count)),
+        partial(_fading, rest, since),
+        tuple(f"{initial}amplitude {i}" for i in numbers),
         "at rest: twist = tau/K + level of the rest + a exp(-t/T), t from the stop on",
+        (Figure("time_constant", lambda own: math.exp(own[-1]), "s", "of the relaxation", True), *amplitudes),
         np.linspace(low, high, _CONSTANTS)[:, None],
         (f"{initial}log time constant",),
-        (low,),
-        (high,),
+        np.array([[low], [high]]),
         of_torque=False,
     )
 
 
-def _fading(rests: _Rests, points: Points, shape: np.ndarray) -> np.ndarray:
-    columns = np.zeros((len(rests.number), rests.count))
-    for i in range(rests.count):
-        own = rests.number == i
-        fading = np.exp(-rests.since[own] / math.exp(shape[0]))
-        columns[own, i] = fading - np.mean(fading)
-    return columns
+def _fading(rest: np.ndarray, since: np.ndarray, points: Points, shape: np.ndarray) -> np.ndarray:
+    own = rest[:, None] == np.arange(int(rest.max()) + 1)
+    fading = own * np.exp(-since / math.exp(shape[0]))[:, None]
+    return fading - own * (np.sum(fading, axis=0) / np.sum(own, axis=0))
 
 
-def _settled(points: Points) -> _Rests:
-    """The longest rests, less the time in which their stops ring."""
+def _settled(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Of each point the number of its rest, -1 elsewhere, and the time from the stop [s].
+
+    Only the longest rests count, less the time in which their stops ring.
+    """
     since, found = np.zeros(len(points.twist)), []
     for i in range(int(points.rest.max()) + 1):
         own = np.flatnonzero(points.rest == i)
         since[own] = points.time[own] - points.time[own[0]]
-        own = own[since[own] >= min(_RINGING * since[own[-1]], _LONGEST_RINGING)]
-        if len(own) >= _FEWEST:
-            found.append(own)
+        found.append(own[since[own] >= min(_RINGING * since[own[-1]], _LONGEST_RINGING)])
+    longest = sorted((own for own in found if len(own) >= _FEWEST), key=len, reverse=True)[:_MOST_RESTS]
     number = np.full(len(points.twist), -1)
-    longest = sorted(found, key=len, reverse=True)[:_MOST_RESTS]
-    for i, own in enumerate(sorted(longest, key=lambda own: int(own[0]))):
+    for i, own in enumerate(sorted(longest, key=lambda own: own[0])):
         number[own] = i
-    return _Rests(number, since)
+    return number, since
 
 
-def _as_logs(points: Points, rests: _Rests, rows: np.ndarray, compliance: float) -> Points:
+def _as_logs(points: Points, rows: np.ndarray, compliance: float) -> Points:
     """The points at rest, each rest as a log; the torque is a constant where its changes could not be seen."""
-    log = rests.number[rows]
-    torque, logged, twist = (getattr(points, name)[rows] for name in ("torque", "logged_torque", "twist"))
-    for i in range(rests.count):
-        for values in (torque, logged, twist):
-            values[log == i] -= np.mean(values[log == i])
-    if compliance * float(np.ptp(torque)) < points.twist_noise:
-        torque = np.zeros_like(torque)
+    log, count = points.log[rows], int(points.log.max()) + 1
+    columns = np.column_stack([points.torque, points.logged_torque, points.twist])[rows]
+    for i in range(count):
+        columns[log == i] -= np.mean(columns[log == i], axis=0)
+    torque, logged, twist = columns.T
     return replace(
         points,
-        torque=torque,
+        torque=torque * (compliance * float(np.ptp(torque)) >= points.twist_noise),
         logged_torque=logged,
         twist=twist,
-        time=rests.since[rows],
+        time=points.time[rows],
         log=log,
         motor_angle=None,
         load_angle=None,
         direction=None,
         rest=np.full(len(rows), -1),
         temperature=None if points.temperature is None else points.temperature[rows],
-        motion=("held",) * rests.count,
-        names=tuple(f"rest {i + 1}" for i in range(rests.count)),
-        paths=("",) * rests.count,
-        rows=(1,) * rests.count,
-        reversals=(0,) * rests.count,
+        motion=("held",) * count,
+        names=tuple(f"rest {i + 1}" for i in range(count)),
+        rows=(1,) * count,
+        reversals=(0,) * count,
     )

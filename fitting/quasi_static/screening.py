@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fitting.quasi_static.form import Form
+from fitting.attribution.screening import Screen
+from fitting.quasi_static.form import Form, Terms
 from fitting.quasi_static.noise_colour import noise_of_the_same_colour
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS
@@ -26,51 +27,27 @@ class Lead:
     """One form, or two that may hide each other, at the grid point that suits best.
 
     Attributes:
-        forms: The form or forms.
-        shapes: Shape parameters of each.
+        terms: The form or forms, with their shape parameters.
         gain: Half the logarithm of the held-out mean square without over that with it.
     """
 
-    forms: tuple[Form, ...]
-    shapes: tuple[np.ndarray, ...]
+    terms: Terms
     gain: float
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        """Without their shape parameters."""
+        return tuple(form for form, _ in self.terms)
 
     @property
     def families(self) -> tuple[str, ...]:
         """Of the forms."""
         return tuple(form.family for form in self.forms)
 
-    @property
-    def name(self) -> str:
-        """Of the forms."""
-        return " and ".join(form.name for form in self.forms)
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return sum(form.size for form in self.forms)
-
-
-@dataclass(frozen=True, eq=False)
-class Screen:
-    """A look at the whole catalogue.
-
-    Attributes:
-        leads: Each choice at its best, best first.
-        null_gains: The best gain over all choices and shapes in each surrogate, (draws,).
-    """
-
-    leads: tuple[Lead, ...]
-    null_gains: np.ndarray
-
-    def p_value(self, gain: float) -> float:
-        """How often chance alone makes the best of the catalogue at least this good."""
-        return (1 + int(np.sum(self.null_gains >= gain))) / (1 + len(self.null_gains))
-
 
 def screen(
     points: Points, model: TwistModel, choices: Sequence[tuple[Form, ...]], fold: np.ndarray, seed: int
-) -> Screen:
+) -> Screen[Lead]:
     """Look at forms beside a fitted model.
 
     Args:
@@ -84,34 +61,28 @@ def screen(
     chance = [noise_of_the_same_colour(model.misfit[own], random) for own in points.logs]
     series = np.column_stack([model.misfit, np.concatenate(chance, axis=1).T])
     known = _orthonormal(model.jacobian)
-    forms = dict.fromkeys(form for choice in choices for form in choice)
-    columns = {form: [_beside(known, form.columns(points, shape)) for shape in form.shapes] for form in forms}
-    products = _Products.of(np.column_stack([known, *(c for own in columns.values() for c in own)]), series, fold)
-    seats, first = {}, known.shape[1]
-    for form, own in columns.items():
-        seats[form] = [np.arange(first + i * c.shape[1], first + (i + 1) * c.shape[1]) for i, c in enumerate(own)]
-        first += sum(c.shape[1] for c in own)
-    tried = [
-        (choice, grid) for choice in choices for grid in itertools.product(*(range(len(f.shapes)) for f in choice))
-    ]
-    chosen = [np.concatenate([seats[f][i] for f, i in zip(*one, strict=True)]) for one in tried]
-    nuisance = np.arange(known.shape[1])
-    before = products.held_out_loss(nuisance[None, :])[0][0]
-    gains = np.zeros((len(tried), series.shape[1]))
-    sizes = np.array([len(own) for own in chosen], dtype=int)
-    for size in np.unique(sizes):
-        these = np.flatnonzero(sizes == size)
-        loss, strengths = products.held_out_loss(np.array([[*nuisance, *chosen[i]] for i in these]))
-        # Only forms that stand alone ask for a sign.
-        signs = np.array([tried[i][0][0].sign if len(tried[i][0]) == 1 else 0 for i in these])
-        wrong = (signs[:, None] != 0) & (np.sign(strengths[:, len(nuisance)]) == -signs[:, None])
-        gains[these] = np.where(wrong, 0.0, 0.5 * np.log(before / np.maximum(loss, 1e-300)))
-    leads: dict[tuple[Form, ...], Lead] = {}
-    for (choice, grid), gain in zip(tried, gains[:, 0].tolist(), strict=True):
-        if choice not in leads or gain > leads[choice].gain:
-            leads[choice] = Lead(choice, tuple(f.shapes[i] for f, i in zip(choice, grid, strict=True)), gain)
-    null_gains = np.max(gains[:, 1:], axis=0, initial=0.0)
-    return Screen(tuple(sorted(leads.values(), key=lambda lead: -lead.gain)), null_gains)
+    columns, places, count = [known], {}, known.shape[1]
+    for form in dict.fromkeys(form for choice in choices for form in choice):
+        for i, shape in enumerate(form.shapes):
+            columns.append(_beside(known, form.columns(points, shape)))
+            places[form, i] = range(count, count + columns[-1].shape[1])
+            count += columns[-1].shape[1]
+    products = _Products.of(np.column_stack(columns), series, fold)
+    nuisance = range(known.shape[1])
+    before, _ = products.held_out_loss([*nuisance])
+    best, null_gains = {}, np.zeros(series.shape[1] - 1)
+    for choice in choices:
+        for grid in itertools.product(*(range(len(form.shapes)) for form in choice)):
+            own = [place for form, i in zip(choice, grid, strict=True) for place in places[form, i]]
+            loss, strengths = products.held_out_loss([*nuisance, *own])
+            # Only forms that stand alone ask for a sign.
+            wrong = choice[0].sign * strengths[len(nuisance)] < 0 if len(choice) == 1 else False
+            gains = np.where(wrong, 0.0, 0.5 * np.log(before / np.maximum(loss, 1e-300)))
+            null_gains = np.maximum(null_gains, gains[1:])
+            if choice not in best or gains[0] > best[choice].gain:
+                shapes = (form.shapes[i] for form, i in zip(choice, grid, strict=True))
+                best[choice] = Lead(tuple(zip(choice, shapes, strict=True)), float(gains[0]))
+    return Screen(tuple(sorted(best.values(), key=lambda lead: -lead.gain)), null_gains)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +102,13 @@ class _Products:
             np.array([np.sum(s**2, axis=0) for _, s in parts]),
         )
 
-    def held_out_loss(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sum of squares on held-out folds of each choice of columns and each series, (choices, series), and the
-        strengths that all folds together give, (choices, columns, series)."""
-        rows, columns = chosen[:, :, None], chosen[:, None, :]
-        whole_gram, whole_against = self.gram.sum(axis=0), self.against.sum(axis=0)
-        loss = np.zeros((len(chosen), self.squares.shape[1]))
-        for gram, against, squares in zip(self.gram, self.against, self.squares, strict=True):
-            solution = _solve((whole_gram - gram)[rows, columns], (whole_against - against)[chosen])
-            quadratic = np.sum(solution * (gram[rows, columns] @ solution), axis=1)
-            loss += squares - 2.0 * np.sum(solution * against[chosen], axis=1) + quadratic
-        return loss, _solve(whole_gram[rows, columns], whole_against[chosen])
+    def held_out_loss(self, own: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of squares on held-out folds of each series with some columns, (series,), and the strengths that all
+        folds together give, (columns, series)."""
+        gram, against = self.gram[:, own][:, :, own], self.against[:, own]
+        without = _solve(gram.sum(axis=0) - gram, against.sum(axis=0) - against)
+        loss = self.squares + np.sum(without * (gram @ without - 2.0 * against), axis=1)
+        return loss.sum(axis=0), _solve(gram.sum(axis=0), against.sum(axis=0))
 
 
 def _solve(gram: np.ndarray, against: np.ndarray) -> np.ndarray:

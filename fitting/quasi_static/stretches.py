@@ -3,22 +3,22 @@
 import math
 
 import numpy as np
-from scipy.special import stdtrit
+
+from fitting.attribution.decisions import tie
+from fitting.autocorrelation import autocovariance
 
 FOLDS = 5
 
 
 def correlation_length(residual: np.ndarray) -> float:
     """Blocks over which residuals resemble each other: one and twice the sum of their autocorrelation."""
-    centred = residual - np.mean(residual)
-    size = len(centred)
-    spectrum = np.abs(np.fft.rfft(centred, 2 * size)) ** 2
-    covariance = np.fft.irfft(spectrum)[: size // 2]
+    size = len(residual)
+    covariance = autocovariance(residual - np.mean(residual), size // 2 - 1)
     if covariance[0] <= 0:
         return 1.0
     rho = covariance / covariance[0]
-    faded = np.flatnonzero(rho < 2.0 / math.sqrt(size))
-    until = int(faded[0]) if len(faded) else len(rho)
+    # Up to where it has faded; the sum over all lags of a series is nothing but its mean.
+    until = np.argmax(np.append(rho, -1.0) < 2.0 / math.sqrt(size))
     return max(1.0, 1.0 + 2.0 * float(np.sum(rho[1:until])))
 
 
@@ -52,11 +52,9 @@ def folds(stretch: np.ndarray) -> np.ndarray:
 
 
 def worse(one: np.ndarray, other: np.ndarray, stretch: np.ndarray, noise: float) -> bool:
-    """Whether the first held-out misfit is clearly above the second, paired over stretches, one-sided 95 %.
+    """Whether the first held-out misfit is clearly above the second, paired over stretches.
 
     A difference of less than a hundredth of the noise's variance is none, or rounding would choose among exact fits.
     """
     excess = np.bincount(stretch, one**2 - other**2)
-    error = float(np.std(excess, ddof=1)) / math.sqrt(len(excess))
-    clear = float(np.mean(excess)) > float(stdtrit(len(excess) - 1, 0.95)) * error
-    return clear and float(np.sum(excess)) > 0.01 * noise**2 * len(one)
+    return not tie("", excess).holds and float(np.sum(excess)) > 0.01 * noise**2 * len(one)

@@ -3,11 +3,13 @@
 import math
 from collections.abc import Iterator
 from functools import partial
+from itertools import accumulate
+from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from fitting.quasi_static.form import Form
+from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.torque_twist import MEMORIES, Memory, remembered
 
@@ -23,58 +25,99 @@ _REVERSALS_FOR_DRIFT = 4
 
 def torque_forms(points: Points) -> Iterator[Form]:
     """The forms that the logs can tell something about, the more usual ones first."""
-    yield from _hysteresis(points)
+    # Friction follows the direction of the motion: one way, or where the torque never turns, no loop is open.
+    if "one way" not in points.motion and max(points.reversals) > 0:
+        yield from _hysteresis(points)
     yield from _stiffness_shapes(points)
-    yield from _creep(points)
+    if _POINTS_IN_CONSTANT * points.step < points.duration / _CONSTANTS_IN_LOG:
+        yield _creep(points)
     yield delay()
     yield from _temperature(points)
 
 
+def _begun(name: str, low: float, high: float, logs: int) -> dict[str, Any]:
+    """Shape parameters of a memory: a positive number, and where each log begins."""
+    values = np.linspace(math.log(low), math.log(high), 10)
+    return {
+        "shapes": np.array([[at, *[start] * logs] for at in values for start in (-1.0, 0.0, 1.0)]),
+        "shape_names": (f"log {name}", *(f"start {i}" for i in range(logs))),
+        "range": np.array([[math.log(low), *[-1.0] * logs], [math.log(high), *[1.0] * logs]]),
+    }
+
+
 def _hysteresis(points: Points) -> Iterator[Form]:
-    if "one way" in points.motion or max(points.reversals) == 0:
-        # Friction follows the direction of the motion, and no loop is open.
-        return
-    low, high = math.log(_REACHES[0] * points.reach), math.log(_REACHES[1] * points.reach)
-    logs = len(points.names)
-    grid = np.array([[at, *[start] * logs] for at in np.linspace(low, high, 10) for start in (-1.0, 0.0, 1.0)])
-    for memory in MEMORIES:
+    figures = (
+        Figure("friction", lambda own: -own[1] / own[0], "N m", "friction behind the loop, half its width in torque"),
+        Figure("width", lambda own: -2.0 * own[1], "rad", "width of the developed loop"),
+        Figure("reach", lambda own: math.exp(own[2]), "N m", "torque over which the branch changes, half way", True),
+    )
+    low, high = (share * points.reach for share in _REACHES)
+    for memory, law in zip(MEMORIES, ("(spring beside a slider)", "(Dahl)"), strict=True):
         yield Form(
             "hysteresis",
             f"{memory} hysteresis",
             partial(_branch, memory),
             ("friction",),
-            "twist = (tau - F s)/K, where s goes from -1 to 1 as the torque turns round "
-            + ("(spring beside a slider)" if memory == "abrupt" else "(Dahl)"),
-            grid,
-            ("log reach", *(f"start {i}" for i in range(logs))),
-            (low, *[-1.0] * logs),
-            (high, *[1.0] * logs),
+            f"twist = (tau - F s)/K, where s goes from -1 to 1 as the torque turns round {law}",
+            figures,
+            **_begun("reach", low, high, len(points.names)),
         )
 
 
 def _branch(memory: Memory, points: Points, shape: np.ndarray) -> np.ndarray:
-    reach = math.exp(shape[0])
-    each = [remembered(memory, points.torque[own], reach, shape[1 + i]) for i, own in enumerate(points.logs)]
+    starts = zip(points.logs, shape[1:], strict=True)
+    each = [remembered(memory, points.torque[own], math.exp(shape[0]), start) for own, start in starts]
     return np.concatenate(each)[:, None]
 
 
 def _stiffness_shapes(points: Points) -> Iterator[Form]:
-    stiffness = "stiffness_shape"
-    yield Form(stiffness, "quadratic", partial(_powers, (2,)), ("quadratic",), "twist = tau/K + q tau^2")
-    yield Form(stiffness, "cubic", partial(_powers, (3,)), ("cubic",), "twist = tau/K + c tau^3")
-    both = ("quadratic", "cubic")
-    yield Form(stiffness, "quadratic and cubic", partial(_powers, (2, 3)), both, "twist = tau/K + q tau^2 + c tau^3")
-    size = np.abs(points.torque - points.centre)
-    knees = np.log(np.quantile(size, _KNEES))
-    ends = (float(knees[0]),), (float(knees[-1]),)
-    line = "twist = tau/K1 up to T1, with slope 1/K2 beyond"
-    yield Form(stiffness, "two slopes", _beyond, ("beyond knee",), line, knees[:, None], ("log knee",), *ends)
+    alpha = Figure(
+        "alpha",
+        lambda own: -own[-1] / own[0] ** 3,
+        "rad^-2",
+        "cubic coefficient in tau = K (x + alpha x^3), to first order",
+    )
+    terms = {"quadratic": "q tau^2", "cubic": "c tau^3"}
+    for names in (("quadratic",), ("cubic",), ("quadratic", "cubic")):
+        powers = tuple(2 if name == "quadratic" else 3 for name in names)
+        yield Form(
+            "stiffness_shape",
+            " and ".join(names),
+            partial(_powers, powers),
+            names,
+            " + ".join(["twist = tau/K", *(terms[name] for name in names)]),
+            (
+                *(_of_a_power(i, name, power) for i, (name, power) in enumerate(zip(names, powers, strict=True), 1)),
+                *((alpha,) if "cubic" in names else ()),
+            ),
+        )
+    knees = np.log(np.quantile(np.abs(points.torque - points.centre), _KNEES))
+    yield Form(
+        "stiffness_shape",
+        "two slopes",
+        _beyond,
+        ("beyond knee",),
+        "twist = tau/K1 up to T1, with slope 1/K2 beyond",
+        (
+            Figure("K2", lambda own: 1.0 / (own[0] + own[1]), "N m/rad", "stiffness beyond the knee", True),
+            Figure("T1", lambda own: math.exp(own[2]), "N m", "torque at the knee", True),
+        ),
+        knees[:, None],
+        ("log knee",),
+        knees[[0, -1], None],
+    )
     if points.centre == 0.0:
-        yield Form("backlash", "dead zone", _dead_zone, ("half-width",), "twist = tau/K + b sgn(tau)", sign=1)
+        half = Figure("half_width", lambda own: own[1], "rad", "half of the dead zone", True)
+        law = "twist = tau/K + b sgn(tau)"
+        yield Form("backlash", "dead zone", _dead_zone, ("half-width",), law, (half,), sign=1)
+
+
+def _of_a_power(at: int, name: str, power: int) -> Figure:
+    return Figure(name, lambda own: own[at], f"rad/(N m)^{power}", f"{name} term of the twist in the torque")
 
 
 def _powers(powers: tuple[int, ...], points: Points, shape: np.ndarray) -> np.ndarray:
-    return np.column_stack([(points.torque - points.centre) ** power for power in powers])
+    return np.power.outer(points.torque - points.centre, powers)
 
 
 def _beyond(points: Points, shape: np.ndarray) -> np.ndarray:
@@ -88,81 +131,83 @@ def _dead_zone(points: Points, shape: np.ndarray) -> np.ndarray:
     return np.tanh(points.torque / max(width, 1e-6 * points.reach))[:, None]
 
 
-def _creep(points: Points) -> Iterator[Form]:
-    low, high = _POINTS_IN_CONSTANT * points.step, points.duration / _CONSTANTS_IN_LOG
-    if not low < high:
-        return
-    logs = len(points.names)
-    constants, starts = np.linspace(math.log(low), math.log(high), 10), (-1.0, 0.0, 1.0)
-    yield Form(
+def _creep(points: Points) -> Form:
+    ends = _POINTS_IN_CONSTANT * points.step, points.duration / _CONSTANTS_IN_LOG
+    return Form(
         "creep",
         "standard linear solid",
         _lagging,
         ("delayed compliance",),
         "twist = tau/K + k z, where T z' = tau - z",
-        np.array([[at, *[start] * logs] for at in constants for start in starts]),
-        ("log time constant", *(f"start {i}" for i in range(logs))),
-        (math.log(low), *[-1.0] * logs),
-        (math.log(high), *[1.0] * logs),
+        (
+            Figure("time_constant", lambda own: math.exp(own[2]), "s", "of the relaxation", True),
+            Figure("share", lambda own: own[1] / own[0], "1", "delayed twist over immediate twist", True),
+        ),
         sign=1,
+        **_begun("time constant", *ends, len(points.names)),
     )
 
 
 def _lagging(points: Points, shape: np.ndarray) -> np.ndarray:
     """The torque behind a first-order lag, which begins by a share of the torque's range off it."""
-    constant, lags = math.exp(shape[0]), []
+    lags = []
     for start, own in zip(shape[1:], points.logs, strict=True):
-        torque, time = points.torque[own], points.time[own]
-        fading = start * points.reach * np.exp(-(time - time[0]) / constant)
-        lags.append(_lag(torque - torque[0], np.diff(time), constant) + torque[0] + fading)
+        torque = points.torque[own]
+        lags.append(_lag(torque, np.diff(points.time[own]), math.exp(shape[0]), torque[0] + start * points.reach))
     return (np.concatenate(lags) - points.centre)[:, None]
 
 
-def _lag(values: np.ndarray, steps: np.ndarray, constant: float) -> np.ndarray:
-    """T z' = values - z from z = 0, with values straight between points."""
-    if np.ptp(steps) <= 1e-6 * np.mean(steps):
-        kept = math.exp(-float(np.mean(steps)) / constant)
-        share = (1.0 - kept) * constant / float(np.mean(steps))
-        return np.asarray(lfilter([1.0 - share, share - kept], [1.0, -kept], values))
+def _lag(values: np.ndarray, steps: np.ndarray, constant: float, start: float) -> np.ndarray:
+    """T z' = values - z, with values straight between points."""
     kept = np.exp(-steps / constant)
     share = (1.0 - kept) * constant / steps
     added = (1.0 - share) * values[1:] + (share - kept) * values[:-1]
-    path = [0.0]
-    for keep, add in zip(kept.tolist(), added.tolist(), strict=True):
-        path.append(keep * path[-1] + add)
-    return np.array(path)
+    pairs = zip(kept.tolist(), added.tolist(), strict=True)
+    return np.array(list(accumulate(pairs, lambda z, step: step[0] * z + step[1], initial=start)))
 
 
 def delay() -> Form:
     """The twist is behind the torque as logged."""
-    return Form("input_delay", "delay", _rate, ("delay",), "twist = tau(t - d)/K, to first order in d")
+    figure = Figure("delay", lambda own: -own[1] / own[0], "s", "by which the twist is behind the torque as logged")
+    return Form("input_delay", "delay", _rate, ("delay",), "twist = tau(t - d)/K, to first order in d", (figure,))
 
 
 def _rate(points: Points, shape: np.ndarray) -> np.ndarray:
-    return points.in_each_log(lambda own: np.gradient(points.torque[own], points.time[own]))[:, None]
+    return points.torque_rate[:, None]
 
 
 def _temperature(points: Points) -> Iterator[Form]:
-    if points.temperature is not None and np.ptp(points.temperature) > 0:
-        law = "twist = (1 - k (T - T0)) tau/K"
-        yield Form("temperature", "stiffness that falls with temperature", _warm_compliance, ("compliance",), law)
+    warmed = points.temperature is not None and np.ptp(points.temperature) > 0
+    drift = Figure("drift", lambda own: own[1], "rad/K" if warmed else "rad/s", "drift of the twist")
+    if warmed:
+        yield Form(
+            "temperature",
+            "stiffness that falls with temperature",
+            _warm_compliance,
+            ("compliance",),
+            "twist = (1 - k (T - T0)) tau/K",
+            (
+                Figure(
+                    "coefficient",
+                    lambda own: -own[1] / own[0],
+                    "1/K",
+                    "share by which the stiffness changes with temperature",
+                ),
+            ),
+        )
         law = "twist = tau/K + d (T - T0)"
-        yield Form("temperature", "thermal drift of the twist", _warm_drift, ("drift",), law)
+        yield Form("temperature", "thermal drift of the twist", _warm_drift, ("drift",), law, (drift,))
     elif min(points.reversals) >= _REVERSALS_FOR_DRIFT:
-        yield Form("temperature", "drift of the twist", _drift, ("drift",), "twist = tau/K + d t")
-
-
-def _warm(points: Points) -> np.ndarray:
-    assert points.temperature is not None
-    return points.temperature - np.mean(points.temperature)
+        yield Form("temperature", "drift of the twist", _drift, ("drift",), "twist = tau/K + d t", (drift,))
 
 
 def _warm_compliance(points: Points, shape: np.ndarray) -> np.ndarray:
-    return ((points.torque - points.centre) * _warm(points))[:, None]
+    return (points.torque - points.centre)[:, None] * _warm_drift(points, shape)
 
 
 def _warm_drift(points: Points, shape: np.ndarray) -> np.ndarray:
-    return _warm(points)[:, None]
+    assert points.temperature is not None
+    return (points.temperature - np.mean(points.temperature))[:, None]
 
 
 def _drift(points: Points, shape: np.ndarray) -> np.ndarray:

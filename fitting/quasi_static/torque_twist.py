@@ -3,8 +3,10 @@
 Plain NumPy in double precision: the curve is algebraic, so that a fit takes milliseconds and compiles nothing.
 """
 
+import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import accumulate
 from typing import Literal, get_args
 
 import numpy as np
@@ -46,29 +48,22 @@ def twist(
     Returns:
         Twist [rad] and its derivative with respect to the torque [rad/(N m)], both (n,).
     """
-    if shape == "linear":
-        compliance = positive(-coefficients[0])
-        return compliance * torque, np.full_like(torque, compliance)
     if shape == "cubic":
         return _cubic(float(positive(-coefficients[0])), coefficients[1], torque)
-    slopes = 2 if shape == "two slopes" else 3
-    signs = [-1.0] * slopes + [1.0] * (slopes - 1)
-    exponentials = np.exp(np.clip(signs * coefficients[: 2 * slopes - 1], -80.0, 80.0))
-    compliances, knees = exponentials[:slopes], np.cumsum(exponentials[slopes:])
-    x = compliances[0] * torque
-    slope = np.full_like(torque, compliances[0])
-    for knee, before, after in zip(knees, compliances[:-1], compliances[1:], strict=True):
+    size = len(SHAPE_NAMES[shape])
+    compliances = positive(-coefficients[: (size + 1) // 2])
+    knees = np.cumsum(positive(coefficients[len(compliances) : size]))
+    x, slope = compliances[0] * torque, np.full_like(torque, compliances[0])
+    for knee, added in zip(knees, np.diff(compliances), strict=True):
         beyond, share = _beyond(torque, knee, blur)
-        x = x + (after - before) * beyond
-        slope = slope + (after - before) * share
+        x, slope = x + added * beyond, slope + added * share
     return x, slope
 
 
 def _beyond(torque: np.ndarray, knee: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
     """How far the torque is expected beyond a knee on either side, with its sign, and the chance that it is beyond."""
-    if blur <= 0.0:
-        beyond = torque - np.clip(torque, -knee, knee)
-        return beyond, (beyond != 0).astype(float)
+    # Without blur the normal law is a step, to within rounding.
+    blur = max(blur, 1e-14 * knee)
     above, below = (torque - knee) / blur, (-torque - knee) / blur
     chance_above, chance_below = ndtr(above), ndtr(below)
     density = (np.exp(-0.5 * above**2) - np.exp(-0.5 * below**2)) / np.sqrt(2.0 * np.pi)
@@ -108,20 +103,19 @@ def remembered(memory: Memory, torque: np.ndarray, reach: float, start: float) -
     References:
         Dahl 1976, AIAA Journal 14(12); Visintin 1994, Differential Models of Hysteresis (play and stop).
     """
-    steps = np.diff(torque) / reach
-    branch = float(start)
-    path = [branch]
-    if memory == "abrupt":
-        for step in steps.tolist():
-            branch += step
-            # Comparisons, since this loop is where a fit spends its time and min and max take twice as long.
-            branch = 1.0 if branch > 1.0 else -1.0 if branch < -1.0 else branch
-            path.append(branch)
-    else:
-        for towards, kept in zip(np.sign(steps).tolist(), np.exp(-np.abs(steps)).tolist(), strict=True):
-            branch = towards + (branch - towards) * kept
-            path.append(branch)
-    return np.array(path)
+    law = _abrupt if memory == "abrupt" else _gradual
+    return np.array(list(accumulate((np.diff(torque) / reach).tolist(), law, initial=float(start))))
+
+
+def _abrupt(branch: float, step: float) -> float:
+    moved = branch + step
+    # Comparisons, since a fit spends its time here and min and max take twice as long.
+    return 1.0 if moved > 1.0 else -1.0 if moved < -1.0 else moved
+
+
+def _gradual(branch: float, step: float) -> float:
+    towards = math.copysign(1.0, step)
+    return towards + (branch - towards) * math.exp(-abs(step))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +127,8 @@ class Blocks:
         twist: [rad], (n,).
         time: [s], (n,).
         log: Number of the log that a block is from, (n,), rising.
-        path: Torque on the way [N m], the blocks' and, between them, the extremes at which it turned, (p,).
-        path_log: Number of the log of each point of the path, (p,).
-        seat: Where the blocks are on the path, (n,).
+        paths: Torque on the way [N m], the blocks' and, between them, the extremes at which it turned, by log.
+        seat: Where the blocks are on the paths, one behind the other, (n,).
         names: Of the logs.
         torque_noise: Standard deviation of the noise of a block's torque [N m].
         twist_noise: Likewise of its twist [rad].
@@ -148,8 +141,7 @@ class Blocks:
     twist: np.ndarray
     time: np.ndarray
     log: np.ndarray
-    path: np.ndarray
-    path_log: np.ndarray
+    paths: tuple[np.ndarray, ...]
     seat: np.ndarray
     names: tuple[str, ...]
     torque_noise: float
@@ -169,6 +161,22 @@ class Blocks:
     def amplitude(self) -> float:
         """Half the range of the torque [N m]."""
         return 0.5 * float(np.ptp(self.torque))
+
+
+@lru_cache(maxsize=8)
+def branch(memory: Memory, blocks: Blocks, reach: float, starts: tuple[float, ...]) -> np.ndarray:
+    """Which branch each block is on, from -1 to 1, (n,).
+
+    The last ones are kept: most parameters of a curve leave the branch as it is.
+
+    Args:
+        memory: The law.
+        blocks: Where to look.
+        reach: Torque over which the branch changes [N m].
+        starts: Branch at the first block of each log, from -1 to 1.
+    """
+    each = [remembered(memory, path, reach, start) for path, start in zip(blocks.paths, starts, strict=True)]
+    return np.concatenate(each)[blocks.seat]
 
 
 @dataclass(frozen=True)
@@ -203,44 +211,31 @@ class Curve:
         """Index of each parameter, by name."""
         return {name: i for i, name in enumerate(self.names)}
 
-    def reach(self, parameters: np.ndarray) -> float:
-        """Torque over which the branch changes after a reversal [N m]."""
-        return float(positive(parameters[self.places["log reach"]]))
+    def value(self, name: str, parameters: np.ndarray) -> float:
+        """A parameter by name; zero where the curve has none of that name."""
+        return float(parameters[self.places[name]]) if name in self.places else 0.0
 
     def elastic(
         self, parameters: np.ndarray, torque: np.ndarray, *, blur: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Twist of the spring above the twist zero [rad], and its slope, at a torque as logged."""
-        bias = parameters[self.places["torque_bias"]] if self.biased else 0.0
-        return twist(self.shape, parameters, torque - bias, blur=blur)
+        return twist(self.shape, parameters, torque - self.value("torque_bias", parameters), blur=blur)
 
     def branch(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
         """Which branch each block is on, from -1 to 1, (n,)."""
         if self.memory is None:
             return np.zeros_like(blocks.torque)
-        reach, start = self.reach(parameters), self.places["start 0"]
-        each = [
-            remembered(self.memory, blocks.path[blocks.path_log == i], reach, parameters[start + i])
-            for i in range(self.logs)
-        ]
-        return np.concatenate(each)[blocks.seat]
+        starts = tuple(self.value(f"start {i}", parameters) for i in range(self.logs))
+        return branch(self.memory, blocks, math.exp(self.value("log reach", parameters)), starts)
 
-    def predict(
-        self, parameters: np.ndarray, blocks: Blocks, branch: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, parameters: np.ndarray, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
         """Twist [rad] and the slope of the elastic part [rad/(N m)] at each block, both (n,).
 
         Hysteresis is a friction torque beside the spring's, as `hdjax` has it: on loading it bears its full part of the
         torque, on unloading it works against the spring.
-
-        Args:
-            parameters: As `names` lists them.
-            blocks: Where to look.
-            branch: From [`Curve.branch`][], where it is known already.
         """
-        branch = self.branch(parameters, blocks) if branch is None else branch
-        friction = parameters[self.places["friction"]] if self.memory is not None else 0.0
-        x, slope = self.elastic(parameters, blocks.torque - friction * branch, blur=blocks.blur)
+        torque = blocks.torque - self.value("friction", parameters) * self.branch(parameters, blocks)
+        x, slope = self.elastic(parameters, torque, blur=blocks.blur)
         return x + self.zero(parameters, blocks), slope
 
     def zero(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
@@ -267,8 +262,7 @@ def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int =
         return torque, elastic, elastic
     way = np.concatenate([torque, torque[-2::-1]])
     # After two cycles the loop has closed, wherever it began.
-    path = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), curve.reach(parameters), -1.0)
-    closed = path[-2 * steps - 1 :]
-    friction = parameters[curve.places["friction"]]
-    x, _ = twist(curve.shape, parameters, way - friction * closed)
+    reach = math.exp(curve.value("log reach", parameters))
+    closed = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), reach, -1.0)[-2 * steps - 1 :]
+    x, _ = twist(curve.shape, parameters, way - curve.value("friction", parameters) * closed)
     return torque, x[: steps + 1], x[: steps - 1 : -1]

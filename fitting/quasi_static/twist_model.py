@@ -1,14 +1,16 @@
-"""The torque-twist equation with effects inside: its fit, and its errors on stretches that the fit has not seen."""
+"""The torque-twist equation with effects inside: its fit, its errors on unseen stretches, and its figures."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.quasi_static.form import START, Form, base_columns
+from fitting.quasi_static.differences import slopes
+from fitting.quasi_static.form import START, Form, Terms
+from fitting.quasi_static.intervals import Figure, Known, scatter
 from fitting.quasi_static.points import Points
-from fitting.quasi_static.stretches import FOLDS
+from fitting.quasi_static.stretches import FOLDS, stretches
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,50 +18,44 @@ class TwistModel:
     """A straight line with effects, fitted.
 
     Attributes:
-        forms: Of the effects, in the order in which they were found.
-        shapes: Their shape parameters.
+        terms: The effects' forms with their shape parameters, in the order in which they were found.
         coefficients: Compliance, each log's zero, then each form's strengths.
         misfit: Measured less fitted twist [rad], (n,).
         jacobian: Of the fitted twist with respect to coefficients and shape parameters, (n, all).
     """
 
-    forms: tuple[Form, ...]
-    shapes: tuple[np.ndarray, ...]
+    terms: Terms
     coefficients: np.ndarray
     misfit: np.ndarray
     jacobian: np.ndarray
 
-    def own(self, form: Form, logs: int) -> tuple[slice, slice]:
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        """Of the effects."""
+        return tuple(form for form, _ in self.terms)
+
+    def own(self, form: Form) -> tuple[slice, slice]:
         """Where a form's strengths and its shape parameters stand in the Jacobian."""
-        at = self.forms.index(form)
-        strengths = [len(f.strengths) for f in self.forms]
-        shapes = [len(s) for s in self.shapes]
-        first = 1 + logs + sum(strengths[:at])
+        at, strengths, shapes = self.forms.index(form), *_sizes(self.terms)
+        first = len(self.coefficients) - sum(strengths[at:])
         behind = len(self.coefficients) + sum(shapes[:at])
         return slice(first, first + strengths[at]), slice(behind, behind + shapes[at])
 
-    def without(self, form: Form) -> tuple[tuple[Form, ...], tuple[np.ndarray, ...]]:
-        """The other forms and their shapes."""
-        kept = [i for i, other in enumerate(self.forms) if other is not form]
-        return tuple(self.forms[i] for i in kept), tuple(self.shapes[i] for i in kept)
 
-
-def fit_twist(points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ...]) -> TwistModel:
+def fit_twist(points: Points, terms: Terms = ()) -> TwistModel:
     """Least squares over strengths and shape parameters together (variable projection: Golub and Pereyra 1973).
 
     Args:
         points: To be fitted.
-        forms: Of the effects.
-        shapes: Where to begin, for each form.
+        terms: Of the effects, with shape parameters to begin with.
     """
-    everywhere = np.ones(len(points.twist), dtype=bool)
-    found = _polished(points, forms, shapes, everywhere)
-    matrix = design(points, forms, found)
+    found = _polished(points, terms, np.ones(len(points.twist), dtype=bool))
+    matrix = design(points, found)
     coefficients = _solved(matrix, points.twist)
-    moved = list(_shape_slopes(points, forms, found, coefficients))
-    return TwistModel(
-        forms, found, coefficients, points.twist - matrix @ coefficients, np.column_stack([matrix, *moved])
-    )
+    flat, ranges = _flat(found), [form.range for form, _ in found]
+    steps = 1e-3 * np.concatenate([np.zeros(0), *(high - low for low, high in ranges)])
+    moved = [slopes(lambda at: design(points, _moved(found, at)) @ coefficients, flat, steps)] if flat.size else []
+    return TwistModel(found, coefficients, points.twist - matrix @ coefficients, np.column_stack([matrix, *moved]))
 
 
 def hold_out(points: Points, model: TwistModel, fold: np.ndarray) -> np.ndarray:
@@ -68,57 +64,94 @@ def hold_out(points: Points, model: TwistModel, fold: np.ndarray) -> np.ndarray:
     Where a log or a rest begins, the branch of a loop or the state of a relaxation, is taken from the fit of all
     points: it is an initial state, of which only the log's first stretch or the rest knows.
     """
-    base = len(model.coefficients) - sum(len(form.strengths) for form in model.forms)
-    names = [*[""] * base, *(name for form in model.forms for name in form.strengths)]
-    start = np.array([name.startswith(START) for name in names])
+    names = [name for form in model.forms for name in form.strengths]
+    line = [False] * (len(model.coefficients) - len(names))
+    start = np.array(line + [name.startswith(START) for name in names])
     misfit = np.empty_like(points.twist)
     for i in range(FOLDS):
         seen = fold != i
-        shapes = _polished(points, model.forms, model.shapes, seen, starts=False)
-        matrix = design(points, model.forms, shapes)
-        left = points.twist - matrix[:, start] @ model.coefficients[start]
-        free = matrix[:, ~start]
+        matrix = design(points, _polished(points, model.terms, seen, starts=False))
+        left, free = points.twist - matrix[:, start] @ model.coefficients[start], matrix[:, ~start]
         misfit[~seen] = (left - free @ _solved(free[seen], left[seen]))[~seen]
     return misfit
 
 
-def design(points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ...]) -> np.ndarray:
+def stiffness_of(points: Points, model: TwistModel) -> dict[str, Known]:
+    """The stiffness that stands beside the effects."""
+    where = "stiffness" if points.centre == 0.0 else f"stiffness at {points.centre:.3g} N m"
+    bent = any(form.family in ("stiffness_shape", "backlash") for form in model.forms)
+    text = where + (" (without what the effects add)" if bent else "")
+    return _known(points, model, [Figure("K", lambda fitted: 1.0 / fitted[0], "N m/rad", text, True)])
+
+
+def strengths_of(points: Points, model: TwistModel, form: Form) -> dict[str, Known]:
+    """The figures of one effect, by name."""
+    strengths, shapes = model.own(form)
+    own = np.r_[0, strengths, shapes]
+    figures = (replace(one, formula=lambda fitted, of=one.formula: of(fitted[own])) for one in form.figures)
+    return _known(points, model, figures)
+
+
+def contribution(model: TwistModel, forms: tuple[Form, ...]) -> np.ndarray:
+    """What effects add to the twist [rad], (n,), less its mean."""
+    own = [model.own(form)[0] for form in forms]
+    total = np.sum([model.jacobian[:, strengths] @ model.coefficients[strengths] for strengths in own], axis=0)
+    return total - np.mean(total)
+
+
+def _known(points: Points, model: TwistModel, figures: Iterable[Figure]) -> dict[str, Known]:
+    fitted = np.concatenate([model.coefficients, *(shape for _, shape in model.terms)])
+    found = scatter(model.jacobian, model.misfit, stretches(model.misfit, points.log, each=2))
+    # A thousandth of each parameter's scatter; without noise nothing scatters.
+    steps = 1e-3 * np.sqrt(np.maximum(np.diag(found.classical), 0.0))
+    steps = np.maximum(steps, 1e-9 * np.maximum(np.abs(fitted), 1e-12))
+    return {one.name: one.known(fitted, steps, found) for one in figures}
+
+
+def design(points: Points, terms: Terms) -> np.ndarray:
     """All columns: the straight line's, then each form's, (n, coefficients)."""
-    own = [form.columns(points, shape) for form, shape in zip(forms, shapes, strict=True)]
-    return np.column_stack([base_columns(points), *own])
+    zeros = (points.log == i for i in range(len(points.names)))
+    added = (form.columns(points, shape) for form, shape in terms)
+    return np.column_stack([points.torque - points.centre, *zeros, *added])
 
 
-def _polished(
-    points: Points,
-    forms: tuple[Form, ...],
-    shapes: tuple[np.ndarray, ...],
-    seen: np.ndarray,
-    *,
-    starts: bool = True,
-) -> tuple[np.ndarray, ...]:
+def _sizes(terms: Terms) -> tuple[list[int], list[int]]:
+    """Numbers of strengths and of shape parameters."""
+    return [len(form.strengths) for form, _ in terms], [len(shape) for _, shape in terms]
+
+
+def _flat(terms: Terms) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *(shape for _, shape in terms)])
+
+
+def _moved(terms: Terms, flat: np.ndarray) -> Terms:
+    """The forms with other shape parameters."""
+    shapes = np.split(flat, np.cumsum(_sizes(terms)[1])[:-1])
+    return tuple((form, shape) for (form, _), shape in zip(terms, shapes, strict=True))
+
+
+def _polished(points: Points, terms: Terms, seen: np.ndarray, *, starts: bool = True) -> Terms:
     """Shape parameters that suit the seen points best, with or without those that say where a log begins."""
-    start = np.concatenate([np.zeros(0), *shapes])
-    names = [name for form in forms for name in form.shape_names]
+    names = [name for form, _ in terms for name in form.shape_names]
     free = np.array([starts or not name.startswith(START) for name in names], dtype=bool)
     if not free.any():
-        return shapes
-    ends = np.cumsum([len(shape) for shape in shapes])[:-1]
-    scale = float(np.std(points.twist)) or 1.0
+        return terms
+    flat, scale = _flat(terms), float(np.std(points.twist)) or 1.0
 
-    def whole(moved: np.ndarray) -> tuple[np.ndarray, ...]:
-        shape = start.copy()
-        shape[free] = moved
-        return tuple(np.split(shape, ends))
+    def moved(values: np.ndarray) -> Terms:
+        whole = flat.copy()
+        whole[free] = values
+        return _moved(terms, whole)
 
-    def residual(moved: np.ndarray) -> np.ndarray:
-        matrix = design(points, forms, whole(moved))[seen]
+    def residual(values: np.ndarray) -> np.ndarray:
+        matrix = design(points, moved(values))[seen]
         return (points.twist[seen] - matrix @ _solved(matrix, points.twist[seen])) / scale
 
-    low, high = (np.concatenate([np.asarray(getattr(form, side)) for form in forms])[free] for side in ("low", "high"))
-    inside = np.clip(start[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
+    low, high = np.hstack([form.range for form, _ in terms])[:, free]
+    inside = np.clip(flat[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
     # Kinks pass from point to point: steps of the derivative must reach over them.
     found = least_squares(residual, inside, bounds=(low, high), diff_step=1e-3, x_scale=high - low, max_nfev=25)
-    return whole(found.x)
+    return moved(found.x)
 
 
 def _solved(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -127,17 +160,3 @@ def _solved(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
     scale = 1.0 / np.where(norms > 0, norms, 1.0)
     solution, *_ = np.linalg.lstsq(matrix * scale, values, rcond=1e-8)
     return scale * solution
-
-
-def _shape_slopes(
-    points: Points, forms: tuple[Form, ...], shapes: tuple[np.ndarray, ...], coefficients: np.ndarray
-) -> Iterator[np.ndarray]:
-    first = 1 + len(points.names)
-    for form, shape in zip(forms, shapes, strict=True):
-        strengths = coefficients[first : first + len(form.strengths)]
-        first += len(form.strengths)
-        for i in range(len(shape)):
-            step = np.zeros(len(shape))
-            step[i] = 1e-3 * (form.high[i] - form.low[i])
-            up, down = (form.columns(points, shape + sign * step) @ strengths for sign in (1.0, -1.0))
-            yield (up - down) / (2.0 * step[i])
