@@ -6,13 +6,8 @@ import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, long_gains
-from fitting.attribution.decisions import (
-    RULES,
-    ChallengeEvidence,
-    ModelEvidence,
-    names_stand,
-    next_question,
-)
+from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
+from fitting.attribution.decisions import RULES, names_stand, next_question
 from fitting.attribution.study import Study
 from fitting.attribution.support import (
     Standing,

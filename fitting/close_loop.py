@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.decisions import CaseEvidence, decide
+from fitting.attribution.case_evidence import CaseEvidence
+from fitting.attribution.decisions import decide
 from fitting.attribution.effect_evidence import evidence
 from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
 from fitting.attribution.selection_round import Round

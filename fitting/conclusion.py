@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
+from fitting.attribution.case_evidence import FinalEvidence
+from fitting.attribution.decisions import RULES, Outcome, conclude
 from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
 from fitting.challenge import Challenge

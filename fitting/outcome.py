@@ -3,7 +3,8 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from fitting.attribution.decisions import CaseEvidence, Check, Outcome
+from fitting.attribution.case_evidence import CaseEvidence
+from fitting.attribution.decisions import Check, Outcome
 from fitting.attribution.effect_evidence import Evidence
 from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Setting

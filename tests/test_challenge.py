@@ -9,7 +9,8 @@ import pytest
 import rig
 from fitting import challenge as module
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.decisions import ChallengeEvidence, ModelEvidence, names_stand, next_question
+from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
+from fitting.attribution.decisions import names_stand, next_question
 from fitting.attribution.study import Setting, Study
 from fitting.effect_search import base_trial
 from fitting.experiment import split

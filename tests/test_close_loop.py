@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.attribution.decisions import ChallengeEvidence
+from fitting.attribution.case_evidence import ChallengeEvidence
 from fitting.attribution.selection_round import Round, Verdict
 from fitting.challenge import Challenge, model_evidence
 from fitting.close_loop import close_loop

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import fitting
-from fitting.attribution.decisions import (
-    RULES,
+from fitting.attribution.case_evidence import (
     CaseEvidence,
     ChallengeEvidence,
     EffectEvidence,
@@ -18,13 +17,9 @@ from fitting.attribution.decisions import (
     ModelEvidence,
     Rival,
     RoundEvidence,
-    conclude,
-    decide,
-    leader,
-    support,
-    tie,
+    case_evidence,
 )
-from fitting.attribution.stored_evidence import case_evidence
+from fitting.attribution.decisions import RULES, conclude, decide, leader, support, tie
 from fitting.files import finite
 from fitting.report.rules import rules_page
 from undeclared.replay import OFF, differing

@@ -5,15 +5,24 @@ evidence can be decided anew under other rules.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
+from fitting.attribution.case_evidence import (
+    CaseEvidence,
+    ChallengeEvidence,
+    EffectEvidence,
+    FinalEvidence,
+    NoiseEvidence,
+    Question,
+    Rival,
+)
+
 Outcome = Literal["effect_found", "model_sufficient", "unexplained"]
-Question = Literal["instead", "beside"]
 
 
 def _rule(default: float, unit: str, meaning: str, source: str) -> Any:
@@ -180,31 +189,6 @@ class Check:
     holds: bool
 
 
-@dataclass(frozen=True)
-class EffectEvidence:
-    """What the data say of the best candidate of a round.
-
-    Attributes:
-        name: of the form.
-        gain: decrease of the objective on selection data.
-        p_value: chance that the best of the catalogue gains as much where nothing is missing.
-        removed: what it removes of the error, over what the effects before it have removed (rms).
-        imperfection: what the laws of the effects before it may get wrong, likewise.
-        strength_errors: standard errors by which its best known strength differs from zero.
-        over_noise: log likelihood by which it betters noise; infinite where that is no explanation.
-        at_bounds: how many of its parameters ended at a bound.
-    """
-
-    name: str
-    gain: float
-    p_value: float
-    removed: float = np.inf
-    imperfection: float = 0.0
-    strength_errors: float = np.inf
-    over_noise: float = np.inf
-    at_bounds: int = 0
-
-
 def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
     """Whether the data support an effect: all checks must hold.
 
@@ -241,31 +225,6 @@ def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = 
     return Check("tie_level", name, statistic, limit, statistic <= limit)
 
 
-@dataclass(frozen=True)
-class Rival:
-    """A candidate among those that can't be told from the best one.
-
-    Attributes:
-        name: of the form.
-        gain: over short segments.
-        long_gain: in free runs along whole stretches; over short segments where these tell nothing.
-        tied: whether it can't be told from the best one over short segments.
-        parameters: number of free parameters.
-        states: likewise of states.
-        plausible: whether no parameter is larger than real drives show.
-        remembers: whether it has states that the model before it has not.
-    """
-
-    name: str
-    gain: float
-    long_gain: float
-    tied: bool
-    parameters: int
-    states: int
-    plausible: bool
-    remembers: bool
-
-
 def compete(best: Rival, others: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, ...]:
     """Those that compete over whole stretches, the best one included: what is tied with it, and all where it has a
     memory, whose states short segments leave free.
@@ -295,41 +254,6 @@ def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival
     return first, tuple(r.name for r in close)
 
 
-@dataclass(frozen=True)
-class ModelEvidence:
-    """A fitted model as the final decision sees it.
-
-    Attributes:
-        training: objective on training data: half the log-determinant of the error's covariance.
-        selection: likewise on selection data.
-        parameters: number of free parameters.
-        excess: what short segments of the selection data leave of each output, over the measurement noise.
-        white: whether training data leave nothing of the dynamic error that its colour betrays, and of no output more
-            than the noise.
-    """
-
-    training: float
-    selection: float
-    parameters: int
-    excess: tuple[float, ...]
-    white: bool
-
-
-@dataclass(frozen=True)
-class NoiseEvidence:
-    """What a Kalman filter with noise of sensors and torque leaves.
-
-    Attributes:
-        share: the noise of the torque over its rms.
-        predictable: share of the innovations' variance that earlier ones predict.
-        size: rms of the innovations in units of what the filter expects, of the output where it is largest.
-    """
-
-    share: float
-    predictable: float
-    size: float
-
-
 def only_noise(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
     """Whether what a model leaves is noise of sensors and torque: all checks must hold.
 
@@ -342,51 +266,6 @@ def only_noise(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check
         Check("innovations", about, seen.predictable, rules.innovations, seen.predictable <= rules.innovations),
         Check("excess", "innovations of that filter", seen.size, rules.excess, seen.size < rules.excess),
     )
-
-
-@dataclass(frozen=True)
-class ChallengeEvidence:
-    """What is known when a learned term challenges names.
-
-    Attributes:
-        base: the model without effects.
-        named: the model with those that were found; the base model where there are none.
-        names: how many there are.
-        noise: the objective that nothing but measurement noise makes.
-        imperfect: whether all that is left is what the laws of the names may get wrong.
-        beside: the named model with a learned term beside them; None where none is supported or it was not asked.
-        instead: the base model with a learned term in their place; likewise.
-        asked: what was learned, or could not be.
-        come_out: share of the term in their place that the names make up.
-        shown: whether every name still has a strength that is told from zero beside the learned term.
-        one_shape: whether a name is one shape of the function that was learned both beside it and in its place.
-        left: what the names leave as noise; None where they leave no more than white measurement noise.
-        longer_worse: log of the rms error of free runs with the term in their place, over that with the names; zero
-            where free runs tell nothing.
-    """
-
-    base: ModelEvidence
-    named: ModelEvidence
-    names: int
-    noise: float
-    imperfect: bool
-    beside: ModelEvidence | None = None
-    instead: ModelEvidence | None = None
-    asked: tuple[Question, ...] = ()
-    come_out: float = 0.0
-    shown: bool = True
-    one_shape: bool = False
-    left: NoiseEvidence | None = None
-    longer_worse: float = 0.0
-
-    @property
-    def enough(self) -> bool:
-        """Whether the names leave nothing that could be learned."""
-        return self.named.white or self.imperfect
-
-    def answered(self, question: Question, found: ModelEvidence | None, **changes: Any) -> "ChallengeEvidence":
-        """The same with one more answer."""
-        return replace(self, asked=(*self.asked, question), **{question: found}, **changes)
 
 
 def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Question | None:
@@ -475,27 +354,6 @@ def _adds_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
     return all(added < rules.little * explained for added, explained in pairs)
 
 
-@dataclass(frozen=True)
-class FinalEvidence:
-    """What the last decision rests on.
-
-    Attributes:
-        names: of the effects that are trusted.
-        learned: whether a term was learned beside them, or in the place of all.
-        excess: what short segments of the selection data leave of each output under the names alone, over the noise.
-        excess_at_first: likewise under the base model.
-        noise_explains: whether what is left is noise of the sensors, with a memory, and of the torque.
-        surprise: by how much free runs are farther off than they promised; None where that is not asked.
-    """
-
-    names: tuple[str, ...]
-    learned: bool
-    excess: tuple[float, ...]
-    excess_at_first: tuple[float, ...]
-    noise_explains: bool = False
-    surprise: float | None = None
-
-
 def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome, tuple[Check, ...]]:
     """What the data say in the end, and the checks that led there.
 
@@ -522,36 +380,6 @@ def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome
         checks.append(Check("surprise", "free runs over their bands", seen.surprise, rules.surprise, as_promised))
         found = as_promised
     return "effect_found" if found else "unexplained", tuple(checks)
-
-
-@dataclass(frozen=True)
-class RoundEvidence:
-    """What one look at the catalogue rests on.
-
-    Attributes:
-        asked: what the data say of the candidate that leads, and of those before it that they do not support.
-        behind: of each candidate that was refitted, how far it is behind the best one, block by block.
-        rivals: those that competed over whole stretches.
-    """
-
-    asked: tuple[EffectEvidence, ...]
-    behind: dict[str, tuple[float, ...]]
-    rivals: tuple[Rival, ...]
-
-
-@dataclass(frozen=True)
-class CaseEvidence:
-    """All that the decision on one case rests on.
-
-    Attributes:
-        rounds: every look at the catalogue.
-        challenge: of the names that were found.
-        final: what the last decision rests on.
-    """
-
-    rounds: tuple[RoundEvidence, ...]
-    challenge: ChallengeEvidence
-    final: FinalEvidence
 
 
 @dataclass(frozen=True)

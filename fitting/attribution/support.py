@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.attribution.candidate_fit import Trial
-from fitting.attribution.decisions import RULES, DecisionRules, NoiseEvidence, only_noise
+from fitting.attribution.case_evidence import NoiseEvidence
+from fitting.attribution.decisions import RULES, DecisionRules, only_noise
 from fitting.estimate import Fit
 from fitting.free import effect_paths, strength_paths
 from fitting.measurement_noise import MeasurementNoise

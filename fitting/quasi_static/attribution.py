@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fitting.attribution.decisions import RULES, EffectEvidence, support
+from fitting.attribution.case_evidence import EffectEvidence
+from fitting.attribution.decisions import RULES, support
 from fitting.attribution.screening import Screen
 from fitting.attribution.selection_round import Round, Verdict
 from fitting.attribution.shortlist import NEARLY

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from fitting.attribution.decisions import RULES, FinalEvidence, Outcome, conclude
+from fitting.attribution.case_evidence import FinalEvidence
+from fitting.attribution.decisions import RULES, Outcome, conclude
 from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
