@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 from bench_fit import RATE, TRUTH, C, Record, _growth, experiment, record, verdict
 
-from fitting.engines import linearise, with_engine
-from fitting.experiment import Stretch, scales
-from fitting.free import base_paths, fitted_paths
-from fitting.machine_code import task
-from fitting.posing import Segmentation, pose, short_horizon
-from fitting.residual import Problem, Unknowns, blocks
-from fitting.solve import _WIDTH as WIDTH
+from fitting.estimation.engines import linearise, with_engine
+from fitting.estimation.experiment import Stretch, scales
+from fitting.estimation.free_parameters import base_paths, fitted_paths
+from fitting.estimation.machine_code import task
+from fitting.estimation.problem import Segmentation, pose, short_horizon
+from fitting.estimation.residual import Problem, Unknowns, blocks
+from fitting.estimation.solve import _WIDTH as WIDTH
 from hdjax import Model, sampled
 from hdjax.effects import CATALOGUE, Effect, Scales
 from hdjax.engine.kernel import _MADE

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from bench_fit import NOISE, RATE, Ours, Record, at, experiment, fit_peer, peer_start, record
 
-from fitting.estimate import Fit
-from fitting.refits import refits
+from fitting.estimation.estimate import Fit
+from fitting.uncertainty.refits import refits
 from hdjax.engine import one_thread
 
 PEER_SUBSTEPS = 2

@@ -1,7 +1,7 @@
 """Does a fit without starting values end in the right minimum? Drives and logs drawn at random, each with its verdict.
 
 Every draw is simulated by this script's own Runge-Kutta in dimensionless form (omega_0 = 1, twist of order 1) and then
-scaled to units; `fitting.base_fit.base_fit` gets nothing but the log. See README.md beside this file.
+scaled to units; `fitting.estimation.base_fit.base_fit` gets nothing but the log. See README.md beside this file.
 """
 
 import argparse
@@ -16,15 +16,15 @@ import numba
 import numpy as np
 from scipy.signal import lfilter
 
-from fitting.base_fit import base_fit, leaves_white_noise
 from fitting.errors import DataError
-from fitting.estimate import Fit, fit
-from fitting.experiment import Experiment, Stretch
-from fitting.free import base_paths
-from fitting.long_fit import long_fit
-from fitting.outliers import left_out
-from fitting.posing import Segmentation
-from fitting.uncertainty import uncertainty
+from fitting.estimation.base_fit import base_fit, leaves_white_noise
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.outliers import left_out
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.whole_log_fit import long_fit
+from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 
 EXCITATIONS = ("multisine", "chirp", "steps", "slow", "harmonic")

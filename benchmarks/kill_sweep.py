@@ -38,7 +38,7 @@ windows = 10
 
 def begun(spec: Path, store: Path, workers: int) -> subprocess.Popen:
     """The command in a process of its own."""
-    command = [sys.executable, "-c", "from fitting.command_line import main; main()", "sweep", str(spec)]
+    command = [sys.executable, "-c", "from fitting.commands.main import main; main()", "sweep", str(spec)]
     options = ["--out", str(store), "--workers", str(workers), "--memory", "32", "--no-plot"]
     return subprocess.Popen(command + options, stdout=subprocess.DEVNULL)
 

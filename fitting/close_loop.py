@@ -9,23 +9,23 @@ from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import CaseEvidence
 from fitting.attribution.decisions import decide
 from fitting.attribution.effect_evidence import evidence
+from fitting.attribution.effect_search import Search, base_trial, refitted_without, search_effects
 from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
 from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
-from fitting.challenge import Challenge, challenge_names
 from fitting.clock import Clock
-from fitting.compare import Account, account, excess, free_runs
 from fitting.conclusion import Conclusion, draw_conclusion
-from fitting.diagnostics import diagnose
-from fitting.effect_search import Search, base_trial, refitted_without, search_effects
-from fitting.estimate import Fit
-from fitting.experiment import Experiment, Stretch, split, whole
-from fitting.free_run import FreeRun, rms_error
-from fitting.long_fit import refitted_on_all
+from fitting.discrepancy.challenge import Challenge, challenge_names
+from fitting.estimation.estimate import Fit
+from fitting.estimation.experiment import Experiment, Stretch, split, whole
+from fitting.estimation.free_run import FreeRun, rms_error
+from fitting.estimation.whole_log_fit import refitted_on_all
 from fitting.outcome import Finding, Loop
 from fitting.progress import Progress, silent
 from fitting.search_options import SearchOptions
+from fitting.validation.account import Account, account, excess, free_runs
+from fitting.validation.residual_diagnostics import diagnose
 from hdjax import Hold, Model
 from hdjax.effects import CATALOGUE, Effect
 

@@ -11,15 +11,15 @@ from fitting.attribution.case_evidence import FinalEvidence
 from fitting.attribution.decisions import RULES, Outcome, conclude
 from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
-from fitting.challenge import Challenge
-from fitting.compare import excess, free_runs
-from fitting.estimate import Fit
-from fitting.free_run import FreeRun, rms_error
-from fitting.long_fit import long_fit
-from fitting.measurement_noise import MeasurementNoise
-from fitting.noise_model import NoiseModel
-from fitting.surprise import surprise
-from fitting.unknown import Unknown, learn_supported
+from fitting.discrepancy.challenge import Challenge
+from fitting.discrepancy.learn import Unknown, learn_supported
+from fitting.estimation.estimate import Fit
+from fitting.estimation.free_run import FreeRun, rms_error
+from fitting.estimation.whole_log_fit import long_fit
+from fitting.uncertainty.measurement_noise import MeasurementNoise
+from fitting.uncertainty.noise_model import NoiseModel
+from fitting.validation.account import excess, free_runs
+from fitting.validation.free_run_check import surprise
 from hdjax import Hold
 
 

@@ -8,10 +8,10 @@ from fitting.attribution.decisions import Check, Outcome
 from fitting.attribution.effect_evidence import Evidence
 from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Setting
-from fitting.compare import Account
-from fitting.diagnostics import ResidualDiagnostics
-from fitting.experiment import Stretch
-from fitting.unknown import Unknown
+from fitting.discrepancy.learn import Unknown
+from fitting.estimation.experiment import Stretch
+from fitting.validation.account import Account
+from fitting.validation.residual_diagnostics import ResidualDiagnostics
 from hdjax import Hold
 from hdjax.effects import Effect
 

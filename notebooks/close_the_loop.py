@@ -22,8 +22,8 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 from fitting.close_loop import close_loop
-from fitting.demonstration import hidden_truth, write_demo_logs
-from fitting.rig import read_rig
+from fitting.commands.demo import hidden_truth, write_demo_logs
+from fitting.drive_data import read_rig
 
 # %% [markdown]
 # ## The logs

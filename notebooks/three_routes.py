@@ -22,14 +22,14 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from fitting.demonstration import write_demo_logs
-from fitting.estimate import fit
-from fitting.experiment import Stretch
-from fitting.free import fitted_paths
-from fitting.posing import Segmentation
-from fitting.rig import read_rig
-from fitting.starting_values import starting_models
-from fitting.uncertainty import uncertainty
+from fitting.commands.demo import write_demo_logs
+from fitting.drive_data import read_rig
+from fitting.estimation.estimate import fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import fitted_paths
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.starting_values import starting_models
+from fitting.uncertainty.standard_errors import uncertainty
 
 with TemporaryDirectory() as folder:
     logs, drive_file = write_demo_logs(Path(folder), seconds=4.0)

@@ -14,11 +14,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.arrow import ArrowLevenbergMarquardt, normal_equations
-from fitting.residual import Blocks, LinearisedResidual, Products, Unknowns
+from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt, normal_equations
+from fitting.estimation.residual import Blocks, LinearisedResidual, Products, Unknowns
 
 SAMPLES, PARAMETERS = 250, 9
-# Where a model leaves the numbers, as in `fitting.residual`: a rejected step.
+# Where a model leaves the numbers, as in `fitting.estimation.residual`: a rejected step.
 LOST = 1e8
 
 
@@ -91,7 +91,7 @@ _FORMS = list(dict.fromkeys(MODELS.values()))
 TABLE = tomllib.loads((Path(__file__).parent / "nist_strd.toml").read_text(encoding="utf-8"))
 
 
-# Fitted by their logarithm, as `fitting.free` fits what must be positive.
+# Fitted by their logarithm, as `fitting.estimation.free_parameters` fits what must be positive.
 POSITIVE = {"MGH10": (0, 1, 2)}
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fitting.experiment import Experiment, experiment_from_log
-from fitting.logs import Log
+from fitting.estimation.experiment import Experiment, experiment_from_log
+from fitting.logs.log import Log
 from hdjax import Drive, ReducedDrive, ReducedModel, TwoInertiaModel
 
 N, J_M, J_L = 50.0, 5.26e-4, 5.0e-2

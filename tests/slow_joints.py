@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from fitting.logs import Log
+from fitting.logs.log import Log
 from fitting.quasi_static.loop import QuasiStaticLoop, close_loop
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import Motion

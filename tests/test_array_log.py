@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 
 from fitting.errors import InputError
-from fitting.log_table import read_table
+from fitting.logs.read_table import read_table
 
 A = np.arange(300.0)
 B = A**2

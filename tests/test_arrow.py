@@ -9,14 +9,14 @@ import pytest
 from scipy.optimize import least_squares
 
 import rig
-from fitting.arrow import ArrowLevenbergMarquardt, normal_equations, project
-from fitting.engines import residual_and_products
-from fitting.experiment import Stretch, cut
-from fitting.free import base_paths, free_parameters
-from fitting.posing import initial_states
-from fitting.residual import Blocks, Problem, Products, Unknowns, blocks, residual
-from fitting.solve import evaluate
-from fitting.solve import solve as solve_by_steps
+from fitting.estimation.engines import residual_and_products
+from fitting.estimation.experiment import Stretch, cut
+from fitting.estimation.free_parameters import base_paths, free_parameters
+from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt, normal_equations, project
+from fitting.estimation.problem import initial_states
+from fitting.estimation.residual import Blocks, Problem, Products, Unknowns, blocks, residual
+from fitting.estimation.solve import evaluate
+from fitting.estimation.solve import solve as solve_by_steps
 
 SEGMENTS, ROWS, PARAMETERS, STATES = 4, 11, 3, 2
 

@@ -15,12 +15,12 @@ from fitting.attribution.candidate_fit import Trial, attempt, halo_for
 from fitting.attribution.selection_round import Verdict, look
 from fitting.attribution.study import Setting, Study
 from fitting.attribution.support import Standing
-from fitting.base_fit import base_fit
-from fitting.experiment import split
-from fitting.free import effect_paths
-from fitting.measurement_noise import MeasurementNoise, measurement_noise
-from fitting.posing import Segmentation
-from fitting.uncertainty import Estimate, Uncertainty
+from fitting.estimation.base_fit import base_fit
+from fitting.estimation.experiment import split
+from fitting.estimation.free_parameters import effect_paths
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.base_fit import _refined, base_fit, is_held, leaves_white_noise
-from fitting.estimate import Fit, Strategy, fit
-from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.free import base_paths
-from fitting.outliers import left_out
-from fitting.posing import Segmentation
-from fitting.starting_values import starting_models
-from fitting.uncertainty import uncertainty
+from fitting.estimation.base_fit import _refined, base_fit, is_held, leaves_white_noise
+from fitting.estimation.estimate import Fit, Strategy, fit
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.outliers import left_out
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.starting_values import starting_models
+from fitting.uncertainty.standard_errors import uncertainty
 
 PLACEHOLDER = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
 COUNT = 1000

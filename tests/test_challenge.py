@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 import rig
-from fitting import challenge as module
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
 from fitting.attribution.decisions import names_stand, next_question
+from fitting.attribution.effect_search import base_trial
 from fitting.attribution.study import Setting, Study
-from fitting.effect_search import base_trial
-from fitting.experiment import split
-from fitting.learned_look import Candidate
-from fitting.posing import Segmentation
-from fitting.unknown import Unknown
+from fitting.discrepancy import challenge as module
+from fitting.discrepancy.learn import Unknown
+from fitting.discrepancy.variable_selection import Candidate
+from fitting.estimation.experiment import split
+from fitting.estimation.problem import Segmentation
 from hdjax.effects import Conditions
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.creep import Creep

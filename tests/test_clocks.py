@@ -12,9 +12,9 @@ import rig
 from fitting.attribution.candidate_fit import Trial, attempt, halo_for
 from fitting.attribution.log_alignment import Phasors, put_back, with_clocks_set
 from fitting.attribution.study import Data, Setting, Study
-from fitting.base_fit import base_fit
-from fitting.experiment import Experiment, experiment_from_log, split
-from fitting.linear_look import Acting, look_along, products
+from fitting.estimation.base_fit import base_fit
+from fitting.estimation.experiment import Experiment, experiment_from_log, split
+from fitting.first_order.gains import Acting, look_along, products
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
 

@@ -10,11 +10,11 @@ import pytest
 
 import rig
 from fitting.attribution.case_evidence import ChallengeEvidence
+from fitting.attribution.effect_search import _holds_given_up
 from fitting.attribution.selection_round import Round, Verdict
-from fitting.challenge import Challenge, model_evidence
 from fitting.close_loop import close_loop
-from fitting.effect_search import _holds_given_up
-from fitting.experiment import Experiment, experiment_from_log
+from fitting.discrepancy.challenge import Challenge, model_evidence
+from fitting.estimation.experiment import Experiment, experiment_from_log
 from fitting.outcome import Loop
 from fitting.search_options import SearchOptions
 from hdjax import Hold

@@ -14,10 +14,10 @@ import polars as pl
 import pytest
 
 import rig
-from fitting import command_line
-from fitting.command_line import main
-from fitting.free_run import WINDOW
-from fitting.model_file import StoredModel, to_json
+from fitting.commands import main as command_line
+from fitting.commands.main import main
+from fitting.estimation.free_run import WINDOW
+from fitting.stored_model import StoredModel, to_json
 from hdjax import Model, TwoInertiaModel, hdc_40_050
 from hdjax.effects.thermal import ThermalStiffness
 
@@ -119,7 +119,7 @@ BAD_LOGS: dict[str, tuple[Callable[[], dict[str, np.ndarray]], int, Sequence[str
 HEAVY = ("hdjax", "jax", "matplotlib", "numpy", "plotly", "polars", "scipy")
 ANSWER_AND_TELL = """\
 import sys
-from fitting.command_line import main
+from fitting.commands.main import main
 try:
     main(sys.argv[1:])
 except SystemExit as end:
@@ -156,7 +156,7 @@ def test_a_fit_of_a_plain_log_imports_no_more_than_it_needs(tmp_path: Path):
     assert answer.stderr.split() == []
 
 
-@pytest.mark.parametrize("start", [("-m", "hdjax"), ("-c", "from fitting.command_line import main; main()")])
+@pytest.mark.parametrize("start", [("-m", "hdjax"), ("-c", "from fitting.commands.main import main; main()")])
 def test_the_version_is_that_of_the_package(start: Sequence[str]):
     answer = subprocess.run([sys.executable, *start, "--version"], capture_output=True, text=True, check=True)
     assert answer.stdout.split() == [importlib.metadata.version("hdjax")]

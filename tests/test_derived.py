@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 
 import rig
-from fitting.compare import Account
-from fitting.derived import derived, drive_figures
-from fitting.identifiability import Identifiability
-from fitting.uncertainty import Estimate, Uncertainty
+from fitting.uncertainty.identifiability import Identifiability
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
+from fitting.validation.account import Account
+from fitting.validation.derived_quantities import derived, drive_figures
 from hdjax import Model
 
 X_MAX = 2e-3

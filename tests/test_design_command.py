@@ -8,11 +8,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from fitting.command_line import main
-from fitting.design_file import read_design_file
-from fitting.drawn_drives import drawn_from_report, spread_around
+from fitting.commands.design_file import read_design_file
+from fitting.commands.main import main
+from fitting.commands.parameter_draws import drawn_from_report, spread_around
 from fitting.errors import DataError, InputError
-from fitting.model_file import StoredModel, to_json
+from fitting.stored_model import StoredModel, to_json
 from hdjax import TwoInertiaModel, hdc_40_050
 from hdjax.design import MEASURES
 

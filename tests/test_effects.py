@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from fitting.engines import linearise, with_engine
-from fitting.experiment import Experiment, Stretch, cut
-from fitting.free import FreeParameters
-from fitting.residual import Problem, Unknowns
+from fitting.estimation.engines import linearise, with_engine
+from fitting.estimation.experiment import Experiment, Stretch, cut
+from fitting.estimation.free_parameters import FreeParameters
+from fitting.estimation.residual import Problem, Unknowns
 from hdjax import Drive, Harmonic, ReducedDrive, ReducedModel, TwoInertiaModel, sampled, simulate
 from hdjax.effects import CATALOGUE, Motion, Scales
 from hdjax.effects.actuation import InputDelay

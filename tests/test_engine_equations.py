@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.free import fitted_paths
+from fitting.estimation.free_parameters import fitted_paths
 from hdjax import Drive, Model, ReducedDrive, ReducedModel, TwoInertiaModel
 from hdjax.effects import CATALOGUE, Conditions, DryFriction, Effect, Rubbing, Scales
 from hdjax.effects.actuation import TorqueBias, TorqueGain

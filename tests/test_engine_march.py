@@ -10,11 +10,11 @@ import pytest
 from test_engine_equations import models
 
 import rig
-from fitting.engines import linearise, residual_with_blocks, rows_at, simulate, with_engine
-from fitting.experiment import Experiment, Stretch, cut
-from fitting.free import fitted_paths, free_parameters
-from fitting.machine_code import _gap, lanes_of, task
-from fitting.residual import LOST, Blocks, Problem, Products, Unknowns, blocks
+from fitting.estimation.engines import linearise, residual_with_blocks, rows_at, simulate, with_engine
+from fitting.estimation.experiment import Experiment, Stretch, cut
+from fitting.estimation.free_parameters import fitted_paths, free_parameters
+from fitting.estimation.machine_code import _gap, lanes_of, task
+from fitting.estimation.residual import LOST, Blocks, Problem, Products, Unknowns, blocks
 from hdjax import Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 from hdjax.effects import CATALOGUE, DryFriction
 from hdjax.effects.effect import MeshTorqueEffect, Motion

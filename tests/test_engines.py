@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import rig
-from fitting import engines
-from fitting.estimate import fit
-from fitting.experiment import Stretch
-from fitting.free import fitted_paths
-from fitting.posing import Segmentation, pose
-from fitting.residual import Engine
-from fitting.rig import read_rig
-from fitting.starting_values import starting_models
-from fitting.uncertainty import uncertainty
+from fitting.drive_data import read_rig
+from fitting.estimation import engines
+from fitting.estimation.estimate import fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import fitted_paths
+from fitting.estimation.problem import Segmentation, pose
+from fitting.estimation.residual import Engine
+from fitting.estimation.starting_values import starting_models
+from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import TwoInertiaModel
 from hdjax.effects.effect import MeshTorqueEffect, Motion
 from hdjax.parameters import Scalar, parameter

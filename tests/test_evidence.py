@@ -5,9 +5,9 @@ import pytest
 
 import rig
 from fitting.attribution.effect_evidence import Evidence, evidence
-from fitting.estimate import Fit, Strategy, fit
-from fitting.experiment import Stretch
-from fitting.posing import Segmentation
+from fitting.estimation.estimate import Fit, Strategy, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.problem import Segmentation
 from hdjax.effects import Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import rig
 from fitting.errors import DataError
-from fitting.experiment import (
+from fitting.estimation.experiment import (
     Experiment,
     Stretch,
     cut,

@@ -6,13 +6,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-import fitting.fleet
+import fitting.batch_fit
 import rig
-from fitting.compare import Account
+from fitting.batch_fit import find_logs, fit_fleet, fleet_text, parameter_columns
 from fitting.errors import DataError, InputError
-from fitting.fleet import find_logs, fit_fleet, fleet_text, parameter_columns
-from fitting.identifiability import Identifiability
-from fitting.uncertainty import Estimate, Uncertainty
+from fitting.uncertainty.identifiability import Identifiability
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
+from fitting.validation.account import Account
 
 COUNT = 1200
 DRIVE = '[drive]\nname = "cells"\n[signals]\ntorque_hold = "zero-order"\n'
@@ -44,7 +44,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
         seen.extend(logs)
         raise DataError(f"{logs[0]}: no")
 
-    monkeypatch.setattr(fitting.fleet, "read_rig", refuse)
+    monkeypatch.setattr(fitting.batch_fit, "read_rig", refuse)
     return seen
 
 
@@ -98,9 +98,9 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch
         seen.extend(paths)
         raise DataError(f"{paths[0]}: no")
 
-    monkeypatch.setattr(fitting.fleet, "read_rig", read)
+    monkeypatch.setattr(fitting.batch_fit, "read_rig", read)
     # One after the other.
-    monkeypatch.setattr(fitting.fleet.os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(fitting.batch_fit.os, "cpu_count", lambda: 1)
     with pytest.raises(KeyboardInterrupt):
         fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     assert not (tmp_path / "out" / "fleet.parquet").exists()
@@ -119,7 +119,7 @@ def test_a_bug_in_one_fit_stops_nobody(tmp_path: Path, drive: Path, monkeypatch:
             raise ZeroDivisionError("oops")
         raise DataError(f"{logs[0]}: no")
 
-    monkeypatch.setattr(fitting.fleet, "read_rig", broken)
+    monkeypatch.setattr(fitting.batch_fit, "read_rig", broken)
     table = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     assert table["state"].to_list() == ["failed", "refused"]
     assert "ZeroDivisionError: oops" in table["message"][0]
@@ -136,7 +136,7 @@ def test_a_drive_file_beside_a_log_goes_first(tmp_path: Path, drive: Path, monke
         used[logs[0].parent.name] = drive
         raise DataError("no")
 
-    monkeypatch.setattr(fitting.fleet, "read_rig", note)
+    monkeypatch.setattr(fitting.batch_fit, "read_rig", note)
     fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     assert used == {"one": own, "two": drive}
 

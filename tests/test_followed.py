@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.along import along
-from fitting.estimate import Fit, fit
-from fitting.experiment import split
-from fitting.followed import Followed, follow, respond
-from fitting.free import base_paths, strength_paths
-from fitting.posing import Segmentation
-from fitting.regressors import regressors
-from fitting.residual import simulate_segments
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import split
+from fitting.estimation.free_parameters import base_paths, strength_paths
+from fitting.estimation.linear_response import Followed, follow, respond
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.residual import simulate_segments
+from fitting.first_order.motion import along
+from fitting.first_order.regressors import regressors
 from hdjax import PiecewisePolynomial
 from hdjax.effects import Effect
 from hdjax.effects.actuation import InputDelay, TorqueBias

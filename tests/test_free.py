@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rig
-from fitting.free import base_paths, effect_paths, free_parameters, strength_paths
+from fitting.estimation.free_parameters import base_paths, effect_paths, free_parameters, strength_paths
 from hdjax.effects import BY_NAME, CATALOGUE, Effect, Scales
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.hysteresis import BoucWen

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import fitting.free_run as module
+import fitting.estimation.free_run as module
 import rig
-from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.free_run import WINDOW, FreeRun, free_run, motor_rms_error, rms_error
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
+from fitting.estimation.free_run import WINDOW, FreeRun, free_run, motor_rms_error, rms_error
 from hdjax import Model
 
 COUNT = 600

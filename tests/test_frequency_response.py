@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 
 import rig
-from fitting.experiment import Experiment, experiment_from_log
-from fitting.frequency_response import (
+from fitting.estimation.experiment import Experiment, experiment_from_log
+from fitting.validation.frequency_response import (
     FrequencyResponse,
     coherent_band,
     excites_resonance,

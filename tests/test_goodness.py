@@ -8,17 +8,17 @@ import pytest
 from scipy import stats
 
 import rig
-from fitting.compare import Account
-from fitting.diagnostics import diagnose
-from fitting.estimate import Fit, fit
-from fitting.experiment import experiment_from_log, split
-from fitting.free import base_paths
-from fitting.free_run import FreeRun
-from fitting.goodness import Goodness, fit_percent, goodness
-from fitting.identifiability import Identifiability
-from fitting.posing import Segmentation
-from fitting.residual_tests import residual_tests
-from fitting.uncertainty import Uncertainty
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import experiment_from_log, split
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.free_run import FreeRun
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.identifiability import Identifiability
+from fitting.uncertainty.standard_errors import Uncertainty
+from fitting.validation.account import Account
+from fitting.validation.goodness_of_fit import Goodness, fit_percent, goodness
+from fitting.validation.residual_diagnostics import diagnose
+from fitting.validation.residual_tests import residual_tests
 
 NOISE = np.array([[4e-10, 1e-10], [1e-10, 9e-10]])
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.drive_file import ColumnMap, DriveFile, read_drive_file
+from fitting.drive_data import ready_log
 from fitting.errors import DataError
-from fitting.findings import Finding
-from fitting.health import examine, refuse_unfit
-from fitting.logs import Log, read_log
-from fitting.rig import ready_log
+from fitting.logs.checks import examine, refuse_unfit
+from fitting.logs.drive_file import ColumnMap, DriveFile, read_drive_file
+from fitting.logs.findings import Finding
+from fitting.logs.log import Log, read_log
 
 N = 50.0
 ROWS = 4000

@@ -7,11 +7,18 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, Start, Strategy, fit
-from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.identifiability import _held_one, at_bound, identifiability, needed_samples, needed_twist, reason
-from fitting.posing import Segmentation
-from fitting.uncertainty import Estimate, uncertainty
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.identifiability import (
+    _held_one,
+    at_bound,
+    identifiability,
+    needed_samples,
+    needed_twist,
+    reason,
+)
+from fitting.uncertainty.standard_errors import Estimate, uncertainty
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.parameters import ParameterInfo
 

@@ -13,10 +13,10 @@ jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[2])
 import rig
-from fitting.estimate import fit
-from fitting.posing import Segmentation
-from fitting.experiment import Stretch
-from fitting.free import base_paths
+from fitting.estimation.estimate import fit
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import base_paths
 
 experiment = rig.reduced_experiment(2048, noise=1e-5)
 model = rig.reduced_model()

@@ -13,10 +13,10 @@ import pytest
 from scipy.interpolate import BSpline
 
 import rig
-from fitting.along import acting_at_knots, unit_pushes, unit_reading
 from fitting.errors import InputError
-from fitting.experiment import cut, experiment_from_log, split
-from fitting.model_file import StoredModel, read_model, to_json
+from fitting.estimation.experiment import cut, experiment_from_log, split
+from fitting.first_order.motion import acting_at_knots, unit_pushes, unit_reading
+from fitting.stored_model import StoredModel, read_model, to_json
 from hdjax import sampled
 from hdjax.effects import Conditions, Effect, Motion, Scales
 from hdjax.effects.actuation import TorqueGain

@@ -12,21 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rig
-from fitting.along import place_of
+from fitting.attribution.effect_search import base_trial
 from fitting.attribution.screening import Screen
 from fitting.close_loop import close_loop
-from fitting.effect_search import base_trial
-from fitting.experiment import experiment_from_log, split
-from fitting.learned_look import learned_look
-from fitting.learned_response import learned_response
-from fitting.model_file import StoredModel, read_model, to_json
+from fitting.discrepancy.dynamic_laws import remembering
+from fitting.discrepancy.dynamic_stiffness import learned_response
+from fitting.discrepancy.learn import share_of
+from fitting.discrepancy.variable_selection import learned_look
+from fitting.estimation.experiment import experiment_from_log, split
+from fitting.first_order.motion import place_of
 from fitting.outcome import Loop
-from fitting.plots import response_plot
-from fitting.remembering import remembering
 from fitting.report import write_report
+from fitting.report.plots import response_plot
 from fitting.search_options import SearchOptions
-from fitting.uncertainty import Estimate, Uncertainty
-from fitting.unknown import share_of
+from fitting.stored_model import StoredModel, read_model, to_json
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
 from hdjax import Model
 from hdjax.effects import Effect, Motion, Scales
 from hdjax.effects.hysteresis import BoucWen, Dahl, SharpBoucWen
@@ -178,7 +178,7 @@ def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: p
         asked.extend(catalogue)
         return Screen((), np.zeros(1))
 
-    monkeypatch.setattr("fitting.remembering.screen", screen)
+    monkeypatch.setattr("fitting.discrepancy.dynamic_laws.screen", screen)
     data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
     before, study = base_trial(rig.reduced_model(), data, "zero-order")
     seen = learned_look(before.training)

@@ -12,9 +12,9 @@ import polars as pl
 import pytest
 import scipy.io
 
-from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.logs import Log, read_log
+from fitting.logs.drive_file import DriveFile, read_drive_file
+from fitting.logs.log import Log, read_log
 
 N = 50.0
 ROWS = 400

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch
-from fitting.long_fit import long_fit
-from fitting.posing import Segmentation
-from fitting.uncertainty import uncertainty
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.whole_log_fit import long_fit
+from fitting.uncertainty.standard_errors import uncertainty
 from hdjax.effects.backlash import Backlash
 
 COUNT, HORIZON, GAP = 8000, 128, 2e-4

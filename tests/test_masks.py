@@ -7,8 +7,8 @@ import pytest
 
 import rig
 from fitting.errors import DataError
-from fitting.logs import Log
-from fitting.masks import glitches, masked
+from fitting.logs.log import Log
+from fitting.logs.masks import glitches, masked
 
 COUNT = 4000
 TORQUE = rig.drive_torque(COUNT)

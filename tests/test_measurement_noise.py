@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, Strategy, fit
-from fitting.experiment import Stretch
-from fitting.free import base_paths
-from fitting.measurement_noise import _MOTION, measurement_noise
-from fitting.posing import Segmentation
+from fitting.estimation.estimate import Fit, Strategy, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.measurement_noise import _MOTION, measurement_noise
 
 COUNT = 1000
 NOISE = 1e-3

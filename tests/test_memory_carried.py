@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Strategy, fit
-from fitting.experiment import Stretch, experiment_from_log
-from fitting.long_fit import with_memory_carried
-from fitting.posing import Segmentation
+from fitting.estimation.estimate import Strategy, fit
+from fitting.estimation.experiment import Stretch, experiment_from_log
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.whole_log_fit import with_memory_carried
 from hdjax.effects.hysteresis import MaxwellSlip
 
 COUNT, HORIZON, NOISE = 6000, 64, 1e-4

@@ -9,7 +9,7 @@ import pytest
 
 import rig
 from fitting.errors import InputError
-from fitting.model_file import StoredModel, read_model, to_json
+from fitting.stored_model import StoredModel, read_model, to_json
 from hdjax import HOLDS, Model, TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, Scales
 from hdjax.effects.hysteresis import BoucWen

@@ -12,15 +12,16 @@ import plotly.graph_objects as go
 import pytest
 
 import rig
-from fitting import command_search, discrimination
 from fitting.close_loop import close_loop
-from fitting.command_search import Candidate, search
-from fitting.discrimination import Bench, Explanation, explanation, refit, respond, signals, start
-from fitting.estimate import Start, Strategy, fit
-from fitting.excitation import Limits, excitations, reached
-from fitting.experiment import Experiment, Stretch, experiment_from_log, split
-from fitting.fit_only import fit_only
-from fitting.next_experiment import (
+from fitting.estimation.estimate import Start, Strategy, fit
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log, split
+from fitting.estimation.problem import Segmentation
+from fitting.fit_drive import fit_only
+from fitting.next_experiment import command_search, discrimination
+from fitting.next_experiment.command_search import Candidate, search
+from fitting.next_experiment.discrimination import Bench, Explanation, explanation, refit, respond, signals, start
+from fitting.next_experiment.excitation import Limits, excitations, reached
+from fitting.next_experiment.proposal import (
     NextExperiment,
     Precision,
     Separation,
@@ -28,12 +29,11 @@ from fitting.next_experiment import (
     experiment_for_ties,
     tied,
 )
-from fitting.plots import next_experiment_plot
-from fitting.posing import Segmentation
 from fitting.report import write_report
+from fitting.report.plots import next_experiment_plot
 from fitting.report.proposal import command_table, proposal_dict
 from fitting.search_options import SearchOptions
-from fitting.uncertainty import uncertainty
+from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Hold, sampled, simulate
 from hdjax.effects.friction import MotorFriction, StribeckMotorFriction
 

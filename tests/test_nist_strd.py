@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nist_strd import MODELS, TABLE, Regression, padded, physical, regression, residual, solve
 
-from fitting.residual import Unknowns
+from fitting.estimation.residual import Unknowns
 
 DIGITS = 1e-6
 # Lanczos1 is noiseless but for the 14th digit: evaluated in double precision, its residual of 1e-13 keeps three digits,

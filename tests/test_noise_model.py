@@ -14,16 +14,16 @@ import rig
 from fitting.attribution.decisions import RULES
 from fitting.attribution.support import is_noise, noise_of_torque
 from fitting.close_loop import close_loop
-from fitting.engines import with_engine
-from fitting.estimate import Fit, fit
-from fitting.experiment import Experiment, experiment_from_log, whole
-from fitting.free import base_paths
-from fitting.measurement_noise import measurement_noise
-from fitting.noise_model import NoiseModel, SensorNoise, _filtered, _Steps, noise_model, spread_by_torque
-from fitting.posing import Segmentation
-from fitting.prediction_band import prediction_bands
-from fitting.residual import Unknowns
-from fitting.uncertainty import uncertainty
+from fitting.estimation.engines import with_engine
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Experiment, experiment_from_log, whole
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.residual import Unknowns
+from fitting.uncertainty.measurement_noise import measurement_noise
+from fitting.uncertainty.noise_model import NoiseModel, SensorNoise, _filtered, _Steps, noise_model, spread_by_torque
+from fitting.uncertainty.prediction_band import prediction_bands
+from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Hold
 
 COUNT, STD = 3000, 0.01

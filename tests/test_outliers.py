@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.experiment import Stretch, cut, experiment_from_log
-from fitting.outliers import _alone, left_out, with_weights, without_glitches
+from fitting.estimation.experiment import Stretch, cut, experiment_from_log
+from fitting.estimation.outliers import _alone, left_out, with_weights, without_glitches
 
 COUNT = 2000
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.pieces import SHORTEST, Sampling, bridge_error, bridged, pieces
+from fitting.logs.gaps import SHORTEST, Sampling, bridge_error, bridged, pieces
 
 COUNT = 2000
 TIME = np.arange(COUNT) * rig.STEP

@@ -9,13 +9,13 @@ import pytest
 from scipy.optimize import least_squares
 
 import rig
-from fitting.engines import linearise
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch
-from fitting.posing import Segmentation
-from fitting.posterior import Posterior, posterior
-from fitting.residual import Unknowns
-from fitting.uncertainty import Uncertainty, uncertainty
+from fitting.estimation.engines import linearise
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.residual import Unknowns
+from fitting.uncertainty.posterior import Posterior, posterior
+from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
 
 COUNT, HORIZON = 256, 64
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch
-from fitting.free_run import free_run
-from fitting.posing import Segmentation
-from fitting.prediction_band import PredictionBand, prediction_bands
-from fitting.uncertainty import Uncertainty, uncertainty
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_run import free_run
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
+from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
 
 COUNT, HORIZON, NOISE = 600, 128, 2e-3
 # From a moving drive on: one that begins at rest has no rate to be uncertain of.

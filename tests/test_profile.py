@@ -8,11 +8,11 @@ from scipy.optimize import least_squares
 from scipy.stats import t
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch
-from fitting.posing import Segmentation
-from fitting.profile import profile, with_profiles
-from fitting.uncertainty import Uncertainty, uncertainty
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.profile_likelihood import profile, with_profiles
+from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
 
 COUNT, SHORT, NOISE = 400, 128, 2e-3
 

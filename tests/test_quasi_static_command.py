@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from torque_cycles import FRICTION, K1, cycles, line, no_friction, sliders
 
-from fitting.command_line import main
-from fitting.drive_file import read_drive_file
-from fitting.logs import read_log
-from fitting.model_file import StoredModel, to_json
+from fitting.commands.main import main
+from fitting.logs.drive_file import read_drive_file
+from fitting.logs.log import read_log
 from fitting.quasi_static.fit import fit_quasi_static
 from fitting.quasi_static.preparation import prepare
+from fitting.stored_model import StoredModel, to_json
 from hdjax import TwoInertiaModel, hdc_40_050
 
 DRIVE = "[drive]\nrated_torque = 54.0\n"

@@ -8,8 +8,8 @@ import slow_joints
 from slow_joints import K, closed, slow_joint
 from test_quasi_static_command import lara_drive
 
-from fitting.drive_file import read_drive_file
-from fitting.logs import read_log
+from fitting.logs.drive_file import read_drive_file
+from fitting.logs.log import read_log
 from fitting.quasi_static.attribution import Held
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.lookalikes import lookalikes

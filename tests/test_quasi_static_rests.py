@@ -7,7 +7,7 @@ import slow_joints
 from slow_joints import RATIO, Effect, closed, slow_joint
 from test_quasi_static_loop import RIPPLE, families, lara
 
-from fitting.drive_file import DriveFile
+from fitting.logs.drive_file import DriveFile
 from fitting.quasi_static.attribution import Held
 from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.lookalikes import lookalikes

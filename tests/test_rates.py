@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.drive_file import DriveFile, read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.experiment import experiment_from_log
-from fitting.logs import read_log
+from fitting.estimation.experiment import experiment_from_log
+from fitting.logs.drive_file import DriveFile, read_drive_file
+from fitting.logs.log import read_log
 
 COUNT = 4000
 DRIVE = """

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, Start, Strategy, fit
-from fitting.experiment import Experiment, Stretch
-from fitting.free import base_paths
-from fitting.posing import Segmentation
-from fitting.refits import refits
-from fitting.uncertainty import uncertainty
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.refits import refits
+from fitting.uncertainty.standard_errors import uncertainty
 
 COUNT, HORIZON, NOISE, DRAWS = 1024, 512, 1e-3, 5
 

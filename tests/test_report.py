@@ -22,14 +22,12 @@ import rig
 from fitting import formatting
 from fitting.attribution.selection_round import Verdict
 from fitting.close_loop import close_loop
-from fitting.diagnostics import Dependence
-from fitting.estimate import Fit
-from fitting.experiment import Experiment, whole
-from fitting.findings import Finding
-from fitting.fit_only import FitOnly, fit_only
+from fitting.estimation.estimate import Fit
+from fitting.estimation.experiment import Experiment, whole
+from fitting.estimation.starting_values import starting_models
+from fitting.fit_drive import FitOnly, fit_only
+from fitting.logs.findings import Finding
 from fitting.outcome import Loop
-from fitting.plots import decimated, fit_plots, plots
-from fitting.posterior import Posterior
 from fitting.report import (
     explained_share,
     report_dict,
@@ -39,11 +37,13 @@ from fitting.report import (
 )
 from fitting.report.intervals import say_what_intervals_hold
 from fitting.report.limits import limits, parameter_note
+from fitting.report.plots import decimated, fit_plots, plots
 from fitting.report.summary import _change, _remembering
+from fitting.report.web_page import environment
 from fitting.search_options import SearchOptions
-from fitting.starting_values import starting_models
-from fitting.uncertainty import Estimate, Uncertainty
-from fitting.web_page import environment
+from fitting.uncertainty.posterior import Posterior
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
+from fitting.validation.residual_diagnostics import Dependence
 from hdjax import Hold
 from hdjax.effects import FAMILIES
 from hdjax.effects.actuation import TorqueBias
@@ -393,7 +393,7 @@ def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
         )
         return dataclasses.replace(known, estimates=known.estimates | {"alpha": alpha})
 
-    monkeypatch.setattr("fitting.compare.with_profiles", doubt)
+    monkeypatch.setattr("fitting.validation.account.with_profiles", doubt)
     known, test = rig.drive_parts(2400, 600)
     start = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     good = report_dict(fit_only(start, {HOLD: (known,)}, test={HOLD: (test,)}, hold=HOLD))

@@ -6,13 +6,13 @@ from scipy import stats
 from scipy.signal import lfilter
 
 import rig
-from fitting.autocorrelation import autocorrelation, autocovariance, left_over
-from fitting.diagnostics import diagnose
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch
-from fitting.free import base_paths
-from fitting.posing import Segmentation
-from fitting.residual_tests import LAGS, independence, normality, residual_tests, whiteness, zero_mean
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.whiteness import autocorrelation, autocovariance, left_over
+from fitting.validation.residual_diagnostics import diagnose
+from fitting.validation.residual_tests import LAGS, independence, normality, residual_tests, whiteness, zero_mean
 
 REPETITIONS = 300
 SAMPLES = 2000

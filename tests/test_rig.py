@@ -5,8 +5,8 @@ from pathlib import Path
 import mutations
 import pytest
 
+from fitting.drive_data import read_rig
 from fitting.errors import InputError
-from fitting.rig import read_rig
 
 
 def write(folder: Path, name: str, seed: int) -> Path:

@@ -10,11 +10,11 @@ from scipy.signal import lfilter
 from scipy.stats import binom, t
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import Stretch, experiment_from_log
-from fitting.posing import Segmentation
-from fitting.sandwich import Linearised, Record, covariance, linearised
-from fitting.uncertainty import uncertainty
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Stretch, experiment_from_log
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.sandwich import Linearised, Record, covariance, linearised
+from fitting.uncertainty.standard_errors import uncertainty
 
 COUNT, DRAWS = 2000, 400
 PERIOD = 16.0

@@ -7,13 +7,13 @@ import pytest
 
 import rig
 from fitting.attribution.screening import Screen, screen
-from fitting.estimate import Fit, Start, Strategy, fit
-from fitting.experiment import split
-from fitting.explained import solved, without_untold
-from fitting.free import FreeParameters, base_paths
-from fitting.posing import Segmentation
-from fitting.residual import Blocks
-from fitting.surrogates import DRAWS, surrogates
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.experiment import split
+from fitting.estimation.free_parameters import FreeParameters, base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.projection import solved, without_untold
+from fitting.estimation.residual import Blocks
+from fitting.first_order.surrogates import DRAWS, surrogates
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import csd, welch
 
-from fitting.spectral_density import cross_density, density
+from fitting.validation.welch import cross_density, density
 
 STEP = 0.004
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import experiment_from_log, split
-from fitting.free import base_paths
-from fitting.posing import Segmentation
-from fitting.spectral_lines import spectral_lines
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import experiment_from_log, split
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.first_order.spectral_lines import spectral_lines
 
 
 def found(forcing: np.ndarray, hidden: np.ndarray) -> Fit:

@@ -5,8 +5,8 @@ import pytest
 
 import rig
 from fitting.errors import DataError
-from fitting.experiment import Experiment, Stretch, experiment_from_log
-from fitting.starting_values import _weak_form, starting_models
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
+from fitting.estimation.starting_values import _weak_form, starting_models
 
 COUNT = 3000
 C = (rig.N**2 * rig.J_M + rig.J_L) / (rig.N**2 * rig.J_M * rig.J_L)

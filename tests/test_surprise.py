@@ -9,14 +9,14 @@ import pytest
 from scipy.signal import lfilter
 
 import rig
-from fitting.compare import Account, account
-from fitting.estimate import Fit, Strategy, fit
-from fitting.experiment import experiment_from_log, split
-from fitting.free_run import FreeRun
-from fitting.measurement_noise import measurement_noise
-from fitting.posing import Segmentation
-from fitting.prediction_band import PredictionBand
-from fitting.surprise import over_bands, surprise
+from fitting.estimation.estimate import Fit, Strategy, fit
+from fitting.estimation.experiment import experiment_from_log, split
+from fitting.estimation.free_run import FreeRun
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.measurement_noise import measurement_noise
+from fitting.uncertainty.prediction_band import PredictionBand
+from fitting.validation.account import Account, account
+from fitting.validation.free_run_check import over_bands, surprise
 
 NOISE = 1e-6
 PATHS = ("mu", "omega_0", "alpha", "gain")
@@ -83,7 +83,7 @@ def test_a_band_that_left_the_numbers_promised_nothing():
 def test_bands_are_asked_where_names_do_not_explain(
     fitted: tuple[Fit, Account], before: float, after: float, asked: bool, monkeypatch: pytest.MonkeyPatch
 ):
-    module = import_module("fitting.surprise")
+    module = import_module("fitting.validation.free_run_check")
     monkeypatch.setattr(module, "prediction_bands", lambda *args, runs, **options: [band(runs[0])])
     found, _ = fitted
     then, now = ((run(times),) for times in (before, after))

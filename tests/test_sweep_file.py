@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from fitting.commands.sweep_file import read_sweep_file
 from fitting.errors import InputError
-from fitting.sweep_file import read_sweep_file
 from hdjax.sweep.points import Points, drawn
 
 GOOD = """

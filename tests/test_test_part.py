@@ -9,10 +9,10 @@ import pytest
 
 import rig
 from fitting.commands.run_close_loop import close_loop_on_logs
-from fitting.drive_file import read_drive_file
-from fitting.logs import read_log
+from fitting.estimation.test_part import parted
+from fitting.logs.drive_file import read_drive_file
+from fitting.logs.log import read_log
 from fitting.search_options import SearchOptions
-from fitting.test_part import parted
 
 COUNT, TEST = 1500, 300
 OUTPUTS = ("motor_angle", "load_angle")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fitting.errors import InputError
-from fitting.plain_numbers import plain_columns
-from fitting.raw_table import RawTable, split_unit
-from fitting.text_cells import cells, column_from_text
-from fitting.text_log import read_text
+from fitting.logs.plain_numbers import plain_columns
+from fitting.logs.raw_table import RawTable, split_unit
+from fitting.logs.text import read_text
+from fitting.logs.text_cells import cells, column_from_text
 
 TIME = [0.0, 0.5, 1.0, 1.5]
 A = [1.5, -2.25, 3.0, 1e-3]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fitting.errors import InputError
-from fitting.time_stamps import TimeBase, time_base
+from fitting.logs.time_stamps import TimeBase, time_base
 
 COUNT, STEP = 4000, 5e-4
 CLOCK = np.arange(COUNT) * STEP

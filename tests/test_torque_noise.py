@@ -6,12 +6,12 @@ from scipy.optimize import nnls
 from scipy.stats import kstest
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import experiment_from_log, split
-from fitting.free import base_paths
-from fitting.posing import Segmentation
-from fitting.sandwich import covariance, linearised
-from fitting.torque_noise import nonnegative, torque_noise_covariance, uniformity
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import experiment_from_log, split
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.input_noise import nonnegative, torque_noise_covariance, uniformity
+from fitting.uncertainty.sandwich import covariance, linearised
 
 COUNT, DRAWS = 700, 48
 # Little damping: what the noise leaves is nearly a line at the resonance, and there are few periods of it.

@@ -5,8 +5,8 @@ import pytest
 import rig
 from fitting.attribution.candidate_fit import attempt, challenge, halo_for
 from fitting.attribution.study import Data, Setting, Study
-from fitting.base_fit import base_fit
-from fitting.experiment import split
+from fitting.estimation.base_fit import base_fit
+from fitting.estimation.experiment import split
 from hdjax import Hold
 from hdjax.effects.friction import CoulombFriction
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.command_line import main
-from fitting.drive_file import read_drive_file
+from fitting.commands.main import main
+from fitting.drive_data import ready_log
 from fitting.errors import DataError, InputError
-from fitting.health import examine, refuse_unfit
-from fitting.logs import Log
-from fitting.rig import ready_log
+from fitting.logs.checks import examine, refuse_unfit
+from fitting.logs.drive_file import read_drive_file
+from fitting.logs.log import Log
 
 # A log of 600 rows takes milliseconds; a loaded machine may take a hundred times as long.
 LONGEST = 20.0

@@ -6,11 +6,11 @@ import pytest
 from scipy.stats import binom, chi2, t
 
 import rig
-from fitting.estimate import Fit, fit
-from fitting.experiment import Experiment, Stretch
-from fitting.free import base_paths, free_parameters
-from fitting.posing import Segmentation
-from fitting.uncertainty import Uncertainty, uncertainty
+from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.free_parameters import base_paths, free_parameters
+from fitting.estimation.problem import Segmentation
+from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
 
 COUNT, HORIZON, NOISE = 1000, 128, 2e-3
 TRUTH = {"mu": rig.MU, "omega_0": rig.OMEGA_0, "alpha": rig.REDUCED_ALPHA, "gain": rig.GAIN}

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 pytest.importorskip("numba", reason="the study's rig needs the extra `benchmark`")
 
-from fitting.rig import read_rig
+from fitting.drive_data import read_rig
 from undeclared import drawing
 from undeclared.detection import LIMIT, detectability
 from undeclared.equations import integrate

@@ -7,7 +7,7 @@ import numpy as np
 import pint
 import pytest
 
-from fitting.unit_strings import USUAL, UnitError, convert, parse_number, to_base
+from fitting.logs.units import USUAL, UnitError, convert, parse_number, to_base
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_what_is_no_angle_is_refused(text: str):
 def test_usual_units_need_no_pint():
     program = (
         "import sys, numpy\n"
-        "from fitting.unit_strings import convert, to_base\n"
+        "from fitting.logs.units import convert, to_base\n"
         "convert(numpy.ones(2), 'rev / 2^17', 'rad'), convert(numpy.ones(2), 'ms', 's')\n"
         "to_base(numpy.ones(2), 'deg')\n"
         "assert 'pint' not in sys.modules\n"

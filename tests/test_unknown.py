@@ -13,18 +13,18 @@ import rig
 from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.study import Setting, Study
 from fitting.close_loop import close_loop
-from fitting.experiment import Stretch, experiment_from_log, split
-from fitting.free_run import free_run
-from fitting.learned_curve import LearnedCurve, learned_curve
-from fitting.model_file import StoredModel, read_model, to_json
+from fitting.discrepancy.closed_forms import shapes
+from fitting.discrepancy.curve import LearnedCurve, learned_curve
+from fitting.discrepancy.learn import Unknown, is_supported, learn, share_of
+from fitting.estimation.experiment import Stretch, experiment_from_log, split
+from fitting.estimation.free_run import free_run
+from fitting.estimation.problem import Segmentation
 from fitting.outcome import Loop
-from fitting.plots import learned_plot
-from fitting.posing import Segmentation
 from fitting.report import report_dict, write_report
+from fitting.report.plots import learned_plot
 from fitting.search_options import SearchOptions
-from fitting.shapes import shapes
-from fitting.uncertainty import uncertainty
-from fitting.unknown import Unknown, is_supported, learn, share_of
+from fitting.stored_model import StoredModel, read_model, to_json
+from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Model
 from hdjax.effects.actuation import TorqueBias, TorqueGain
 from hdjax.effects.damping import QuadraticDamping

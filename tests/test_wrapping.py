@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitting.wrapping import unwrapped_angle, unwrapped_overflow
+from fitting.logs.unwrapping import unwrapped_angle, unwrapped_overflow
 
 COUNT = 4000
 TIME = np.arange(COUNT) * 5e-4

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.drive_file import DriveFile
-from fitting.logs import Log
-from fitting.zero import zeroed
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.log import Log
+from fitting.logs.zeroing import zeroed
 
 DRIVE = DriveFile(Path("drive.toml"), "rig", rig.N, rig.J_M, rig.J_L, "zero-order", None, {})
 COUNT = 6000

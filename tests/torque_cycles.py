@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from fitting.logs import Log
+from fitting.logs.log import Log
 
 K1, K2, K3, T1, T2 = 3e4, 4.5e4, 6e4, 15.0, 50.0
 FRICTION = 4.0

@@ -10,13 +10,13 @@ from jaxtyping import Float
 
 from fitting.attribution.decisions import RULES
 from fitting.attribution.study import LEAST_PROGRESS, Study
-from fitting.base_fit import leaves_white_noise
-from fitting.estimate import Fit, Start, Strategy, fit
-from fitting.experiment import Stretch
-from fitting.free import fitted_paths
-from fitting.free_run import FreeRun, free_run, rms_error
-from fitting.long_fit import follows, over_whole_stretches, with_gaps_closed, with_memory_carried
-from fitting.posing import states_from
+from fitting.estimation.base_fit import leaves_white_noise
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import fitted_paths
+from fitting.estimation.free_run import FreeRun, free_run, rms_error
+from fitting.estimation.problem import states_from
+from fitting.estimation.whole_log_fit import follows, over_whole_stretches, with_gaps_closed, with_memory_carried
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -64,7 +64,7 @@ def attempt(
         hold: what the torque does between samples.
         start: a trial near by, whose error covariance weighs the outputs at the start, and whose initial states it
             starts from.
-        hold_parameters: see [`fitting.estimate.Strategy`][].
+        hold_parameters: see [`fitting.estimation.estimate.Strategy`][].
     """
     near = None if start is None else start.training
     strategy = replace(_strategy_beside(near, model), hold_parameters=hold_parameters)

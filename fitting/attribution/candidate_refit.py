@@ -9,8 +9,8 @@ from fitting.attribution.candidate_fit import Trial, challenge, first_pass, last
 from fitting.attribution.decisions import RULES
 from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
-from fitting.estimate import Fit, Strategy
-from fitting.experiment import scales
+from fitting.estimation.estimate import Fit, Strategy
+from fitting.estimation.experiment import scales
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.along import place_of
-from fitting.estimate import Fit
-from fitting.explained import solved
-from fitting.linear_look import Acting, Look, look_along, products
+from fitting.estimation.estimate import Fit
+from fitting.estimation.projection import solved
+from fitting.first_order.gains import Acting, Look, look_along, products
+from fitting.first_order.motion import place_of
 from hdjax import Drive, Model
 from hdjax.effects import (
     Effect,

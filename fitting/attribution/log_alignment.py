@@ -8,16 +8,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from fitting.along import place_of
 from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.decisions import RULES
 from fitting.attribution.study import Data, Study
-from fitting.estimate import Fit, segments_of_logs
-from fitting.experiment import Stretch
-from fitting.explained import solved
-from fitting.free import effect_paths
-from fitting.linear_look import Acting, Look, best_steps, left_after, look_along, products
-from fitting.spectral_lines import spectral_lines
+from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import effect_paths
+from fitting.estimation.projection import solved
+from fitting.first_order.gains import Acting, Look, best_steps, left_after, look_along, products
+from fitting.first_order.motion import place_of
+from fitting.first_order.spectral_lines import spectral_lines
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, Learned, LearnedPeriodic, LearnedTorque
 from hdjax.effects.learned_axes import PeriodicAxis

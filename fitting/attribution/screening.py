@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float
 from typing_extensions import TypeVar
 
-from fitting.estimate import Fit
-from fitting.experiment import scales
-from fitting.free import strength_paths
-from fitting.sight import Answered, Sight, batches, follow_on, sight
-from fitting.spectral_lines import spectral_lines
-from fitting.surrogates import DRAWS, Scores, null_gains
+from fitting.estimation.estimate import Fit
+from fitting.estimation.experiment import scales
+from fitting.estimation.free_parameters import strength_paths
+from fitting.first_order.linearised_fit import Answered, Sight, batches, follow_on, sight
+from fitting.first_order.spectral_lines import spectral_lines
+from fitting.first_order.surrogates import DRAWS, Scores, null_gains
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 

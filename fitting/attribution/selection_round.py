@@ -23,9 +23,9 @@ from fitting.attribution.support import (
     share_of_removed,
     strength_errors,
 )
-from fitting.base_fit import leaves_white_noise
-from fitting.experiment import scales
-from fitting.identifiability import parameters_at_bounds
+from fitting.estimation.base_fit import leaves_white_noise
+from fitting.estimation.experiment import scales
+from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 
 # Work in proportion: what is tied with the best gains as much but for this share; so it must in its first pass to be

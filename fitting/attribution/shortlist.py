@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from fitting.attribution.screening import Lead, Screen
-from fitting.free import effect_paths
+from fitting.estimation.free_parameters import effect_paths
 from hdjax.effects import CATALOGUE
 
 NEARLY = 0.95

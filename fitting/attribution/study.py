@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 
 from fitting.attribution.decisions import RULES
-from fitting.estimate import Fit, needed_substeps
-from fitting.experiment import Stretch
-from fitting.posing import Segmentation
+from fitting.estimation.estimate import Fit, needed_substeps
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.problem import Segmentation
 from fitting.progress import Progress, silent
 from hdjax import Hold
 

@@ -9,12 +9,12 @@ from jaxtyping import Float
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import NoiseEvidence
 from fitting.attribution.decisions import RULES, DecisionRules, only_noise
-from fitting.estimate import Fit
-from fitting.free import effect_paths, strength_paths
-from fitting.measurement_noise import MeasurementNoise
-from fitting.noise_model import NoiseModel, noise_model
-from fitting.normal_law import NORMAL_95
-from fitting.uncertainty import Estimate, Uncertainty, uncertainty
+from fitting.estimation.estimate import Fit
+from fitting.estimation.free_parameters import effect_paths, strength_paths
+from fitting.uncertainty.measurement_noise import MeasurementNoise
+from fitting.uncertainty.noise_model import NoiseModel, noise_model
+from fitting.uncertainty.normal_law import NORMAL_95
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty, uncertainty
 from hdjax import ReducedModel
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters

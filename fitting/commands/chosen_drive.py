@@ -4,7 +4,7 @@ import dataclasses
 
 from fitting.commands.options import DriveOptions, require_number
 from fitting.errors import InputError
-from fitting.model_file import read_model
+from fitting.stored_model import read_model
 from hdjax import PRESETS, Drive, ReducedDrive
 from hdjax.effects import Effect
 

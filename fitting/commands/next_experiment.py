@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 
 from fitting.commands.options import ExperimentLimits
+from fitting.drive_data import WHY_NOT_QUASI_STATIC, Rig
 from fitting.errors import InputError
-from fitting.experiment import Experiment
-from fitting.logs import Log
-from fitting.rig import WHY_NOT_QUASI_STATIC, Rig
+from fitting.estimation.experiment import Experiment
+from fitting.logs.log import Log
 
 _FEWEST_SAMPLES = 200
 
 
 def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) -> dict[str, float]:
-    """The limits that the user states, by their names in [`fitting.excitation.Limits`][].
+    """The limits that the user states, by their names in [`fitting.next_experiment.excitation.Limits`][].
 
     Args:
         options: as given.
@@ -36,7 +36,7 @@ def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) 
             raise InputError(f"{option} is for drives, but a reduced log has no motor; leave it out")
     if options.duration is not None:
         # Loaded here: few fits look for a next experiment.
-        from fitting.next_experiment import MOST_SAMPLES
+        from fitting.next_experiment.proposal import MOST_SAMPLES
 
         step = experiments[0].time_step
         shortest, longest = _FEWEST_SAMPLES * step, MOST_SAMPLES * step

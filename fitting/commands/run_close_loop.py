@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fitting.close_loop import close_loop
+from fitting.commands.demo import write_demo_logs
 from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_limits
 from fitting.commands.options import ExperimentLimits
 from fitting.commands.spinner import Spinner
-from fitting.demonstration import write_demo_logs
-from fitting.drive_file import read_drive_file
+from fitting.drive_data import Rig, read_logs, read_rig, rig_of
 from fitting.errors import InputError
-from fitting.model_file import StoredModel, to_json
-from fitting.next_experiment import experiment_for_ties
+from fitting.logs.drive_file import read_drive_file
+from fitting.next_experiment.proposal import experiment_for_ties
 from fitting.report import rig_text, write_rig_report
-from fitting.rig import Rig, read_logs, read_rig, rig_of
 from fitting.search_options import SearchOptions
+from fitting.stored_model import StoredModel, to_json
 
 
 def close_loop_on_logs(

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from fitting.commands.design_file import read_design_file
+from fitting.commands.design_report import design_dict, design_text
 from fitting.commands.pictures import show_files
-from fitting.design_file import read_design_file
-from fitting.design_report import design_dict, design_text
 from fitting.errors import DataError
 from fitting.files import write_whole
 from hdjax.design import confirm, optimise
@@ -48,7 +48,7 @@ def design_file(spec: Path, out: Path, *, plot: bool) -> None:
         out / "design.json": json.dumps(design_dict(study, found, proof), indent=1, allow_nan=False) + "\n"
     }
     if plot:
-        from fitting.design_plot import summary
+        from fitting.commands.design_plot import summary
 
         files[out / "design.png"] = summary(study, found, proof)
     write_whole(files)

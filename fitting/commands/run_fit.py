@@ -5,12 +5,12 @@ from pathlib import Path
 from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_limits
 from fitting.commands.options import ExperimentLimits
 from fitting.commands.spinner import Spinner
-from fitting.drive_file import read_drive_file
+from fitting.drive_data import Rig, read_logs, rig_of
 from fitting.errors import InputError
-from fitting.fit_only import fit_only
-from fitting.model_file import StoredModel, to_json
+from fitting.fit_drive import fit_only
+from fitting.logs.drive_file import read_drive_file
 from fitting.report import rig_text, write_rig_report
-from fitting.rig import Rig, read_logs, rig_of
+from fitting.stored_model import StoredModel, to_json
 
 
 def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
@@ -43,7 +43,7 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
 
 
 def _check_posterior() -> None:
-    from fitting.posterior import sampler
+    from fitting.uncertainty.posterior import sampler
 
     try:
         sampler()
@@ -58,7 +58,7 @@ def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits |
         proposed = None
         if stated is not None:
             # Loaded here: few fits look for a next experiment.
-            from fitting.next_experiment import experiment_for_alpha
+            from fitting.next_experiment.proposal import experiment_for_alpha
 
             proposed = experiment_for_alpha(fitted, rig.experiments[fitted.hold], stated, progress=progress)
     stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from fitting.batch_fit import fit_fleet, fleet_text
 from fitting.commands.options import FleetOptions
 from fitting.commands.spinner import counting
-from fitting.drive_file import read_drive_file
 from fitting.errors import DataError, InputError
-from fitting.fleet import fit_fleet, fleet_text
+from fitting.logs.drive_file import read_drive_file
 
 
 def fit_folder(folders: list[Path], drive: Path, out: Path, fleet: FleetOptions) -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from fitting.commands.table import write_table
-from fitting.drive_file import read_drive_file
+from fitting.drive_data import WHY_NOT_QUASI_STATIC, experiments, ready_log
 from fitting.errors import DataError, InputError
-from fitting.experiment import Stretch
-from fitting.free_run import WINDOW, free_run
-from fitting.model_file import read_model
-from fitting.rig import WHY_NOT_QUASI_STATIC, experiments, ready_log
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_run import WINDOW, free_run
+from fitting.logs.drive_file import read_drive_file
+from fitting.stored_model import read_model
 from hdjax import TwoInertiaModel
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from fitting.commands.options import ForcingOptions
 from fitting.commands.table import write_table
 from fitting.errors import InputError
-from fitting.model_file import read_model
+from fitting.stored_model import read_model
 from hdjax import PRESETS, Chirp, Harmonic, TwoInertiaModel, random_phase_multisine, sampled, simulate
 
 

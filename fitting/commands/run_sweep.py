@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from fitting.commands.spinner import counting
+from fitting.commands.sweep_file import read_sweep_file
 from fitting.errors import InputError
 from fitting.files import write_whole
-from fitting.sweep_file import read_sweep_file
 from hdjax.sweep import sweep
 
 _MEBIBYTE = 1 << 20
@@ -46,7 +46,7 @@ def sweep_file(spec: Path, out: Path, *, workers: int, scheduler: str | None, me
     folder = out / result.attrs["request"]
     _write_result(result, folder / "result.zarr")
     if plot:
-        from fitting.sweep_plot import summary
+        from fitting.commands.sweep_plot import summary
 
         write_whole({folder / "summary.png": summary(result)})
     print(_text(result))

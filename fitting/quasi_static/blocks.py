@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import find_peaks
 
-from fitting.logs import Log
+from fitting.logs.log import Log
 from fitting.quasi_static.torque_twist import Blocks
 
 # Assumed: fine enough to place a knee to a few per cent, coarse enough to average noise away.

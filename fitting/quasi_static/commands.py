@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fitting.drive_file import DriveFile
-from fitting.logs import Log
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.log import Log
 from fitting.quasi_static.content import report_dict
 from fitting.quasi_static.fit import fit_quasi_static
 from fitting.quasi_static.loop import close_loop

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fitting.logs import Log
+from fitting.logs.log import Log
 from fitting.quasi_static.blocks import average
 from fitting.quasi_static.curve_figures import figures
 from fitting.quasi_static.curve_fit import CurveFit, best_fit, polish

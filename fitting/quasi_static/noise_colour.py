@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import prev_fast_len
 from scipy.signal import lfilter
 
-from fitting.spectral_lines import without_lines
+from fitting.first_order.spectral_lines import without_lines
 
 DRAWS = 999
 """Draws: cheap here, and with fewer a chance of one in a hundred would itself be a matter of chance."""

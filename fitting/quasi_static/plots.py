@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from fitting.diagnostics import order_amplitude
 from fitting.formatting import axis_label, scaled_unit
-from fitting.plots import Plot
-from fitting.plots.look import AFTER, BEFORE, INK, axis, figure, numbers
-from fitting.plots.plot import Figure
 from fitting.quasi_static.fit import QuasiStaticFit
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.motion_forms import HIGHEST_ORDER
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.torque_twist import Blocks
 from fitting.quasi_static.twist_model import contribution
+from fitting.report.plots import Plot
+from fitting.report.plots.axes import AFTER, BEFORE, INK, axis, figure, numbers
+from fitting.report.plots.plot import Figure
+from fitting.validation.residual_diagnostics import order_amplitude
 
 _ORDERS = ("kinematic_error", "position_dependent_stiffness", "position_dependent_friction", "encoder_eccentricity")
 _IN_TIME = ("creep", "motor_friction", "temperature")

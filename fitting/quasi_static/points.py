@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from fitting.logs import Log
+from fitting.logs.log import Log
 from fitting.quasi_static.blocks import means, noise, turns
 from fitting.quasi_static.preparation import MOVES, Motion, speed_of, torque_of
 

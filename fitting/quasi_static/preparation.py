@@ -7,13 +7,13 @@ from typing import Literal
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
-from fitting.drive_file import DriveFile
 from fitting.errors import DataError
-from fitting.findings import Finding
-from fitting.health import examine, refuse_unfit
-from fitting.logs import Log
-from fitting.mix_ups import FREE_MOTION
-from fitting.pieces import SHORTEST
+from fitting.logs.checks import examine, refuse_unfit
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.findings import Finding
+from fitting.logs.gaps import SHORTEST
+from fitting.logs.log import Log
+from fitting.logs.plausibility import FREE_MOTION
 from fitting.quasi_static.blocks import means
 
 Motion = Literal["held", "one way", "both ways", "unknown"]

@@ -11,10 +11,10 @@ from plotly.offline import get_plotlyjs
 from fitting import formatting
 from fitting.files import write_whole
 from fitting.formatting import plain
-from fitting.plots import Plot
 from fitting.quasi_static.content import plain_shape
 from fitting.quasi_static.facts import ARCMIN
-from fitting.web_page import environment
+from fitting.report.plots import Plot
+from fitting.report.web_page import environment
 
 
 def write_report(out: Path, report: Mapping[str, Any], shown: Sequence[Plot]) -> Path:

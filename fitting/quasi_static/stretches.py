@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from fitting.attribution.decisions import tie
-from fitting.autocorrelation import autocovariance
+from fitting.estimation.whiteness import autocovariance
 
 FOLDS = 5
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from fitting import findings
 from fitting.files import finite
-from fitting.next_experiment import NextExperiment
+from fitting.logs import findings
+from fitting.next_experiment.proposal import NextExperiment
 from fitting.outcome import Loop
 from fitting.report.alternatives import alternatives
 from fitting.report.earlier_schema import with_old_names

@@ -4,15 +4,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
-from fitting.fit_only import FitOnly
-from fitting.frequency_response import (
+from fitting.fit_drive import FitOnly
+from fitting.uncertainty.prediction_band import coverage
+from fitting.validation.frequency_response import (
     FrequencyResponse,
     coherent_band,
     excites_resonance,
     resonance_seen,
     unexplained_band,
 )
-from fitting.prediction_band import coverage
 
 # Measured and modelled resonance that differ by less than this, or than the lines' distance, agree.
 _AGREES = 0.03

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.identifiability import Identifiability
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
 from fitting.report.steps import beyond_prediction
-from fitting.uncertainty import Estimate
+from fitting.uncertainty.identifiability import Identifiability
+from fitting.uncertainty.standard_errors import Estimate
 from hdjax.parameters import ParameterInfo
 
 # Beyond it two parameters are told as one combination.

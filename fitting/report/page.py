@@ -8,13 +8,13 @@ from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from fitting import formatting
-from fitting.plots import Plot
 from fitting.report.parameters import parts_of
+from fitting.report.plots import Plot
 from fitting.report.posterior import QUANTILES
 from fitting.report.separating import plain_family
 from fitting.report.summary import chance
 from fitting.report.tables import changes, parameter_rows
-from fitting.web_page import environment
+from fitting.report.web_page import environment
 
 _SECTIONS = ("fit", "left_over", "look", "found", "next")
 
@@ -24,7 +24,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
 
     Args:
         report: from [`report_dict`][].
-        pictures: from [`fitting.plots.plots`][].
+        pictures: from [`fitting.report.plots.plots`][].
     """
     filters = {
         "percent": formatting.percent,

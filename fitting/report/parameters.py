@@ -8,11 +8,11 @@ import numpy as np
 
 from fitting import formatting
 from fitting.close_loop import Finding
-from fitting.compare import Account
-from fitting.derived import Derived, derived, drive_figures, effect_figures
 from fitting.report.limits import NOT_TOLD_FROM_ZERO, in_words_of_log, parameter_note
 from fitting.report.outcome import Outcome
-from fitting.uncertainty import Estimate, Uncertainty
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
+from fitting.validation.account import Account
+from fitting.validation.derived_quantities import Derived, derived, drive_figures, effect_figures
 from hdjax import Model, ReducedModel
 from hdjax.effects import ActuatorEffect
 

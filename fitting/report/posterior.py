@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.posterior import Posterior
+from fitting.uncertainty.posterior import Posterior
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 """Levels that a report lists."""

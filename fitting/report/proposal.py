@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.next_experiment import NextExperiment, Precision, Separation
+from fitting.next_experiment.proposal import NextExperiment, Precision, Separation
 from fitting.report.limits import in_words_of_log
 
 COMMAND_FILE = "next_experiment.csv"

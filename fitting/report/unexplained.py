@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from fitting.diagnostics import Dependence, diagnose
 from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
+from fitting.validation.residual_diagnostics import Dependence, diagnose
 
 
 def unexplained(outcome: Outcome, noise: float) -> dict[str, Any] | None:

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.along import place_of
-from fitting.free import effect_paths
-from fitting.learned_curve import PLACES, WORDS, LearnedCurve, learned_curve
-from fitting.learned_response import LearnedResponse, learned_response
+from fitting.discrepancy.closed_forms import Shape, shapes
+from fitting.discrepancy.curve import PLACES, WORDS, LearnedCurve, learned_curve
+from fitting.discrepancy.dynamic_stiffness import LearnedResponse, learned_response
+from fitting.estimation.free_parameters import effect_paths
+from fitting.first_order.motion import place_of
 from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
-from fitting.shapes import Shape, shapes
 from hdjax import ReducedModel
 from hdjax.effects.learned import Learned
 from hdjax.effects.learned_axes import UNITS

@@ -6,21 +6,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fitting import findings
+from fitting.discrepancy.curve import LearnedCurve
+from fitting.drive_data import Rig
 from fitting.files import write_whole
-from fitting.fit_only import FitOnly
-from fitting.learned_curve import LearnedCurve
-from fitting.next_experiment import NextExperiment
+from fitting.fit_drive import FitOnly
+from fitting.logs import findings
+from fitting.next_experiment.proposal import NextExperiment
 from fitting.outcome import Loop
-from fitting.plots import Plot, evidence_plot, fit_plots, learned_plot, next_experiment_plot, plots, response_plot
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page
+from fitting.report.plots import (
+    Plot,
+    evidence_plot,
+    fit_plots,
+    learned_plot,
+    next_experiment_plot,
+    plots,
+    response_plot,
+)
 from fitting.report.posterior import DRAWS_FILE, draws_table
 from fitting.report.proposal import COMMAND_FILE, command_table
 from fitting.report.text import report_text
 from fitting.report.unknown import curve_of, unit_in_log
-from fitting.rig import Rig
 from hdjax.effects.learned_axes import UNITS
 
 

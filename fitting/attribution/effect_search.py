@@ -1,0 +1,146 @@
+"""The search for effects: add the best one, refit, look again; then drop what a later one has made superfluous."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+
+from fitting.attribution.candidate_fit import Trial, attempt, gone_on, halo_for
+from fitting.attribution.decisions import RULES
+from fitting.attribution.selection_round import Round, look
+from fitting.attribution.study import Data, Setting, Study
+from fitting.attribution.support import Standing, leaves_imperfection
+from fitting.errors import DataError
+from fitting.estimation.base_fit import base_fit, is_held
+from fitting.estimation.estimate import lost
+from fitting.estimation.outliers import with_weights
+from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_noise
+from hdjax import Hold, Model
+from hdjax.effects import Effect
+
+# Share of segments in which the base model may run away.
+_MOST_LOST = 0.5
+
+
+class Search(eqx.Module):
+    """What was found.
+
+    Attributes:
+        named: the model with the effects that were found.
+        rounds: every look at the catalogue.
+        dropped: names of what was found, and was superfluous beside what came later.
+        without: the model without each of what was kept.
+        noise: of the measured outputs, as far as fits were asked for it.
+    """
+
+    named: Trial
+    rounds: tuple[Round, ...]
+    dropped: tuple[str, ...] = eqx.field(static=True)
+    without: dict[str, Trial]
+    noise: MeasurementNoise
+
+
+def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Study]:
+    """The base model fitted under the stated hold, or under the one that suits it best, and a study of the data
+    without the samples that its fit does not believe.
+
+    Args:
+        model: the base model; its stiffness and damping are only placeholders.
+        data: the stretches.
+        hold: what the torque does between samples, where the user states it.
+
+    Raises:
+        DataError: where no oscillator fits the data.
+    """
+    first = hold if hold is not None else next(iter(data))
+    training = data[first][0]
+    best = base_fit(model, training, halo=halo_for(training))
+    data = {h: (with_weights(t, best.stretches), v) for h, (t, v) in data.items()}
+    study = Study(data, Setting(best.segmentation))
+    holds: list[Hold] = list(data) if hold is None else [hold]
+    trials = [attempt(best.model, study, h, hold_parameters=is_held(best)) for h in holds]
+    chosen = min(trials, key=lambda t: t.training.objective)
+    finer = study.fine_enough(chosen.training)
+    if finer is not study:
+        chosen = attempt(chosen.model, finer, chosen.hold, start=chosen, hold_parameters=is_held(best))
+    if np.mean(lost(chosen.training)) > _MOST_LOST:
+        raise DataError(
+            "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
+            "drive file, and unit, sign and side of the torque column"
+        )
+    return chosen, finer
+
+
+def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Sequence[type[Effect]]) -> Search:
+    """Look for effects until the data support no further one.
+
+    Args:
+        base: the model without effects.
+        study: the data, and how they are cut.
+        max_effects: effects to add at most.
+        catalogue: forms to look for.
+    """
+    current, rounds, noise = base, [], measurement_noise(base.training)
+    while len(rounds) < max_effects:
+        if rounds:
+            enough, noise = leaves_imperfection(current, base, noise)
+            if enough:
+                break
+        turn = replace(study, seed=study.seed + len(rounds))
+        this = look(Standing(current, base, noise), turn, catalogue=catalogue)
+        rounds.append(this)
+        if not this.accepted:
+            break
+        assert this.winner.trial is not None
+        study = study.with_substeps(this.winner.trial.training.substeps)
+        # What a trial has not quite reached the next look would take for a further effect.
+        current = gone_on(this.winner.trial, study)
+        study.progress(f"found {this.winner.name}")
+    dropped = _holds_given_up(rounds, base.hold, current.hold)
+    current, superfluous, without = _without_superfluous(current, base, study)
+    dropped += superfluous
+    kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
+    if kept and not dropped:
+        without[kept[-1].winner.name] = kept[-1].before
+    for name in (this.winner.name for this in kept if this.winner.name not in without):
+        without[name] = base if len(kept) == 1 else refitted_without([name], current, base, study)
+    return Search(current, tuple(rounds), tuple(dropped), without, noise)
+
+
+def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Trial, list[str], dict[str, Trial]]:
+    """The model without effects that selection data hardly miss beside later ones, their names, and the model without
+    each of the others but the last."""
+    dropped, without = [], {}
+    for name in [e.name for e in current.model.effects][:-1]:
+        poorer = refitted_without([name], current, base, study)
+        if poorer.held_out.objective - current.held_out.objective < RULES.least_gain:
+            dropped.append(name)
+            current, without = poorer, {}
+        else:
+            without[name] = poorer
+    return current, dropped, without
+
+
+def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[str]:
+    """Findings of another hold of the torque that a later one has taken back."""
+    holds = [
+        this for this in rounds if this.accepted and this.winner.trial and this.winner.trial.hold != this.before.hold
+    ]
+    return [this.winner.name for this in holds if last == first or this is not holds[-1]]
+
+
+def refitted_without(names: Collection[str], current: Trial, base: Trial, study: Study) -> Trial:
+    """The model refitted without some of what was found, by as many solver steps.
+
+    Args:
+        names: of effects; any other one is that of another hold of the torque, which is taken back.
+        current: the model.
+        base: the model without effects.
+        study: the data, and how they are cut.
+    """
+    model, effects = current.model, {e.name for e in current.model.effects}
+    for name in effects.intersection(names):
+        model = model.without_effect(name)
+    hold = current.hold if effects.issuperset(names) else base.hold
+    return attempt(model, study.with_substeps(current.training.substeps), hold, start=current)

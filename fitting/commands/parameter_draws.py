@@ -1,0 +1,119 @@
+"""Drives that a fit can't tell apart: draws of the fitted parameters, from the folder of its report."""
+
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+from scipy.stats import qmc
+
+from fitting.errors import DataError, InputError
+from fitting.report.posterior import DRAWS_FILE
+from fitting.stored_model import read_model
+from hdjax import TwoInertiaModel
+from hdjax.design import Draws
+
+
+def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), seed: int = 0) -> Draws:
+    """Draws of a fitted drive's parameters.
+
+    Those of `hdjax fit --posterior` where the folder has them, evenly thinned; else of the normal law of its standard
+    errors and correlations, in the logarithm of what is positive. Correlations below 0.1, which a report leaves out,
+    count as none.
+
+    Args:
+        folder: of a report of `hdjax fit` or `hdjax close-loop`.
+        count: how many draws.
+        hold: parameters that keep their fitted value.
+        seed: of the normal law.
+
+    Raises:
+        InputError: where the folder holds no such report.
+        DataError: where the log does not tell a parameter, so that its draws would mean nothing.
+    """
+    model = fitted_model(folder)
+    try:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        account = report["after"] if report["after"]["parameters"] else report["before"]
+        estimates = {p: e for p, e in account["parameters"].items() if p not in hold}
+        spreads = {
+            p: (float(e["value"]), float(e["std"] or np.inf), bool(e["identifiable"])) for p, e in estimates.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder}: no report.json of `hdjax fit` ({error}); give the folder of a report") from error
+    if not spreads:
+        raise InputError(f"{folder}: all parameters are held, so that nothing is drawn; hold fewer")
+    for path, (_, std, identifiable) in spreads.items():
+        if not (identifiable and np.isfinite(std)):
+            raise DataError(
+                f"{folder}: its log does not tell {path}, so that draws of it would mean nothing; "
+                f'add hold = ["{path}"] to [robust]'
+            )
+    paths = tuple(spreads)
+    if (folder / DRAWS_FILE).exists():
+        try:
+            table = pl.read_parquet(folder / DRAWS_FILE).select(paths)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise InputError(
+                f"{folder / DRAWS_FILE}: not the draws of {', '.join(paths)} ({error}); fit again"
+            ) from error
+        rows = np.linspace(0, table.height - 1, min(count, table.height)).round().astype(int)
+        return Draws(paths, jnp.asarray(table.to_numpy()[rows]))
+    positive = np.array([model.parameters()[p][1].positive for p in paths])
+    return Draws(paths, jnp.asarray(_normal(spreads, _correlation(account, paths), positive, count, seed)))
+
+
+def fitted_model(folder: Path) -> TwoInertiaModel:
+    """The model of a report.
+
+    Raises:
+        InputError: where there is none, or it is a reduced one.
+    """
+    model = read_model(folder / "model.json").model
+    if not isinstance(model, TwoInertiaModel):
+        raise InputError(f"{folder}: a reduced model has no inertias to design; fit a log of both angles")
+    return model
+
+
+def _correlation(account: Mapping[str, Any], paths: tuple[str, ...]) -> np.ndarray:
+    found = np.eye(len(paths))
+    for pair in account["correlations"]:
+        if all(name in paths for name in pair["between"]):
+            i, j = (paths.index(name) for name in pair["between"])
+            found[i, j] = found[j, i] = pair["value"]
+    return found
+
+
+def _normal(
+    spreads: Mapping[str, tuple[float, float, bool]],
+    correlation: np.ndarray,
+    positive: np.ndarray,
+    count: int,
+    seed: int,
+) -> np.ndarray:
+    """Draws of a normal law that fill it evenly."""
+    values, stds = (np.array(column) for column in zip(*((v, s) for v, s, _ in spreads.values()), strict=True))
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    # What was left out of the correlations may have taken them out of the cone.
+    root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    standard = qmc.MultivariateNormalQMC(np.zeros(values.size), engine=qmc.LatinHypercube(values.size, rng=seed))
+    z = standard.random(count) @ root.T
+    relative = np.where(positive, stds / np.abs(values), 0.0)
+    return np.where(positive, values * np.exp(relative * z - 0.5 * relative**2), values + stds * z)
+
+
+def spread_around(values: Mapping[str, float], spreads: Mapping[str, float], count: int, seed: int = 0) -> Draws:
+    """Draws of independent parameters with relative standard deviations, log-normal about their values.
+
+    Args:
+        values: by path, other than zero.
+        spreads: relative standard deviation by path.
+        count: how many draws.
+        seed: of the draws.
+    """
+    told = {path: (values[path], abs(values[path]) * spread, True) for path, spread in spreads.items()}
+    positive = np.ones(len(told), dtype=bool)
+    return Draws(tuple(told), jnp.asarray(_normal(told, np.eye(len(told)), positive, count, seed)))

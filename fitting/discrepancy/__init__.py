@@ -1,0 +1,1 @@
+"""Terms that are learned where no name explains what is missing."""

@@ -1,0 +1,153 @@
+"""Names challenged by a learned term: where they leave something, one is learned beside them and in their place."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+
+from fitting.attribution.candidate_fit import Trial, long_gains
+from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
+from fitting.attribution.decisions import RULES, names_stand, next_question
+from fitting.attribution.effect_search import refitted_without
+from fitting.attribution.study import Study
+from fitting.attribution.support import (
+    Standing,
+    is_noise,
+    leaves_imperfection,
+    noise_evidence,
+    told_from_zero,
+)
+from fitting.discrepancy.learn import Unknown, learn_supported, share_of
+from fitting.estimation.base_fit import leaves_white_noise
+from fitting.estimation.estimate import half_log_determinant
+from fitting.uncertainty.measurement_noise import MeasurementNoise
+from fitting.uncertainty.noise_model import NoiseModel
+from fitting.validation.account import excess
+
+
+class Challenge(eqx.Module):
+    """The outcome of a challenge.
+
+    Attributes:
+        trusted: the model whose names can be trusted.
+        unknown: what was learned beside them, or in the place of all.
+        left: noise of the sensors and of the torque, where that is what the names leave.
+        seen: what that rests on.
+    """
+
+    trusted: Trial
+    unknown: Unknown | None
+    left: NoiseModel | None
+    seen: ChallengeEvidence = eqx.field(static=True)
+
+
+def challenge_names(base: Trial, named: Trial, study: Study, *, noise: MeasurementNoise) -> Challenge:
+    """Learn what decides whether names can be trusted, as far as the rules ask for it.
+
+    Names of which a learned term beside them leaves nothing fall in any case.
+
+    Args:
+        base: the model without effects.
+        named: the model with those that were found.
+        study: the data, and how they are cut.
+        noise: of the measured outputs, as far as fits have been asked for it.
+    """
+
+    def seen_as(trial: Trial) -> ModelEvidence:
+        return model_evidence(trial, noise)
+
+    beside: Unknown | None = None
+    instead: Unknown | None = None
+    imperfect = leaves_imperfection(named, base, noise)[0]
+    least = half_log_determinant(noise.covariance)
+    seen = ChallengeEvidence(seen_as(base), seen_as(named), len(_names(base, named)), least, imperfect)
+    standing = Standing(named, base, noise)
+    left = None if seen.enough else standing.left
+    if left is not None:
+        seen = replace(seen, left=noise_evidence(left))
+    while (question := next_question(seen)) is not None:
+        if question == "instead":
+            instead = _learned(Standing(base, base, noise), study)
+            if instead is None:
+                seen = seen.answered("instead", None)
+                continue
+            come_out = share_of(named.model, instead, named.training) if named.hold == base.hold else 0.0
+            seen = seen.answered("instead", seen_as(instead.trial), come_out=come_out)
+        else:
+            beside = _learned(standing, study.with_substeps(named.training.substeps))
+            if beside is not None:
+                named, beside = _without_superfluous(base, named, beside, study)
+            seen = seen.answered("beside", None if beside is None else seen_as(beside.trial))
+            seen = replace(seen, named=seen_as(named), names=len(_names(base, named)))
+    left = left if beside is None and is_noise(left) else None
+    if named is base:
+        return Challenge(base, beside, left, seen)
+    if instead is not None:
+        rival = named if beside is None else beside.trial
+        gains = long_gains(base, [rival, instead.trial], study)
+        # Where both leave the numbers neither is worse.
+        follow = gains is not None and np.isfinite(gains).any()
+        seen = replace(seen, longer_worse=gains[0] - gains[1] if gains is not None and follow else 0.0)
+    if instead is not None and beside is not None:
+        names = {e.name for e in named.model.effects}
+        seen = replace(
+            seen,
+            shown=told_from_zero(beside.trial.training, names) == names,
+            one_shape=beside.chosen.of == instead.chosen.of
+            and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
+        )
+    stand = any(check.holds for check in names_stand(seen))
+    return Challenge(named, beside, left, seen) if stand else Challenge(base, instead, None, seen)
+
+
+def _learned(standing: Standing, study: Study) -> Unknown | None:
+    """What can be learned that the data support, beyond noise where that would explain as much."""
+    found = learn_supported(standing.before, study)
+    supported = found is not None and standing.over_noise(found.trial) > RULES.noise_gain
+    return found if supported else None
+
+
+def model_evidence(trial: Trial, noise: MeasurementNoise) -> ModelEvidence:
+    """A fitted model as decisions see it.
+
+    Args:
+        trial: the model.
+        noise: of the measured outputs.
+    """
+    left = excess(trial.training, noise.covariance)
+    return ModelEvidence(
+        training=trial.training.objective,
+        selection=trial.held_out.objective,
+        parameters=len(trial.training.free.paths),
+        excess=tuple(map(float, excess(trial.held_out, noise.covariance))),
+        # What moves a motor as a whole hardly twists the gear.
+        white=leaves_white_noise(trial.training) and bool(np.all(left < RULES.excess)),
+    )
+
+
+def _names(base: Trial, named: Trial) -> set[str]:
+    """What was found: effects, or another hold of the torque."""
+    found = {e.name for e in named.model.effects}
+    return found | ({"hold"} if named.hold != base.hold else set())
+
+
+def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Study) -> tuple[Trial, Unknown]:
+    """Names, and what was learned beside them, without the effects that this has made superfluous: none of their
+    strengths is told from zero any more, and selection data hardly miss them."""
+    names = {e.name for e in named.model.effects}
+    fallen = names - told_from_zero(beside.trial.training, names)
+    if not fallen:
+        return named, beside
+    trial = refitted_without(fallen, beside.trial, base, study)
+    missed = trial.held_out.objective - beside.trial.held_out.objective
+    if missed >= max(RULES.least_gain, RULES.little * beside.gain):
+        return named, beside
+    bare = base
+    if fallen != names or named.hold != base.hold:
+        bare = refitted_without(fallen, named, base, study)
+    states = [n for n in named.model.state_names if n in bare.model.state_names]
+    kept = [named.model.state_names.index(n) for n in states]
+    gain = bare.held_out.objective - trial.held_out.objective
+    return bare, replace(
+        beside, before=bare, trial=trial, states=beside.states[:, kept], push=beside.push[:, kept], gain=gain
+    )

@@ -1,0 +1,396 @@
+"""The first look for what a learned function may depend on: places and variables, by what they would explain.
+
+Along the fitted motion everything is linear. How many coefficients a function is worth is decided on training data
+alone, by leaving parts of them out in turn.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from fitting.attribution.decisions import RULES
+from fitting.estimation.estimate import Fit
+from fitting.estimation.free_parameters import effect_paths
+from fitting.first_order.gains import (
+    Acting,
+    Look,
+    Products,
+    Sizes,
+    best_steps,
+    left_after,
+    look_along,
+    parameter_torques,
+    products,
+)
+from fitting.first_order.motion import ERROR, SLOPE, place_of, unit_reading
+from fitting.first_order.spectral_lines import spectral_lines
+from hdjax import Model, ReducedModel
+from hdjax.effects.learned import (
+    LEARNED,
+    Learned,
+    LearnedFriction,
+    LearnedMeshError,
+    LearnedMeshTorque,
+    LearnedPeriodic,
+    LearnedReading,
+    LearnedTorque,
+)
+from hdjax.effects.learned_axes import (
+    ANGLES,
+    UNITS,
+    AngleAxis,
+    Axis,
+    LinearAxis,
+    PeriodicAxis,
+    PowerAxis,
+    SignAxis,
+    axes_over,
+)
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
+
+# Parts that training data are left out in, in turn.
+_FOLDS = 4
+# How many coefficients a function of one variable may have, and of two.
+_SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (1, 2, 3, 5, 7, 9, 12, 16, 20, 24)}
+# What explains this share of what the best one does, to first order, may be the better one after all.
+NEARLY = 0.8
+# Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
+_SAME_FUNCTION = 0.99
+# Motions that so few samples reach are no part of the range.
+_RARE = 5e-4
+# What the functions of a `PowerAxis` count as rough: so much apart that they come one by one, by their degree.
+_ROUGHNESS_OF_POWERS = (0.0, 1e-8, 1.0, 1e-4, 1e4)
+# A sign comes after the constant and before all else.
+_ROUGHNESS_OF_A_SIGN = 1e-10
+# Instants of the motion that stand for the density of the data.
+_INSTANTS = 3000
+
+
+class Candidate(eqx.Module):
+    """A place and variables, as the first look sees them.
+
+    Attributes:
+        form: the place.
+        variables: what the function depends on.
+        gain: decrease of the objective on parts of the training data that were left out, to first order.
+        effect: the learned function, at the coefficients that suit best to first order.
+        known: functions of the variables that the free parameters stand for already, at the instants that are kept.
+    """
+
+    form: type[Learned] = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
+    gain: float
+    effect: Learned
+    known: Float[np.ndarray, "instants known"]
+
+    @property
+    def of(self) -> tuple[type[Learned], tuple[str, ...]]:
+        """Place and variables."""
+        return self.form, self.variables
+
+
+class LearnedLook(eqx.Module):
+    """A look at a fit, with what candidates share.
+
+    Attributes:
+        look: at the fit.
+        values: variables at each knot.
+        weight: of each knot.
+        lines: frequencies that stand out of what the fit leaves over [rad/s].
+    """
+
+    look: Look
+    values: dict[str, Float[np.ndarray, "segments knots"]]
+    weight: Float[np.ndarray, "segments knots"]
+    lines: tuple[float, ...] = eqx.field(static=True)
+
+    @property
+    def instants(self) -> Int[np.ndarray, " instants"]:
+        """Some of the knots with weight, evenly spread: they stand for the density of the data."""
+        kept = np.flatnonzero(self.weight.reshape(-1) > 0)
+        return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
+
+    def acting(self, form: type[Learned]) -> Acting:
+        """What a unit of a form's function does, and one of its slope as well for an error of the mesh."""
+        if issubclass(form, LearnedReading):
+            return Acting(reading=unit_reading(self.look.model, form))
+        names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
+        return Acting(tuple(self.look.pushes[name] for name in names))
+
+    def torque_push(self, place: type[LearnedTorque] | None) -> Float[np.ndarray, "segments knots states"]:
+        """What a unit of torque does at a place; in the mesh where it is none."""
+        return self.look.pushes[(place or LearnedMeshTorque).name]
+
+
+def learned_look(fit: Fit) -> LearnedLook:
+    """Look at a fit, of a model that lacks something, along its motion."""
+    look = look_along(fit)
+    values = {n: np.asarray(getattr(look.motion, n)) for n in UNITS if getattr(look.motion, n) is not None}
+    weight = np.asarray(look.problem.segments.weight)
+    finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
+    # The last knot of a segment is the first one of the next.
+    weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
+    return LearnedLook(look, values, weight, spectral_lines(fit))
+
+
+def candidates(seen: LearnedLook) -> list[Candidate]:
+    """Every place with every variable, and with pairs of them: the best one and another, or any two where no variable
+    alone explains anything."""
+    reduced = isinstance(seen.look.model, ReducedModel)
+    forms = [form for form in LEARNED if not (form.needs_motor and reduced)]
+    own = {form: own_functions(seen, form) for form in forms}
+    may = {form: [name for name in seen.values if form.may_depend_on(name)] for form in forms}
+
+    def look_at(form: type[Learned], choices: Iterable[tuple[str, ...]]) -> list[Candidate]:
+        found = (_simplest(seen, form, variables, own[form]) for variables in choices)
+        return [candidate for candidate in found if candidate is not None]
+
+    alone = {form: look_at(form, [(name,) for name in may[form]]) for form in forms}
+    found = [candidate for those in alone.values() for candidate in those]
+    any_two = all(candidate.gain < RULES.coefficient for candidate in found)
+    for form, those in alone.items():
+        best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
+        pairs = (p for p in combinations(may[form], 2) if any_two or best & set(p))
+        # The angles of both shafts are one and the same, but for the twist.
+        found += look_at(form, (p for p in pairs if not set(p) <= set(ANGLES)))
+    return found
+
+
+def looked_again(first: Candidate, seen: LearnedLook) -> list[Candidate]:
+    """A candidate's place and variables again, with the coefficients that another look calls for: the function that
+    explains most, and before it the simplest one that explains nearly as much.
+
+    To first order a steep slope is as good as a jump along a motion that was found with a slope."""
+    found = _functions_of(seen, first.form, first.variables, own_functions(seen, first.form))
+    if not found:
+        return []
+    best = max(found, key=lambda c: c.gain)
+    simplest = next(c for c in found if c.gain > NEARLY * best.gain)
+    return [simplest] if simplest is best else [simplest, best]
+
+
+def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
+    """The functions that a candidate's coefficients multiply, along another fit's motion."""
+    values = {name: np.nan_to_num(value) for name, value in seen.values.items()}
+    mixing = np.asarray(chosen.effect.mixing)
+    return tuple(part @ mixing for part in _functions(chosen.form, chosen.effect.axes, values))
+
+
+def own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
+    """The free parameters as torques at the place of a form; none of them is an error of an angle."""
+    if issubclass(form, LearnedTorque):
+        return parameter_torques(seen.look, seen.torque_push(place_of(form)))
+    return np.zeros((*seen.weight.shape, len(seen.look.problem.free.paths)))
+
+
+def _functions(form: type[Learned], axes: Sequence[Axis], values: dict[str, np.ndarray]) -> Sizes:
+    """The functions of the axes, and their slopes for an error of the mesh."""
+    along = [(values[axis.variable], axis) for axis in axes]
+    raw = _all_products([at_instants(_functions_along, (value, value.ndim), (axis, 0)) for value, axis in along])
+    if not issubclass(form, LearnedMeshError):
+        return (raw,)
+    ((value, axis),) = along
+    return raw, slopes_at_instants(_functions_of_one, (value[..., None], value.ndim), (axis, 0))[..., 0]
+
+
+def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """All products of one function of each part."""
+    found = parts[0]
+    for part in parts[1:]:
+        found = (found[..., :, None] * part[..., None, :]).reshape(*found.shape[:-1], -1)
+    return found
+
+
+def _ranges(seen: LearnedLook, variables: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Between which values the data have each quantity."""
+    found = {}
+    for variable in variables:
+        low, high = np.quantile(seen.values[variable][seen.weight > 0], [_RARE, 1.0 - _RARE])
+        reach = max(high - low, 1e-12 * max(abs(low), abs(high)), 1e-300)
+        found[variable] = (float(low), float(low + reach))
+    return found
+
+
+def _functions_along(value: Array, axis: Axis) -> Array:
+    return axis.functions(value)
+
+
+def _functions_of_one(value: Array, axis: Axis) -> Array:
+    return axis.functions(value[0])
+
+
+def _simplest(
+    seen: LearnedLook,
+    form: type[Learned],
+    variables: tuple[str, ...],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> Candidate | None:
+    """One place and choice of variables, by the simplest function that explains as much as any."""
+    best: Candidate | None = None
+    for candidate in _functions_of(seen, form, variables, own):
+        if best is None or candidate.gain > best.gain + RULES.coefficient:
+            best = candidate
+    return best
+
+
+def _functions_of(
+    seen: LearnedLook,
+    form: type[Learned],
+    variables: tuple[str, ...],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> list[Candidate]:
+    """One place and choice of variables with all that a function of them may be made of, fewest coefficients first."""
+    jumps_with = next((name for name in variables if form.may_jump_with(name)), None)
+    # A second look knows how sharp a jump is, and at which frequency a torque comes back.
+    before = next((e for e in seen.look.model.effects if isinstance(e, form)), None)
+    corner = float(before.corner) if isinstance(before, LearnedFriction) else None
+    lines = (float(before.omega),) if isinstance(before, LearnedPeriodic) else seen.lines
+    axes = axes_over(_ranges(seen, variables), jumps_with=jumps_with, corner=corner, lines=lines)
+    choices = (_candidate(seen, form, each, own) for each in axes)
+    return sorted((c for c in choices if c is not None), key=lambda c: len(c.effect.c))
+
+
+def _candidate(
+    seen: LearnedLook,
+    form: type[Learned],
+    axes: tuple[Axis, ...],
+    own: Float[np.ndarray, "segments knots parameters"],
+) -> Candidate | None:
+    """One place and choice of variables, with as many coefficients as parts of the data that were left out call for."""
+    instants = seen.instants
+    raw = _functions(form, axes, seen.values)
+    flat = np.asarray(raw[0]).reshape(-1, raw[0].shape[2])[instants]
+    parameters = own.shape[2] - _of_its_own(seen.look.model, form)
+    known = _same_functions(flat, own.reshape(-1, own.shape[2])[instants][:, :parameters])
+    sizes = _SIZES[len(axes)]
+    roughness = _roughness(axes)
+    first = axes[0]
+    if isinstance(first.beside if isinstance(first, SignAxis) else first, PowerAxis):
+        roughness = _but_for(known, flat, roughness)
+    mixing = _smooth_first(flat, known, roughness)[:, : max(sizes)]
+    if mixing.shape[1] == 0:
+        return None
+    found = products(seen.look, seen.acting(form), tuple(part @ mixing for part in raw)).in_parts(_FOLDS)
+    found = _instead_of_own(found, seen.look, parameters, own.shape[2])
+    sizes = [s for s in sizes if s <= mixing.shape[1]]
+    base, *left = _left_out(found, [parameters, *(parameters + s for s in sizes)])
+    gain, size = 0.0, 0
+    for more, after in zip(sizes, left, strict=True):
+        if size == 0 or base - after > gain + RULES.coefficient:
+            gain, size = float(base - after), more
+    if not gain > 0:
+        return None
+    (step,) = best_steps(found.first(parameters + size).in_parts(1))
+    effect = form.made_of(axes, mixing[:, :size], step[parameters:])
+    return Candidate(form, tuple(axis.variable for axis in axes), gain, effect, known)
+
+
+def _of_its_own(model: Model, form: type[Learned]) -> int:
+    """How many free parameters a learned function at this place has that a model has already; its last effect."""
+    return next((len(effect_paths(e)) for e in model.effects if isinstance(e, form)), 0)
+
+
+def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Products:
+    """Products with what the model's learned torque explains put back into the residual, and its columns left out."""
+    if kept == free:
+        return found
+    own = np.zeros(found.gram.shape[-1])
+    # What is no coefficient, only moves the corner of a jump.
+    linear = [i for i in range(kept, free) if not look.problem.free.logarithmic[i]]
+    own[linear] = np.asarray(look.problem.free.pack(look.model))[linear]
+    moved = found.gram @ own
+    against = found.gradient @ own
+    others = np.delete(np.arange(own.size), np.s_[kept:free])
+    return Products(
+        found.gram[..., others[:, None], others],
+        (found.gradient + moved)[..., others],
+        found.square + against + np.swapaxes(against, 1, 2) + moved @ own,
+        found.samples,
+    )
+
+
+def _same_functions(raw: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Those free parameters that are functions of the same variables at the same place: the learned torque leaves what
+    they can do to them."""
+    size = np.sqrt(np.mean(own**2, axis=0))
+    own = own[:, size > 0] / size[size > 0]
+    if own.shape[1] == 0:
+        return own
+    coefficients = np.linalg.lstsq(raw, own, rcond=1e-10)[0]
+    left = np.mean((own - raw @ coefficients) ** 2, axis=0)
+    return own[:, left < 1.0 - _SAME_FUNCTION]
+
+
+def _roughness(axes: Sequence[Axis]) -> np.ndarray:
+    """Penalty on the curvature of a function over the unit range of each axis, per pair of products."""
+    total = np.zeros((1, 1))
+    for part in (_roughness_along(axis) for axis in axes):
+        total = np.kron(total, np.eye(len(part))) + np.kron(np.eye(len(total)), part)
+    return total
+
+
+def _roughness_along(axis: Axis) -> np.ndarray:
+    if isinstance(axis, SignAxis):
+        beside = [] if axis.beside is None else [_roughness_along(axis.beside)]
+        from scipy.linalg import block_diag
+
+        return np.asarray(block_diag(_ROUGHNESS_OF_A_SIGN, *beside))
+    if isinstance(axis, AngleAxis | PeriodicAxis):
+        order = np.concatenate([[0.0], np.repeat(np.arange(1.0, axis.orders + 1), 2)])
+        return np.diag((2 * np.pi * order) ** 4)
+    if isinstance(axis, PowerAxis):
+        return np.diag(_ROUGHNESS_OF_POWERS)
+    if isinstance(axis, LinearAxis):
+        return np.zeros((1, 1))
+    bends = np.diff(np.eye(axis.count), 2, axis=0)
+    rises = np.diff(np.eye(axis.count), axis=0)
+    # The slope, counted little, puts the constant before the straight line.
+    return axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises
+
+
+def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """The penalty, where any part of what is known already costs nothing: it is among the functions."""
+    if known.shape[1] == 0:
+        return roughness
+    own = np.linalg.lstsq(raw, known / np.sqrt(np.mean(known**2, axis=0)), rcond=1e-10)[0]
+    pulled = roughness @ own
+    return roughness - pulled @ np.linalg.pinv(own.T @ pulled, hermitian=True) @ pulled.T
+
+
+def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Combinations of functions, smoothest first, each of unit rms on the data, uncorrelated with each other and with
+    what is known already (the basis of Demmler and Reinsch 1975)."""
+    from scipy.linalg import eigh, null_space
+
+    moment = raw.T @ raw / len(raw)
+    free = null_space((raw.T @ known / len(raw)).T, rcond=1e-8) if known.shape[1] else np.eye(raw.shape[1])
+    inside = free.T @ moment @ free
+    seen, directions = np.linalg.eigh(inside)
+    # Where there are no data, nothing can be learned.
+    free = free @ directions[:, seen > 1e-12 * np.max(seen, initial=0.0)]
+    if free.shape[1] == 0:
+        return free
+    _, vectors = eigh(free.T @ roughness @ free, free.T @ moment @ free)
+    return free @ vectors
+
+
+def _left_out(found: Products, counts: Sequence[int]) -> Float[np.ndarray, " counts"]:
+    """The objective over the parts of the data, each after least squares on the others, with so many of the first
+    columns free."""
+    most = max(counts)
+    free = np.arange(most) < np.asarray(counts)[:, None]
+
+    def for_each(products: Products) -> Products:
+        """Once for each count; columns that are not free explain nothing."""
+        first = products.first(most)
+        gradient = first.gradient * free[:, None, None, None, :]
+        gram = first.gram * free[:, None, None, None, :, None] * free[:, None, None, None, None, :]
+        square, samples = (np.broadcast_to(a, (len(counts), *a.shape)) for a in (first.square, first.samples))
+        return Products(*(a.reshape(-1, *a.shape[2:]) for a in (gram, gradient, square, samples)))
+
+    left = left_after(for_each(found), best_steps(for_each(found.others())))
+    left = np.sum(left.reshape(len(counts), -1, *left.shape[1:]), axis=1)
+    return 0.5 * np.linalg.slogdet(left / found.samples.sum())[1]

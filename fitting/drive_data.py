@@ -1,0 +1,155 @@
+"""A drive file and its logs made ready: the base model, and the logs under each assumption about the torque."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+
+from fitting.errors import InputError
+from fitting.estimation.experiment import Experiment, experiments_from_log
+from fitting.estimation.test_part import TEST_SHARE, parted, whole_test_log
+from fitting.logs.checks import examine, refuse_unfit
+from fitting.logs.drive_file import DriveFile, read_drive_file
+from fitting.logs.findings import Finding
+from fitting.logs.log import Log, read_log
+from fitting.logs.masks import masked
+from fitting.logs.zeroing import zeroed
+from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
+
+WHY_NOT_QUASI_STATIC = (
+    "a quasi-static log holds nothing of the resonance, so that there is no motion to simulate; `hdjax fit` finds its "
+    "stiffness and hysteresis, and for the rest record a drive log with motor torque"
+)
+
+
+class Rig(eqx.Module):
+    """One drive and its logs.
+
+    Attributes:
+        name: of the drive.
+        model: base model; its stiffness and damping are placeholders until they are fitted.
+        hold: what the drive file says of the torque between samples, or None.
+        experiments: the logs' stretches between gaps, without test data, under each hold, or under the one stated
+            alone.
+        test: likewise of the test data.
+        logs: as fitted, without test data.
+        findings: what the health gate saw, by log.
+        error_unit: unit of the dynamic error.
+    """
+
+    name: str = eqx.field(static=True)
+    model: Model
+    hold: Hold | None = eqx.field(static=True)
+    experiments: dict[Hold, tuple[Experiment, ...]]
+    test: dict[Hold, tuple[Experiment, ...]]
+    logs: tuple[Log, ...] = eqx.field(static=True)
+    findings: dict[str, tuple[Finding, ...]] = eqx.field(static=True)
+    error_unit: str = eqx.field(static=True)
+
+
+def read_rig(
+    log_paths: Sequence[Path], drive_path: Path, *, test: Sequence[Path] = (), other_holds: bool = True
+) -> Rig:
+    """Read a drive file and logs, and refuse what can't be fitted.
+
+    Args:
+        log_paths: of one drive.
+        drive_path: its drive file.
+        test: logs of the same drive that are test data; where none is given, the end of each log is.
+        other_holds: whether the torque is wanted under other holds as well, where the drive file states one.
+
+    Raises:
+        InputError: for a bad file, or logs of different kinds.
+        DataError: for logs that can't support a fit.
+    """
+    drive_file = read_drive_file(drive_path)
+    fitted, tested = read_logs(log_paths, drive_file, test=test)
+    return rig_of(fitted, drive_file, test=tested, other_holds=other_holds)
+
+
+def rig_of(
+    logs: tuple[Log, ...], drive_file: DriveFile, *, test: tuple[Log, ...] = (), other_holds: bool = True
+) -> Rig:
+    """[`read_rig`][] for logs that have been read."""
+    if logs[0].kind == "quasi-static":
+        raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
+    stated = drive_file.torque_hold
+    holds = HOLDS if stated is None or other_holds else (stated,)
+    parts = [parted(log, drive_file, share=0.0 if test else TEST_SHARE) for log in logs]
+    findings = {}
+    for known, _ in parts:
+        findings[known.name] = examine(known, drive_file)
+        refuse_unfit(findings[known.name], known)
+    for log in test:
+        findings[log.name] = examine(log, drive_file)
+    fitted = tuple(known for known, _ in parts)
+    tests = [whole_test_log(log, drive_file) for log in test] or [end for _, end in parts if end is not None]
+    # The end of a log goes on by its clock.
+    starts = {log.name: float(log.time[0]) for log in (*fitted, *test)}
+    return Rig(
+        name=drive_file.name,
+        model=base_model(drive_file, fitted[0]),
+        hold=stated,
+        experiments={h: tuple(e for log in fitted for e in experiments(log, drive_file, h)) for h in holds},
+        test={
+            h: tuple(replace(e, origin=starts[e.log]) for log in tests for e in experiments(log, drive_file, h))
+            for h in holds
+        },
+        logs=fitted,
+        findings=findings,
+        error_unit=fitted[0].units.get("dynamic_error", "rad"),
+    )
+
+
+def read_logs(
+    paths: Sequence[Path], drive_file: DriveFile, *, test: Sequence[Path] = ()
+) -> tuple[tuple[Log, ...], tuple[Log, ...]]:
+    """Logs as they are in their files, and those that are test data; all of one kind, each with a name of its own.
+
+    Raises:
+        InputError: They are of several kinds, or a log is to be fitted and to be test data.
+    """
+    both = {path.resolve() for path in paths} & {path.resolve() for path in test}
+    if both:
+        raise InputError(f"{min(both)}: the log is both fitted and test data; name it once")
+    logs = _with_own_names([read_log(path, drive_file) for path in (*paths, *test)])
+    kinds = sorted({log.kind for log in logs})
+    if len(kinds) > 1:
+        raise InputError(
+            f"{paths[0]} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
+        )
+    return logs[: len(paths)], logs[len(paths) :]
+
+
+def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
+    """A log that was read, its wrong samples masked, and its dynamic error zeroed; arguments as in
+    [`fitting.logs.log.read_log`][]. The fit of a quasi-static log finds its zero itself."""
+    log = read_log(path, drive_file, outputs_until=outputs_until)
+    return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file)
+
+
+def base_model(drive_file: DriveFile, log: Log) -> Model:
+    """The model without effects that suits a log; stiffness and damping are placeholders."""
+    if log.kind == "reduced":
+        return ReducedModel(ReducedDrive(mu=1.0, omega_0=1.0))
+    return TwoInertiaModel(
+        Drive(N=drive_file.reduction_ratio, J_m=drive_file.motor_inertia, J_l=drive_file.load_inertia, K=1.0)
+    )
+
+
+def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment, ...]:
+    """The stretches of the log between its gaps, on their sample grids, under one hold."""
+    ratio = drive_file.reduction_ratio if log.kind == "drive" else None
+    return experiments_from_log(log, hold=hold, N=ratio)
+
+
+def _with_own_names(logs: Sequence[Log]) -> tuple[Log, ...]:
+    """Logs of the same name in several folders are told apart by their folder, and then by their number."""
+    named: list[Log] = []
+    for log in logs:
+        alike = sum(log.path.stem == other.path.stem for other in logs) > 1
+        name = f"{log.path.absolute().parent.name}/{log.name}" if alike else log.name
+        before = sum(other.name.split(" (")[0] == name for other in named)
+        named.append(replace(log, name=f"{name} ({before + 1})" if before else name))
+    return tuple(named)

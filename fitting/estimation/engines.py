@@ -1,0 +1,145 @@
+"""Which engine evaluates a residual: machine code where this processor and the model allow it, XLA otherwise."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimation.machine_code import (
+    blocks_by_machine_code,
+    residual_by_machine_code,
+    rows_by_machine_code,
+    simulated,
+)
+from fitting.estimation.residual import (
+    Blocks,
+    LinearisedResidual,
+    Problem,
+    Products,
+    Unknowns,
+    blocks,
+    moved_residual,
+    residual,
+    seen_residual,
+    simulate_segments,
+)
+from hdjax.engine import UntranslatableError, kernel, unusable
+from hdjax.lanes import jit_lanes
+
+
+def with_engine(problem: Problem, *, values: bool = False) -> Problem:
+    """The problem with machine code for its model, where that can be.
+
+    Args:
+        problem: what is solved.
+        values: whether the residual is wanted without derivatives as well.
+    """
+    return _ready(problem, values)[0]
+
+
+def why_not(problem: Problem) -> str | None:
+    """Why XLA evaluates the residual; None where machine code does."""
+    return _ready(problem, values=False)[1]
+
+
+def _ready(problem: Problem, values: bool) -> tuple[Problem, str | None]:
+    """The problem with machine code; or as it is, and why."""
+    reason = unusable() if problem.engine is None else f"{problem.engine} was asked for"
+    if reason is not None:
+        return problem, reason
+    try:
+        made = kernel(
+            problem.model,
+            problem.free.paths,
+            loaded=problem.segments.load_torque is not None,
+            warm=problem.segments.temperature is not None,
+            solver=problem.solver,
+            values=values,
+        )
+    except UntranslatableError as error:
+        return problem, f"the model uses {error}, which the engine for machine code does not know"
+    return dataclasses.replace(problem, kernel=made), None
+
+
+def linearise(problem: Problem, unknowns: Unknowns, width: int | None = None) -> Blocks:
+    """Residual and Jacobian of a problem at some point, by its engine.
+
+    Args:
+        problem: what is solved.
+        unknowns: where.
+        width: columns of the derivatives by parameters, those behind the last parameter zero; one each where None.
+    """
+    if problem.kernel is not None:
+        return blocks_by_machine_code(problem, unknowns, width)
+    found = _linearise_by_xla(problem, unknowns)
+    return found if width is None else _widened(found, width)
+
+
+_linearise_by_xla = jit_lanes(blocks)
+
+
+def rows_at(problem: Problem, unknowns: Unknowns) -> Float[Array | np.ndarray, "segments rows"]:
+    """The rows of a problem's residual at some point: by machine code without derivatives, or by the program of XLA
+    that computes these too, so that no other is compiled."""
+    if problem.kernel is not None:
+        return rows_by_machine_code(problem, unknowns)
+    return _linearise_by_xla(problem, unknowns).residual
+
+
+def _widened(found: Blocks, width: int) -> Blocks:
+    def wide(columns: Array) -> Array:
+        return jnp.asarray(np.pad(np.asarray(columns), [(0, 0)] * 2 + [(0, width - columns.shape[-1])]))
+
+    places = (found.by_parameter, found.before_by_parameter)
+    return eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), found, tuple(map(wide, places)))
+
+
+def blocks_inside(problem: Problem, unknowns: Unknowns) -> Blocks:
+    """[`linearise`][] inside a program of JAX."""
+    return blocks(problem, unknowns) if problem.kernel is None else blocks_by_machine_code(problem, unknowns)
+
+
+def residual_inside(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
+    """[`fitting.estimation.residual.residual`][] inside a program of JAX, by the problem's engine."""
+    if problem.kernel is None or problem.kernel.values is None:
+        return residual(problem, unknowns)
+    return residual_by_machine_code(problem, unknowns)
+
+
+def simulate(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
+    """Outputs of a problem's model on each segment, and the state it ends in, by the engine that suits it."""
+    ready = with_engine(problem, values=True)
+    return _simulate_by_xla(problem, unknowns) if ready.kernel is None else simulated(ready, unknowns)
+
+
+_simulate_by_xla = jit_lanes(simulate_segments)
+
+
+def residual_and_products(unknowns: Unknowns, problem: Problem) -> tuple[LinearisedResidual, Products]:
+    """What [`fitting.estimation.levenberg_marquardt.ArrowLevenbergMarquardt`][] minimises: the residual with weighted gaps; and what it needs
+    of it."""
+    found = blocks_inside(problem, unknowns)
+    return seen_residual(found, problem.gap_weight), Products.of(found)
+
+
+@eqx.filter_custom_jvp
+def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> LinearisedResidual:
+    """[`fitting.estimation.residual.residual`][] with weighted gaps, inside a program of JAX; its derivative is a product with
+    the blocks rather than a second simulation."""
+    rows, gap = residual_inside(problem, unknowns)
+    return LinearisedResidual(rows, gap * problem.gap_weight[None])
+
+
+@residual_with_blocks.def_jvp
+def _residual_jvp(primals, tangents):
+    unknowns, problem = primals
+    tangent, _ = tangents
+    found = blocks_inside(problem, unknowns)
+    joined, weight = problem.segments.joined, problem.gap_weight
+    return seen_residual(found, weight), moved_residual(found, weight, joined, tangent)

@@ -1,0 +1,381 @@
+"""The only least squares: parameters, initial states and noise covariance from segments of logs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from fitting.estimation.engines import linearise
+from fitting.estimation.experiment import Stretch, scales
+from fitting.estimation.free_parameters import FreeParameters
+from fitting.estimation.linear_response import readout
+from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
+from fitting.estimation.projection import FirstStates
+from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
+from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
+from hdjax import Model
+from hdjax.effects.learned import FAMILY
+
+REWEIGHTINGS = 3
+"""Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
+
+# An output that the model can't follow may take longer to lose its say.
+_MOST_REWEIGHTINGS = 12
+# Simulations longer than this many segments start from states that shorter ones have found already.
+_LONGEST_RETRY = 16
+# A segment with this many times the median sum of squares may have ended in a wrong minimum.
+_OUTLIER = 6.0
+# Iterations in each window of samples, of windows that grow.
+_WINDOW_STEPS = 12
+
+
+class Start(eqx.Module):
+    """Where a fit begins, beside the values of its model.
+
+    Attributes:
+        covariance: of the outputs' errors, to start the weighing with; that of the model where not given.
+        states: initial states of the segments; from their first samples where not given.
+    """
+
+    covariance: Float[Array | np.ndarray, "outputs outputs"] | None = None
+    states: Float[Array, "segments states"] | None = None
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How a fit is iterated.
+
+    Attributes:
+        max_steps: iterations of each pass at most; no further pass begins after twice as many in all.
+        least_progress: share of the sum of squares that a few steps must take off it, see [`fitting.estimation.solve.solve`][].
+        reweigh: whether to weigh by what is left over; with False the covariance at the start is kept.
+        hold_parameters: fit the initial states only, by the same program that fits the parameters.
+        begin_anew_above: an objective above which a first pass that does not converge is begun anew, from the first
+            samples of each segment: it may have lost its way.
+        retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
+        give_up_above: an objective that the fit must reach in its first pass to be worth another.
+    """
+
+    max_steps: int = 60
+    least_progress: float = 0.0
+    reweigh: bool = True
+    hold_parameters: bool = False
+    begin_anew_above: float = -np.inf
+    retry_states: bool = True
+    give_up_above: float = np.inf
+
+    def solve(self, problem: Problem, begin: Unknowns, damping: float) -> Solution:
+        """One pass: the least squares under fixed weights, by [`fitting.estimation.solve.solve`][]."""
+        return solve(problem, begin, self.max_steps, damping, least_progress=self.least_progress)
+
+
+class Fit(eqx.Module):
+    """A fitted model and what it leaves over.
+
+    Attributes:
+        model: with the fitted values.
+        problem: what was solved (its model holds the starting values).
+        unknowns: the solution.
+        error: measured minus simulated outputs on each segment.
+        covariance: of the output error, from the error itself.
+        objective: half the log-determinant of that covariance; a decrease of 0.01 is 1 % less error.
+        stretches: the data.
+        horizon: samples until a simulation starts anew.
+        converged: whether the iteration met its tolerance.
+        steps: iterations spent.
+    """
+
+    model: Model
+    problem: Problem
+    unknowns: Unknowns
+    error: Float[Array, "segments samples outputs"]
+    covariance: Float[Array, "outputs outputs"]
+    objective: float = eqx.field(static=True)
+    stretches: tuple[Stretch, ...]
+    horizon: int = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+
+    @property
+    def free(self) -> FreeParameters:
+        """What was free."""
+        return self.problem.free
+
+    @property
+    def substeps(self) -> int:
+        """Solver steps in a sample interval."""
+        return int(self.problem.substeps)
+
+    @property
+    def segmentation(self) -> Segmentation:
+        """How its data are cut: other fits on segments as long and as many share its compiled program."""
+        count, length = self.problem.segments.weight.shape
+        return Segmentation(self.horizon, length, self.problem.segments.halo, self.substeps, count)
+
+    @property
+    def at_solution(self) -> Problem:
+        """What was solved, at the fitted values."""
+        return eqx.tree_at(lambda p: p.model, self.problem, self.model)
+
+    @property
+    def white_error(self) -> Float[np.ndarray, "segments samples outputs"]:
+        """The whitened output error."""
+        return np.asarray(self.error) @ np.asarray(self.problem.whitening).T
+
+    @property
+    def pieces(self) -> Int[np.ndarray, " stretches"]:
+        """How many segments each stretch was cut into; those that only fill up a program come last."""
+        return np.array([-(-len(s) // self.error.shape[1]) for s in self.stretches])
+
+    def by_stretch(self, values: Shaped[np.ndarray, "segments samples *each"]) -> list[Shaped[np.ndarray, "_ *each"]]:
+        """What belongs to samples of segments, stretch by stretch and without padding."""
+        parts = np.split(values, np.cumsum(self.pieces))
+        return [a.reshape(-1, *a.shape[2:])[: len(s)] for s, a in zip(self.stretches, parts, strict=False)]
+
+    def with_all_free(self) -> "Fit":
+        """The same with fixed parameters counted as free, so that the data are asked what they say of them."""
+        return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
+
+    @property
+    def dynamic_error_std(self) -> float:
+        """Rms of what is left of the dynamic error [rad]."""
+        return float(np.sqrt(self.covariance[-1, -1]))
+
+
+def fit(
+    model: Model,
+    stretches: Sequence[Stretch],
+    paths: Sequence[str],
+    segmentation: Segmentation,
+    *,
+    start: Start = Start(),
+    strategy: Strategy = Strategy(),
+    engine: Engine | None = None,
+) -> Fit:
+    """Fit parameters of a model to stretches of logs.
+
+    Simulations start anew every so many samples (the horizon), and their initial states are fitted with the shared
+    parameters. Longer horizons are cut into joined segments that run side by side; their gaps close as the fit
+    converges, so that the result is that of one simulation (multiple shooting). The outputs are weighed by the
+    covariance of what is left over, which maximises the likelihood of Gaussian errors of unknown covariance: an output
+    that the model cannot follow is down-weighted.
+
+    Args:
+        model: equations and starting values.
+        stretches: the data.
+        paths: dotted paths of what is free; may be empty.
+        segmentation: how the data are cut.
+        start: where the fit begins.
+        strategy: how it is iterated.
+        engine: what evaluates the residual; machine code where not given, or XLA where there can be none.
+
+    Returns:
+        The fit.
+    """
+    problem, unknowns = pose(
+        model,
+        stretches,
+        paths,
+        segmentation,
+        hold_parameters=strategy.hold_parameters,
+        states=start.states,
+        engine=engine,
+    )
+    swing = float(scales(stretches).x)
+    # The scale of a single output changes nothing but the say of the hidden states' prior.
+    scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
+    covariance = start.covariance
+    if covariance is None:
+        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[swing**2]])
+    objective, steps = np.inf, 0
+    solution = None
+    for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
+        problem = weighed(problem, covariance, swing)
+        solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
+        if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
+            solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
+        unknowns, covariance = solution.unknowns, solution.left_over.covariance
+        before, objective = objective, half_log_determinant(covariance)
+        steps += solution.steps
+        settled = not np.isfinite(objective) or abs(before - objective) < max(1e-4, 0.5 * strategy.least_progress)
+        if settled or objective > strategy.give_up_above or steps >= 2 * strategy.max_steps:
+            break
+    assert solution is not None
+    # By way of the host: what is computed with the model alone need not run on every device.
+    values = jnp.asarray(np.asarray(unknowns.parameters))
+    return Fit(
+        model=problem.free.unpack(model, values),
+        problem=weighed(problem, covariance, swing) if strategy.reweigh else problem,
+        unknowns=unknowns,
+        error=jnp.asarray(solution.left_over.error),
+        covariance=jnp.asarray(covariance),
+        objective=objective,
+        stretches=tuple(stretches),
+        horizon=segmentation.horizon,
+        converged=solution.success,
+        steps=steps,
+    )
+
+
+def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution, strategy: Strategy) -> Solution:
+    """Repeat the first pass from other initial states, in all segments or in some, where the strategy says so.
+
+    Args:
+        problem: what is solved.
+        begin: where the first pass began.
+        found: where it came to.
+        strategy: how the fit is iterated.
+    """
+    reached = half_log_determinant(found.left_over.covariance)
+    if reached > strategy.begin_anew_above and not (found.success or strategy.hold_parameters):
+        grown = _grown(problem, begin, strategy.least_progress)
+        again = strategy.solve(problem, grown, NEARBY_DAMPING)
+        found = min(found, again, key=lambda s: np.sum(s.left_over.squares))
+    mended = _retry_states(problem, found, strategy.least_progress) if strategy.retry_states else None
+    return found if mended is None else strategy.solve(problem, mended, NEARBY_DAMPING)
+
+
+def weighed(problem: Problem, covariance: Array | np.ndarray, swing: float) -> Problem:
+    """The problem, weighed by the covariance of the outputs' errors."""
+    white = whitening(covariance)
+    weights = white, _gap_weight(problem, white, swing)
+    return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, tuple(map(jnp.asarray, weights)))
+
+
+def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
+    """Fit the first samples of each segment, then ever more of them, until it is all of them.
+
+    Over half a natural period a simulation depends on parameters and state so smoothly that the fit finds its way from
+    afar; each window starts near the solution of the next one. Masking the later samples lets the same compiled
+    program do it.
+    """
+    weight = problem.segments.weight
+    length = weight.shape[1]
+    apart = zeros_like(problem.segments.joined)
+    for samples in _growing(problem, length):
+        masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
+        part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
+        part, unknowns = on_all_devices(part, unknowns)
+        unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING, least_progress=least_progress).unknowns
+    return unknowns
+
+
+def _retry_states(problem: Problem, found: Solution, least_progress: float) -> Unknowns | None:
+    """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one; None where
+    none is better.
+
+    A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
+    segments would dominate the sum of squares.
+    """
+    parameters, old = found.unknowns.parameters, found.left_over.squares
+    suspect = old > _OUTLIER * np.median(old[np.asarray(problem.segments.weight).any(axis=1)])
+    if not suspect.any():
+        return None
+    held = eqx.tree_at(lambda p: p.active, problem, zeros_like(problem.active))
+    model = problem.free.unpack(problem.model, parameters)
+    fresh = _grown(held, Unknowns(parameters, initial_states(model, problem.segments)), least_progress)
+    new = evaluate(problem, fresh).squares
+    better = (new < 0.99 * old) & suspect
+    if not better.any():
+        return None
+    return Unknowns(parameters, jnp.where(better[:, None], fresh.states, found.unknowns.states))
+
+
+def zeros_like(array: Array) -> Array:
+    """Zeros in the place of an array, without a program that makes them."""
+    return jax.device_put(np.zeros(array.shape, array.dtype), array.sharding if array.committed else None)
+
+
+def _growing(problem: Problem, length: int) -> list[int]:
+    """From half a natural period, within which hardly a wrong state runs away, to the whole segment."""
+    knots = np.asarray(problem.segments.torque.knots)
+    half = np.pi / float(problem.model.drive.omega_0) / float(np.median(np.diff(knots)))
+    first = min(length, max(4, round(half)))
+    return [first * 4**k for k in range(10) if first * 4**k < length] + [length]
+
+
+def whitening(covariance: Float[Array | np.ndarray, "outputs outputs"]) -> Float[np.ndarray, "outputs outputs"]:
+    """W with `W covariance W^T = 1`."""
+    return np.linalg.inv(np.linalg.cholesky(np.asarray(covariance)))
+
+
+def _gap_weight(problem: Problem, white: np.ndarray, swing: float) -> Float[np.ndarray, " states"]:
+    """What the states count in a gap: about what the segment behind it would pay for it.
+
+    An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
+    state by what the error does while it runs through its range. Counted less, the residual that a closed gap costs
+    would look too dear.
+    """
+    model = problem.model
+    angles = len(model.motion_states) // 2
+    shown = np.linalg.norm(white @ readout(model, model.rest())[:, :angles], axis=0)
+    visible = 0.1 * swing * np.linalg.norm(white[:, -1])
+    hidden = [visible / np.asarray(e.state_scale()) for e in model.effects if e.states]
+    weights = np.concatenate([shown, shown / float(model.drive.omega_0), *hidden])
+    return np.sqrt(problem.segments.weight.shape[1]) * weights
+
+
+def half_log_determinant(covariance: Array | np.ndarray) -> float:
+    """The objective that errors of this covariance make; infinite where it is none."""
+    sign, value = np.linalg.slogdet(np.asarray(covariance))
+    return float(0.5 * value) if sign > 0 else np.inf
+
+
+def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
+    """Which segments of a fit are of which of its stretches."""
+    ends, place = np.cumsum(found.pieces)[:, None], np.arange(len(found.error))
+    return (ends - found.pieces[:, None] <= place) & (place < ends)
+
+
+def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
+    """The segments in which the simulation runs away."""
+    return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))
+
+
+def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 16) -> int:
+    """Solver steps in a sample interval that keep the step error below a fraction of the residual.
+
+    Args:
+        found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
+        tolerance: largest rms difference in units of the residual's standard deviation.
+        shift: by how many standard errors the difference may move the parameters, coefficients of learned functions
+            aside. An error too small to be seen in a sample adds up over all of them.
+        most: where to stop.
+    """
+    problem, substeps = found.at_solution, found.substeps
+    columns = None
+    if np.isfinite(shift):
+        slopes = linearise(problem, found.unknowns)
+        columns = FirstStates.of(slopes, problem.segments.joined).parameters_without(slopes)
+    error, white_by_error = evaluate(problem, found.unknowns).error, np.asarray(problem.whitening)
+    count = np.sum(np.asarray(problem.segments.weight))
+    while substeps < most:
+        better = evaluate(replace(problem, substeps=2 * substeps), found.unknowns).error
+        white = (better - error) @ white_by_error.T
+        mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
+        moved = 0.0 if columns is None else _standard_errors_moved(columns, white, _named(found))
+        if np.sqrt(mean_square) < tolerance and moved < shift:
+            break
+        substeps, error = 2 * substeps, better
+    return substeps
+
+
+def _named(found: Fit) -> Bool[np.ndarray, " parameters"]:
+    """Which parameters are no coefficients of something learned."""
+    learned = {e.name for e in found.model.effects if e.family == FAMILY}
+    return np.array([path.partition(".")[0] not in learned for path in found.free.paths], dtype=bool)
+
+
+def _standard_errors_moved(columns: np.ndarray, white: np.ndarray, which: Bool[np.ndarray, " parameters"]) -> float:
+    """How far a whitened output error would move some of the parameters, in standard errors of their joint estimate."""
+    rows = white.reshape(white.shape[0], -1)
+    slopes = columns[:, : rows.shape[1]].reshape(rows.size, -1)
+    gradient, information = slopes.T @ rows.ravel(), slopes.T @ slopes
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    moved, covariance = (inverse @ (scale * gradient))[which], inverse[np.ix_(which, which)]
+    return float(np.sqrt(max(0.0, moved @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ moved)))

@@ -1,0 +1,405 @@
+"""A log made ready for simulation: torque between samples, measured outputs, and the stretches they are cut into."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import comb
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitting.errors import DataError
+from fitting.logs.gaps import bridged
+from fitting.logs.log import Log
+from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
+from hdjax.effects import Scales
+
+# Both assumed: a Runge-Kutta step this much longer than the others is cut; so many samples may be put in per row.
+_LONGEST_STEP = 1.5
+_MOST_PUT_IN = 10
+
+
+class Experiment(eqx.Module):
+    """One log on its sample grid.
+
+    Attributes:
+        name: the log's name.
+        time: sample stamps [s].
+        torque: motor torque [N m] or forcing, as logged, between samples.
+        load_torque: torque on the load [N m], or None.
+        measured: (theta_m/N, dynamic error) [rad] by row, or the dynamic error alone.
+        motor_angle: measured motor angle [rad], or None in a reduced log.
+        weight: 1 for a sample whose outputs count, 0 for one that was put in or is not believed; None where all count.
+            The outputs of a sample without weight are something finite in between.
+        rows: which samples are rows of the log, the others having been put in; None where all are.
+        temperature: of the drive [K], or None.
+        origin: when the log starts, on the clock of `time` [s].
+        log: the name of the log that it is a part of.
+    """
+
+    name: str = eqx.field(static=True)
+    time: Float[np.ndarray, " n"]
+    torque: PiecewisePolynomial
+    load_torque: PiecewisePolynomial | None
+    measured: Float[np.ndarray, "n outputs"]
+    motor_angle: Float[np.ndarray, " n"] | None
+    weight: Float[np.ndarray, " n"] | None = None
+    rows: Bool[np.ndarray, " n"] | None = None
+    temperature: PiecewisePolynomial | None = None
+    origin: float = eqx.field(static=True, default=0.0)
+    log: str = eqx.field(static=True, default="")
+
+    def __len__(self) -> int:
+        return self.time.size
+
+    @property
+    def time_step(self) -> float:
+        """Median sampling interval [s]."""
+        return float(np.median(np.diff(self.time)))
+
+
+class Stretch(eqx.Module):
+    """Samples `start` to `stop` (exclusive) of one experiment."""
+
+    experiment: Experiment
+    start: int = eqx.field(static=True)
+    stop: int = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def name(self) -> str:
+        """The log's name."""
+        return self.experiment.name
+
+    @property
+    def weight(self) -> Float[np.ndarray, " n"]:
+        """1 for a sample whose outputs count, 0 for the others."""
+        weight = self.experiment.weight
+        return np.ones(len(self)) if weight is None else weight[self.start : self.stop]
+
+    def beginning(self, count: int) -> "Stretch":
+        """The shortest part from the start on that has `count` samples with weight, or all of them."""
+        enough = np.flatnonzero(np.cumsum(self.weight) >= count)
+        known = np.flatnonzero(self.weight)
+        last = enough[0] if len(enough) else known[-1] if len(known) else len(self) - 1
+        return replace(self, stop=self.start + int(last) + 1)
+
+
+class Segments(eqx.Module):
+    """Stretches cut into equally long pieces, the lanes of one program. Missing samples have weight zero.
+
+    A segment either starts anew, or it is joined to the one before and must start where that one ends. Which it is
+    are data, so that one compiled program fits short horizons and whole logs.
+
+    Attributes:
+        torque: logged torque of each segment; its first `halo` intervals lie before the segment, so that a delay
+            has something to reach back to. Its knots count from the log's start.
+        load_torque: coefficients of the load torque, or None.
+        measured: outputs at the samples.
+        weight: 1 for a sample whose outputs count, 0 for the others and for padding.
+        joined: whether a segment starts where the one before it ends.
+        halo: intervals before each segment's first sample.
+        temperature: likewise of the drive's temperature, or None where a log lacks it.
+    """
+
+    torque: PiecewisePolynomial
+    load_torque: PiecewisePolynomial | None
+    measured: Float[Array, "segments samples outputs"]
+    weight: Float[Array, "segments samples"]
+    joined: Bool[Array, " segments"]
+    halo: int = eqx.field(static=True)
+    temperature: PiecewisePolynomial | None = None
+
+    @property
+    def count(self) -> Array:
+        """Number of samples that carry weight."""
+        return jnp.sum(self.weight)
+
+    @property
+    def knots(self) -> Float[np.ndarray, "segments knots"]:
+        """Stamps of each segment's own samples, and of its end."""
+        return np.asarray(self.torque.knots)[:, self.halo :]
+
+    @property
+    def width(self) -> Float[np.ndarray, "segments samples"]:
+        """Time from each sample to the next one."""
+        return np.diff(self.knots)
+
+
+def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tuple[Experiment, ...]:
+    """The stretches of a log between its gaps, each an experiment of its own; arguments as in
+    [`experiment_from_log`][]."""
+    if log.pieces is None:
+        return (experiment_from_log(log, hold=hold, N=N),)
+    several = len(log.pieces) > 1
+    parts = (
+        experiment_from_log(
+            replace(log.rows(start, stop), pieces=None, name=f"{log.name}, part {i + 1}" if several else log.name),
+            hold=hold,
+            N=N,
+        )
+        for i, (start, stop) in enumerate(log.pieces)
+    )
+    return tuple(replace(part, origin=float(log.time[0]), log=log.name) for part in parts)
+
+
+def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Experiment:
+    """Turn a log without wide gaps into an experiment.
+
+    Where the log lacks samples, the torque's are bridged and the simulation gets steps of the usual length; the outputs
+    put in there have no weight.
+
+    Args:
+        log: what was measured.
+        hold: what the torque does between samples.
+        N: reduction ratio of a drive log.
+
+    Raises:
+        DataError: for a log that is mostly a gap.
+    """
+    drive_log = log.kind == "drive"
+    input_samples = log.motor_torque if drive_log else log.forcing
+    assert input_samples is not None
+    lasts = (log.time[-1] - log.time[0]) / np.median(np.diff(log.time))
+    if lasts > _MOST_PUT_IN * len(log):
+        raise DataError(
+            f"{log.path}: the log is mostly gaps, since its {len(log)} samples are spread over {lasts:.3g} sampling "
+            "intervals; cut it into logs without gaps"
+        )
+    known = np.ones(len(log), dtype=bool) if log.input_known is None else log.input_known.copy()
+    known[[0, -1]] = True
+    stamps, samples = bridged(log.time[known], input_samples[known])
+    time, rows = _grid(log, stamps)
+    torque = _on_grid(sampled(stamps, samples, hold=hold), time)
+    # What a digital drive commands is held on both sides; what sensors measure runs on, and straight lines follow it.
+    load_hold = hold if hold == "zero-order" else "linear"
+    load_torque = _channel(log, log.load_torque, time, load_hold) if drive_log else None
+    columns = [log.dynamic_error]
+    if drive_log:
+        assert log.motor_angle is not None and N is not None
+        columns.insert(0, log.motor_angle / N)
+    weight = rows.astype(float)
+    if log.trusted is not None:
+        weight[rows] = log.trusted
+    if log.outputs_until is not None:
+        weight[np.cumsum(rows) > log.outputs_until] = 0.0
+    measured = np.stack([_filled(log, column, time, rows) for column in columns], axis=1)
+    return Experiment(
+        name=log.name,
+        time=time,
+        torque=torque,
+        load_torque=load_torque,
+        measured=measured,
+        motor_angle=_filled(log, log.motor_angle, time, rows) if drive_log and log.motor_angle is not None else None,
+        weight=None if weight.all() else weight,
+        rows=None if rows.all() else rows,
+        temperature=_channel(log, log.temperature, time, "linear"),
+        origin=float(log.time[0]),
+        log=log.name,
+    )
+
+
+def _channel(log: Log, values: np.ndarray | None, time: np.ndarray, hold: Hold) -> PiecewisePolynomial | None:
+    """A channel of the log on the grid; None where the log has none."""
+    return None if values is None else _on_grid(sampled(log.time, values, hold=hold), time)
+
+
+def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The log's stamps with those of the torque and others where a step would be long, and which are the log's."""
+    time = np.union1d(log.time, stamps)
+    step = np.diff(time)
+    usual = max(float(np.median(step)), float(np.median(np.diff(log.time))))
+    lacking = np.where(step > _LONGEST_STEP * usual, np.rint(step / usual) - 1, 0.0)
+    if lacking.any():
+        count = lacking.astype(int)
+        part = np.concatenate([np.arange(1, n + 1) / (n + 1) for n in count if n])
+        where = np.repeat(np.arange(len(step)), count)
+        time = np.insert(time, where + 1, time[where] + part * step[where])
+    return time, np.isin(time, log.time)
+
+
+def _on_grid(signal: PiecewisePolynomial, time: np.ndarray) -> PiecewisePolynomial:
+    """The same signal with more knots."""
+    knots, coefficients = np.asarray(signal.knots), np.asarray(signal.coefficients)
+    if time.size == knots.size - 1 and (time == knots[:-1]).all():
+        return signal
+    piece = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, coefficients.shape[0] - 1)
+    late = (time - knots[piece])[:, None]
+    own, powers = coefficients[piece], np.arange(coefficients.shape[1])
+    # A polynomial about a later point (Taylor).
+    shifted = [
+        sum((comb(k, i) * own[:, [k]] * late ** (k - i) for k in powers[i:]), np.zeros_like(late)) for i in powers
+    ]
+    return PiecewisePolynomial(
+        jnp.asarray(np.append(time, max(knots[-1], time[-1] + np.median(np.diff(time))))),
+        jnp.asarray(np.concatenate(shifted, axis=1)),
+    )
+
+
+def _filled(log: Log, values: np.ndarray, time: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """An output on the grid; where it was not measured or is not believed, a straight line."""
+    if log.trusted is None and log.outputs_until is None and rows.all():
+        return values
+    known = np.ones(len(log), dtype=bool) if log.trusted is None else log.trusted
+    known = known & (np.arange(len(log)) < (log.outputs_until or len(log)))
+    return np.interp(time, log.time[known], values[known])
+
+
+def whole(experiments: Sequence[Experiment]) -> tuple[Stretch, ...]:
+    """Each experiment as one stretch."""
+    return tuple(Stretch(e, 0, len(e)) for e in experiments)
+
+
+def split(
+    experiments: Sequence[Experiment], *, held_out: float = 0.2
+) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]]:
+    """The part of each experiment that candidates are fitted to, and the stretch at its end by which one is selected.
+
+    Args:
+        experiments: without the test data.
+        held_out: share that serves selection.
+    """
+    training, selection = [], []
+    for experiment in experiments:
+        border = _border(experiment, held_out)
+        training.append(Stretch(experiment, 0, border))
+        selection.append(Stretch(experiment, border, len(experiment)))
+    return tuple(training), tuple(selection)
+
+
+def _border(experiment: Experiment, held_out: float) -> int:
+    """The sample that parts the experiment so that each side has its share of the samples with weight."""
+    if experiment.weight is None:
+        return round(len(experiment) * (1.0 - held_out))
+    total = np.cumsum(experiment.weight)
+    return int(np.clip(np.searchsorted(total, total[-1] * (1.0 - held_out)) + 1, 1, len(experiment) - 1))
+
+
+def segment_count(stretches: Sequence[Stretch], length: int) -> int:
+    """How many segments of `length` samples the stretches need, rounded up so that logs of similar length share a
+    compiled program."""
+    needed = sum(-(-len(s) // length) for s in stretches)
+    return needed if needed <= 8 else needed + -needed % 16
+
+
+def cut(
+    stretches: Sequence[Stretch], length: int, *, horizon: int | None = None, halo: int = 0, count: int | None = None
+) -> Segments:
+    """Cut stretches into segments of `length` samples; the last one of each stretch is padded.
+
+    Args:
+        stretches: the data.
+        length: samples in a segment.
+        horizon: samples until a simulation starts anew; the length where not given.
+        halo: intervals of torque before each segment.
+        count: number of segments, the superfluous ones without weight; [`segment_count`][] where not given.
+    """
+    pieces = 1 if horizon is None else max(1, -(-horizon // length))
+    loaded = any(s.experiment.load_torque is not None for s in stretches)
+    warm = all(s.experiment.temperature is not None for s in stretches)
+    parts = [_cut_one(s, length, pieces, halo, loaded=loaded, warm=warm) for s in stretches]
+    found = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    missing = max(0, (segment_count(stretches, length) if count is None else count) - found[0].shape[0])
+    filled = [np.concatenate([column, np.repeat(column[-1:], missing, axis=0)]) for column in found]
+    knots, torque, load, warmth, measured, weight, joined = filled
+    weight[weight.shape[0] - missing :] = 0.0
+    joined[joined.shape[0] - missing :] = False
+    own_knots = jnp.asarray(knots)
+    return Segments(
+        torque=PiecewisePolynomial(own_knots, jnp.asarray(torque)),
+        load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if loaded else None,
+        measured=jnp.asarray(measured),
+        weight=jnp.asarray(weight),
+        joined=jnp.asarray(joined),
+        halo=halo,
+        temperature=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(warmth)) if warm else None,
+    )
+
+
+def _cut_one(
+    stretch: Stretch, length: int, pieces: int, halo: int, *, loaded: bool, warm: bool
+) -> tuple[np.ndarray, ...]:
+    """Of one stretch's segments by row: knots, torque, load torque (none acts where only other logs have one),
+    temperature, measured outputs, weight, whether joined."""
+    experiment = stretch.experiment
+    last = len(experiment) - 1
+    begin = np.arange(stretch.start, stretch.stop, length)
+    index = begin[:, None] + np.arange(-halo, length)
+    inside = np.clip(index, 0, last)
+    # Before the record the first torque is assumed to have been held; beyond it the last.
+    torque = np.asarray(experiment.torque.coefficients)[inside]
+    torque[index != inside, 1:] = 0.0
+    outer = begin[:, None] + np.arange(-halo, length + 1)
+    known = np.clip(outer, 0, last + 1)
+    knots = np.asarray(experiment.torque.knots)[known] + (outer - known) * experiment.time_step
+    own = index[:, halo:]
+    load, warmth = experiment.load_torque, experiment.temperature
+    on_load = np.zeros((last + 1, torque.shape[-1] if loaded else 0)) if load is None else np.asarray(load.coefficients)
+    # Straight lines need no higher powers.
+    line = np.asarray(warmth.coefficients)[:, :2] if warm and warmth is not None else np.zeros((last + 1, 0))
+    own_row = np.clip(own, 0, last)
+    return (
+        knots - experiment.origin,
+        torque,
+        on_load[own_row],
+        line[own_row],
+        experiment.measured[np.clip(own, 0, stretch.stop - 1)],
+        _weight(experiment, own) * (own < stretch.stop),
+        np.arange(begin.size) % pieces != 0,
+    )
+
+
+def _weight(experiment: Experiment, index: np.ndarray) -> np.ndarray:
+    if experiment.weight is None:
+        return np.ones(index.shape)
+    return experiment.weight[np.clip(index, 0, len(experiment) - 1)]
+
+
+def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
+    """Orders of magnitude of the measured motion.
+
+    Args:
+        stretches: the data.
+        model: supplies the natural frequency and the reduction ratio where it is given.
+    """
+    x = np.concatenate([s.experiment.measured[s.start : s.stop, -1] for s in stretches])
+    x = x - np.median(x)
+    step = stretches[0].experiment.time_step
+
+    def rate(values: np.ndarray) -> float:
+        """Rms slope over a few samples, so that encoder noise does not pass for speed."""
+        span = 8
+        return float(np.sqrt(np.mean(((values[span:] - values[:-span]) / (span * step)) ** 2)))
+
+    angles = [s.experiment.motor_angle[s.start : s.stop] for s in stretches if s.experiment.motor_angle is not None]
+    motor = float(np.sqrt(np.mean([rate(a) ** 2 for a in angles]))) if angles else 1.0
+    output = [rate(s.experiment.measured[s.start : s.stop, 0]) for s in stretches]
+    temperature, change = _temperature(stretches)
+    return Scales(
+        x=float(np.std(x)),
+        x_max=float(np.max(np.abs(x))),
+        v=rate(x),
+        omega_m=motor,
+        omega_l=float(np.sqrt(np.mean(np.square(output)))),
+        time_step=step,
+        duration=max(float(np.ptp(s.experiment.time)) for s in stretches),
+        reduction_ratio=float(model.drive.N) if isinstance(model, TwoInertiaModel) else 1.0,
+        omega_0=None if model is None else float(model.drive.omega_0),
+        temperature=temperature,
+        temperature_change=change,
+    )
+
+
+def _temperature(stretches: Sequence[Stretch]) -> tuple[float | None, float]:
+    """Mean temperature of the first log and the rms distance from it [K], where all logs have one."""
+    found = []
+    for stretch in stretches:
+        signal = stretch.experiment.temperature
+        if signal is None:
+            return None, 0.0
+        found.append(np.asarray(signal.coefficients)[stretch.start : stretch.stop, 0])
+    mean = float(np.mean(found[0]))
+    return mean, float(np.sqrt(np.mean((np.concatenate(found) - mean) ** 2)))

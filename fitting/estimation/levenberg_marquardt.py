@@ -1,0 +1,342 @@
+"""Levenberg-Marquardt for arrow-shaped least squares: shared parameters, and states that belong to one segment each.
+
+The dense Jacobian of a log has thousands of columns, nearly all of them zero. Where segments are joined, closing the
+gaps between them makes each initial state an affine function of the shared parameters and of the state that its
+chain starts from (multiple shooting with condensing: Bock and Plitt 1984). Eliminating the chains' first states leaves
+a system as small as the number of shared parameters (the Schur complement), so that a step costs little more than the
+simulation behind it, and a chain of many segments no more than as many segments that start anew. optimistix does the
+iteration; this file tells it how to solve for a step.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from fitting.estimation.residual import Blocks, Products, Unknowns, moved_gap
+from hdjax.where import where
+
+# Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
+# keeps more is followed by a bolder one.
+# Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
+# across it, so it must go quickly where the model predicts well.
+_KEPT, _WELL = 0.01, 0.75
+_LONGER, _SHORTER = 30.0, 0.1
+# Relative changes of the sum of squares that are none; shares of the gaps that are left by a step that closes them, and
+# of the residual that it may cost.
+_SLIGHT, _CLOSED, _DEAREST = 1e-4, 0.25, 1.5
+# With less damping than this, relative to the diagonal, rounding decides whether the normal equations are definite.
+_LEAST_DAMPING = 1e-12
+# Points between which an iteration must make progress.
+_LATEST = 6
+
+
+class Chains(eqx.Module):
+    """What closing the gaps makes of each segment's initial state: `by_parameter dp + by_first dc + closing`, where
+    dc is the change of the state that its chain starts from.
+
+    Attributes:
+        by_parameter: response to the shared parameters.
+        by_first: response to the chain's first state.
+        closing: what closes the gaps where nothing else moves.
+        index: the chain of each segment.
+    """
+
+    by_parameter: Float[Array, "segments states parameters"]
+    by_first: Float[Array, "segments states states"]
+    closing: Float[Array, "segments states"]
+    index: Int[Array, " segments"]
+
+    def collect(self, each: Array) -> Array:
+        """Sum over the segments of each chain; there are as many places as segments."""
+        return jax.ops.segment_sum(each, self.index, num_segments=each.shape[0])
+
+
+def chains(found: Blocks | Products, joined: Bool[Array, " segments"]) -> Chains:
+    """Follow the linearised motion from segment to segment."""
+    states, parameters = found.before_by_parameter.shape[1:]
+    first = jnp.concatenate([jnp.zeros((states, parameters)), jnp.eye(states), jnp.zeros((states, 1))], axis=1)
+    added = jnp.concatenate(
+        [found.before_by_parameter, jnp.zeros_like(found.before_by_state), -found.gap[:, :, None]], axis=2
+    )
+
+    def follow(before, inputs):
+        continues, by_state, own = inputs
+        here = where(continues, by_state @ before + own, first)
+        return here, here
+
+    _, path = jax.lax.scan(follow, first, (joined, found.before_by_state, added))
+    index = jnp.cumsum(where(joined, 0, 1)) - 1
+    return Chains(path[..., :parameters], path[..., parameters:-1], path[..., -1], jnp.maximum(index, 0))
+
+
+class ArrowSystem(eqx.Module):
+    """The normal equations of [`Blocks`][], in blocks. The gradients have two columns: of the residual as it is, and
+    what closing the gaps adds to it.
+
+    Attributes:
+        shared: sum over segments of J_p^T J_p.
+        own: J_c^T J_c of each chain.
+        coupling: J_c^T J_p of each chain.
+        shared_gradient: sum of J_p^T r.
+        own_gradient: J_c^T r of each chain.
+        chains: how segments' states follow from shared parameters and chains' first states.
+        yardstick: what damping of the shared parameters is relative to.
+    """
+
+    shared: Float[Array, "parameters parameters"]
+    own: Float[Array, "segments states states"]
+    coupling: Float[Array, "segments states parameters"]
+    shared_gradient: Float[Array, "parameters 2"]
+    own_gradient: Float[Array, "segments states 2"]
+    chains: Chains
+    yardstick: Float[Array, " parameters"]
+
+    def eliminate(self, damping: Array, closing: Array) -> tuple[Array, Array, Array, Array]:
+        """Solve each chain for its own first state.
+
+        Args:
+            damping: relative to the yardstick of the shared parameters and to the diagonals of the chains.
+            closing: share of the gaps that the step closes.
+
+        Returns:
+            The reduced matrix and gradient of the shared parameters, and each chain's response `own^-1 coupling`
+            and `own^-1 own_gradient`.
+        """
+        share = jnp.stack([jnp.ones_like(closing), closing])
+        own = self.own + damping * _diagonal(self.own)
+        right = jnp.concatenate([self.coupling, (self.own_gradient @ share)[:, :, None]], axis=2)
+        solved = jax.vmap(_solve_scaled)(own, right)
+        response, own_step = solved[:, :, :-1], solved[:, :, -1]
+        shared = self.shared + damping * jnp.diag(where(self.yardstick > 0, self.yardstick, 1.0))
+        matrix = shared - jnp.einsum("sqp,sqr->pr", self.coupling, response)
+        gradient = self.shared_gradient @ share - jnp.einsum("sqp,sq->p", self.coupling, own_step)
+        return matrix, gradient, response, own_step
+
+    def step(self, damping: Array, longest: Float[Array, " parameters"] | float = jnp.inf) -> Unknowns:
+        """The damped Gauss-Newton step; damping holds back the closing of the gaps as well.
+
+        Args:
+            damping: relative to the diagonals, see [`ArrowSystem.eliminate`][].
+            longest: how far each shared parameter may go; where one would go farther, all else suits where it goes.
+        """
+        closing = 1.0 / (1.0 + damping)
+        matrix, gradient, response, own_step = self.eliminate(damping, closing)
+        wanted = -_solve_scaled(matrix, gradient[:, None])[:, 0]
+        held = jnp.abs(wanted) > longest
+        ends = where(held, jnp.sign(wanted) * longest, 0.0)
+        left = where(held, 0.0, gradient + matrix @ ends)
+        others = where(held[:, None] | held[None, :], 0.0, matrix)
+        shared = ends - _solve_scaled(others, left[:, None])[:, 0]
+        first = -own_step - jnp.einsum("sqp,p->sq", response, shared)
+        path = self.chains
+        states = jnp.einsum("sqp,p->sq", path.by_parameter, shared)
+        states = states + jnp.einsum("sqk,sk->sq", path.by_first, first[path.index]) + closing * path.closing
+        return Unknowns(shared, states)
+
+
+def normal_equations(found: Products, joined: Bool[Array, " segments"]) -> ArrowSystem:
+    """The normal equations of a linearised residual, with the gaps closed."""
+    path = chains(found, joined)
+    states, parameters = found.before_by_parameter.shape[1:]
+    # From (parameters, first state, residual, closing) to (parameters, own state, residual), segment by segment.
+    through = jnp.concatenate(
+        [path.by_parameter, path.by_first, jnp.zeros_like(path.closing)[..., None], path.closing[..., None]], axis=2
+    )
+    above = jnp.broadcast_to(jnp.eye(parameters, through.shape[2]), (through.shape[0], parameters, through.shape[2]))
+    below = jnp.broadcast_to(jnp.eye(1, through.shape[2], parameters + states), (through.shape[0], 1, through.shape[2]))
+    change = jnp.concatenate([above, through, below], axis=1)
+    total = jnp.einsum("sia,sij,sjb->sab", change, found.products, change)
+    mine = slice(parameters, parameters + states)
+    shared = jnp.sum(total[:, :parameters, :parameters], axis=0)
+    return ArrowSystem(
+        shared=shared,
+        own=path.collect(total[:, mine, mine]),
+        coupling=path.collect(total[:, mine, :parameters]),
+        shared_gradient=jnp.sum(total[:, :parameters, parameters + states :], axis=0),
+        own_gradient=path.collect(total[:, mine, parameters + states :]),
+        chains=path,
+        yardstick=jnp.diagonal(shared),
+    )
+
+
+def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "segments rows parameters"]:
+    """The parameters' columns without what each chain's own first state could do as well."""
+    system = normal_equations(Products.of(found), joined)
+    _, _, response, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
+    path = system.chains
+    moved = path.by_parameter - jnp.einsum("sqk,skp->sqp", path.by_first, response[path.index])
+    return found.by_parameter + jnp.einsum("srq,sqp->srp", found.by_state, moved)
+
+
+def _diagonal(matrix: Array) -> Array:
+    """The diagonal part of each matrix; where it is zero (padding), ones."""
+    d = jnp.diagonal(matrix, axis1=-2, axis2=-1)
+    return where(d > 0, d, 1.0)[..., None] * jnp.broadcast_to(jnp.eye(d.shape[-1]), matrix.shape)
+
+
+def _solve_scaled(matrix: Array, right: Array) -> Array:
+    """Solve a symmetric positive system after scaling its diagonal to one; a direction without information does not
+    move."""
+    d = jnp.diagonal(matrix)
+    scale = where(d > 0, 1.0 / jnp.sqrt(where(d > 0, d, 1.0)), 0.0)
+    empty = where(d > 0, 0.0, 1.0)
+    scaled = matrix * scale[:, None] * scale[None, :] + jnp.diag(empty + 1e-13)
+    lower = jax.lax.linalg.cholesky(scaled, symmetrize_input=False)
+    half = jax.lax.linalg.triangular_solve(lower, scale[:, None] * right, left_side=True, lower=True)
+    whole = jax.lax.linalg.triangular_solve(lower, half, left_side=True, lower=True, transpose_a=True)
+    return scale[:, None] * whole
+
+
+class Iteration(eqx.Module):
+    """What [`ArrowLevenbergMarquardt`][] carries from step to step.
+
+    Attributes:
+        ahead: where to look next.
+        found: the normal equations at the best point.
+        costs: half the sums of squares at the latest best points, newest first; infinite where there were none.
+        rows: sum of squares of the residual at the best point.
+        gap: of the weighted gaps.
+        promised: by how much the next step is to lower half the sum of squares, negative.
+        size: inverse of the damping in units of the first one.
+        yardstick: the largest diagonal of J^T J so far, of the shared parameters.
+        count: how many steps were taken.
+        accepted: whether the point that was seen last is the best.
+    """
+
+    ahead: Unknowns
+    found: Products
+    costs: Float[Array | np.ndarray, " latest"]
+    rows: Float[Array | np.ndarray, ""]
+    gap: Float[Array | np.ndarray, ""]
+    promised: Float[Array | np.ndarray, ""]
+    size: Float[Array | np.ndarray, ""]
+    yardstick: Float[Array | np.ndarray, " parameters"]
+    count: Int[Array | np.ndarray, ""]
+    accepted: Bool[Array | np.ndarray, ""]
+
+
+class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt of optimistix for arrow-shaped problems: damped Gauss-Newton steps by elimination of the
+    segments' states. All that it uses of its function are the [`Products`][fitting.estimation.residual.Products] that this returns
+    as a second result.
+
+    A step is taken where it lowers the sum of squares by a share of what it promised. Two more kinds are taken in any
+    case: one that hardly changes the sum of squares, and one that closes most of the gaps for a little more residual.
+    No finite weight of the gaps repays what closing the last of them costs.
+
+    It ends where a step promises next to nothing: less than `rtol` of what one more degree of freedom explains of
+    noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) Corners
+    of a nonsmooth model make steps promise what they do not keep: the iteration ends as well where the latest of them
+    together have taken off less than a share of the sum of squares, where one is given. How many steps it may take, and
+    that share, are data, so that one compiled program serves hasty fits and patient ones.
+
+    Attributes:
+        joined: whether a segment starts where the one before it ends.
+        gap_weight: of each state, as in the problem.
+        damping: of the first step, relative to the diagonal of J^T J; for the shared parameters to the largest that it
+            has been.
+        most_steps: where the iteration ends at the latest.
+        rows: how many rows the residual has.
+        longest: how far a step may carry each shared parameter.
+        least_progress: share of the sum of squares that a few steps must take off it.
+    """
+
+    joined: Bool[Array, " segments"]
+    gap_weight: Float[Array, " states"]
+    damping: Float[Array | np.ndarray, ""]
+    most_steps: Int[Array | np.ndarray, ""]
+    rows: Float[Array | np.ndarray, ""]
+    longest: Float[Array | np.ndarray, " parameters"] | float = jnp.inf
+    least_progress: Float[Array | np.ndarray, ""] | float = 0.0
+    rtol: float = 1e-3
+    atol: float = 0.0
+    norm: Callable[[Any], Array] = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Iteration:
+        # By numpy: outside programs of JAX nothing is compiled for it.
+        zero = np.zeros(())
+        return Iteration(
+            ahead=y,
+            found=jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), aux_struct),
+            costs=np.full(_LATEST, np.inf),
+            rows=zero,
+            gap=zero,
+            promised=np.array(-np.inf),
+            size=np.ones(()),
+            yardstick=np.zeros(y.parameters.shape),
+            count=np.zeros((), int),
+            accepted=np.zeros((), bool),
+        )
+
+    def step(self, fn, y, args, options, state: Iteration, tags) -> tuple[Unknowns, Iteration, Products]:
+        _, seen = fn(state.ahead, args)
+        weight = self.gap_weight[None]
+        rows, gap = seen.square, jnp.sum((seen.gap * weight) ** 2)
+        cost, before, first = 0.5 * (rows + gap), state.costs[0], state.count == 0
+        kept = first | (cost - before <= _KEPT * state.promised)
+        well = ~first & (cost - before < _WELL * state.promised)
+        slight = jnp.abs(cost - before) < _SLIGHT * before
+        closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * state.rows)
+        accepted = kept | slight | closing
+        size = state.size * where(kept, where(well, _LONGER, 1.0), where(accepted, 1.0, _SHORTER))
+        costs = jnp.concatenate([cost[None], state.costs[:-1]])
+        new, old = (state.ahead, seen, costs, rows, gap), (y, state.found, state.costs, state.rows, state.gap)
+        best, found, costs, rows, gap = jax.tree.map(lambda a, b: where(accepted, a, b), new, old)
+
+        system = normal_equations(found, self.joined)
+        # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
+        # most that it has ever shown (Moré 1978).
+        yardstick = jnp.maximum(system.yardstick, state.yardstick)
+        system = eqx.tree_at(lambda s: s.yardstick, system, yardstick)
+        step = system.step(jnp.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
+        promised = self._promised(found, step)
+        # Where the system has no solution to working precision, another step from here is more damped.
+        solved = jnp.isfinite(promised)
+        after = Iteration(
+            ahead=jax.tree.map(lambda a, b: where(solved, a + b, a), best, step),
+            found=found,
+            costs=costs,
+            rows=rows,
+            gap=gap,
+            promised=where(solved, promised, -jnp.inf),
+            size=where(solved, size, _SHORTER * size),
+            yardstick=yardstick,
+            count=state.count + 1,
+            accepted=accepted,
+        )
+        return best, after, found
+
+    def _promised(self, found: Products, step: Unknowns) -> Float[Array, ""]:
+        """By how much half the sum of squares changes along a step, to second order."""
+        segments = step.states.shape[0]
+        own = jnp.broadcast_to(step.parameters, (segments, step.parameters.size))
+        column = jnp.concatenate([own, step.states, jnp.zeros((segments, 1))], axis=1)
+        changed = jnp.einsum("sij,sj->si", found.products, column)
+        gap, moved = (g * self.gap_weight[None] for g in (found.gap, moved_gap(found, self.joined, step)))
+        rows = jnp.sum(changed[:, -1]) + 0.5 * jnp.sum(column * changed)
+        return rows + jnp.sum(moved * (gap + 0.5 * moved))
+
+    def terminate(self, fn, y, args, options, state: Iteration, tags):
+        """Whether to stop: by the decrease that the next step promises."""
+        costs = jnp.asarray(state.costs)
+        newest, oldest = costs[0], costs[-1]
+        small = jnp.abs(state.promised) < self.rtol * newest / self.rows
+        # Rounding may leave nothing of a step that still promises something.
+        still = [jnp.all(a == b) for a, b in zip(jax.tree.leaves(state.ahead), jax.tree.leaves(y), strict=True)]
+        small = small | (jnp.isfinite(state.promised) & jnp.all(jnp.stack(still)))
+        # To close gaps may cost more than it takes off: without a least progress none is asked for.
+        least = jnp.asarray(self.least_progress)
+        stalled = (least > 0) & (oldest - newest < least * newest)
+        done = (state.count > 0) & (small | stalled)
+        late = ~done & (state.count >= self.most_steps)
+        successful, most = optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        return done | late, optx.RESULTS.where(late, most, successful)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {}

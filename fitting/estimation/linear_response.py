@@ -1,0 +1,233 @@
+"""The motion that a fit found, sample by sample, and how a small force anywhere along it would change it.
+
+To first order every candidate effect is a force (or a reading) along the motion that the model has found. How the
+model answers a force is the same for all of them, so that it is computed once: one matrix a sample interval carries
+the deviation on, two more add what a force that runs in a straight line through the interval does.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.polynomial.polynomial import polyval
+
+from fitting.estimation.experiment import Segments
+from fitting.estimation.machine_code import actuated
+from fitting.estimation.residual import Problem, Unknowns
+from hdjax import Model, PiecewisePolynomial
+from hdjax.effects import ActuatorEffect, Conditions
+from hdjax.engine import unusable
+from hdjax.engine.equations import LOAD, TEMPERATURE
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
+from hdjax.engine.response import Pushed, Response, response
+from hdjax.lanes import jit_small_lanes
+from hdjax.simulate import march
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
+"""Where a sample interval, from -1 to 1, is looked into; exact for a sextic's mean and a quintic's first moment."""
+
+# Segments that a program of JAX takes at a time.
+_SEGMENTS = 32
+
+
+class Followed(eqx.Module):
+    """A simulated motion on every segment, and its linear response in every sample interval.
+
+    Attributes:
+        states: at each knot, the end of the last interval included.
+        between: at the `NODES` of each interval.
+        transition: what a deviation of the state at an interval's start is at its end.
+        from_start: what a force (a rate of the state) that falls from one to zero through the interval adds.
+        from_end: likewise of one that rises from zero to one.
+        readout: derivative of the outputs by the state, at each sample.
+    """
+
+    states: Float[np.ndarray, "segments knots states"]
+    between: Float[np.ndarray, "segments samples nodes states"]
+    transition: Float[np.ndarray, "segments samples states states"]
+    from_start: Float[np.ndarray, "segments samples states states"]
+    from_end: Float[np.ndarray, "segments samples states states"]
+    readout: Float[np.ndarray, "segments samples outputs states"]
+
+
+def follow(problem: Problem, unknowns: Unknowns) -> Followed:
+    """Simulate the segments and linearise every sample interval along the way."""
+    model = problem.free.unpack(problem.model, unknowns.parameters)
+    if problem.kernel is None:
+        found = _response_by_xla(problem, unknowns)
+    else:
+        found = _response(model, problem, np.asarray(unknowns.states))
+    states, transition, from_start, from_end = (np.asarray(a) for a in vars(found).values())
+    between, read = _between(model, states, problem.segments), readout(model, states[:, :-1])
+    return Followed(states, between, transition, from_start, from_end, read)
+
+
+def _response(model: Model, problem: Problem, states: Float[np.ndarray, "segments states"]) -> Response:
+    segments = problem.segments
+    beside = {LOAD: segments.load_torque, TEMPERATURE: segments.temperature}
+    found = {name: np.asarray(signal.coefficients) for name, signal in beside.items() if signal is not None}
+    own = segments.knots, acting(model, segments)[:, segments.halo :], found
+    return response(model, states, *own, int(problem.substeps), problem.solver)
+
+
+def readout(
+    model: Model, states: Float[Array | np.ndarray, "*many states"]
+) -> Float[np.ndarray, "*many outputs states"]:
+    """Derivatives of the outputs by the state, at each of many states."""
+    return slopes_at_instants(_outputs, (states, states.ndim - 1), (model, 0))
+
+
+def _outputs(state: Array, model: Model) -> Array:
+    return model.outputs(state)
+
+
+@jit_small_lanes
+def _response_by_xla(problem: Problem, unknowns: Unknowns) -> Response:
+    model = problem.free.unpack(problem.model, unknowns.parameters)
+    segments = problem.segments
+    options = {"solver": problem.solver, "substeps": problem.substeps}
+
+    def one(torque, load_torque, temperature, state):
+        acting = model.actuate(torque)
+        own = PiecewisePolynomial(acting.knots[segments.halo :], acting.coefficients[segments.halo :])
+        states, end = march(model, own, load_torque, state, temperature=temperature, **options)
+
+        def through(start, steady, rising, pieces):
+            pushed = Pushed.of(model, tuple(steady), tuple(rising))
+            torque, load, warmth = pieces
+            initial = jnp.append(start, 0.0)
+            return march(pushed, torque, load, initial, temperature=warmth, **options)[1][:-1]
+
+        none, begin, width = jnp.zeros_like(state), own.knots[:-1], jnp.diff(own.knots)
+        intervals = jnp.stack([begin, begin + width], axis=1)
+        pieces = tuple(
+            None if s is None else PiecewisePolynomial(intervals, s.coefficients[:, None])
+            for s in (own, load_torque, temperature)
+        )
+        linear = jax.jacfwd(through, argnums=(0, 1, 2))
+        transition, steady, rising = jax.vmap(linear, in_axes=(0, None, None, 0))(states, none, none, pieces)
+        return Response.of(jnp.concatenate([states, end[None]]), transition, steady, rising, width)
+
+    return jax.vmap(one)(segments.torque, segments.load_torque, segments.temperature, unknowns.states)
+
+
+def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments intervals powers"]:
+    """Coefficients of the torque that acts on a drive, or of the forcing; those before each segment come first."""
+    effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
+    if not effects:
+        return np.asarray(segments.torque.coefficients)
+    knots, logged = segments.torque.knots, segments.torque.coefficients
+    return some_at_a_time(
+        lambda *torque: actuated(effects, (), jnp.zeros(0), PiecewisePolynomial(*torque))[0], knots, logged
+    )
+
+
+def some_at_a_time(program: Callable[..., Array], *arrays: Array | np.ndarray) -> np.ndarray:
+    """What a program of JAX makes of segments, so many at a time that logs of all lengths share it.
+
+    Args:
+        program: from arrays whose first axis is one of segments to such an array.
+        arrays: of all segments.
+    """
+    count = len(arrays[0])
+    places = (np.minimum(np.arange(start, start + _SEGMENTS), count - 1) for start in range(0, count, _SEGMENTS))
+    found = [np.asarray(program(*(jnp.asarray(np.asarray(a)[own]) for a in arrays))) for own in places]
+    return np.concatenate(found)[:count]
+
+
+def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray) -> np.ndarray:
+    """Values of polynomials so late in their intervals."""
+    return polyval(late, np.moveaxis(coefficients, -1, 0), tensor=False)
+
+
+class Inputs(eqx.Module):
+    """Inputs of a model at many instants.
+
+    Attributes:
+        torque: that acts on a drive, or the forcing.
+        load_torque: on the output.
+        conditions: time and temperature.
+    """
+
+    torque: Float[Array, "*instants"]
+    load_torque: Float[Array, "*instants"]
+    conditions: Conditions
+
+
+def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segments samples *nodes"]) -> Inputs:
+    """Inputs so late in each sample interval."""
+    nodes = (slice(None), slice(None), *[None] * (late.ndim - 2))
+
+    def at(coefficients: Array | np.ndarray) -> np.ndarray:
+        return polynomial(np.asarray(coefficients)[(*nodes, slice(None))], late)
+
+    load, warmth = segments.load_torque, segments.temperature
+    time = segments.knots[:, :-1][nodes] + late
+    conditions = Conditions(jnp.asarray(time), None if warmth is None else jnp.asarray(at(warmth.coefficients)))
+    on_load = np.zeros(late.shape) if load is None else at(load.coefficients)
+    torque = jnp.asarray(at(acting(model, segments)[:, segments.halo :]))
+    return Inputs(torque, jnp.asarray(on_load), conditions)
+
+
+def _rates(model: Model, state: Array, inputs: Inputs) -> Array:
+    return model.rates(state, inputs.torque, inputs.load_torque, inputs.conditions)
+
+
+def _between(
+    model: Model, knots: Float[np.ndarray, "segments knots states"], segments: Segments
+) -> Float[np.ndarray, "segments samples nodes states"]:
+    """States inside the intervals: cubics with the right values and rates at both ends (Hermite)."""
+    width = segments.width
+    y0, y1 = knots[:, :-1], knots[:, 1:]
+
+    def rise_at(states: np.ndarray, late: np.ndarray) -> np.ndarray:
+        return width[..., None] * at_instants(_rates, (model, 0), (states, 2), (inputs_at(model, segments, late), 2))
+
+    r0, r1 = (r[:, :, None] for r in (rise_at(y0, np.zeros_like(width)), rise_at(y1, width)))
+    y0, y1 = y0[:, :, None], y1[:, :, None]
+    s = 0.5 * (NODES[:, None] + 1.0)
+    rise = y1 - y0
+    return y0 + s * rise + s * (1.0 - s) * ((1.0 - s) * (r0 - rise) - s * (r1 - rise))
+
+
+class Forces(eqx.Module):
+    """What acts along a motion: in each sample interval a sum of parts.
+
+    Attributes:
+        lands: what a unit of each part adds to the state by the end of the interval.
+        sizes: how much of each part each force has.
+    """
+
+    lands: Float[np.ndarray, "segments samples states parts"]
+    sizes: Float[np.ndarray, "segments samples parts columns"]
+
+
+def respond(
+    followed: Followed,
+    forces: Forces,
+    start: Float[np.ndarray, "#segments states columns"] | float = 0.0,
+    readout: Float[np.ndarray, "segments samples outputs states"] | None = None,
+) -> tuple[Float[np.ndarray, "segments samples outputs columns"], Float[np.ndarray, "segments states columns"]]:
+    """What forces along the motion do to the outputs and to each segment's end.
+
+    Args:
+        followed: the motion.
+        forces: along it.
+        start: where each segment starts.
+        readout: derivative of what is wanted by the state; that of the outputs where not given.
+    """
+    segments, samples, states, _ = forces.lands.shape
+    deviation = np.broadcast_to(start, (segments, states, forces.sizes.shape[-1]))
+    readout = followed.readout if readout is None else readout
+    if unusable() is None:
+        from hdjax.engine.linear import linear_response
+
+        return linear_response(followed.transition, readout, forces.lands, forces.sizes, deviation)
+    outputs = np.empty((segments, samples, readout.shape[2], forces.sizes.shape[-1]))
+    for i in range(samples):
+        outputs[:, i] = readout[:, i] @ deviation
+        deviation = followed.transition[:, i] @ deviation + forces.lands[:, i] @ forces.sizes[:, i]
+    return outputs, deviation

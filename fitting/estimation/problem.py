@@ -1,0 +1,196 @@
+"""What a fit solves, as data and model pose it: segments, where their simulations start, steps, what is free."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimation.engines import with_engine
+from fitting.estimation.experiment import Segments, Stretch, cut, scales
+from fitting.estimation.free_parameters import free_parameters
+from fitting.estimation.residual import Engine, Problem, Unknowns
+from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.lanes import spread
+
+# Segments are no longer than this; longer simulations join several, which are then lanes of one program.
+_LONGEST_SEGMENT = 256
+STEP_ANGLE = 0.15
+"""A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """How data are cut into segments, and how finely these are simulated.
+
+    Attributes:
+        horizon: samples until a simulation starts anew. Short ones converge from far away, long ones use the data
+            fully.
+        length: samples in a segment; see [`segment_length`][] where not given.
+        halo: intervals of torque before each segment, for delays.
+        substeps: solver steps in a sample interval; from the natural frequency where not given.
+        count: number of segments, see [`fitting.estimation.experiment.cut`][].
+    """
+
+    horizon: int
+    length: int | None = None
+    halo: int = 0
+    substeps: int | None = None
+    count: int | None = None
+
+    def of(self, stretches: Sequence[Stretch]) -> Segments:
+        """The segments of some data."""
+        length = segment_length(self.horizon) if self.length is None else self.length
+        return cut(stretches, length, horizon=self.horizon, halo=self.halo, count=self.count)
+
+
+def pose(
+    model: Model,
+    stretches: Sequence[Stretch],
+    paths: Sequence[str],
+    segmentation: Segmentation,
+    *,
+    hold_parameters: bool = False,
+    states: Float[Array, "segments states"] | None = None,
+    engine: Engine | None = None,
+) -> tuple[Problem, Unknowns]:
+    """Pose a fit: what is solved, not weighed yet, and where the iteration begins.
+
+    Args:
+        model: equations and starting values.
+        stretches: the data.
+        paths: dotted paths of what is free.
+        segmentation: how the data are cut.
+        hold_parameters: whether only the initial states are free.
+        states: initial states of the segments; from their first samples where not given.
+        engine: what evaluates the residual, see [`fitting.estimation.estimate.fit`][].
+    """
+    segments, substeps = segmentation.of(stretches), segmentation.substeps
+    if substeps is None:
+        substeps = suggested_substeps(model, stretches)
+    free = free_parameters(model, paths, typical_scales(model, stretches))
+    if states is None:
+        states = initial_states(model, segments)
+    unknowns = Unknowns(free.pack(model), states)
+    active = jnp.asarray(np.full(len(paths), 0.0 if hold_parameters else 1.0))
+    outputs = segments.measured.shape[-1]
+    unweighed = jnp.asarray(np.eye(outputs)), active, jnp.asarray(np.ones(states.shape[1]))
+    problem = Problem(model, free, segments, *unweighed, substeps=substeps, engine=engine)
+    return on_all_devices(with_engine(problem), unknowns)
+
+
+def on_all_devices(problem: Problem, unknowns: Unknowns) -> tuple[Problem, Unknowns]:
+    """The same, its segments shared among the devices where XLA evaluates the residual."""
+    if problem.kernel is not None:
+        return problem, unknowns
+    return spread((problem, unknowns), unknowns.states.shape[0])
+
+
+def segment_length(horizon: int) -> int:
+    """Samples in a segment of simulations that start anew every `horizon` samples."""
+    return min(horizon, _LONGEST_SEGMENT)
+
+
+def initial_states(model: Model, segments: Segments) -> Float[Array, "segments states"]:
+    """Each segment's first state from a local polynomial, through its first samples and, where the log goes on, the
+    last ones of the segment before; hidden states as if it had long moved like this.
+
+    A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
+    """
+    length = segments.measured.shape[1]
+    measured, knots = np.asarray(segments.measured), segments.knots
+    step = float(np.median(np.diff(knots)))
+    quarter = int(min(np.ceil(0.5 * np.pi / float(model.drive.omega_0) / step), _LONGEST_SEGMENT))
+    time = knots[:, :-1] - knots[:, :1]
+    ahead = slice(min(length, max(quarter, 5)))
+    value, rate = _value_and_rate(time[:, ahead], measured[:, ahead])
+    around = min(length - 1, max(quarter, 2))
+    if around >= 2:
+        before, previous = np.roll(knots, 1, axis=0), np.roll(measured, 1, axis=0)
+        earlier = before[:, -1 - around : -1] - knots[:, :1]
+        goes_on = np.abs(before[:, -1] - knots[:, 0]) < 0.5 * step
+        both = _value_and_rate(
+            np.hstack([earlier, time[:, : around + 1]]),
+            np.hstack([previous[:, -around:], measured[:, : around + 1]]),
+        )
+        value, rate = (np.where(goes_on[:, None], b, a) for a, b in zip((value, rate), both, strict=True))
+    if isinstance(model, TwoInertiaModel):
+        N = float(model.drive.N)
+        columns = [N * value[:, 0], value[:, 0] - value[:, 1]]
+        columns += [N * rate[:, 0], rate[:, 0] - rate[:, 1]]
+    else:
+        columns = [value[:, 0], rate[:, 0]]
+    motion = jnp.asarray(np.stack(columns, axis=1))
+    return _settled(model, motion) if any(e.states for e in model.effects) else motion
+
+
+def states_from(
+    model: Model, near: Model, states: Float[Array, "segments near_states"]
+) -> Float[Array, "segments states"]:
+    """Initial states from those of another model on the same segments: what both have, and hidden ones of the new model
+    as if it had long moved like this. From poor states the first step would pull the parameters far away.
+
+    Args:
+        model: with the same motion.
+        near: the other model.
+        states: its initial states.
+    """
+    names = near.state_names
+    if names == model.state_names:
+        return states
+    states = jnp.asarray(np.asarray(states))
+    found = _settled(model, states[:, : len(model.motion_states)])
+    columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
+    return jnp.stack(columns, axis=1)
+
+
+@eqx.filter_jit
+def _settled(model: Model, motion: Array) -> Array:
+    return jax.vmap(model.settled)(motion)
+
+
+def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value and slope at time zero of the cubic through samples of each segment."""
+    span = np.max(np.abs(time), axis=1, keepdims=True)
+    basis = (time / span)[:, :, None] ** np.arange(4)[None, None, :]
+    coefficients = np.linalg.pinv(basis) @ measured
+    return coefficients[:, 0], coefficients[:, 1] / span
+
+
+def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, float]:
+    """Units for parameters that may be zero: what makes each term visible at the measured twist."""
+    motion = scales(stretches)
+    drive = model.drive
+    stiffness = float(drive.stiffness)
+    damping = stiffness * motion.x / motion.v if motion.v > 0 else 1.0
+    typical = {"alpha": 0.1 / motion.x_max**2} if motion.x_max > 0 else {}
+    typical |= {"B_sp": 0.01 * damping} if isinstance(drive, Drive) else {"mu": 0.01 * damping}
+    return typical
+
+
+def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
+    """The fastest oscillation of the dynamic error on the data [rad/s], hardening at full twist included."""
+    drive = model.drive
+    stiffening = max(0.0, 3.0 * float(drive.alpha) * scales(stretches).x_max ** 2)
+    return float(drive.omega_0) * float(np.sqrt(1.0 + stiffening))
+
+
+def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle: float = STEP_ANGLE) -> int:
+    """Solver steps in a sample interval that resolve the fastest oscillation.
+
+    Args:
+        model: supplies the natural frequency.
+        stretches: supply the sample interval, and the twist that hardens the spring.
+        step_angle: by which a step may turn the oscillation [rad].
+    """
+    angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
+    return int(np.clip(np.ceil(angle / step_angle), 1, 16))
+
+
+def short_horizon(model: Model, stretches: Sequence[Stretch], *, periods: float = 6.0) -> int:
+    """Samples in a segment of about `periods` natural periods, as a power of two (few shapes, few programs)."""
+    period = 2 * np.pi / natural_frequency(model, stretches) / stretches[0].experiment.time_step
+    return int(2 ** np.clip(np.round(np.log2(periods * period)), 5, 11))

@@ -1,0 +1,173 @@
+"""Starting values without asking the user: the weak form of the equation of motion.
+
+Multiplied by a compact test function phi and integrated by parts, the equation of the dynamic error needs no
+derivative of a measured signal,
+
+    int phi'' x + mu int (-phi') x + omega_0^2 int phi x + omega_0^2 alpha int phi x^3 = gain int phi u,
+
+and is linear in what is sought (Schaeffer and McCalla 2017; Messenger and Bortz 2021). Test functions whose integral is
+zero do not see a constant load that the log does not contain.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from fitting.errors import DataError
+from fitting.estimation.experiment import Stretch
+from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
+
+# Starts whose stiffness differs by less than this (in its logarithm) end in the same minimum.
+_DISTINCT = 0.1
+_WIDTHS = (12, 24, 48, 96, 192, 384)
+
+
+def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Models with starting values of K, alpha, B_sp (or mu, omega_0, alpha, gain), one for each weak form that gives
+    a stable oscillator; near-duplicates are dropped.
+
+    Args:
+        model: supplies everything that is not estimated here.
+        stretches: the data.
+
+    Raises:
+        DataError: where no weak form gives a positive stiffness.
+    """
+    found = _estimates(model, stretches, blind=False)
+    if not found:
+        names = ", ".join(s.name for s in stretches)
+        raise DataError(
+            f"{names}: the dynamic error does not follow from the torque by any positive stiffness; check the signs "
+            "and units of motor_torque, motor_angle and load_angle in the drive file"
+        )
+    return _distinct(model, [*found, *_estimates(model, stretches, blind=True)])
+
+
+def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Those of the weak forms that see no steady load; there may be none. Arguments as in [`starting_models`][]."""
+    return _distinct(model, _estimates(model, stretches, blind=True))
+
+
+def _estimates(model: Model, stretches: Sequence[Stretch], *, blind: bool) -> list[dict[str, float]]:
+    forms = itertools.product(_WIDTHS, _equations(model))
+    estimates = (_weak_form(model, stretches, width, equation, blind=blind) for width, equation in forms)
+    return [estimate for estimate in estimates if estimate is not None]
+
+
+def _distinct(model: Model, estimates: Sequence[dict[str, float]]) -> tuple[Model, ...]:
+    found: list[Model] = []
+    for values in estimates:
+        stiffness = values["omega_0"] ** 2 if "omega_0" in values else values["K"]
+        if all(_apart(stiffness, float(other.drive.stiffness)) > _DISTINCT for other in found):
+            found.append(model.replace(values))
+    return tuple(found)
+
+
+def apart(model: Model, other: Model) -> float:
+    """By how much the stiffness of two models differs, in its logarithm."""
+    return _apart(float(model.drive.stiffness), float(other.drive.stiffness))
+
+
+def _apart(stiffness: float, other: float) -> float:
+    return float(abs(np.log(stiffness / other)))
+
+
+def _equations(model: Model) -> tuple[str, ...]:
+    """The load's own equation does not contain the motor torque, so that an error of the torque can't spoil it."""
+    return ("error", "load") if isinstance(model, TwoInertiaModel) else ("error",)
+
+
+def _weak_form(
+    model: Model, stretches: Sequence[Stretch], width: int, equation: str, *, blind: bool = False
+) -> dict[str, float] | None:
+    """Starting values of the base parameters; None where the stiffness is not positive."""
+    rows, right = [], []
+    for stretch in stretches:
+        if len(stretch) < 3 * width:
+            continue
+        a, b = _rows(model, stretch, width, equation, blind=blind)
+        rows.append(a)
+        right.append(b)
+    if not rows:
+        return None
+    a, b = np.concatenate(rows), np.concatenate(right)
+    norm = np.linalg.norm(a, axis=0)
+    norm[norm == 0] = 1.0
+    solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0] / norm
+    return _values(model, solution, stretches, equation)
+
+
+def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], equation: str) -> dict[str, float] | None:
+    stiffness, cubic, damping = solution[:3]
+    if not np.isfinite(solution).all() or stiffness <= 0:
+        return None
+    x_max = max(float(np.max(np.abs(s.experiment.measured[s.start : s.stop, -1]))) for s in stretches)
+    # Beyond this the restoring force would turn back inside the data.
+    alpha = float(np.clip(cubic / stiffness, -0.2 / x_max**2, 3.0 / x_max**2))
+    if isinstance(model, ReducedModel):
+        omega_0 = np.sqrt(stiffness)
+        mu = max(damping, 1e-3 * omega_0)
+        return {"omega_0": omega_0, "alpha": alpha, "mu": mu, "gain": solution[3]}
+    drive = model.drive
+    assert isinstance(drive, Drive)
+    inertia = 1.0 if equation == "load" else float(drive.c)
+    K = stiffness / inertia
+    least = 2e-3 * np.sqrt(K / float(drive.c))
+    return {"K": K, "alpha": alpha, "B_sp": max(damping / inertia, least)}
+
+
+def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Weak-form regressors (stiffness, cubic, damping, and gain of a reduced drive) and right-hand side."""
+    experiment = stretch.experiment
+    part = slice(stretch.start, stretch.stop)
+    dt = experiment.time_step
+    x = experiment.measured[part, -1]
+    u = np.asarray(experiment.torque.coefficients)[part, 0]
+    load = experiment.load_torque
+    T_l = np.zeros_like(u) if load is None else np.asarray(load.coefficients)[part, 0]
+    tests, slopes, curvatures = _blind_functions(width, dt) if blind else _test_functions(width, dt)
+    hop = max(1, width // 4)
+
+    def against(signal: np.ndarray, functions: np.ndarray) -> np.ndarray:
+        windows = np.lib.stride_tricks.sliding_window_view(signal, width)[::hop]
+        return (windows @ functions.T).ravel() * dt
+
+    spring, cubic, damper = against(x, tests), against(x**3, tests), -against(x, slopes)
+    if equation == "load":
+        drive = model.drive
+        assert isinstance(drive, Drive)
+        theta_l = experiment.measured[part, 0] - x
+        theta_l = theta_l - theta_l[0]
+        right = float(drive.J_l) * against(theta_l, curvatures) - against(T_l, tests)
+        return np.stack([spring, cubic, damper], axis=1), right
+    right = -against(x, curvatures)
+    if isinstance(model.drive, Drive):
+        forcing = u / float(model.drive.N * model.drive.J_m) - T_l / float(model.drive.J_l)
+        return np.stack([spring, cubic, damper], axis=1), right + against(forcing, tests)
+    return np.stack([spring, cubic, damper, -against(u, tests)], axis=1), right
+
+
+def _test_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A bump (1 - s^2)^4 and its modulations, with first and second derivatives, sampled on the window."""
+    t = (np.arange(width) - 0.5 * (width - 1)) * dt
+    half = 0.5 * width * dt
+    s = t / half
+    bump = np.polynomial.Polynomial([1, 0, -1]) ** 4
+    p, dp, ddp = bump(s), bump.deriv(1)(s) / half, bump.deriv(2)(s) / half**2
+    tests, slopes, curvatures = [], [], []
+    for k in range(4):
+        w = np.pi * k / half
+        for phase in (0.0, -0.5 * np.pi) if k else (0.0,):
+            c, dc = np.cos(w * t + phase), -w * np.sin(w * t + phase)
+            tests.append(p * c)
+            slopes.append(dp * c + p * dc)
+            curvatures.append(ddp * c + 2 * dp * dc - w**2 * p * c)
+    return np.stack(tests), np.stack(slopes), np.stack(curvatures)
+
+
+def _blind_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The modulations, each less so much of the bump that nothing is left of a constant."""
+    tests, slopes, curvatures = _test_functions(width, dt)
+    share = tests[1:].sum(axis=1, keepdims=True) / tests[0].sum()
+    return tests[1:] - share * tests[0], slopes[1:] - share * slopes[0], curvatures[1:] - share * curvatures[0]

@@ -1,0 +1,1 @@
+"""The linearised fit that screening, learned terms, evidence and clocks share."""

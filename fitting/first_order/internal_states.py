@@ -1,0 +1,88 @@
+"""The own states of effects along a motion: settled where it starts, then driven by it."""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.first_order.motion import PART, Along
+from hdjax.effects import Effect, Motion
+from hdjax.engine import unusable
+from hdjax.engine.driven import own_states_along
+from hdjax.engine.pointwise import at_instants
+
+OwnStates = Float[np.ndarray, "segments knots proposals own"]
+"""The own states of each proposal, at each knot."""
+
+
+class Memory(eqx.Module):
+    """An effect's own states along a motion, for each proposal.
+
+    Attributes:
+        at_starts: where each segment starts.
+        at_ends: where each stretch ends.
+    """
+
+    at_starts: Float[np.ndarray, "segments own proposals"]
+    at_ends: Float[np.ndarray, "stretches own proposals"]
+
+
+def own_states(seen: Along, stacked: Effect, proposals: int, before: Memory | None = None) -> OwnStates:
+    """Own states at each knot.
+
+    Args:
+        seen: the motion.
+        stacked: proposals of one form, along the first axis of each array.
+        proposals: how many.
+        before: own states along stretches that these ones continue.
+    """
+    width = seen.segments.width
+    segments, samples = width.shape
+    motion = jax.tree.map(np.asarray, seen.at_knots)
+    # A segment that starts anew does not start where the motion of the one before it ends.
+    before_each, after_each = (
+        jax.tree.map(lambda a, side=side: a[:, side], motion) for side in (slice(-1), slice(1, None))
+    )
+    first = jax.tree.map(lambda a: a[:, 0], motion)
+    each = jax.tree.map(lambda a: a[:, None], stacked)
+    given = np.swapaxes(at_instants(_settled, (each, 2), (first, 1)), 0, 1)
+    if before is not None:
+        given[seen.firsts] = np.swapaxes(before.at_ends, 1, 2)
+    found = np.empty((segments, samples + 1, *given.shape[1:]))
+    starts = np.flatnonzero(~seen.goes_on)
+    lengths = np.diff(np.append(starts, segments))
+    for length in np.unique(lengths):
+        # What goes on from segment to segment is one chain.
+        own = starts[lengths == length][:, None] + np.arange(length)
+
+        def joined(intervals: np.ndarray, own: np.ndarray = own) -> np.ndarray:
+            return intervals[own].reshape(len(own), -1)
+
+        states = own_states_along(
+            stacked,
+            jax.tree.map(joined, before_each),
+            jax.tree.map(joined, after_each),
+            joined(width),
+            given[own[:, 0]],
+            by_machine_code=unusable() is None,
+        )
+        for i in range(length):
+            found[own[:, i]] = states[:, i * samples : (i + 1) * samples + 1]
+    return found
+
+
+def _settled(effect: Effect, motion: Motion) -> Array:
+    return effect.initial_state(motion)
+
+
+def memory_of(seen: Along, states: OwnStates) -> Memory:
+    """What own states leave for what comes after."""
+    ends = states[seen.ends[:, 0], seen.ends[:, 1]]
+    return Memory(np.swapaxes(states[:, 0], 1, 2), np.swapaxes(ends, 1, 2))
+
+
+def own_between(states: OwnStates) -> Float[np.ndarray, "proposals segments samples nodes own"]:
+    """Own states at the nodes of each interval, in a straight line from its start to its end."""
+    by_proposal = np.moveaxis(states, 2, 0)[..., None, :]
+    part = PART[:, None]
+    return by_proposal[:, :, :-1] * (1.0 - part) + by_proposal[:, :, 1:] * part

@@ -1,0 +1,221 @@
+"""A fitted motion as effects look at it, and what a unit of each thing that they can add does there."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from fitting.estimation.experiment import Segments, Stretch
+from fitting.estimation.linear_response import NODES, WEIGHTS, Followed, acting, inputs_at, polynomial
+from fitting.estimation.machine_code import actuated
+from hdjax import Model, TwoInertiaModel
+from hdjax.effects import (
+    ActuatorEffect,
+    Conditions,
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+    Scales,
+)
+from hdjax.effects.learned import LEARNED_TORQUES, LearnedReading, LearnedTorque
+from hdjax.engine.pointwise import at_instants, slopes_at_instants
+from hdjax.parameters import Scalar, parameter
+
+PART = 0.5 * (NODES + 1.0)
+"""The nodes as parts of an interval."""
+
+INPUT, ERROR, SLOPE = "input", "error", "slope"
+"""What effects add beside a torque at one of the places of [`hdjax.effects.learned`][]."""
+
+
+class Along(eqx.Module):
+    """A motion, as effects look at it.
+
+    Attributes:
+        model: whose motion it is.
+        followed: its states.
+        segments: the data that it belongs to.
+        at_knots: the motion at each knot.
+        between: the motion at the nodes of each interval.
+        pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
+        carried: and what it adds to the state by the end of the interval, see [`carried`][].
+        goes_on: whether a segment goes on where the one before it ends in time, joined or not.
+        firsts: the first segment of each stretch.
+        ends: segment and knot where each stretch ends.
+    """
+
+    model: Model
+    followed: Followed
+    segments: Segments
+    at_knots: Motion
+    between: Motion
+    pushes: dict[str, Float[np.ndarray, "segments samples nodes states"]]
+    carried: dict[str, Float[np.ndarray, "segments samples states nodes"]]
+    goes_on: Bool[np.ndarray, " segments"]
+    firsts: Int[np.ndarray, " stretches"]
+    ends: Int[np.ndarray, "stretches 2"]
+
+
+def along(model: Model, followed: Followed, segments: Segments, stretches: Sequence[Stretch]) -> Along:
+    """The motion of a model as effects look at it.
+
+    Args:
+        model: at the solution.
+        followed: its states.
+        segments: the data that it belongs to.
+        stretches: what was cut into them.
+    """
+    length, samples = segments.weight.shape[1], np.array([len(s) for s in stretches])
+    pieces = -(-samples // length)
+    firsts = np.cumsum(pieces) - pieces
+    ends = np.stack([firsts + pieces - 1, samples - (pieces - 1) * length], axis=1)
+    conditions = inputs_at(model, segments, PART * segments.width[..., None]).conditions
+    at_knots = motions(model, followed.states, conditions_at_knots(segments))
+    between = motions(model, followed.between, conditions)
+    pushes = unit_pushes(model, followed.between, conditions)
+    lands = {name: carried(followed, push) for name, push in pushes.items()}
+    return Along(model, followed, segments, at_knots, between, pushes, lands, continues(segments), firsts, ends)
+
+
+def conditions_at_knots(segments: Segments) -> Conditions:
+    """Time and temperature at each knot, the end of the last interval included."""
+    time = segments.knots
+    warmth = segments.temperature
+    found = None if warmth is None else jnp.asarray(_at_knots(np.asarray(warmth.coefficients), np.diff(time)))
+    return Conditions(jnp.asarray(time), found)
+
+
+def acting_at_knots(model: Model, segments: Segments) -> Float[np.ndarray, "segments knots"]:
+    """The torque that acts on a drive, or the forcing, at each knot; where it jumps the middle, so that a straight line
+    from knot to knot is not late."""
+    return _at_knots(acting(model, segments)[:, segments.halo :], segments.width)
+
+
+def acting_slopes_at_knots(
+    model: Model, paths: Sequence[str], segments: Segments
+) -> Float[np.ndarray, "segments knots parameters"]:
+    """Its derivatives by the parameters at some paths."""
+    effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
+    names = {e.name for e in effects}
+    segment_count, samples = segments.weight.shape
+    found = np.zeros((segment_count, samples + 1, len(paths)))
+    own = [i for i, path in enumerate(paths) if path.partition(".")[0] in names]
+    if own:
+        values = jnp.asarray(np.array([float(model.get(paths[i])) for i in own]))
+        _, slopes = actuated(effects, tuple(paths[i] for i in own), values, segments.torque)
+        for i, slope in zip(own, slopes, strict=True):
+            found[..., i] = _at_knots(np.asarray(slope)[:, segments.halo :], segments.width)
+    return found
+
+
+def motions(model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions) -> Motion:
+    """The motion that each of many states means."""
+    return at_instants(_motion, (model, 0), (states, states.ndim - 1), (conditions, states.ndim - 1))
+
+
+def _motion(model: Model, state: Array, conditions: Conditions) -> Motion:
+    return model.motion(state, conditions)
+
+
+class _UnitGeometry(MeshGeometryEffect):
+    """An error of the mesh and a slope of it, each by itself."""
+
+    family: ClassVar[str] = "kinematic_error"
+    name: ClassVar[str] = "unit_geometry"
+
+    e: Scalar = parameter(0.0, unit="rad", doc="the error", role="strength")
+    e_slope: Scalar = parameter(0.0, unit="1", doc="its slope", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return ()
+
+    def error(self, theta_m: Array) -> Array:
+        return self.e
+
+    def slope(self, theta_m: Array) -> Array:
+        return self.e_slope
+
+
+def unit_pushes(
+    model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions
+) -> dict[str, Float[np.ndarray, "*many states"]]:
+    """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
+    of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
+    mesh, and its slope."""
+    whole = isinstance(model, TwoInertiaModel)
+    names = [f.name for f in _torques(model)] + [ERROR, SLOPE] * whole + [INPUT]
+    axes = states.ndim - 1
+    found = slopes_at_instants(_rates, (np.zeros(len(names)), 0), (model, 0), (states, axes), (conditions, axes))
+    return {name: found[..., i] for i, name in enumerate(names)}
+
+
+def _torques(model: Model) -> list[type[LearnedTorque]]:
+    return [f for f in LEARNED_TORQUES if isinstance(model, TwoInertiaModel) or not f.needs_motor]
+
+
+def _rates(strengths: Array, model: Model, state: Array, conditions: Conditions) -> Array:
+    """With a unit of each thing times its strength; the last one is the torque."""
+    # Added afresh, not set by name: the model may have something learned already.
+    forms = zip(_torques(model), strengths, strict=False)
+    torques = [form(axes=(), mixing=jnp.ones((1, 1)), c=(strength,)) for form, strength in forms]
+    whole = isinstance(model, TwoInertiaModel)
+    geometry = [_UnitGeometry(e=strengths[-3], e_slope=strengths[-2])] if whole else []
+    probed = model.with_effects(*torques, *geometry)
+    return probed.rates(state, strengths[-1], jnp.zeros_like(strengths[-1]), conditions)
+
+
+def carried(
+    followed: Followed, push: Float[np.ndarray, "segments samples nodes states"]
+) -> Float[np.ndarray, "segments samples states nodes"]:
+    """What pushes at the nodes of each interval add to the state by its end."""
+    pushed = np.swapaxes(push, -1, -2)
+    first, second = (ends @ (pushed * by) for ends, by in carriers(followed))
+    return first + second
+
+
+def carriers(followed: Followed) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """What the two ends of a push's straight line add to the state by the end of its interval, and the part that each
+    node has in them.
+
+    The line is that which has the pushes' mean and first moment: a system that is slow against the interval sees the
+    same.
+    """
+    mean, rise = 0.5 * WEIGHTS, 1.5 * WEIGHTS * NODES
+    return (followed.from_start, mean - rise), (followed.from_end, mean + rise)
+
+
+def unit_reading(model: Model, form: type[LearnedReading]) -> Float[np.ndarray, " outputs"]:
+    """What a unit of error of what an encoder reads does to the outputs."""
+    bare, at_rest = replace(model, effects=()), jnp.zeros(len(model.motion_states))
+    probed = bare.with_effects(form(axes=(), mixing=jnp.ones((1, 1)), c=(jnp.ones(()),)))
+    return np.asarray(probed.outputs(at_rest) - bare.outputs(at_rest))
+
+
+def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
+    """The learned torque that acts where an effect, or a form, does; None where that is no torque."""
+    own = effect if isinstance(effect, type) else type(effect)
+    kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
+    return next((form for form, kind in zip(LEARNED_TORQUES, kinds, strict=True) if issubclass(own, kind)), None)
+
+
+def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
+    """Whether a segment goes on where the one before it ends in time, joined or not."""
+    knots = segments.knots
+    late = knots[1:, 0] - knots[:-1, -1]
+    return np.append(False, np.abs(late) < 0.5 * np.median(segments.width))
+
+
+def _at_knots(
+    coefficients: Float[np.ndarray, "segments samples powers"], width: Float[np.ndarray, "segments samples"]
+) -> Float[np.ndarray, "segments knots"]:
+    """A signal's values at the samples and at the end of the last interval; where it jumps the middle."""
+    after, before = coefficients[:, :, 0], polynomial(coefficients, width)
+    return np.concatenate([after[:, :1], 0.5 * (before[:, :-1] + after[:, 1:]), before[:, -1:]], axis=1)

@@ -1,0 +1,194 @@
+"""What an effect of little strength would do along a motion: a force, or a change of what the encoders read."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimation.free_parameters import strength_paths
+from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial, some_at_a_time
+from fitting.first_order.internal_states import Memory, memory_of, own_between, own_states
+from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
+from hdjax import Drive, Model, PiecewisePolynomial
+from hdjax.compilation import jit_small
+from hdjax.effects import (
+    ActuatorEffect,
+    Effect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    SensorEffect,
+    ShaftEffect,
+)
+from hdjax.effects.learned import LearnedMotorTorque
+from hdjax.engine.pointwise import slopes_at_instants
+from hdjax.parameters import own_value
+
+# What a sensor effect adds.
+_READING = "reading"
+
+
+class Regressors(eqx.Module):
+    """Derivatives by the strengths of an effect, one column for each strength of each proposal.
+
+    Attributes:
+        forces: of what acts along the motion; None where nothing does.
+        reading: of the outputs at the samples; None where nothing changes there.
+    """
+
+    forces: Forces | None
+    reading: Float[np.ndarray, "segments samples outputs columns"] | None = None
+
+
+def regressors(
+    seen: Along, proposals: Sequence[Effect], before: Memory | None = None
+) -> tuple[Regressors, Memory | None]:
+    """The regressors of proposals of one form along a motion, and the effect's own states there.
+
+    Args:
+        seen: the motion.
+        proposals: effects of one and the same form, at zero strength.
+        before: own states along stretches that these ones continue.
+    """
+    stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *proposals)
+    segments = seen.segments
+    shape = segments.measured.shape
+    states = np.zeros((shape[0], shape[1] + 1, len(proposals), 0))
+    memory = None
+    if stacked.states:
+        states = own_states(seen, stacked, len(proposals), before)
+        memory = memory_of(seen, states)
+    if isinstance(stacked, ShaftEffect) and stacked.takes_inertia():
+        return _with_inertia(seen, stacked, states), memory
+    if isinstance(stacked, ActuatorEffect):
+        added = {INPUT: _inputs(seen, stacked)}
+    else:
+        motion, own = seen.between, own_between(states)
+        if isinstance(stacked, SensorEffect):
+            motion = jax.tree.map(lambda a: np.asarray(a)[:, :-1], seen.at_knots)
+            own = np.moveaxis(states[:, :-1], 2, 0)
+        # What an effect adds is the same whatever others there are.
+        bare = replace(seen.model, effects=())
+        added = _by_strength(_added, stacked, bare, motion, own=own)
+    added = {name: _finite(values) for name, values in added.items()}
+    if _READING in added:
+        return Regressors(None, added[_READING]), None
+    lands, sizes = [seen.carried[name] for name in added], list(added.values())
+    return Regressors(Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))), memory
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """An effect that runs away along the motion explains nothing."""
+    lost = ~np.isfinite(values).all(axis=tuple(range(values.ndim - 1)))
+    return np.where(lost, 0.0, values) if lost.any() else values
+
+
+def _by_strength(function: Callable[..., Any], stacked: Effect, model: Model, *looked_at: Any, own: np.ndarray) -> Any:
+    """Derivatives of what is found of an effect at each instant by each strength of each proposal, as columns: a
+    proposal's strengths side by side.
+
+    Args:
+        function: of the strengths, the effect, the model, what else is looked at, and the effect's own states.
+        stacked: the proposals, along the first axis of each array.
+        model: the equations.
+        looked_at: trees of arrays whose first axes are those of the instants.
+        own: each proposal's, on the first axis. At zero strength they don't depend on it.
+    """
+    instants = own.shape[1:-1]
+    each = jax.tree.map(lambda a: a[:, None], stacked)
+    strengths = np.stack([np.asarray(value) for value in _strengths(each)], axis=-1)
+    flat = [(jax.tree.map(lambda a: np.reshape(a, (-1, *a.shape[len(instants) :])), tree), 1) for tree in looked_at]
+    states = own.reshape(own.shape[0], math.prod(instants), own.shape[-1])
+    found = slopes_at_instants(function, (strengths, 2), (each, 2), (model, 0), *flat, (states, 2))
+
+    def side_by_side(values: np.ndarray) -> np.ndarray:
+        whole = np.moveaxis(values, 0, -2)
+        return whole.reshape(*instants, *whole.shape[1:-2], -1)
+
+    return jax.tree.map(side_by_side, found)
+
+
+def _strengths(effect: Any) -> list[Any]:
+    return [own_value(effect, path.split(".")[1]) for path in strength_paths(effect)]
+
+
+def _with(effect: Effect, strengths: Array) -> Effect:
+    return eqx.tree_at(_strengths, effect, list(strengths))
+
+
+def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: Array) -> dict[str, Array]:
+    """What an effect adds at an instant, by what that is."""
+    effect = _with(effect, strengths)
+    if isinstance(effect, SensorEffect):
+        assert motion.theta_m is not None and motion.theta_l is not None
+        still = jnp.zeros_like(motion.x)
+        state = jnp.stack([motion.theta_m, motion.theta_l, still, still])
+        return {_READING: bare.with_effects(effect).outputs(state)}
+    if isinstance(effect, MeshGeometryEffect):
+        assert motion.theta_m is not None
+        return {ERROR: effect.error(motion.theta_m), SLOPE: effect.slope(motion.theta_m)}
+    place = place_of(effect)
+    assert place is not None and isinstance(effect, MeshTorqueEffect | ShaftEffect)
+    torques = {place.name: effect.torque(motion, bare.drive, own)}  # pyright: ignore[reportArgumentType]
+    if isinstance(effect, MeshTorqueEffect) and effect.reacts() and isinstance(bare.drive, Drive):
+        torques[LearnedMotorTorque.name] = effect.reaction(motion, bare.drive)
+    return torques
+
+
+def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples nodes columns"]:
+    """Derivatives of the torque that acts, at the nodes."""
+    segments = seen.segments
+    knots, logged = np.asarray(segments.torque.knots), acting(seen.model, segments)
+    found = some_at_a_time(functools.partial(_actuated, stacked), knots, logged)[:, segments.halo :]
+    # By columns, and then by powers.
+    return polynomial(found[:, :, None], (PART * segments.width[..., None])[..., None])
+
+
+@jit_small
+def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array, "segments intervals columns powers"]:
+    """Derivatives of a torque that effects have changed by the strengths of each proposal: what happens to a torque
+    looks back in time, which the graph of an instant has no words for."""
+
+    def changed(effect: Effect, strengths: Array) -> Array:
+        whole = _with(effect, strengths)
+        assert isinstance(whole, ActuatorEffect)
+        return jax.vmap(lambda *own: whole.actuate(PiecewisePolynomial(*own)).coefficients)(knots, coefficients)
+
+    columns = []
+    # Written out: there are few, and lanes of lanes take long to compile.
+    for i in range(len(jax.tree.leaves(stacked)[0])):
+        effect = jax.tree.map(lambda a, i=i: a[i], stacked)
+        strengths = jnp.stack(_strengths(effect))
+        along = functools.partial(changed, effect)
+        columns += [jax.jvp(along, (strengths,), (unit,))[1] for unit in np.eye(strengths.size)]
+    return jnp.stack(columns, axis=2)
+
+
+def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:
+    """Of effects that take inertia: what the others do changes with it."""
+    model, segments, followed = seen.model, seen.segments, seen.followed
+    inputs = inputs_at(model, segments, PART * segments.width[..., None])
+    rates = _by_strength(_rates, stacked, model, followed.between, inputs, own=own_between(states))
+    own = np.moveaxis(states[:, :-1], 2, 0)
+    reading = _by_strength(_outputs, stacked, model, followed.states[:, :-1], own=own)
+    # A rate of each state at each node is a part.
+    parts = [[ends * weight for weight in by] for ends, by in carriers(followed)]
+    lands = np.concatenate([first + second for first, second in zip(*parts, strict=True)], axis=-1)
+    sizes = rates.reshape(*rates.shape[:2], -1, rates.shape[-1])
+    return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
+
+
+def _rates(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
+    whole, states = model.with_effects(_with(effect, strengths)), jnp.concatenate([state, own])
+    return whole.rates(states, inputs.torque, inputs.load_torque, inputs.conditions)[: state.size]
+
+
+def _outputs(strengths: Array, effect: Effect, model: Model, state: Array, own: Array) -> Array:
+    return model.with_effects(_with(effect, strengths)).outputs(jnp.concatenate([state, own]))

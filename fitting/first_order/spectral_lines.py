@@ -1,0 +1,76 @@
+"""The strongest lines in what a fit leaves over: where to look for a frequency that no shaft turns at."""
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.estimation.estimate import Fit
+
+# A line stands out of the median of so many frequencies around it.
+_NEIGHBOURS = 41
+# By this factor in power at least: among 10,000 frequencies of noise the largest is about 10 times the mean.
+STANDS_OUT = 15.0
+"""Power of a line against the median of its surroundings, at least."""
+
+
+def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
+    """Frequencies [rad/s] of the strongest lines in the residual, strongest first.
+
+    The periodogram of the longest stretch's whitened residual (Hann window), summed over the outputs and divided by the
+    median of its surroundings, so that the colour of the noise and the drive's resonance do not pass for lines.
+
+    Args:
+        fit: a fit.
+        most: how many lines at most.
+    """
+    # Loaded here, where effects are looked for: a plain fit does without.
+    from scipy.signal import find_peaks
+
+    # Along the longest stretch, samples without weight zero.
+    series = max(reversed(fit.by_stretch(fit.white_error)), key=len)
+    count = series.shape[0]
+    if count < 4 * _NEIGHBOURS:
+        return ()
+    window = np.hanning(count)[:, None]
+    # Twice the length: a frequency between two of the grid's is then no more than a quarter of a step away.
+    power = np.sum(np.abs(np.fft.rfft(series * window, n=2 * count, axis=0)) ** 2, axis=1)
+    around = surroundings(power, neighbours=_NEIGHBOURS)
+    ratio = power / around
+    # The lowest frequencies are drift, not lines: fewer than two periods in the log.
+    ratio[:4] = 0.0
+    peaks, _ = find_peaks(ratio, height=STANDS_OUT, distance=8)
+    strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
+    step = float(np.median(np.diff(fit.stretches[0].experiment.time)))
+    return tuple((2.0 * np.pi * ((strongest + _off_the_grid(power, strongest)) / (2 * count * step))).tolist())
+
+
+def surroundings(power: Float[np.ndarray, " n"], *, neighbours: int = _NEIGHBOURS // 2) -> Float[np.ndarray, " n"]:
+    """The median of a periodogram around each frequency: the colour of the noise without its lines.
+
+    Args:
+        power: of a series without padding.
+        neighbours: on each side.
+    """
+    from scipy.ndimage import median_filter
+
+    return np.maximum(median_filter(power, size=2 * neighbours, mode="nearest"), 1e-300)
+
+
+def without_lines(spectrum: np.ndarray) -> np.ndarray:
+    """A spectrum whose lines are cut down to what noise of the colour around them may reach.
+
+    A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave.
+
+    Args:
+        spectrum: of one series or of several, (n,) or (series, n); their lines are looked for in the sum of powers.
+    """
+    power = np.sum(np.abs(np.atleast_2d(spectrum)) ** 2, axis=0)
+    return spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
+
+
+def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarray:
+    """How far from its highest point each line is: the vertex of the parabola through the logarithms. Unseen data come
+    later, where an error of frequency has become one of phase."""
+    inner = np.clip(peaks, 1, power.size - 2)
+    left, top, right = (np.log(np.maximum(power[inner + k], 1e-300)) for k in (-1, 0, 1))
+    curvature = np.minimum(left - 2 * top + right, -1e-12)
+    return np.clip(0.5 * (left - right) / curvature, -0.5, 0.5)

@@ -1,0 +1,135 @@
+"""A fit without a search for effects, with all that can be said of it."""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.attribution.selection_round import Round
+from fitting.clock import Clock
+from fitting.estimation.base_fit import base_fit
+from fitting.estimation.experiment import Experiment, whole
+from fitting.estimation.whole_log_fit import long_fit
+from fitting.outcome import Finding
+from fitting.progress import Progress, silent
+from fitting.uncertainty.measurement_noise import measurement_noise
+from fitting.uncertainty.posterior import Posterior, posterior
+from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
+from fitting.validation.account import Account, account
+from fitting.validation.frequency_response import FrequencyResponse, frequency_response
+from fitting.validation.goodness_of_fit import Goodness, goodness
+from fitting.validation.residual_diagnostics import ResidualDiagnostics, diagnose
+from fitting.validation.residual_tests import ResidualTests, residual_tests
+from hdjax import Hold, Model
+
+
+class FitOnly(eqx.Module):
+    """A fitted drive; stands in for a [`Loop`][] in reports.
+
+    Attributes:
+        account: the fitted model's.
+        start: the model that the fit started from.
+        noise: covariance of the measurement noise of the outputs.
+        hold: what the torque does between samples, as used.
+        residual: diagnostics of what the model leaves over.
+        tests: of the same.
+        goodness: figures of merit.
+        frequency_response: of the logs and of the model; None where the logs are too short for it.
+        bands: how well the free runs are known, along test data where there are any.
+        posterior: draws, where they were asked for.
+        seconds: where the time went.
+    """
+
+    account: Account
+    start: Model
+    noise: Float[Array, "outputs outputs"]
+    hold: Hold = eqx.field(static=True)
+    residual: ResidualDiagnostics
+    tests: ResidualTests
+    goodness: Goodness
+    frequency_response: FrequencyResponse | None
+    bands: tuple[PredictionBand, ...]
+    posterior: Posterior | None
+    seconds: dict[str, float]
+    decision: ClassVar[str] = "fit_only"
+    findings: ClassVar[tuple[Finding, ...]] = ()
+    rounds: ClassVar[tuple[Round, ...]] = ()
+    dropped: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def before(self) -> Account:
+        """The one account that there is."""
+        return self.account
+
+    @property
+    def after(self) -> Account:
+        """Likewise."""
+        return self.account
+
+
+def fit_only(
+    model: Model,
+    experiments: dict[Hold, tuple[Experiment, ...]],
+    *,
+    test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
+    hold: Hold | None = None,
+    seed: int | None = None,
+    progress: Progress = silent,
+) -> FitOnly:
+    """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.close_loop`][].
+
+    Args:
+        model: the base model; its stiffness and damping are only placeholders.
+        experiments: the same logs under each assumption about the torque between samples.
+        test: likewise of data that only the final figures look at.
+        hold: the assumption that the user states; where None, the one that suits the model best.
+        seed: of draws from the posterior; where None, none are made.
+        progress: told what is being done.
+
+    Raises:
+        DataError: where no oscillator fits the data.
+        ImportError: where draws are asked for and blackjax is not installed.
+    """
+    clock = Clock()
+    progress("fitting the base model")
+    holds: list[Hold] = list(experiments) if hold is None else [hold]
+    fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
+    hold = min(holds, key=lambda h: fits[h].objective)
+    base, tests = fits[hold], whole((test or {}).get(hold, ()))
+    clock.lap("base fit")
+    noise = measurement_noise(base).covariance
+    clock.lap("measurement noise")
+    progress("final fit over long horizons")
+    found = long_fit(base, must_explain=True)
+    clock.lap("final fit")
+    progress("free runs")
+    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True)
+    seen = found.stretches if not tests else tests
+    bands = prediction_bands(found, result.uncertainty, seen, noise=noise, runs=result.judged)
+    clock.lap("free runs and standard errors")
+    residual = diagnose(found)
+    tests = residual_tests(found, residual)
+    response = frequency_response(
+        found.model, experiments[hold], hold=hold, noise=float(np.sqrt(np.asarray(noise)[-1, -1]))
+    )
+    clock.lap("diagnostics")
+    draws = None
+    if seed is not None:
+        progress("drawing from the posterior")
+        draws = posterior(found, result.uncertainty, seed=seed)
+        clock.lap("posterior")
+    return FitOnly(
+        account=result,
+        start=base.problem.model,
+        noise=noise,
+        hold=hold,
+        residual=residual,
+        tests=tests,
+        goodness=goodness(found, result, noise),
+        frequency_response=response,
+        bands=bands,
+        posterior=draws,
+        seconds=clock.laps,
+    )

@@ -1,0 +1,1 @@
+"""From files to signals in SI units on one time base."""

@@ -1,0 +1,182 @@
+"""Logs as named arrays: MATLAB files of all versions, and HDF5."""
+
+import re
+from collections.abc import Callable, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.errors import InputError
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers
+
+# Scalars that MATLAB and HDF5 users keep beside the data.
+_RATE_NAMES = ("fs", "Fs", "FS", "sample_rate", "sampling_rate")
+_STEP_NAMES = ("Ts", "dt", "sample_time")
+_UNIT_NAMES = ("unit", "units", "Unit", "Units")
+_DEEPEST = 12
+
+
+def read_mat(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    """The wanted vectors of a MATLAB file.
+
+    Args:
+        path: named in messages.
+        source: what is read.
+        wanted: names such as "T", "run.T", "logs(2).T" or "data(:,3)"; the last part alone where it is unique.
+    """
+    # Imported here because they cost as much as all the rest of a CSV user's start.
+    import scipy.io
+
+    if _is_hdf5(source):
+        return read_hdf5(path, source, wanted)
+    held = scipy.io.loadmat(source, simplify_cells=True)
+    arrays: dict[str, Any] = {}
+    for name, value in held.items():
+        if not name.startswith("__"):
+            _flatten(name, value, arrays, _DEEPEST)
+    return _table(path, arrays, wanted, ".", lambda name: arrays[name], lambda name: None)
+
+
+def _is_hdf5(source: Path | BytesIO) -> bool:
+    """Whether a file is HDF5; MATLAB puts 512 bytes of its own before it."""
+    with source.open("rb") if isinstance(source, Path) else BytesIO(source.getvalue()[:4096]) as file:
+        head = file.read(4096)
+    return any(head[at : at + 8] == b"\x89HDF\r\n\x1a\n" for at in (0, 512, 1024, 2048))
+
+
+def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    """The wanted datasets of an HDF5 file.
+
+    Args:
+        path: named in messages.
+        source: what is read.
+        wanted: paths such as "run/T", "run/table/T" (a field of a compound dataset) or "run/data(:,3)"; the last part
+            alone where it is unique.
+    """
+    import h5py
+
+    with h5py.File(source, "r") as file:
+        held: dict[str, tuple[Any, str | None]] = {}
+
+        def note(name: str, item: object) -> None:
+            # "#refs#" is where MATLAB v7.3 keeps the insides of its cells.
+            if not isinstance(item, h5py.Dataset) or name.startswith("#"):
+                return
+            if item.dtype.names is None:
+                held[name] = (item, None)
+            for field in item.dtype.names or ():
+                held[f"{name}/{field}"] = (item, field)
+
+        file.visititems(note)
+
+        def load(name: str) -> Any:
+            item, field = held[name]
+            if item.attrs.get("MATLAB_empty", 0):
+                return np.zeros(0)
+            return item[()] if field is None else item[field]
+
+        def unit(name: str) -> str | None:
+            return _text(next((held[name][0].attrs[a] for a in _UNIT_NAMES if a in held[name][0].attrs), None))
+
+        return _table(path, held, wanted, "/", load, unit)
+
+
+def _text(value: object) -> str | None:
+    value = np.asarray(value).reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+    value = value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
+    return value.strip() or None if isinstance(value, str) else None
+
+
+def _flatten(name: str, value: Any, arrays: dict[str, Any], deepest: int) -> None:
+    """Write the insides of structs as "outer.inner", and of struct arrays as "outer(1).inner"."""
+    if deepest == 0:
+        return
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            _flatten(f"{name}.{key}", inner, arrays, deepest - 1)
+        return
+    items = value if isinstance(value, list) or _is_cell(value) else ()
+    structs = [
+        (i, item) for i, item in enumerate(np.ravel(np.asarray(items, dtype=object))) if isinstance(item, Mapping)
+    ]
+    for i, item in structs:
+        _flatten(f"{name}({i + 1})", item, arrays, deepest - 1)
+    if not structs:
+        arrays[name] = value
+
+
+def _is_cell(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind == "O"
+
+
+def _table(
+    path: Path,
+    held: Mapping[str, Any],
+    wanted: tuple[str, ...],
+    parting: str,
+    load: Callable[[str], Any],
+    unit: Callable[[str], str | None],
+) -> RawTable:
+    """The wanted columns of named arrays, and a sample rate that stands beside one of them."""
+    columns: dict[str, RawColumn] = {}
+    rate: float | None = None
+    for asked in wanted:
+        name, column = _place(path, asked, held, parting)
+        if name is None:
+            continue
+        columns[asked] = RawColumn(_vector(path, asked, load(name), column), unit(name))
+        beside = name.rpartition(parting)[0]
+        around = [beside + parting if beside else "", ""]
+        rate = rate or _rate(lambda key, at=around: next((load(a + key) for a in at if a + key in held), None))
+    return RawTable(tuple(held), columns, rate)
+
+
+def _place(path: Path, asked: str, held: Mapping[str, Any], parting: str) -> tuple[str | None, int | None]:
+    """The array of that name, or the only one with that last name; and its column, counted from zero."""
+    if asked in held:
+        return asked, None
+    match = re.fullmatch(r"(.*)\(\s*:\s*,\s*([0-9]{1,6})\s*\)", asked)
+    plain, column = (match[1], int(match[2]) - 1) if match else (asked, None)
+    plain = plain.strip("/")
+    for form in (plain, plain.replace(".", parting), plain.replace("/", parting)):
+        if form in held:
+            return form, column
+    leaves = [name for name in held if name.rpartition(parting)[2] == plain]
+    if len(leaves) > 1:
+        raise InputError(
+            f"{path}: '{asked}' is the name of several datasets ({', '.join(leaves[:6])}); "
+            "give the full path of one of them in [columns] of the drive file"
+        )
+    inside = [name for name in held if name.startswith(plain + parting)]
+    if inside and not leaves:
+        raise not_numbers(path, plain, "is a struct or group", f"name what is inside, such as '{inside[0]}'")
+    return (leaves[0], column) if leaves else (None, None)
+
+
+def _vector(path: Path, name: str, data: Any, column: int | None) -> np.ndarray:
+    if type(data).__name__ in ("MatlabOpaque", "MatlabFunction") or _is_cell(data):
+        raise not_numbers(path, name, "is a cell, table or object of MATLAB's own", "store it with double()")
+    array = np.asarray(data)
+    if array.dtype.names is not None or array.dtype.kind not in "biuf":
+        raise not_numbers(path, name, "is a struct, text or complex")
+    if column is not None:
+        # MATLAB v7.3 keeps its matrices transposed; the long side is time.
+        array = array.T if array.ndim == 2 and array.shape[1] > array.shape[0] else array
+        if array.ndim != 2 or not 0 <= column < array.shape[1]:
+            raise not_numbers(
+                path, name, f"is not there, since the shape is {array.shape}", "correct the column's number"
+            )
+        array = array[:, column]
+    if array.size != max(array.shape, default=1):
+        raise not_numbers(path, name, f"has shape {array.shape}", f'pick a column as "{name}(:,1)"')
+    return array.reshape(-1).astype(np.float64)
+
+
+def _rate(get: Callable[[str], Any]) -> float | None:
+    for name in (*_RATE_NAMES, *_STEP_NAMES):
+        array = np.asarray(get(name))
+        if array.size == 1 and array.dtype.kind in "iuf" and 0 < array.item() < np.inf:
+            return float(array.item()) if name in _RATE_NAMES else 1.0 / float(array.item())
+    return None

@@ -1,0 +1,135 @@
+"""From a raw column to a signal in SI units: unit, sign, offset, blanks, wrapped counts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fitting.errors import InputError
+from fitting.logs.drive_file import ColumnMap, DriveFile
+from fitting.logs.findings import Finding
+from fitting.logs.raw_table import RawColumn
+from fitting.logs.units import UnitError, convert, to_base
+from fitting.logs.unwrapping import unwrapped_angle, unwrapped_overflow
+
+SI = {
+    "time": "s",
+    "motor_angle": "rad",
+    "load_angle": "rad",
+    "motor_torque": "N m",
+    "load_torque": "N m",
+    "temperature": "K",
+    "motor_velocity": "rad/s",
+    "load_velocity": "rad/s",
+    "twist": "rad",
+    "joint_torque": "N m",
+}
+_UNSTATED = {"dynamic_error": "rad", "forcing": "rad/s^2"}
+_FILL = 1e30  # beyond it lie the fill values of NetCDF and its like
+_MOST_TEXT = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One signal of a log.
+
+    Attributes:
+        values: in `unit`, (n,), NaN where unknown.
+        unit: SI, or what the drive file states of a reduced log.
+        findings: what was mended.
+    """
+
+    values: np.ndarray
+    unit: str
+    findings: tuple[Finding, ...] = ()
+
+
+def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *, first_row: int = 0) -> Channel:
+    """The signal that a column holds.
+
+    Args:
+        path: the log, for messages.
+        drive_file: unit, sign and offset of the column.
+        signal: its name.
+        column: as read.
+        first_row: of the column, in the file.
+
+    Raises:
+        InputError: for a unit that does not fit, or a column of text.
+    """
+    place = drive_file.column_of(signal)
+    findings = [*_text(path, place.column, column, first_row)]
+    values = np.where(np.abs(column.values) < _FILL, column.values, np.nan)
+    unit, disagreement = _unit(place, column, signal)
+    findings += disagreement
+    values, wrapped = _unwrapped(drive_file, signal, place, values, unit, first_row)
+    converted, name = _convert(drive_file, signal, place, (values - place.offset) * place.sign, unit)
+    # A unit may be so small or large that nothing of the numbers is left.
+    converted = np.where(np.abs(converted) < _FILL, converted, np.nan)
+    return Channel(converted, name, (*findings, *wrapped))
+
+
+def _text(path: Path, name: str, column: RawColumn, first_row: int) -> Sequence[Finding]:
+    rows = column.text_rows
+    if len(rows) == 0:
+        return ()
+    if len(rows) > max(1, _MOST_TEXT * len(column.values)):
+        raise InputError(
+            f"{path}: the column '{name}' holds text such as {column.text!r} in {len(rows)} rows, first in data row "
+            f"{first_row + rows[0] + 1}, where numbers are needed; name another column or mend these rows"
+        )
+    what = f"{len(rows)} cells hold text such as {column.text!r}"
+    where = f"{name}, first in data row {first_row + rows[0] + 1}"
+    return (Finding("warning", what, where, "they count as blank"),)
+
+
+def _unit(place: ColumnMap, column: RawColumn, signal: str) -> tuple[str | None, Sequence[Finding]]:
+    """The stated unit, else the file's own."""
+    if place.unit is None or column.unit is None:
+        return place.unit or column.unit, ()
+    try:
+        same = np.isclose(convert(np.array(1.0), place.unit, column.unit), 1.0, rtol=1e-6)
+    except UnitError:
+        same = False
+    if same:
+        return place.unit, ()
+    what = f"the file gives the unit {column.unit[:40]!r} and the drive file {place.unit!r}"
+    return place.unit, (Finding("note", what, signal, "the drive file was followed"),)
+
+
+def _unwrapped(
+    drive_file: DriveFile, signal: str, place: ColumnMap, values: np.ndarray, unit: str | None, first_row: int
+) -> tuple[np.ndarray, Sequence[Finding]]:
+    if np.isfinite(values).sum() < 3:
+        return values, ()
+    if signal in ("motor_angle", "load_angle"):
+        radian = float(_convert(drive_file, signal, place, np.array(1.0), unit)[0])
+        found, span, rows = unwrapped_angle(values, 2 * np.pi / abs(radian) if radian else np.inf)
+        severity, what = "note", "wraps"
+    elif signal in ("motor_torque", "load_torque", "forcing"):
+        found, span, rows = unwrapped_overflow(values)
+        severity, what = "warning", "overflows its integers"
+    else:
+        return values, ()
+    if len(rows) == 0:
+        return values, ()
+    where = f"{place.column}, first in data row {first_row + rows[0] + 1}"
+    return found, (
+        Finding(severity, f"{signal} {what} at {span:.10g} in {len(rows)} places", where, "it was unwrapped"),
+    )
+
+
+def _convert(
+    drive_file: DriveFile, signal: str, place: ColumnMap, values: np.ndarray, unit: str | None
+) -> tuple[np.ndarray, str]:
+    if unit is None:
+        return values, SI.get(signal) or _UNSTATED[signal]
+    try:
+        return (convert(values, unit, SI[signal]), SI[signal]) if signal in SI else to_base(values, unit)
+    except UnitError as error:
+        example = ', such as "deg", or "rev / 16777216" for counts' if "angle" in signal else ""
+        raise InputError(
+            f"{drive_file.path}: the column '{place.column}' cannot be used as {signal}, because "
+            f"{error}; give [columns] {signal} a unit{example}"
+        ) from error

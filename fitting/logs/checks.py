@@ -1,0 +1,199 @@
+"""The health gate: what is wrong with a log, and what that does to a fit."""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from fitting.errors import DataError
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.findings import Finding
+from fitting.logs.log import OUTPUTS, Log
+from fitting.logs.masks import clipped, glitches
+from fitting.logs.plausibility import mix_ups
+
+# All thresholds are assumed: they part the practice logs from their mix-ups by a wide margin.
+JITTER = 0.01
+DISTINCT_SHARE = 0.2
+COARSE_STEP = 0.1
+FEWEST = 50
+
+_INPUTS = {"drive": "motor_torque", "reduced": "forcing", "quasi-static": "joint_torque"}
+_UNITS = {"motor_torque": "N m", "load_torque": "N m", "joint_torque": "N m", "motor_angle": "rad", "load_angle": "rad"}
+
+
+def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
+    """Everything worth saying about a log before it is fitted.
+
+    Args:
+        log: The log. Outputs after `log.outputs_until` rows are not looked at.
+        drive_file: The drive that it was read with.
+
+    Returns:
+        The findings of the reader, then those of the checks; refusals are among them.
+    """
+    checks = [_jitter(log), _excitation(log), _response(log), _channels(log, drive_file)]
+    if log.motor_angle is not None and log.load_angle is not None:
+        checks += [_wrapped(log), mix_ups(log, drive_file)]
+    # Numbers of any size may stand in a file; what overflows is no worse than what is merely wrong.
+    with np.errstate(all="ignore"):
+        return (*log.findings, *(finding for check in checks for finding in check))
+
+
+def refuse_unfit(findings: Iterable[Finding], log: Log) -> None:
+    """Nothing when the log can be fitted.
+
+    Args:
+        findings: What `examine` gave.
+        log: The log they are about.
+
+    Raises:
+        DataError: There is a refusal among the findings; the first one is told.
+    """
+    for finding in findings:
+        if finding.severity == "refusal":
+            raise DataError(f"{log.path}: {finding.where}: {finding.what}; {finding.consequence}")
+
+
+def _known(log: Log, signal: str) -> np.ndarray | None:
+    """The values of a signal that checks may look at."""
+    values = getattr(log, signal)
+    if values is None or signal not in OUTPUTS:
+        return values
+    return values[: log.outputs_until]
+
+
+def _is_constant(values: np.ndarray | None) -> bool:
+    return values is None or len(values) == 0 or bool(np.all(values == values[0]))
+
+
+def _jitter(log: Log) -> Iterator[Finding]:
+    step = np.diff(log.time)
+    median = float(np.median(step))
+    # A gap is told by the reader and would hide how regular the rest is.
+    spread = float(np.std(step[step <= 5 * median])) / median
+    if spread > JITTER:
+        yield Finding(
+            "note",
+            f"the sampling jitters by {100 * spread:.2g} % of the median step of {median:.4g} s",
+            "time",
+            "the stamps are used as they are",
+        )
+
+
+def _excitation(log: Log) -> Iterator[Finding]:
+    name = _INPUTS[log.kind]
+    values = _known(log, name)
+    if values is None or not _is_constant(values):
+        return
+    driven = not _is_constant(log.load_torque)
+    yield Finding(
+        "warning" if driven else "refusal",
+        f"{name} is {values[0]:g} in all {len(values)} rows",
+        name,
+        "only the load torque excites the drive, so that the motor side is seen poorly"
+        if driven
+        else "a constant input excites nothing, so check the column or record another log",
+    )
+
+
+def _response(log: Log) -> Iterator[Finding]:
+    outputs = ("motor_angle", "load_angle") if log.kind == "drive" else ("dynamic_error",)
+    stuck = [name for name in outputs if _is_constant(_known(log, name))]
+    for name in stuck:
+        hopeless = stuck == list(outputs)
+        yield Finding(
+            "refusal" if hopeless else "warning",
+            f"{name} never changes",
+            name,
+            "there is no response to fit, so check the column or record another log"
+            if hopeless
+            else "unless that side was locked, the sensor is stuck and the dynamic error is wrong",
+        )
+
+
+def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    inputs = ("motor_torque", "load_torque") if log.kind == "drive" else (_INPUTS[log.kind],)
+    for name in inputs:
+        values = _known(log, name)
+        if values is not None and not _is_constant(values):
+            yield from _inputs(name, values, log.time)
+            yield from _quantised(log, name, values, 1.0, float(np.std(values)))
+    if log.kind != "drive":
+        twist = _known(log, "dynamic_error")
+        assert twist is not None
+        if not _is_constant(twist):
+            yield from _quantised(log, "dynamic_error", twist, 1.0, float(np.std(twist)))
+        return
+    motor, load = _known(log, "motor_angle"), _known(log, "load_angle")
+    assert motor is not None and load is not None
+    if _is_constant(motor) or _is_constant(load) or len(motor) < FEWEST:
+        return
+    spread = float(np.std(log.dynamic_error[: log.outputs_until]))
+    ratio = drive_file.reduction_ratio or 1.0
+    for name, values, side in (("motor_angle", motor, ratio), ("load_angle", load, 1.0)):
+        yield from _quantised(log, name, values, side, spread)
+
+
+def _inputs(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
+    """What is odd about an input; it acts in the fit as it was logged all the same."""
+    for rows, level, count in clipped(values, None):
+        yield Finding(
+            "warning",
+            f"{len(rows)} samples ({100 * len(rows) / len(values):.2g} %) stand exactly at {level:g} in {count} runs",
+            f"{name}, first in data row {rows[0] + 1}",
+            "the channel looks clipped, which bends stiffness and damping unless the drive was at its limit",
+        )
+    spikes = glitches(values, time)
+    if len(spikes):
+        yield Finding(
+            "note",
+            f"{len(spikes)} samples stand far out from those around",
+            f"{name}, first in data row {spikes[0] + 1}",
+            "they act in the fit as they were logged, so mend them if the logger made them",
+        )
+
+
+def _quantised(log: Log, name: str, values: np.ndarray, side: float, spread: float) -> Iterator[Finding]:
+    """A note on the step of a channel.
+
+    Args:
+        log: For the unit.
+        name: Signal.
+        values: Its values.
+        side: What divides a step of this channel to give one of the quantity that matters.
+        spread: rms of the quantity that matters.
+    """
+    levels = np.unique(values)
+    if len(levels) < 3 or len(values) < FEWEST:
+        return
+    gaps = np.diff(levels)
+    step = float(gaps.min())
+    on_grid = float(np.mean(np.abs(gaps / step - np.rint(gaps / step)) < 0.05)) > 0.99
+    share = step / abs(side) / spread if spread > 0 else np.inf
+    few = len(levels) < DISTINCT_SHARE * len(values) and share > COARSE_STEP / 10
+    if not on_grid or not (few or share > COARSE_STEP):
+        return
+    unit = _UNITS.get(name) or log.units.get(name, "")
+    about = "of the rms dynamic error" if name.endswith("_angle") else "of its own rms"
+    yield Finding(
+        "note",
+        f"the values lie {step:.4g} {unit} apart, which is {100 * share:.2g} % {about}",
+        name,
+        "steps of a sensor act like noise of a twelfth of the squared step, and not quite white",
+    )
+
+
+def _wrapped(log: Log) -> Iterator[Finding]:
+    for name in ("motor_angle", "load_angle"):
+        values = _known(log, name)
+        if values is None or len(values) < FEWEST:
+            continue
+        jump = np.abs(np.diff(values))
+        turns = np.flatnonzero(np.abs(jump / (2 * np.pi) - 1) < 0.1)
+        if len(turns) and np.median(jump) < 0.5 and np.ptp(values) < 2.2 * np.pi:
+            yield Finding(
+                "refusal",
+                f"{name} jumps by one revolution in {len(turns)} places",
+                f"{name}, first in data row {turns[0] + 2}",
+                "the angle is wrapped, so unwrap it before it is logged or exported",
+            )

@@ -1,0 +1,229 @@
+"""The drive file: what a log cannot say about itself."""
+
+import math
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from fitting.errors import InputError
+from fitting.logs.units import UnitError, parse_number
+from hdjax import HOLDS, Hold
+
+SIGNALS = (
+    "time",
+    "motor_angle",
+    "load_angle",
+    "motor_torque",
+    "load_torque",
+    "temperature",
+    "dynamic_error",
+    "forcing",
+    "motor_velocity",
+    "load_velocity",
+    "twist",
+    "joint_torque",
+)
+_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2", "rated_torque": "N m"}
+_KEYS = {
+    "drive": ("name", *_DRIVE_UNITS),
+    "signals": ("torque_hold", "sample_rate"),
+    "columns": SIGNALS,
+}
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Where a signal stands in the log.
+
+    Attributes:
+        column: Name of the column; in HDF5 the path of the dataset.
+        unit: Unit of the column's numbers, or None for the file's own, or else SI.
+        sign: +1.0 or -1.0, multiplies the column.
+        offset: What is subtracted before, in the column's own numbers.
+        time: Name of the column with this channel's own stamps, in the unit of [columns] time, or None.
+    """
+
+    column: str
+    unit: str | None
+    sign: float
+    offset: float = 0.0
+    time: str | None = None
+
+
+@dataclass(frozen=True)
+class DriveFile:
+    """A drive as its owner describes it.
+
+    Attributes:
+        path: The file that was read.
+        name: Name of the drive; the file's stem where none is stated.
+        reduction_ratio: N, motor angle over load angle, or None where not stated.
+        motor_inertia: J_m [kg m^2], or None.
+        load_inertia: J_l [kg m^2], or None.
+        torque_hold: What the torque does between samples, one of `HOLDS`, or None.
+        sample_rate: Samples per second [Hz] of a log without time column, or None.
+        columns: Signal name to its place in the log, only where the drive file states it.
+        rated_torque: At the output [N m], or None; lost motion is defined by it.
+    """
+
+    path: Path
+    name: str
+    reduction_ratio: float | None
+    motor_inertia: float | None
+    load_inertia: float | None
+    torque_hold: Hold | None
+    sample_rate: float | None
+    columns: dict[str, ColumnMap]
+    rated_torque: float | None = None
+
+    def column_of(self, signal: str) -> ColumnMap:
+        """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""
+        return self.columns.get(signal, ColumnMap(signal, None, 1.0))
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A suggestion in brackets, or nothing when no known name is close.
+
+    Args:
+        word: What was written.
+        known: Names that would have been understood.
+
+    Returns:
+        " (did you mean 'time'?)" or "".
+    """
+    by_lower = {name.lower(): name for name in known}
+    close = get_close_matches(word.lower(), list(by_lower), n=1, cutoff=0.6)
+    return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
+
+
+def read_drive_file(path: str | PathLike[str]) -> DriveFile:
+    """The drive that a TOML file describes.
+
+    Args:
+        path: A file with the tables [drive], [signals] and [columns], all optional. Physical
+            numbers are SI, or strings with a unit such as "5.26 g m^2".
+
+    Returns:
+        The drive, in SI units.
+
+    Raises:
+        InputError: The file is missing, is not TOML, or says something that is not understood.
+    """
+    path = Path(path)
+    tables = _load(path)
+    _refuse_unknown(path, "table", tables, _KEYS)
+    for table, known in _KEYS.items():
+        if not isinstance(tables.get(table, {}), dict):
+            raise InputError(f"{path}: '{table}' must be a table, so write it as [{table}]")
+        _refuse_unknown(path, f"key in [{table}]", tables.get(table, {}), known)
+    drive, signals = tables.get("drive", {}), tables.get("signals", {})
+    numbers = {k: _positive(path, "drive", k, drive.get(k), u) for k, u in _DRIVE_UNITS.items()}
+    return DriveFile(
+        path=path,
+        name=_text(path, "[drive] name", drive.get("name", path.stem)),
+        torque_hold=_hold(path, signals.get("torque_hold")),
+        sample_rate=_positive(path, "signals", "sample_rate", signals.get("sample_rate"), "Hz"),
+        columns={s: _column_map(path, s, e) for s, e in tables.get("columns", {}).items()},
+        **numbers,
+    )
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such drive file; check the path given to --drive") from error
+    except OSError as error:
+        raise InputError(f"{path}: the drive file cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: the drive file is not text; save it as UTF-8 TOML") from error
+    except (ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: the drive file is not valid TOML, mend it: {reason}") from error
+
+
+def _refuse_unknown(path: Path, kind: str, given: Iterable[str], known: Iterable[str]) -> None:
+    for name in given:
+        if name not in known:
+            raise InputError(
+                f"{path}: unknown {kind} '{name}'{did_you_mean(name, known)}; known are {', '.join(known)}"
+            )
+
+
+def _text(path: Path, where: str, value: object) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise InputError(f"{path}: {where} must be a non-empty string, but is {_short(value)}")
+    return value
+
+
+def _short(value: object) -> str:
+    try:
+        shown = repr(value)
+    except ValueError:
+        # Python refuses to write out an integer of thousands of digits.
+        shown = "a number of thousands of digits"
+    return shown if len(shown) <= 60 else f"{shown[:57]}..."
+
+
+def _positive(path: Path, table: str, key: str, value: object, unit: str) -> float | None:
+    if value is None:
+        return None
+    shown = "" if unit == "1" else f" in {unit}"
+    wanted = f"[{table}] {key} must be a positive number{shown}"
+    if isinstance(value, str):
+        try:
+            value = parse_number(value, unit)
+        except UnitError as error:
+            raise InputError(f"{path}: {wanted}, but is {_short(value)} ({error})") from error
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{path}: {wanted}, but is {_short(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not (math.isfinite(number) and number > 0):
+        raise InputError(f"{path}: {wanted}, but is {_short(value)}")
+    return number
+
+
+def _hold(path: Path, value: object) -> Hold | None:
+    if value is None:
+        return None
+    for hold in HOLDS:
+        if value == hold:
+            return hold
+    hint = did_you_mean(value, HOLDS) if isinstance(value, str) else ""
+    raise InputError(f"{path}: [signals] torque_hold must be one of {', '.join(HOLDS)}, but is {_short(value)}{hint}")
+
+
+def _column_map(path: Path, signal: str, entry: object) -> ColumnMap:
+    where = f"[columns] {signal}"
+    if isinstance(entry, str):
+        return ColumnMap(_text(path, where, entry), None, 1.0)
+    if not isinstance(entry, dict):
+        raise InputError(
+            f"{path}: {where} must be a column name or a table such as "
+            f'{{ column = "name", unit = "deg", sign = 1 }}, but is {_short(entry)}'
+        )
+    _refuse_unknown(path, f"key in {where}", entry, ("column", "unit", "sign", "offset", "time"))
+    sign = entry.get("sign", 1)
+    if isinstance(sign, bool) or not isinstance(sign, int | float) or sign not in (1, -1):
+        raise InputError(f"{path}: sign in {where} must be 1 or -1, but is {_short(sign)}")
+    offset = entry.get("offset", 0)
+    # An integer of a thousand digits is valid TOML, and no float.
+    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) < 1e30:
+        raise InputError(
+            f"{path}: offset in {where} must be a number in the column's own unit, but is {_short(offset)}"
+        )
+    unit, time = entry.get("unit"), entry.get("time")
+    return ColumnMap(
+        column=_text(path, f"column in {where}", entry.get("column", signal)),
+        unit=None if unit is None else _text(path, f"unit in {where}", unit),
+        sign=float(sign),
+        offset=float(offset),
+        time=None if time is None else _text(path, f"time in {where}", time),
+    )

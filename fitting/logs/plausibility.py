@@ -1,0 +1,234 @@
+"""Mix-ups that the signals give away together: ratio, sides, signs, units, time base."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.findings import Finding
+from fitting.logs.log import Log
+
+# All thresholds are assumed: they part the practice logs from their mix-ups by a wide margin.
+RATIO_TOLERANCE = 0.02
+FREE_MOTION = 0.02  # rad of the output, more than any gear twists; below it a load may be locked
+LARGE_TWIST = 5e-3  # rad, more than a gear twists by within its ratings, assumed
+SLOW_MODES = 8
+SLOW_SHARE = 0.5
+SLOW_CORRELATION = 0.999
+VELOCITY_TOLERANCE = 0.02
+MOMENTUM_CORRELATION = 0.98
+MOMENTUM_TOLERANCE = 0.15
+FEWEST = 50
+_GAP = 5.0
+
+
+def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    """What the signals of a drive log say against each other.
+
+    Args:
+        log: A drive log. Outputs after `log.outputs_until` rows are not looked at.
+        drive_file: The drive that it was read with.
+    """
+    assert log.motor_angle is not None
+    if len(log.motor_angle[: log.outputs_until]) < 4 * FEWEST:
+        return
+    found = list(_ratio(log, drive_file))
+    yield from found
+    yield from _velocity(log, drive_file, "motor")
+    yield from _velocity(log, drive_file, "load")
+    # With a wrong ratio or side the sum of momenta says nothing new.
+    if not any(finding.severity == "refusal" for finding in found):
+        yield from _momentum(log, drive_file)
+
+
+def _slow(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Amplitudes of the slowest cosines over the log, and their share in the variance.
+
+    A wrong ratio shows at all frequencies, but near and above the resonance the two sides of a
+    healthy drive disagree as well; in slow motion they cannot.
+    """
+    phase = (np.arange(len(values)) + 0.5) * (np.pi / len(values))
+    centred = values - values.mean()
+    modes = np.array([np.cos(k * phase) @ centred for k in range(1, SLOW_MODES + 1)])
+    modes *= 2 / len(values)
+    variance = float(centred @ centred) / len(values)
+    return modes, float(modes @ modes) / 2 / variance if variance > 0 else 0.0
+
+
+def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    """Slope of the load angle against the motor angle in slow motion, against 1/N."""
+    ratio = drive_file.reduction_ratio
+    assert log.motor_angle is not None and log.load_angle is not None and ratio is not None
+    motor, load = log.motor_angle[: log.outputs_until], log.load_angle[: log.outputs_until]
+    (slow_motor, motor_share), (slow_load, load_share) = _slow(motor), _slow(load)
+    if min(motor_share, load_share) < SLOW_SHARE:
+        return
+    cross = float(slow_motor @ slow_load)
+    norms = float(slow_motor @ slow_motor), float(slow_load @ slow_load)
+    if abs(cross) < SLOW_CORRELATION * np.sqrt(norms[0] * norms[1]):
+        return
+    slope = cross / norms[0]
+    where = "load_angle against motor_angle"
+    if ratio > 1.5 and abs(abs(slope) / ratio - 1) < RATIO_TOLERANCE:
+        yield Finding(
+            "refusal",
+            f"the load angle moves {abs(slope):.4g} times as far as the motor angle",
+            where,
+            "the motor and load columns seem swapped, so exchange them in [columns]",
+        )
+        return
+    if slope < 0:
+        yield Finding(
+            "refusal",
+            "the load angle moves against the motor angle",
+            where,
+            "give one of the two sign = -1 in [columns]",
+        )
+        return
+    says = 1 / slope
+    deviation = abs(slope * ratio - 1)
+    span = max(float(np.ptp(load)), float(np.ptp(motor)) / ratio)
+    neighbour = round(says) != ratio and abs(says - round(says)) < 0.02
+    drifts = neighbour and deviation * span > FREE_MOTION
+    if deviation <= RATIO_TOLERANCE and not drifts:
+        return
+    mend = _mend(says, ratio)
+    if span <= FREE_MOTION:
+        severity, consequence = "warning", f"unless it was locked, {mend}"
+    elif deviation * span <= LARGE_TWIST:
+        severity, consequence = "warning", f"unless slow torque twists the gear by {deviation * span:.2g} rad, {mend}"
+    else:
+        severity, consequence = "refusal", mend
+    yield Finding(severity, f"reduction_ratio says {ratio:g} but the angles say {_shown(says)}", where, consequence)
+
+
+def _shown(ratio: float) -> str:
+    return f"{ratio:.1f}" if 0.95 <= ratio < 1e5 else f"{ratio:.3g}"
+
+
+def _mend(says: float, ratio: float) -> str:
+    factor = says / ratio
+    degrees = 180 / np.pi
+    if abs(factor / degrees - 1) < RATIO_TOLERANCE:
+        return 'motor_angle looks like degrees, so give it unit = "deg" in [columns]'
+    if abs(factor * degrees - 1) < RATIO_TOLERANCE:
+        return 'load_angle looks like degrees, so give it unit = "deg" in [columns]'
+    if abs(says - 1) < RATIO_TOLERANCE:
+        return f'both angles seem to be referred to one side, so give motor_angle unit = "{ratio:g} rad" in [columns]'
+    return "correct the ratio in [drive] or the units of the angles in [columns]"
+
+
+def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
+    """A logged velocity, integrated over the stamps, against the angle."""
+    name, ratio = f"{side}_velocity", drive_file.reduction_ratio or 1.0
+    angle, velocity = getattr(log, f"{side}_angle"), getattr(log, name)
+    if velocity is None or np.all(angle == angle[0]):
+        return
+    velocity = velocity[: log.outputs_until]
+    known = np.isfinite(velocity)
+    if log.trusted is not None:
+        known &= log.trusted[: len(known)]
+    if known.sum() < 4 * FEWEST:
+        return
+    time, angle, velocity = log.time[: len(known)][known], angle[: len(known)][known], velocity[known]
+    step = np.diff(time)
+    through = step < _GAP * np.median(step)
+    path = np.cumsum(np.where(through, 0.5 * (velocity[1:] + velocity[:-1]) * step, 0.0))
+    moved = np.cumsum(np.where(through, np.diff(angle), 0.0))
+    moved, gone = moved - moved.mean(), path - path.mean()
+    norms = float(moved @ moved), float(gone @ gone)
+    if norms[1] == 0 or abs(moved @ gone) < 0.99 * np.sqrt(norms[0] * norms[1]):
+        return
+    factor = float(moved @ gone) / norms[1]
+    if abs(factor - 1) <= VELOCITY_TOLERANCE:
+        return
+    units = {
+        "is of the other sign, so give it sign = -1": -1.0,
+        f'looks like the output side\'s, so give it unit = "{ratio:g} rad/s"': ratio,
+        f'looks like the motor side\'s, so give it unit = "rad/s / {ratio:g}"': 1.0 / ratio,
+        'looks like rpm, so give it unit = "rpm"': 2 * np.pi / 60,
+        'looks like degrees, so give it unit = "deg/s"': np.pi / 180,
+    }
+    mend = _closest(factor, units, 1.0)
+    harmless = mend is not None or abs(factor - 1) <= 0.2
+    yield Finding(
+        "warning" if harmless else "refusal",
+        f"the {side} angle moves {factor:.4g} times as far as {name} over time says",
+        name,
+        f"{name} {mend}; it is not fitted"
+        if mend
+        else f"the time base, the side or a unit is wrong, so correct [columns] time, {side}_angle or {name}",
+    )
+
+
+def _closest(factor: float, known: Mapping[str, float], usual: float, tolerance: float = RATIO_TOLERANCE) -> str | None:
+    """The explanation of a factor, unless it is as near to the usual one."""
+    words, value = min(known.items(), key=lambda item: abs(factor / item[1] - 1))
+    likely = abs(value / usual - 1) > 2 * tolerance and abs(factor / value - 1) < tolerance
+    return words if likely else None
+
+
+def _momentum(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    """Rate of change of the momentum of both inertias against the torque from outside; the spring cancels in it.
+
+    N J_m theta_m'' + J_l theta_l'' = N T_m + T_l, times test functions and integrated by parts, so that no angle is
+    differentiated.
+    """
+    N, J_m, J_l = drive_file.reduction_ratio, drive_file.motor_inertia, drive_file.load_inertia
+    if None in (N, J_m, J_l) or log.motor_torque is None or log.outputs_until is not None or log.pieces is not None:
+        return
+    assert log.motor_angle is not None and log.load_angle is not None
+    assert N is not None and J_m is not None and J_l is not None
+    momentum = N * J_m * (log.motor_angle - log.motor_angle[0]) + J_l * (log.load_angle - log.load_angle[0])
+    torque = N * log.motor_torque + (0.0 if log.load_torque is None else log.load_torque)
+    best, gain = 0.0, 1.0
+    for count in (8, 32, 128):
+        changes, pushes = _weak_momentum(log.time, momentum, torque, count)
+        norms = float(changes @ changes), float(pushes @ pushes)
+        if min(norms) == 0 or not np.isfinite(norms).all():
+            continue
+        together = float(changes @ pushes)
+        if abs(together) > best * np.sqrt(norms[0] * norms[1]):
+            best, gain = abs(together) / np.sqrt(norms[0] * norms[1]), together / norms[1]
+    if best < MOMENTUM_CORRELATION or (0.33 < gain < 3.0):
+        return
+    units = {
+        "motor_torque acts against the motion that it makes, so give it, or both angles, sign = -1": -1.0,
+        'motor_torque looks like mN m, so give it unit = "mN m"': 1e-3,
+        'motor_torque looks like kN m, so give it unit = "kN m"': 1e3,
+        f'motor_torque looks like that of the output side, so give it unit = "N m / {N:g}"': 1 / N,
+        f'motor_torque looks too small by the ratio, so give it unit = "{N:g} N m"': N,
+        'both angles look like degrees, so give them unit = "deg"': 180 / np.pi,
+        'both angles look like revolutions, so give them unit = "rev"': 1 / (2 * np.pi),
+        'the time looks like milliseconds, so give it unit = "ms"': 1e-6,
+        'the time looks like microseconds, so give it unit = "us"': 1e-12,
+    }
+    mend = _closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
+    yield Finding(
+        "refusal" if mend else "warning",
+        f"both inertias together accelerate {gain:.3g} times as much as the torque says",
+        "motor_torque against motor_angle and load_angle",
+        f"{mend} in [columns]"
+        if mend
+        else "check motor_inertia and load_inertia in [drive], and the unit of motor_torque",
+    )
+
+
+def _weak_momentum(
+    time: np.ndarray, momentum: np.ndarray, torque: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrals of phi'' times momentum and of phi times torque over `count` windows, phi = (1 - s^2)^4."""
+    edges = np.linspace(0, len(time), count + 1).astype(int)
+    changes, pushes = np.zeros(count), np.zeros(count)
+    for i, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        if b - a < 16:
+            continue
+        t = time[a:b]
+        half = 0.5 * (t[-1] - t[0])
+        s = (t - t[0]) / half - 1.0
+        weight = np.gradient(t)
+        bump = (1 - s**2) ** 4
+        curvature = 8 * (1 - s**2) ** 2 * (7 * s**2 - 1) / half**2
+        changes[i] = np.sum(weight * curvature * (momentum[a:b] - momentum[a]))
+        pushes[i] = np.sum(weight * bump * torque[a:b])
+    return changes, pushes

@@ -1,0 +1,130 @@
+"""The raw columns of a log file, in the file's own names and units, whatever its format."""
+
+import zlib
+from collections.abc import Callable, Iterable
+from io import BytesIO
+from pathlib import Path
+
+from fitting.errors import InputError
+from fitting.logs.arrays import read_hdf5, read_mat
+from fitting.logs.mdf import read_mdf
+from fitting.logs.raw_table import RawTable
+from fitting.logs.text import read_text
+
+# A packed file of more than this is no log of a drive but a mistake, or a trap.
+_LARGEST = 2 << 30
+
+
+def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
+    """The wanted columns of a log file.
+
+    Args:
+        path: CSV, TSV, TXT, DAT, MAT (v5 to v7.3), HDF5, Parquet or MDF4, told by the first bytes where they say it and
+            by the suffix otherwise; also packed by gzip.
+        wanted: Names of columns; those that the file lacks are left out of the answer.
+
+    Returns:
+        The columns as float64 vectors.
+
+    Raises:
+        InputError: The file is missing, corrupt or of no known format, or a wanted column is
+            not a vector of numbers.
+    """
+    suffix = path.with_suffix("").suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    known = _READERS.get(suffix)
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: this is no file; give the log file itself")
+    if not path.exists():
+        if known is None:
+            raise _unknown(path, suffix)
+        raise InputError(f"{path}: there is no such log file; check the path")
+    try:
+        source: Path | BytesIO = _unpacked(path) if path.suffix.lower() == ".gz" else path
+        head = source.getvalue()[:1024] if isinstance(source, BytesIO) else _head(path)
+        reader = next((r for magic, r in _MAGIC.items() if head.startswith(magic)), known)
+        if reader is None:
+            raise _unknown(path, suffix)
+        return reader(path, source, tuple(dict.fromkeys(wanted)))
+    except InputError:
+        raise
+    except OSError as error:
+        if error.strerror:
+            raise InputError(f"{path}: the log cannot be read ({error.strerror}); check its permissions") from error
+        raise _unreadable(path, suffix, error) from error
+    except BaseException as error:
+        # Readers of binary formats meet corrupt bytes with whatever exception is at hand; polars' is no `Exception`.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise _unreadable(path, suffix, error) from error
+
+
+def _unknown(path: Path, suffix: str) -> InputError:
+    return InputError(f"{path}: the format '{suffix}' is not known; save the log as one of {', '.join(_READERS)}")
+
+
+def _unreadable(path: Path, suffix: str, error: BaseException) -> InputError:
+    reason = " ".join(str(error).split())[:200].rstrip(". ") or type(error).__name__
+    return InputError(f"{path}: the file cannot be read as {suffix[1:].upper()}, export it again or mend it: {reason}")
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(1024)
+
+
+def _unpacked(path: Path) -> BytesIO:
+    unpacker = zlib.decompressobj(wbits=31)
+    found = unpacker.decompress(path.read_bytes(), _LARGEST)
+    if unpacker.unconsumed_tail:
+        raise InputError(f"{path}: the log is larger than {_LARGEST >> 30} GiB when unpacked; cut it into shorter ones")
+    if not unpacker.eof:
+        raise InputError(f"{path}: the packed file ends too early; copy it again")
+    return BytesIO(found)
+
+
+def _text(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    return read_text(path, source.getvalue() if isinstance(source, BytesIO) else source.read_bytes(), wanted)
+
+
+def _parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    # Loaded here: most logs are text.
+    from fitting.logs.parquet import read_parquet
+
+    return read_parquet(path, source, wanted)
+
+
+def _mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    raise InputError(
+        f"{path}: MCAP files hold messages of many encodings, which this program does not decode; "
+        "export the joint's topics as CSV or Parquet"
+    )
+
+
+def _zip(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    raise InputError(f"{path}: this is a zip archive or a spreadsheet; unpack it or save the table as CSV")
+
+
+Reader = Callable[[Path, Path | BytesIO, tuple[str, ...]], RawTable]
+_READERS: dict[str, Reader] = {
+    ".csv": _text,
+    ".tsv": _text,
+    ".txt": _text,
+    ".dat": _text,
+    ".asc": _text,
+    ".mat": read_mat,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
+    ".parquet": _parquet,
+    ".mf4": read_mdf,
+    ".mdf": read_mdf,
+}
+_MAGIC: dict[bytes, Reader] = {
+    b"\x89HDF\r\n\x1a\n": read_hdf5,
+    b"PAR1": _parquet,
+    b"MATLAB ": read_mat,
+    b"MDF     ": read_mdf,
+    b"\x89MCAP0\r\n": _mcap,
+    b"PK\x03\x04": _zip,
+}
+LOG_SUFFIXES = tuple(_READERS)
+"""How the names of log files end."""

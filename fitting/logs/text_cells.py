@@ -1,0 +1,117 @@
+"""Cells of text: how polars parts them, and the numbers in a column of them, however they are spelled."""
+
+from io import BytesIO
+
+import numpy as np
+import polars as pl
+
+from fitting.logs.raw_table import RawColumn
+
+# What loggers write where they have no number.
+_BLANKS = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "?", "nil", "missing")
+_SECONDS_A_DAY = 86400.0
+# Day first is the custom wherever a dot parts day and month; a slash says nothing, so such stamps are refused.
+_DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
+
+
+def cells(lines: list[str], delimiter: str, width: int, places: list[int]) -> pl.DataFrame:
+    """The cells of some columns as text; rows that are too short end blank, longer ones are cut."""
+    if delimiter == " ":
+        lines = [" ".join(line.split()) for line in lines]
+    source = "\n".join(line for line in lines if line.strip()).encode()
+    if b'"' in source:
+        rows = sum(bool(line.strip()) and not line.startswith("#") for line in lines)
+        try:
+            found = _parsed(source, delimiter, width, places, '"')
+        except pl.exceptions.PolarsError:
+            found = None
+        # A quotation mark that stands alone swallows the rest of the file.
+        if found is not None and found.height == rows:
+            return found
+    return _parsed(source, delimiter, width, places, None)
+
+
+def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote: str | None) -> pl.DataFrame:
+    return pl.read_csv(
+        BytesIO(source),
+        separator=delimiter,
+        comment_prefix="#",
+        quote_char=quote,
+        has_header=False,
+        schema={f"c{i}": pl.String for i in range(width)},
+        columns=places,
+        truncate_ragged_lines=True,
+    )
+
+
+def column_from_text(text: pl.Series, *, comma_parts_cells: bool) -> RawColumn:
+    """The numbers in a column of text: any decimal sign, thousands separators where they can't be mistaken, dates.
+
+    Args:
+        text: the cells.
+        comma_parts_cells: whether the comma is the file's delimiter, so that a comma inside a (quoted) cell with three
+            digits behind it parts thousands.
+    """
+    cells = text.cast(pl.String).str.strip_chars()
+    blank = (cells.is_null() | cells.str.to_lowercase().is_in(_BLANKS)).to_numpy()
+    values = _numbers(cells, comma_parts_cells)
+    wrong = (
+        np.isnan(values) & ~blank & ~cells.str.to_lowercase().is_in(("+nan", "-nan")).fill_null(value=False).to_numpy()
+    )
+    if wrong.sum() > 0.5 * max(1, (~blank).sum()):
+        stamps = _stamps(cells.filter(pl.Series(~blank)))
+        if stamps is not None:
+            values = np.full(len(cells), np.nan)
+            values[~blank] = stamps
+            return RawColumn(values, unit="s")
+    rows = np.flatnonzero(wrong)
+    return RawColumn(values, text_rows=rows, text=str(cells[int(rows[0])])[:40] if len(rows) else "")
+
+
+def _numbers(cells: pl.Series, comma_parts_cells: bool) -> np.ndarray:
+    values = cells.cast(pl.Float64, strict=False)
+    if values.null_count() > cells.null_count():
+        # Minus signs, spaces and exponents that typesetters and Fortran write.
+        plain = cells.str.replace_all(r"[\u2212\u2013]", "-").str.replace_all(r"['’\s\u00a0\u202f]", "")
+        plain = plain.str.replace(r"^([-+]?[0-9.,]+)[dD]([-+]?[0-9]+)$", "${1}e${2}")
+        values = _point(plain, comma_parts_cells).cast(pl.Float64, strict=False)
+    return values.fill_null(float("nan")).to_numpy().astype(np.float64)
+
+
+def _point(cells: pl.Series, comma_parts_cells: bool) -> pl.Series:
+    """The cells with a decimal point and no thousands separators."""
+    comma, point = cells.str.contains(",", literal=True), cells.str.contains(".", literal=True)
+    if not comma.any():
+        several = cells.str.count_matches(r"\.").fill_null(0)
+        return cells.str.replace_all(".", "", literal=True) if (several > 1).any() else cells
+    both = comma & point
+    if both.any():
+        example = str(cells.filter(both.fill_null(value=False))[0])
+        grouping = "," if example.rfind(".") > example.rfind(",") else "."
+    else:
+        grouped = cells.filter(comma.fill_null(value=False)).str.contains(r"^[-+]?[0-9]{1,3}(,[0-9]{3})+$")
+        several = (cells.str.count_matches(",").fill_null(0) > 1).any()
+        # A lone "1,234" is a decimal comma unless commas part the cells.
+        grouping = "," if grouped.all() and (several or comma_parts_cells) else "."
+    return cells.str.replace_all(grouping, "", literal=True).str.replace(",", ".", literal=True)
+
+
+def _stamps(cells: pl.Series) -> np.ndarray | None:
+    """Seconds of dates, since 1970, or of times of day; None where they are neither."""
+    # Digits beyond the ninth are dropped, a zone is taken off: only differences matter.
+    plain = cells.str.replace(",", ".", literal=True).str.replace(r"\s*(Z|UTC|[-+][0-9]{2}:?[0-9]{2})$", "")
+    parts = plain.str.extract_groups(r"^(?:([0-9./-]+)[T\s_]+)?([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:\.[0-9]*)?))?$")
+    date, hour, minute, second = (parts.struct.field(f) for f in ("1", "2", "3", "4"))
+    if hour.null_count() or len(cells) == 0:
+        return None
+    clock = [p.cast(pl.Float64, strict=False).fill_null(0.0).to_numpy() for p in (hour, minute, second)]
+    seconds = clock[0] * 3600.0 + clock[1] * 60.0 + clock[2]
+    if date.null_count() == len(date):
+        # The clock starts anew at midnight.
+        return seconds + _SECONDS_A_DAY * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY)
+    for form in _DATES:
+        days = date.str.to_date(form, strict=False)
+        if days.null_count() == 0:
+            number = days.cast(pl.Int32).to_numpy()
+            return seconds + _SECONDS_A_DAY * number
+    return None

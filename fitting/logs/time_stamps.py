@@ -1,0 +1,304 @@
+"""From logged stamps to a time base that rises: wrapped counters, doubled, swapped and coarse stamps."""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+
+from fitting.errors import InputError
+from fitting.logs.findings import Finding
+
+# All thresholds are assumed: no timer or logger states them.
+_COUNTERS = tuple(2.0**bits for bits in (16, 24, 31, 32, 53))
+_DAY = 86400.0
+_SCALES = (1.0, 1e-3, 1e-6, 1e-9)
+_FAR = 20.0  # typical steps; as close to the counter's ends a wrap must begin and end
+_LONG = 50  # rows of a recording that starts anew, rather than of a packet that came late
+_IRREGULAR = 0.3
+_WORST = 0.2  # share of rows that may be lost before the column is no clock at all
+_COARSE = 1e-4  # stamps this much finer than the step are as good as exact
+_MOST_STEPS = 64
+_LATEST = 1e30  # nanoseconds since the big bang are fewer; beyond are fill values
+_FEW = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class TimeBase:
+    """Stamps that rise strictly.
+
+    Attributes:
+        rows: which rows of the table have one, in the order of their stamps.
+        time: [s], like `rows`.
+        restarts: places in `rows` where a recording starts anew, with no known time since the one before.
+        findings: what was mended.
+    """
+
+    rows: np.ndarray
+    time: np.ndarray
+    restarts: np.ndarray
+    findings: tuple[Finding, ...]
+
+
+class _Mender:
+    """The stamps of one column on their way; each step keeps or drops rows and says so."""
+
+    def __init__(self, name: str, stamps: np.ndarray, first_row: int):
+        self.name, self.first_row = name, first_row
+        self.time = np.where(np.abs(stamps) < _LATEST, stamps, np.nan)
+        self.rows = np.arange(len(stamps))
+        self.restarts = np.zeros(0, dtype=int)
+        self.findings: list[Finding] = []
+        self.lost = 0
+
+    def say(self, severity, what: str, place: int | None, consequence: str) -> None:
+        where = (
+            self.name if place is None else f"{self.name}, first in data row {self.first_row + self.rows[place] + 1}"
+        )
+        self.findings.append(Finding(severity, what, where, consequence))
+
+    def keep(self, kept: np.ndarray) -> None:
+        """Keep some rows (a mask)."""
+        self.restarts = np.searchsorted(np.flatnonzero(kept), self.restarts)
+        self.rows, self.time = self.rows[kept], self.time[kept]
+
+    def lose(self, lost: np.ndarray) -> None:
+        """Drop rows (a mask) that the log is poorer for."""
+        self.lost += int(lost.sum())
+        self.keep(~lost)
+
+
+def time_base(
+    stamps: np.ndarray, samples: np.ndarray, *, path: object, name: str, second: float, first_row: int
+) -> TimeBase:
+    """The time base that a column of stamps means.
+
+    Args:
+        stamps: [s] as logged, (n,), NaN where blank.
+        samples: all other columns, (n, columns); a row that repeats them and its stamp is a doubled row.
+        path: the log, for messages.
+        name: the column, for messages.
+        second: how many of the column's own units make a second; counters wrap in these.
+        first_row: row of the file in which the stamps begin.
+
+    Returns:
+        The time base.
+
+    Raises:
+        InputError: The column is no clock: it stands still, or too few of its rows make sense.
+    """
+    mender = _Mender(name, stamps, first_row)
+    _unwrap(mender, second)
+    _drop_doubled(mender, samples)
+    _order(mender, samples)
+    _fill_blanks(mender)
+    _spread_coarse(mender)
+    _drop_repeated(mender)
+    if len(mender.time) < 2 or mender.lost > _WORST * len(stamps):
+        lost = mender.lost / max(1, len(stamps))
+        raise InputError(
+            f"{path}: the column '{name}' is no clock, since it stands still, runs backwards or is blank in "
+            f"{100 * lost:.0f} % of its rows; name the right column in [columns] time, export its stamps with all "
+            "their digits, or remove it and give [signals] sample_rate"
+        )
+    return TimeBase(mender.rows, mender.time, mender.restarts, tuple(mender.findings))
+
+
+def _typical(time: np.ndarray) -> float:
+    """Median of the steps, whichever way they go, that are none of standing still."""
+    step = np.abs(np.diff(time[np.isfinite(time)]))
+    return float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+
+
+def _unwrap(mender: _Mender, second: float) -> None:
+    ticks = mender.time * second
+    step = np.diff(ticks)
+    typical = _typical(ticks)
+    back = np.flatnonzero(step < 0)
+    if typical == 0 or len(back) == 0:
+        return
+    reach = _FAR * typical
+    for span in (*(c * s for c in _COUNTERS for s in _SCALES), *(_DAY * s for s in (1.0, 1e3, 1e6, 1e9))):
+        if span < 10 * reach:
+            continue
+        for low in (0.0, -span / 2):
+            from_end = np.abs(ticks[back] - (low + span)) < reach
+            to_begin = np.abs(ticks[back + 1] - low) < reach
+            wraps = back[from_end & to_begin]
+            if len(wraps) == 0 or np.nanmin(ticks) < low - 1 or np.nanmax(ticks) > low + span:
+                continue
+            turns = np.zeros(len(ticks))
+            turns[wraps + 1] = 1.0
+            mender.time = (ticks + span * np.cumsum(turns)) / second
+            mender.say(
+                "note", f"the clock wraps at {span:.10g} in {len(wraps)} places", int(wraps[0]) + 1, "it was unwrapped"
+            )
+            return
+
+
+def _drop_doubled(mender: _Mender, samples: np.ndarray) -> None:
+    """Rows that repeat an earlier row altogether: a buffer was written twice."""
+    known = np.flatnonzero(np.isfinite(mender.time))
+    order = known[np.argsort(mender.time[known], kind="stable")]
+    same = np.diff(mender.time[order]) == 0
+    alike = np.all((samples[order][1:] == samples[order][:-1]) | np.isnan(samples[order][1:]), axis=1)
+    doubled = order[1:][same & alike]
+    if len(doubled) == 0:
+        return
+    mender.say("warning", f"twice the same row, stamp and all, {len(doubled)} times", int(doubled.min()), "one is used")
+    kept = np.ones(len(mender.rows), dtype=bool)
+    kept[doubled] = False
+    mender.keep(kept)
+
+
+def _irregular(step: np.ndarray, typical: float) -> int:
+    return int(np.sum(np.abs(step / typical - 1) > _IRREGULAR))
+
+
+def _order(mender: _Mender, samples: np.ndarray) -> None:
+    """Rows that came late are sorted in; a recording that starts anew is set behind the one before."""
+    known = np.flatnonzero(np.isfinite(mender.time))
+    time = mender.time[known]
+    step, typical = np.diff(time), _typical(time)
+    back = np.flatnonzero(step < 0)
+    if len(back) == 0 or typical == 0:
+        return
+    order = np.argsort(time, kind="stable")
+    sorted_step = np.diff(time[order])
+    if (sorted_step > 0).all() and _irregular(sorted_step, typical) < _irregular(step, typical):
+        mender.say(
+            "warning", f"{len(back)} times a row comes late", int(known[back[0]]) + 1, "rows were sorted by stamp"
+        )
+        mender.rows, mender.time = mender.rows[known[order]], time[order]
+        return
+    runs = np.diff(np.concatenate(([0], back + 1, [len(time)])))
+    wild = ~_rising(time)
+    if wild.mean() > _FEW and runs.min() >= _LONG:
+        # How long the pause was nobody knows; what follows is fitted as a stretch of its own.
+        shift = np.zeros(len(time))
+        shift[back + 1] = -step[back] + 100 * typical
+        mender.time[known] = time + np.cumsum(shift)
+        mender.say(
+            "warning",
+            f"the clock starts anew in {len(back)} places",
+            int(known[back[0]]) + 1,
+            "each part is fitted as a stretch of its own, and its stamps were shifted behind those before",
+        )
+        mender.restarts = known[back] + 1
+        return
+    # Single stamps that fit nowhere: the greatest rising part is kept.
+    mender.time[known[wild]] = np.nan
+
+
+def _rising(time: np.ndarray) -> np.ndarray:
+    """Which stamps belong to the longest rising subsequence (patience sorting)."""
+    tails: list[float] = []
+    ends: list[int] = []
+    before = np.full(len(time), -1)
+    for i, value in enumerate(time.tolist()):
+        place = bisect_right(tails, value)
+        before[i] = ends[place - 1] if place else -1
+        tails[place : place + 1] = [value]
+        ends[place : place + 1] = [i]
+    kept = np.zeros(len(time), dtype=bool)
+    at = ends[-1]
+    while at >= 0:
+        kept[at] = True
+        at = int(before[at])
+    return kept
+
+
+def _fill_blanks(mender: _Mender) -> None:
+    """Stamps that are blank or wild: what the rows around say, where the sampling is regular; else the row goes."""
+    blank = np.isnan(mender.time)
+    if not blank.any() or blank.all():
+        mender.lose(blank)
+        return
+    typical = _typical(mender.time)
+    place = np.arange(len(blank))
+    filled = np.interp(place, place[~blank], mender.time[~blank])
+    around = (
+        np.interp(place, place[~blank][:-1] + 0.5, np.diff(mender.time[~blank]) / np.diff(place[~blank]))
+        if ((~blank).sum() > 1)
+        else np.zeros(len(blank))
+    )
+    inside = (place > place[~blank][0]) & (place < place[~blank][-1])
+    fits = blank & inside & (np.abs(around - typical) < _IRREGULAR * typical)
+    first = int(np.flatnonzero(blank)[0])
+    mender.say(
+        "warning",
+        f"{int(blank.sum())} stamps are blank or fit nowhere in the order",
+        first,
+        f"{int(fits.sum())} were put between their neighbours, the rows of the others were left out",
+    )
+    mender.time = np.where(fits, filled, mender.time)
+    mender.lose(blank & ~fits)
+
+
+def _spread_coarse(mender: _Mender) -> None:
+    """Stamps rounded to a grid of their own, of samples that a steadier clock took: the steady clock's stamps.
+
+    Stamps in milliseconds of samples at 2 kHz repeat; single-precision stamps of a long uptime step by their last bit.
+    If the sample count explains every stamp to within its rounding, the count is the better clock.
+    """
+    time = mender.time
+    step = np.diff(time)
+    if len(step) < 2 or (step < 0).any() or len(mender.restarts):
+        return
+    quantum = _quantum(step)
+    mean = float(np.mean(step[step <= np.median(step) + 2 * quantum]))
+    as_good_as_it_gets = 4 * np.spacing(np.max(np.abs(time)))
+    if quantum <= as_good_as_it_gets or mean <= 0 or quantum < _COARSE * mean:
+        return
+    # A pause has a length that the stamps know to their rounding only, so that the count starts anew behind it.
+    late = step > (mean + 1.2 * quantum if quantum > 0.4 * mean else 1.5 * mean)
+    run = np.concatenate(([0], np.cumsum(late)))
+    count = np.arange(len(time), dtype=float)
+    length = np.bincount(run)
+    time_off = time - (np.bincount(run, time - time[0]) / length)[run] - time[0]
+    count_off = count - (np.bincount(run, count) / length)[run]
+    mean = float(count_off @ time_off / max(1.0, count_off @ count_off))
+    off = time_off - mean * count_off
+    # Steps of one and two quanta may also be those of an exact clock with samples missing, here and there.
+    missing = (step > 0).all() and quantum > 0.75 * np.median(step)
+    loosest = 1.02 if missing else 1.3
+    if mean <= 0 or np.ptp(off) > loosest * quantum or np.max(np.abs(off)) < _COARSE * mean:
+        return
+    steady = time - off
+    if missing and (late.any() or np.sum(step > 1.5 * quantum) < 5) or (np.diff(steady) <= 0).any():
+        return
+    mender.time = steady
+    mender.say(
+        "note",
+        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {mean:.7g} s",
+        None,
+        "the steady clock was used",
+    )
+
+
+def _quantum(step: np.ndarray) -> float:
+    """The grid on which the steps lie, or 0 where they lie on none."""
+    scale = float(np.median(np.abs(step))) or float(np.mean(np.abs(step)))
+    if not scale > 0:
+        return 0.0
+    # Differences closer than a fraction of the step are one, and the rounding of a double.
+    gaps = np.diff(np.unique(step))
+    gaps = gaps[gaps > _COARSE * scale]
+    if not 1 <= len(gaps) < _MOST_STEPS:
+        return 0.0
+    quantum = float(gaps.min())
+    off = np.abs(step / quantum - np.rint(step / quantum))
+    # Of a very fine grid the steps say no more than how far they lie apart.
+    return quantum if quantum < 0.01 * scale or np.mean(off < 0.05) > 0.98 else 0.0
+
+
+def _drop_repeated(mender: _Mender) -> None:
+    repeated = np.concatenate(([False], np.diff(mender.time) <= 0))[: len(mender.time)]
+    if not repeated.any():
+        return
+    mender.say(
+        "warning",
+        f"{int(repeated.sum())} rows repeat the stamp of the row before with other numbers",
+        int(np.argmax(repeated)),
+        "they were left out",
+    )
+    mender.lose(repeated)

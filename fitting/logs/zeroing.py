@@ -1,0 +1,116 @@
+"""Where the spring is relaxed, in a log whose two sensors were not zeroed together."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.findings import Finding
+from fitting.logs.log import Log
+
+LARGEST_TWIST = 0.02  # rad, more than any gear twists, assumed
+_OFFSET = 3.0  # standard deviations, assumed
+_NO_MEAN = 0.1  # likewise, of an input
+_WIDTHS = (16, 32, 64, 128, 256)
+_EVEN = 0.2
+_FEWEST = 25
+
+
+def zeroed(log: Log, drive_file: DriveFile) -> Log:
+    """The log with its dynamic error counted from where the spring is relaxed.
+
+    A spring that is held away from zero needs a mean torque, and no gear twists by more than a degree; what neither
+    explains is an offset of the sensors, and is taken off. A smaller one can't be told from a load, and stays.
+
+    Args:
+        log: as read and masked.
+        drive_file: for the load's inertia.
+
+    Returns:
+        The log, its `zero`, and a finding where there is something to tell.
+    """
+    with np.errstate(all="ignore"):
+        known = slice(log.outputs_until) if log.trusted is None else log.trusted[: log.outputs_until]
+        x = log.dynamic_error[: log.outputs_until][known]
+        middle, spread = float(np.median(x)), float(np.std(x))
+        torque = log.motor_torque if log.forcing is None else log.forcing
+        assert torque is not None
+        impossible = log.kind == "drive" and abs(middle) > max(LARGEST_TWIST, _OFFSET * spread)
+        balanced = abs(float(np.mean(torque))) < _NO_MEAN * float(np.std(torque)) and log.load_torque is None
+        unexplained = balanced and abs(middle) > _OFFSET * spread > 0 and log.outputs_until is None
+        if not (impossible or unexplained):
+            return log
+        offset = _relaxed(log, torque, drive_file.load_inertia, middle)
+    unit = log.units["dynamic_error"]
+    finding = Finding(
+        "note" if unexplained else "warning",
+        f"the dynamic error stands {middle:.4g} {unit} off zero, around which it moves by {spread:.3g} {unit} rms",
+        "dynamic_error",
+        f"the sensors were not zeroed together, so that it is counted from {offset:.7g} {unit}"
+        + ("" if unexplained else "; a steady load looks the same, so that alpha may be the one around this point"),
+    )
+    return replace(log, dynamic_error=log.dynamic_error - offset, zero=offset, findings=(*log.findings, finding))
+
+
+def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: float) -> float:
+    """The twist at which the spring's torque vanishes: the root of a cubic that is fitted with the equation of motion.
+
+    Weak form as for the starting values: the load's equation J_l theta_l'' = p(x) + B x', or that of the reduced drive
+    with b u on its right, times test functions and integrated by parts.
+    """
+    best, root = np.inf, middle
+    x = log.dynamic_error - middle
+    for width in _WIDTHS:
+        windows = _windows(log, width)
+        if len(windows) < _FEWEST:
+            continue
+        # A short beginning of a log can't tell a cubic from a line.
+        powers = 4 if log.outputs_until is None else 2
+        s = (np.arange(width) + 0.5) / width * 2 - 1
+        half = 0.5 * width * float(np.median(np.diff(log.time)))
+        bump, slope = (1 - s**2) ** 4, -8 * s * (1 - s**2) ** 3 / half
+        curvature = 8 * (1 - s**2) ** 2 * (7 * s**2 - 1) / half**2
+
+        def against(signal: np.ndarray, shape: np.ndarray, windows: np.ndarray = windows, width: int = width):
+            return np.lib.stride_tricks.sliding_window_view(signal, width)[windows] @ shape
+
+        spring = [against(x**k, bump) for k in range(powers)]
+        if log.kind == "drive":
+            assert log.motor_angle is not None and log.load_angle is not None
+            rows = [*spring, -against(x, slope)]
+            right = (load_inertia or 1.0) * against(log.load_angle - log.load_angle[0], curvature)
+        else:
+            rows = [*spring, -against(x, slope), -against(torque, bump)]
+            right = -against(x, curvature)
+        matrix = np.stack(rows, axis=1)
+        norm = np.linalg.norm(matrix, axis=0)
+        norm[norm == 0] = 1.0
+        if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
+            continue
+        found = np.linalg.lstsq(matrix / norm, right, rcond=1e-9)[0]
+        missed = float(np.linalg.norm(matrix / norm @ found - right) / np.linalg.norm(right))
+        found = found / norm
+        relaxed = _root(found[:powers], float(np.ptp(x[: log.outputs_until])))
+        if missed < best and found[1] > 0 and relaxed is not None:
+            best, root = missed, middle + relaxed
+    return root if best < 0.5 else middle
+
+
+def _windows(log: Log, width: int) -> np.ndarray:
+    """First rows of windows, overlapping by three quarters, in which sampling is even and all outputs are believed."""
+    step = np.diff(log.time)
+    good = np.concatenate((np.abs(step / np.median(step) - 1) < _EVEN, [True]))[: log.outputs_until]
+    if log.trusted is not None:
+        good &= log.trusted[: log.outputs_until]
+    bad = np.concatenate(([0], np.cumsum(~good)))
+    first = np.arange(0, len(good) - width + 1, max(1, min(width // 4, len(good) // 50)))
+    return first[bad[first + width] == bad[first]]
+
+
+def _root(cubic: np.ndarray, span: float) -> float | None:
+    """The real root closest to zero, if within the motion."""
+    if not np.isfinite(cubic).all():
+        return None
+    roots = np.roots(cubic[::-1])
+    real = roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)]
+    return float(real[np.argmin(np.abs(real))]) if len(real) and np.min(np.abs(real)) < span else None

@@ -1,0 +1,1 @@
+"""The experiment that would decide what the logs leave open."""

@@ -1,0 +1,296 @@
+"""How far an experiment tells two models apart: what stays between them once the rival has been refitted.
+
+If one model is right, and a rival is fitted to what it makes, the rival's sum of squares in units of the noise is twice
+the log-likelihood ratio to be expected: the T-optimality of Atkinson and Fedorov (1975, Biometrika 62, "The design of
+experiments for discriminating between two rival models"). Summed over both cases of which model is right it is the
+divergence of Box and Hill (1967, Technometrics 9, "Discrimination among mechanistic models").
+
+The refit's minimum has no slope, so that the derivative of the sum of squares by the command is that at fixed
+parameters (the envelope theorem).
+"""
+
+from collections.abc import Sequence
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimation.estimate import whitening
+from fitting.estimation.free_parameters import FreeParameters, free_parameters
+from fitting.next_experiment.excitation import Excitation, Limits
+from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
+from hdjax.lanes import jit_lanes
+from hdjax.simulate import march
+
+# A refit has arrived where another step would lower its sum of squares by less than this share (or in all).
+_ARRIVED, _NOTHING = 1e-2, 1e-2
+_STEPS = 6
+_HALVINGS = 3
+# Largest step of a parameter that moves by its logarithm.
+_LONGEST = 1.0
+# A simulation that runs away, or whose derivatives do, is this far off in units of the noise.
+_LOST = 1e15
+# A parameter that could change by more than a factor of twenty within the noise is not sought any further.
+_DAMPING = 0.1
+# Directions of the unknowns that the outputs hardly see.
+_BLIND = 1e-10
+
+
+class Explanation(eqx.Module):
+    """A model that may be right.
+
+    Attributes:
+        name: what tells it from its rivals.
+        model: with fitted values.
+        free: what its refit may change.
+        hold: what the torque does between samples.
+    """
+
+    name: str = eqx.field(static=True)
+    model: Model
+    free: FreeParameters
+    hold: Hold = eqx.field(static=True)
+
+
+def explanation(
+    name: str, model: Model, paths: Sequence[str], *, scale: dict[str, float] | None = None, hold: Hold
+) -> Explanation:
+    """An explanation whose refit may change the parameters at `paths`; `scale` as in
+    [`fitting.estimation.free_parameters.free_parameters`][]."""
+    return Explanation(name, model, free_parameters(model, paths, scale or {}), hold)
+
+
+class Bench(eqx.Module):
+    """How an experiment is simulated.
+
+    Attributes:
+        motor_angle: where the motor rests at the start [rad].
+        noise: covariance of the measurement noise of the outputs.
+        limits: in whose units the motion is told.
+        halo: intervals of no torque before the start, for delays.
+        substeps: solver steps in a sample interval.
+        temperature: of the drive [K], where an effect depends on it.
+    """
+
+    motor_angle: float
+    noise: Float[Array, "outputs outputs"]
+    limits: Limits
+    halo: int
+    substeps: int
+    temperature: float | None
+
+
+class Signals(eqx.Module):
+    """A command's shapes between the samples."""
+
+    knots: Float[Array, " knots"]
+    shapes: Float[Array, "intervals powers shapes"]
+
+
+class Response(eqx.Module):
+    """What a model answers to a command, and its derivatives.
+
+    Attributes:
+        outputs: in units of the noise.
+        by_unknown: derivative with respect to what a refit may change: free parameters, then the first motion state.
+        by_command: derivative with respect to the command's coefficients.
+        motion: motor speed and the output's way from the start (of a drive alone), then the dynamic error; in units of
+            the limits.
+        motion_by_command: derivative likewise.
+    """
+
+    outputs: Float[np.ndarray, " rows"]
+    by_unknown: Float[np.ndarray, "rows unknowns"]
+    by_command: Float[np.ndarray, "rows shapes"]
+    motion: Float[np.ndarray, "samples quantities"]
+    motion_by_command: Float[np.ndarray, "samples quantities shapes"]
+
+    @property
+    def usable(self) -> bool:
+        """Whether neither the simulation nor its derivatives run away."""
+        return all(bool(np.all(np.abs(a) < _LOST)) for a in (self.outputs, self.by_unknown, self.by_command))
+
+
+class Refit(eqx.Module):
+    """A rival that was fitted to what another model makes.
+
+    Attributes:
+        unknowns: the rival's free parameters and first motion state.
+        response: at these.
+        left: what stays of the difference, in units of the noise.
+    """
+
+    unknowns: Float[np.ndarray, " unknowns"]
+    response: Response
+    left: Float[np.ndarray, " rows"]
+
+    @property
+    def squares(self) -> float:
+        """Its sum of squares, twice the log-likelihood ratio to be expected."""
+        return float(self.left @ self.left)
+
+    def slope(self, truth: Response) -> Float[np.ndarray, " shapes"]:
+        """Derivative of the sum of squares by the command's coefficients."""
+        return 2.0 * self.left @ (truth.by_command - self.response.by_command)
+
+
+def signals(excitation: Excitation, *, hold: Hold, bench: Bench) -> Signals:
+    """A command's shapes between the samples."""
+    step = bench.limits.time_step
+    time = np.arange(-bench.halo, excitation.shapes.shape[0]) * step
+    made = []
+    for shape in excitation.shapes.T:
+        values = np.concatenate([np.zeros(bench.halo), excitation.torque * shape])
+        made.append(np.asarray(sampled(time, values, hold=hold).coefficients))
+    knots = np.arange(-bench.halo, excitation.shapes.shape[0] + 1) * step
+    return Signals(jnp.asarray(knots), jnp.asarray(np.stack(made, axis=-1)))
+
+
+def in_own_units(white: Float[np.ndarray, " rows"], bench: Bench) -> Float[np.ndarray, "samples outputs"]:
+    """Outputs in their own units, from those in units of the noise."""
+    colour = np.linalg.inv(np.asarray(whitening(bench.noise)))
+    return white.reshape(-1, colour.shape[0]) @ colour.T
+
+
+def start(of: Explanation) -> Float[np.ndarray, " unknowns"]:
+    """The unknowns of an explanation as it is."""
+    return np.concatenate([np.asarray(of.free.pack(of.model)), np.zeros(len(of.model.motion_states))])
+
+
+def respond(
+    of: Explanation,
+    unknowns: Float[np.ndarray, " unknowns"],
+    command: Float[np.ndarray, " shapes"],
+    *,
+    signals: Signals,
+    bench: Bench,
+) -> Response:
+    """Simulate an experiment from rest, with all derivatives."""
+    model = of.model
+    drive = isinstance(model, TwoInertiaModel)
+    rest = np.zeros(len(model.motion_states))
+    if drive:
+        rest[0], rest[1] = bench.motor_angle, bench.motor_angle / float(model.drive.N)
+    warm = any(e.needs_temperature for e in model.effects)
+    limits = bench.limits
+    units = [limits.speed, limits.travel * float(model.drive.N)] if drive else []
+    setup = _Setup(
+        rest=jnp.asarray(rest),
+        white=jnp.asarray(whitening(bench.noise)),
+        units=jnp.asarray(np.array([*units, limits.twist])),
+        temperature=jnp.asarray(np.asarray(bench.temperature if warm and bench.temperature is not None else 0.0)),
+        substeps=jnp.asarray(np.asarray(bench.substeps)),
+        halo=bench.halo,
+    )
+    found = _respond(model, of.free, signals, setup, jnp.asarray(np.concatenate([unknowns, command])))
+    outputs, motion, columns, motion_columns = (np.asarray(a) for a in found)
+    return Response(
+        outputs.ravel(),
+        columns[..., : unknowns.size].reshape(outputs.size, -1),
+        columns[..., unknowns.size :].reshape(outputs.size, -1),
+        motion,
+        motion_columns[..., unknowns.size :],
+    )
+
+
+class _Setup(eqx.Module):
+    """A bench as a compiled program takes it.
+
+    Attributes:
+        rest: motion state at the start.
+        white: whitening of the outputs.
+        units: of what has limits.
+        temperature: of the drive [K].
+        substeps: solver steps in a sample interval.
+        halo: intervals of no torque before the start.
+    """
+
+    rest: Array
+    white: Array
+    units: Array
+    temperature: Array
+    substeps: Array
+    halo: int = eqx.field(static=True)
+
+
+@jit_lanes
+def _respond(
+    model: Model, free: FreeParameters, signals: Signals, setup: _Setup, at: Array
+) -> tuple[Array, Array, Array, Array]:
+    own, motions = len(free.paths), len(model.motion_states)
+
+    def simulated(entries: Array) -> tuple[Array, Array]:
+        drive = free.unpack(model, entries[:own])
+        torque = PiecewisePolynomial(signals.knots, signals.shapes @ entries[own + motions :])
+        acting = drive.actuate(torque)
+        acting = PiecewisePolynomial(acting.knots[setup.halo :], acting.coefficients[setup.halo :])
+        steady = jnp.broadcast_to(setup.temperature, (acting.coefficients.shape[0], 1))
+        warmth = PiecewisePolynomial(acting.knots, steady)
+        state = drive.settled(setup.rest + entries[own : own + motions])
+        states, _ = march(drive, acting, None, state, solver=dfx.Tsit5(), substeps=setup.substeps, temperature=warmth)
+        outputs = jax.vmap(drive.outputs)(states)
+        moved = [states[:, 2], states[:, 0] - setup.rest[0]] if setup.units.size > 1 else []
+        return outputs @ setup.white.T, jnp.stack([*moved, outputs[:, -1]], axis=1) / setup.units[None, :]
+
+    def along(tangent: Array):
+        return jax.jvp(simulated, (at,), (tangent,))
+
+    (outputs, motion), (columns, motion_columns) = jax.vmap(along, out_axes=(None, -1))(jnp.eye(at.size))
+    return outputs, motion, columns, motion_columns
+
+
+def refit(
+    rival: Explanation,
+    target: Response,
+    command: Float[np.ndarray, " shapes"],
+    *,
+    signals: Signals,
+    bench: Bench,
+    begin: Float[np.ndarray, " unknowns"] | None = None,
+) -> Refit:
+    """Fit a rival to what another model makes, by Gauss-Newton steps.
+
+    Args:
+        rival: what is fitted.
+        target: what the other model makes of the command.
+        command: the command's coefficients.
+        signals: the command's shapes, under the rival's hold.
+        bench: how it is simulated.
+        begin: unknowns to start from; the rival's own where not given.
+    """
+    unknowns = start(rival) if begin is None else begin
+    logarithmic = np.append(rival.free.logarithmic, np.zeros(len(rival.model.motion_states))) > 0
+    response = respond(rival, unknowns, command, signals=signals, bench=bench)
+    if not (target.usable and response.usable):
+        return Refit(unknowns, response, np.full(target.outputs.size, np.nan))
+    for _ in range(_STEPS):
+        error = target.outputs - response.outputs
+        step, left = _solved(response.by_unknown, error, logarithmic)
+        gained = float(error @ error - left @ left)
+        if gained <= _ARRIVED * float(left @ left) + _NOTHING:
+            break
+        size = min(1.0, _LONGEST / max(float(np.max(np.abs(step[logarithmic]), initial=0.0)), 1e-300))
+        for _ in range(_HALVINGS):
+            tried = respond(rival, unknowns + size * step, command, signals=signals, bench=bench)
+            after = target.outputs - tried.outputs
+            if tried.usable and float(after @ after) < float(error @ error):
+                break
+            size *= 0.5
+        else:
+            break
+        unknowns, response = unknowns + size * step, tried
+    return Refit(unknowns, response, _solved(response.by_unknown, target.outputs - response.outputs, logarithmic)[1])
+
+
+def _solved(columns: np.ndarray, error: np.ndarray, logarithmic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least-squares step, damped in what noise would hide anyway, and what stays after it."""
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-150)
+    scaled = columns / size
+    damping = np.where(logarithmic, _DAMPING / size**2, 0.0)
+    values, vectors = np.linalg.eigh(scaled.T @ scaled + np.diag(np.minimum(damping, 1.0)))
+    inverse = np.where(values > _BLIND, 1.0 / np.maximum(values, _BLIND), 0.0)
+    step = vectors @ (inverse * (vectors.T @ (scaled.T @ error)))
+    return step / size, error - scaled @ step

@@ -1,0 +1,76 @@
+"""What a found effect does, beside what the data say of it."""
+
+import numpy as np
+
+from fitting.attribution.effect_evidence import Evidence
+from fitting.formatting import axis_label, pretty_unit
+from fitting.report.plots.axes import AFTER, BEFORE, INK, axis, figure, numbers
+from fitting.report.plots.plot import Figure, Plot
+
+_NORMAL_95 = 1.96
+
+
+def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
+    """The effect along the motion as points, and with error bars what the data call for.
+
+    Args:
+        found: the evidence.
+        units: of its quantity and of its variable, by name.
+    """
+    cloud = {
+        "type": "scatter",
+        "mode": "markers",
+        "name": "as fitted",
+        "x": numbers(found.at),
+        "y": numbers(found.does),
+        "marker": {"color": AFTER, "size": 3, "opacity": 0.5},
+        "hoverinfo": "skip",
+    }
+    layout = {
+        "xaxis": axis(axis_label(found.variable, pretty_unit(units[found.variable])), exponentformat="power"),
+        "yaxis": axis(axis_label(found.quantity, pretty_unit(units[found.quantity])), exponentformat="power"),
+    }
+    caption = f"What {_plain(found.effect)} does along the fitted motion."
+    if found.told.size:
+        caption += (
+            " With error bars (95 %): the torque that the data call for at this place, whatever its law, with all else "
+            "as fitted. Where the law is right, the points lie on it."
+        )
+    if len(found.told) > 1:
+        caption += " The two directions of the motion are asked apart."
+    return Plot(
+        f"evidence-{found.effect.replace('_', '-')}",
+        "found",
+        f"{_plain(found.effect).capitalize()} in the data",
+        caption,
+        figure([cloud, *_told(found)], 380, **layout),
+    )
+
+
+def _told(found: Evidence) -> list[Figure]:
+    apart = len(found.told) > 1
+    traces = []
+    for row, (places, told, std) in enumerate(zip(found.places, found.told, found.std, strict=True)):
+        asked = np.isfinite(places)
+        color = (BEFORE, INK)[row] if apart else INK
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": ("data, backward", "data, forward")[row] if apart else "data",
+                "x": numbers(places[asked]),
+                "y": numbers(told[asked]),
+                "error_y": {
+                    "type": "data",
+                    "array": numbers(_NORMAL_95 * std[asked]),
+                    "color": color,
+                    "thickness": 1.2,
+                },
+                "marker": {"color": color, "size": 6, "symbol": "circle-open"},
+            }
+        )
+    return traces
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")

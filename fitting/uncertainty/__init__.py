@@ -1,0 +1,1 @@
+"""How well parameters and predictions are known, and the noise behind them."""

@@ -1,0 +1,366 @@
+"""What a log can't tell, and why: directions it does not see, parameters too small for it, values taken for granted."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.special import stdtrit
+
+from fitting.estimation.engines import linearise
+from fitting.estimation.estimate import Fit
+from fitting.estimation.experiment import scales
+from fitting.estimation.projection import FirstStates
+from fitting.estimation.residual import Problem
+from fitting.formatting import words
+from fitting.uncertainty.sandwich import directions
+from fitting.uncertainty.standard_errors import Estimate, Uncertainty
+from hdjax import Model, TwoInertiaModel
+from hdjax.parameters import ParameterInfo
+
+# Two standard errors along a direction that are more than 40 % leave it open.
+_WEAK = 0.2
+# Parameters with less than this share of a direction are no part of it.
+_SHARE = 0.2
+# What a drive file states and no log of angles and torque can check: 1 % of it is the unit of its error.
+_HELD = ("J_m", "J_l")
+_PERCENT = 0.01
+# Relative changes of a parameter beyond this are no longer told by derivatives.
+_MOST_LINEAR = 0.3
+# Relative step of the central differences by what is held; their error is its square.
+_STEP = 1e-4
+# A positive parameter below this share of its start has run to zero.
+_VANISHED = 1e-3
+# Next to a bound: within this share of it.
+_AT_BOUND = 0.01
+
+
+class Direction(eqx.Module):
+    """A combination of the free parameters that the logs know independently of all others.
+
+    Attributes:
+        weights: entries of a unit vector by path. A positive parameter counts by its logarithm, any other in `units`.
+        members: the paths that have more than a small share of it.
+        units: what one is of each parameter: 1 for a logarithm, else in SI units.
+        std: standard error along the direction.
+        sentence: what is not determined; None where the direction is.
+    """
+
+    weights: dict[str, float]
+    members: tuple[str, ...] = eqx.field(static=True)
+    units: dict[str, float]
+    std: float
+    sentence: str | None
+
+
+class Held(eqx.Module):
+    """A value that the drive file states, and what an error of it does.
+
+    Attributes:
+        path: dotted path.
+        value: in SI units.
+        changes: relative change of each free parameter for a value that is 1 % larger, at the fit's weights.
+        std_if_free: relative standard error of each free parameter if this value were fitted as well.
+        sentence: the same in words.
+    """
+
+    path: str = eqx.field(static=True)
+    value: float
+    changes: dict[str, float]
+    std_if_free: dict[str, float]
+    sentence: str
+
+
+class Identifiability(eqx.Module):
+    """What the logs of a fit can't tell.
+
+    Attributes:
+        reasons: by path of each parameter that is not identifiable, a sentence that says why and what would help.
+        directions: of the free parameters, the least determined first.
+        held: what was taken from the drive file.
+        bounds: by path of each parameter that ended at a bound, a sentence that says so.
+    """
+
+    reasons: dict[str, str]
+    directions: tuple[Direction, ...]
+    held: tuple[Held, ...]
+    bounds: dict[str, str]
+
+    def note(self, path: str) -> str | None:
+        """Why a parameter's number can't be relied on; None where it can."""
+        return self.bounds.get(path) or self.reasons.get(path)
+
+
+def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
+    """Look for what the logs of a fit can't tell.
+
+    Args:
+        fit: the fit.
+        found: its uncertainty.
+    """
+    if not fit.free.paths:
+        return Identifiability({}, (), (), {})
+    estimates = found.estimates
+    x_max = scales(fit.stretches).x_max
+    x_unit = "rad" if isinstance(fit.model, TwoInertiaModel) else "[x]"
+    known, first = fit.model.parameters(), fit.problem.model
+    bounds = {
+        p: at_bound(p, float(known[p][0]), _in_units_of(fit.model, known[p][1]), start=float(first.get(p)))
+        for p in estimates
+    }
+    return Identifiability(
+        reasons={p: reason(e, x_max=x_max, x_unit=x_unit) for p, e in estimates.items() if not e.identifiable},
+        directions=_directions(fit, found),
+        held=_held(fit, found),
+        bounds={p: sentence for p, sentence in bounds.items() if sentence is not None},
+    )
+
+
+def needed_twist(alpha: Estimate, size: float, *, x_max: float) -> float:
+    """Largest twist that a log of the same kind needs to tell an alpha of a given size from zero.
+
+    The cubic torque grows with the third power of the twist, and the standard error of alpha falls with it.
+
+    Args:
+        alpha: its estimate.
+        size: of the alpha to be seen, in the estimate's unit.
+        x_max: largest twist in the fitted logs.
+    """
+    return x_max * np.cbrt(_reach(alpha) / abs(size)) if size else np.inf
+
+
+def needed_samples(estimate: Estimate, size: float) -> float:
+    """How many times the samples would tell a parameter of a given size from zero."""
+    return (_reach(estimate) / abs(size)) ** 2 if size else np.inf
+
+
+def reason(estimate: Estimate, *, x_max: float, x_unit: str) -> str:
+    """Why a parameter is not identifiable, and what would help.
+
+    Args:
+        estimate: of the parameter.
+        x_max: largest twist in the fitted logs.
+        x_unit: unit of the twist.
+    """
+    path, unit = estimate.path, "" if estimate.unit == "1" else f" {estimate.unit}"
+    low, high = estimate.ci95
+    largest = max(abs(low), abs(high))
+    opening = f"{path} is not identifiable from these logs"
+    if low >= 0 or high <= 0 or not np.isfinite(largest):
+        known = f"they leave it open {_between(low, high, unit)}"
+    elif path == "alpha":
+        known = (
+            f"|alpha| is at most {largest:.2g}{unit}, so that alpha x^2 is at most {largest * x_max**2:.2g} at their "
+            f"largest twist of {x_max:.2g} {x_unit}"
+        )
+    else:
+        known = f"it may be anything up to {largest:.2g}{unit} either way"
+    samples = needed_samples(estimate, estimate.value)
+    if low >= 0 or high <= 0 or not np.isfinite(samples):
+        return f"{opening}: {known}."
+    twist = f"a twist above {needed_twist(estimate, estimate.value, x_max=x_max):.2g} {x_unit}, or "
+    return (
+        f"{opening}: {known}. To tell {estimate.value:.2g}{unit} from zero they would need "
+        f"{twist if path == 'alpha' else ''}{samples:.2g} times the samples."
+    )
+
+
+def _between(low: float, high: float, unit: str) -> str:
+    """An interval in words, whose ends may be infinite."""
+    if not np.isfinite([low, high]).any():
+        return "on both sides"
+    if not np.isfinite(high):
+        return f"above {low:.2g}{unit}"
+    return f"between {low:.2g} and {high:.2g}{unit}" if np.isfinite(low) else f"below {high:.2g}{unit}"
+
+
+def _reach(estimate: Estimate) -> float:
+    """Half the length of a parameter's interval."""
+    return float(stdtrit(estimate.degrees_of_freedom, 0.975)) * estimate.std
+
+
+def _directions(fit: Fit, found: Uncertainty) -> tuple[Direction, ...]:
+    """Principal axes of the free vector's covariance, whose entries are of order one."""
+    free = fit.free
+    units = {
+        p: 1.0 if logarithmic else float(s)
+        for p, logarithmic, s in zip(free.paths, free.logarithmic, np.asarray(free.scale), strict=True)
+    }
+    made = []
+    for std, vector in directions(found.covariance):
+        weights = dict(zip(free.paths, vector.tolist(), strict=True))
+        largest = max(abs(w) for w in weights.values())
+        part = {p: w / largest for p, w in weights.items() if abs(w) >= _SHARE * largest}
+        sentence = _not_determined(fit, part, units) if std > _WEAK and len(part) > 1 else None
+        made.append(Direction(weights, tuple(part), units, std, sentence))
+    return tuple(made)
+
+
+def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, float]) -> str:
+    """A weak direction as a sentence.
+
+    Args:
+        fit: the fit.
+        part: weights of those that have a share of it, the largest of size one.
+        units: what one is of each parameter.
+    """
+    logarithmic = dict(zip(fit.free.paths, fit.free.logarithmic, strict=True))
+    values = {p: float(fit.model.get(p)) for p in part}
+    # Relative changes are what an engineer thinks in; near zero there are none.
+    relative = {
+        p: w if logarithmic[p] else w * units[p] / values[p]
+        for p, w in part.items()
+        if logarithmic[p] or abs(values[p]) > 0.1 * units[p]
+    }
+    moves = [
+        f"{p} by {10 * relative[p]:+.2g} %" if p in relative else f"{p} by {0.1 * w * units[p]:+.2g}"
+        for p, w in part.items()
+    ]
+    names = list(part)
+    sentence = f"The logs can't tell {words(names)} apart: {words(moves)} together hardly change the simulation"
+    if len(relative) < len(part):
+        return f"{sentence}."
+    # The gentlest mover makes the others' products with its powers stand still.
+    still = min(relative, key=lambda p: abs(relative[p]))
+    known = [f"{p} {_power(still, -relative[p] / relative[still])}" for p in names if p != still]
+    return f"{sentence}. They determine {words(known)}, but no factor alone."
+
+
+def _power(path: str, exponent: float) -> str:
+    return path if np.isclose(exponent, 1.0) else f"{path}^{exponent:.2g}"
+
+
+def _in_units_of(model: Model, info: ParameterInfo) -> ParameterInfo:
+    """What is known of a parameter of a model. The units of a reduced log are its own, so that of bounds in SI units no
+    more is left than a sign."""
+    if isinstance(model, TwoInertiaModel) or info.unit == "1":
+        return info
+    low, high = info.bounds
+    return replace(info, bounds=(low if low == 0.0 else -np.inf, high if high == 0.0 else np.inf))
+
+
+def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> str | None:
+    """A sentence about a parameter that ended at a bound of its domain; None where it did not.
+
+    Args:
+        path: of the parameter.
+        value: fitted.
+        info: of the parameter.
+        start: what the fit started from.
+    """
+    if info.positive and value < _VANISHED * start:
+        return (
+            f"{path} ran from {start:.2g} to {value:.2g} {info.unit}, towards its bound at zero: the logs want none, "
+            "and its standard error means nothing."
+        )
+    bound = reached_bound(value, info)
+    if bound is None:
+        return None
+    return (
+        f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense, and its "
+        "standard error means nothing."
+    )
+
+
+def reached_bound(value: float, info: ParameterInfo) -> float | None:
+    """The bound of its domain, zero apart, at which a parameter ended or that it passed; None where there is none.
+
+    Args:
+        value: fitted.
+        info: of the parameter.
+    """
+    low, high = info.bounds
+    for bound, beyond in ((low, value < low), (high, value > high)):
+        if beyond or (bound and np.isfinite(bound) and abs(value - bound) <= _AT_BOUND * abs(bound)):
+            return bound
+    return None
+
+
+def parameters_at_bounds(model: Model, name: str) -> list[str]:
+    """The paths of an effect's parameters that ended at a bound of their domain; a shape that went to zero has become
+    another law, and is none.
+
+    Args:
+        model: with fitted values.
+        name: of the effect.
+    """
+    known = {p: v for p, v in model.parameters().items() if p.startswith(f"{name}.")}
+    return [p for p, (v, info) in known.items() if reached_bound(float(v), _in_units_of(model, info)) is not None]
+
+
+# What the logs do not see at all has no bounds.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
+    """What the drive file states and the fit takes for granted."""
+    if not isinstance(fit.model, TwoInertiaModel):
+        return ()
+    held = tuple(p for p in _HELD if p not in fit.free.paths)
+    if not held:
+        return ()
+    products = np.asarray(_products(fit, held))
+    count = len(fit.free.paths)
+    information, coupling = products[:count, :count], products[:count, count:]
+    # The optimum follows where the gradient stays zero: (J^T J) dp + J^T dr/dJ dJ = 0.
+    response = -np.linalg.lstsq(information, coupling, rcond=None)[0]
+    values = np.array([e.value for e in found.estimates.values()])
+    relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
+    classical = np.linalg.pinv(information, hermitian=True)
+    robust = np.diag(found.covariance) / np.diag(classical)
+    made = []
+    for i, path in enumerate(held):
+        own = products[count + i, count + i] - coupling[:, i] @ classical @ coupling[:, i]
+        if_free = np.diag(classical) + response[:, i] ** 2 / max(own, 1e-300)
+        std_if_free = np.nan_to_num(relative * np.sqrt(robust * if_free), nan=np.inf)
+        change = _PERCENT * response[:, i] * np.sign(values) * relative
+        made.append(
+            _held_one(
+                fit,
+                path,
+                dict(zip(found.estimates, change.tolist(), strict=True)),
+                dict(zip(found.estimates, std_if_free.tolist(), strict=True)),
+            )
+        )
+    return tuple(made)
+
+
+def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[str, float]) -> Held:
+    own = {p: c for p, c in changes.items() if "." not in p and p != "alpha"}
+    sentence = f"{path} is taken from the drive file"
+    if any(abs(c) > _MOST_LINEAR for c in own.values()):
+        sentence += f", and has to be right there: an error of 1 % is more than {words(list(own))} could make up for."
+    elif own:
+        moved = words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
+        sentence += (
+            ", since a log of angles and torque knows inertia and stiffness only in proportion to the torque: if it is "
+            f"1 % too large there, that moves {moved}."
+        )
+    else:
+        sentence += "."
+    return Held(path, float(fit.model.get(path)), changes, std_if_free, sentence)
+
+
+def _products(fit: Fit, held: tuple[str, ...]) -> Float[np.ndarray, "all all"]:
+    """J^T J of the free parameters and the logarithms of what is held, without the initial states.
+
+    By central differences through the program that the fit runs anyway.
+    """
+    problem = fit.at_solution
+    found = linearise(problem, fit.unknowns)
+    rows, gaps = [], []
+    for path in held:
+        value = float(fit.model.get(path))
+        up, down = (
+            linearise(_with_held(problem, path, value * (1.0 + sign * _STEP)), fit.unknowns) for sign in (1, -1)
+        )
+        rows.append((up.residual - down.residual) / (2 * _STEP))
+        gaps.append((up.gap - down.gap) / (2 * _STEP))
+    states = FirstStates.of(found, problem.segments.joined)
+    columns, before = np.stack(rows, axis=-1), -np.stack(gaps, axis=-1)
+    both = np.concatenate([states.parameters_without(found), states.without(columns, before)], axis=2)
+    flat = both.reshape(-1, both.shape[-1])
+    return flat.T @ flat
+
+
+def _with_held(problem: Problem, path: str, value: float) -> Problem:
+    return eqx.tree_at(lambda p: p.model, problem, problem.model.replace({path: value}))

@@ -1,0 +1,165 @@
+"""The noise of the measured outputs, whatever the model lacks."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.estimation.engines import linearise
+from fitting.estimation.estimate import REWEIGHTINGS, Fit, weighed, zeros_like
+from fitting.estimation.experiment import Stretch, cut, scales
+from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
+from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
+from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
+
+# So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.
+_SAMPLES = 2500
+_SETTLED = 0.02
+_STEPS = 30
+# A few steps that together take less than this share off the squares are not worth another.
+_LEAST_PROGRESS = 1e-3
+# Powers of time that forces beyond the model's add to a piece, whose initial state gives it the constant and the slope.
+_POWERS = (2, 3)
+# These take at most 1.4 times off the rms of noise of any colour up to a random walk; where more goes, it was motion.
+_MOTION = 1.5
+# Where pieces are so short that fewer of their numbers are left to tell the noise, powers of time are not taken off.
+_LEAST_LEFT = 0.25
+
+
+class _Pieces(eqx.Module):
+    """What the pieces of some segments leave over.
+
+    Attributes:
+        squares: of the outputs' errors, added up.
+        samples: how many.
+        freedom: how many numbers were fitted to them.
+    """
+
+    squares: Float[np.ndarray, "outputs outputs"]
+    samples: float = 0.0
+    freedom: float = 0.0
+
+    def and_more(self, squares: np.ndarray, samples: float, freedom: float) -> "_Pieces":
+        """With further pieces."""
+        return _Pieces(self.squares + squares, self.samples + samples, self.freedom + freedom)
+
+    @property
+    def left(self) -> float:
+        """Share of the measured numbers that tell the noise, beyond those that were fitted; zero without samples."""
+        rows = self.samples * len(self.squares)
+        return 1.0 - self.freedom / rows if rows else 0.0
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "outputs outputs"]:
+        """Corrected for what was fitted."""
+        return self.squares / self.samples / self.left
+
+
+class MeasurementNoise(eqx.Module):
+    """The noise of the measured outputs, as the fit sees it that leaves the least.
+
+    Each fit of the same data leaves the noise at least; one that goes astray leaves more.
+
+    Attributes:
+        covariance: of the outputs.
+        asked: the fits that were asked; asking takes as long as a fit.
+    """
+
+    covariance: Float[Array, "outputs outputs"]
+    asked: tuple[Fit, ...]
+
+    def and_beside(self, found: Fit) -> "MeasurementNoise":
+        """The same, where one more fit is asked."""
+        if any(found is fit for fit in self.asked):
+            return self
+        other = _noise_beside(found)
+        least = min(self.covariance, other, key=lambda c: float(np.linalg.slogdet(np.asarray(c))[1]))
+        return MeasurementNoise(least, (*self.asked, found))
+
+
+def measurement_noise(found: Fit) -> MeasurementNoise:
+    """The noise as one fit sees it."""
+    return MeasurementNoise(_noise_beside(found), (found,))
+
+
+def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
+    """Covariance of the outputs' measurement noise: what stays when each short piece of the log may start anew.
+
+    Within half a period an initial state explains most smooth motion, missing physics included, so that little but
+    noise is left; what a strong force that is missing does within a piece is a low power of time, and is taken off as
+    well where it is more than noise could be. Corrected for what was fitted.
+
+    Args:
+        found: a fit; its parameters are held, and its compiled program does the work.
+    """
+    count, length = found.problem.segments.weight.shape
+    half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
+    piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
+    held = eqx.tree_at(lambda p: p.active, found.problem, zeros_like(found.problem.active))
+    swing = float(scales(found.stretches).x)
+    anew = smoothed = _Pieces(np.zeros(found.covariance.shape))
+    # A piece is the head of a segment; segments that begin later have other heads.
+    for offset in range(0, length - piece + 1, piece):
+        shifted = [Stretch(s.experiment, s.start + offset, s.stop) for s in found.stretches if len(s) >= offset + piece]
+        if not shifted or anew.samples >= _SAMPLES:
+            break
+        segments = cut(shifted, length, halo=held.segments.halo, count=count)
+        weight = np.asarray(segments.weight)
+        head = weight * weight[:, piece - 1 : piece] * (np.arange(length) < piece)[None]
+        part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
+        unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
+        part, unknowns = on_all_devices(part, unknowns)
+        covariance, before = found.covariance, np.full(len(found.covariance), np.inf)
+        for turn in range(REWEIGHTINGS):
+            part = weighed(part, covariance, swing)
+            damping = NEARBY_DAMPING if turn else FIRST_DAMPING
+            solution = solve(part, unknowns, _STEPS, damping, least_progress=_LEAST_PROGRESS)
+            unknowns, covariance = solution.unknowns, solution.left_over.covariance
+            now = np.sqrt(np.diag(covariance))
+            if np.all(np.abs(now - before) <= _SETTLED * now):
+                break
+            before = now
+        seen = linearise(part, unknowns)
+        anew = anew.and_more(covariance * head.sum(), float(head.sum()), _states_freedom(part, seen))
+        smoothed = smoothed.and_more(*_smoothed(part, seen, piece))
+    return jnp.asarray(_of_both(anew, smoothed))
+
+
+def _of_both(anew: _Pieces, smoothed: _Pieces) -> Float[np.ndarray, "outputs outputs"]:
+    if smoothed.left < _LEAST_LEFT:
+        return anew.covariance
+    less = np.sqrt(np.diag(anew.covariance) / np.diag(smoothed.covariance))
+    return smoothed.covariance if np.max(less) > _MOTION else anew.covariance
+
+
+def _states_freedom(problem: Problem, seen: Blocks) -> float:
+    """How many numbers the initial states have fitted to the outputs; a state that its prior holds counts in part."""
+    by_state = np.asarray(seen.by_state)
+    outputs = by_state[:, : problem.segments.measured[0].size]
+    measured, all_rows = (np.einsum("sri,srj->sij", rows, rows) for rows in (outputs, by_state))
+    scale = np.sqrt(np.einsum("sii->si", all_rows))
+    scale = np.where(scale > 0, scale, 1.0)
+    units = scale[:, :, None] * scale[:, None, :]
+    inverse = np.linalg.pinv(all_rows / units, rcond=1e-12, hermitian=True)
+    return float(np.einsum("sij,sji->", inverse, measured / units))
+
+
+def _smoothed(problem: Problem, seen: Blocks, piece: int) -> tuple[Float[np.ndarray, "outputs outputs"], float, float]:
+    """What pieces leave over where each output may also move by a few powers of time: squares, samples, and numbers
+    fitted. Pieces whose simulation runs away tell nothing."""
+    outputs = problem.segments.measured.shape[2]
+    rows = np.asarray(seen.residual)[:, : piece * outputs]
+    kept = (np.asarray(problem.segments.weight)[:, piece - 1] > 0) & (np.abs(rows) < RUNAWAY).all(axis=1)
+    time = np.linspace(-1.0, 1.0, piece)[:, None] ** np.arange(2 + len(_POWERS))
+    powers = np.linalg.qr(time)[0][:, list(_POWERS)]
+    moves = np.broadcast_to(
+        np.kron(powers, np.eye(outputs)), (int(kept.sum()), rows.shape[1], powers.shape[1] * outputs)
+    )
+    columns = np.concatenate([np.asarray(seen.by_state)[kept, : rows.shape[1]], moves], axis=2)
+    size = np.linalg.norm(columns, axis=1, keepdims=True)
+    directions, sizes, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    directions = directions * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
+    white = rows[kept]
+    white = white - np.einsum("srd,sd->sr", directions, np.einsum("srd,sr->sd", directions, white))
+    error = white.reshape(-1, outputs) @ np.linalg.inv(np.asarray(problem.whitening)).T
+    return error.T @ error, float(len(error)), float(np.sum(directions**2))

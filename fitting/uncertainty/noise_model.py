@@ -1,0 +1,348 @@
+"""A model of the noise: of the sensors, each with a memory where it has one, and of the logged torque.
+
+What acts and what was logged differ by noise; the drive answers it, so that simulations leave more than the sensors'
+noise although no effect is missing. Along a fitted motion the deviation from it is linear and driven by that noise.
+Under the right variances the innovations of a Kalman filter are white, and their likelihood is largest.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitting.estimation.engines import linearise
+from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.linear_response import Followed, follow
+from fitting.estimation.residual import Problem, Unknowns
+from fitting.uncertainty.input_noise import torque_pushes
+from hdjax import Model
+
+# Standard deviations, in units of what simulations leave, by which a segment's first state may be off.
+_FREE = 10.0
+# Samples of a segment in which the filter finds that state, which the likelihood leaves out.
+_LEAD = 12
+# Shares of its rms between which the torque's noise is sought, and how well its logarithm is wanted.
+_LEAST, _MOST, _SETTLED = 1e-5, 1.0, 0.02
+# Logs that are asked at most, and segments of each, evenly spread: some thousand samples know a variance to a few
+# percent. The sensors' noise is told from fewer of the first log.
+_LOGS, _SEGMENTS, _SEGMENTS_OF_MEMORY = 4, 24, 12
+# Lags over which innovations are tested for whiteness.
+_LAGS = 20
+# Where the search for the sensors' noise begins: halves with and without memory, one of five samples. Steps of its
+# differences, and by how much the likelihood may still grow at its end [nats a sample].
+_HALF, _FIVE_SAMPLES, _STEP, _GROWS = np.log(0.5), 1.5, 1e-4, 1e-5
+
+
+class SensorNoise(eqx.Module):
+    """Noise of the outputs, each the sum of a white part and of one whose correlation decays by a constant share from
+    sample to sample, where the outputs are combined so that their noise is independent.
+
+    Attributes:
+        combined: the outputs by independent ones of unit variance.
+        white: variance of each one's white part.
+        slow: likewise of the other part.
+        correlation: of neighbouring samples of that part.
+    """
+
+    combined: Float[np.ndarray, "outputs outputs"]
+    white: Float[np.ndarray, "*settings outputs"]
+    slow: Float[np.ndarray, "*settings outputs"]
+    correlation: Float[np.ndarray, "*settings outputs"]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "outputs outputs"]:
+        """Of the outputs."""
+        return self.combined @ np.diag(self.white + self.slow) @ self.combined.T
+
+    def memory(self, time_step: float) -> float | None:
+        """Time [s] after which the slow part of the last output's noise has forgotten all but 1/e; None where it has
+        no slow part."""
+        slow = self.combined[-1] ** 2 * self.slow
+        return -time_step / float(np.log(slow @ self.correlation / slow.sum())) if slow.any() else None
+
+
+def white_noise(covariance: Float[np.ndarray, "outputs outputs"]) -> SensorNoise:
+    """Noise of the outputs without memory."""
+    one = np.ones(len(covariance))
+    return SensorNoise(np.linalg.cholesky(covariance), one, 0.0 * one, 0.0 * one)
+
+
+class NoiseModel(eqx.Module):
+    """Noise of the torque beside that of the sensors.
+
+    Attributes:
+        std: of one sample of the torque, held through its interval [N m], or in the forcing's unit; rms over the logs.
+        share: the same over the rms of the torque.
+        sensors: noise of the outputs.
+        size: rms of each output's innovations in units of what the filter expects; the largest.
+        predictable: share of the innovations' variance that earlier ones predict, of the output and the log where it is
+            largest: none where the noise is white.
+        likelihood: log likelihood of the innovations, but for a constant.
+        without: likewise without noise of the torque.
+        count: how many there are.
+    """
+
+    std: float
+    share: float
+    sensors: SensorNoise
+    size: float
+    predictable: float
+    likelihood: float
+    without: float
+    count: int = eqx.field(static=True)
+
+
+class _Steps(eqx.Module):
+    """The linearised motion, a sample after the other, of several segments at once.
+
+    Attributes:
+        transition: of a deviation of the state through a sample interval.
+        push: what a unit of torque adds to it.
+        readout: of the outputs.
+        error: of the outputs, and its derivatives by the free parameters.
+        counts: whether a sample has weight.
+        prior: covariance of the first states.
+        torque: its rms.
+    """
+
+    transition: Float[np.ndarray, "samples segments states states"]
+    push: Float[np.ndarray, "samples segments states"]
+    readout: Float[np.ndarray, "samples segments outputs states"]
+    error: Float[np.ndarray, "samples segments outputs columns"]
+    counts: Bool[np.ndarray, "samples segments"]
+    prior: Float[np.ndarray, "states states"]
+    torque: float
+
+    def fewer(self, segments: int) -> "_Steps":
+        """Of so many segments at most, evenly spread."""
+        chosen = _spread(self.counts.shape[1], segments)
+        places = (self.transition, self.push, self.readout, self.error, self.counts)
+        return eqx.tree_at(
+            lambda s: (s.transition, s.push, s.readout, s.error, s.counts), self, tuple(p[:, chosen] for p in places)
+        )
+
+
+def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float) -> NoiseModel:
+    """The noise that a fit's residual shows.
+
+    The sensors' noise has a memory only where innovations can be predicted without one.
+
+    Args:
+        fit: of a model from which nothing is thought to be missing, over short horizons.
+        outputs: covariance of the measurement noise, as short pieces tell it.
+        predictable: share of the innovations' variance that counts as none.
+
+    References:
+        Ljung (1999), System Identification, 2nd edition, sections 7.3 and 16.6.
+    """
+    problem = fit.at_solution
+    followed = follow(problem, fit.unknowns)
+    # Each log on its own: its torque sensor may have been set to another range.
+    logs = segments_of_logs(fit)
+    steps = [_steps(fit, problem, followed, logs[i]) for i in _spread(len(logs), _LOGS)]
+    white = _of_logs(steps, white_noise(np.asarray(outputs)))
+    if white.predictable <= predictable:
+        return white
+    return _of_logs(steps, _with_memory(steps[0].fewer(_SEGMENTS_OF_MEMORY), white))
+
+
+def _of_logs(steps: list[_Steps], sensors: SensorNoise) -> NoiseModel:
+    """The noise of the torque that suits each log best."""
+    # Loaded here: it takes as long as jax, and only what nothing else explains needs it.
+    from scipy.optimize import minimize_scalar
+
+    found = []
+    for own in steps:
+
+        def unlikely(logarithm: float, own: _Steps = own) -> float:
+            return -_likelihood(_filtered(own, np.exp(logarithm) * own.torque, sensors))
+
+        span = np.log([_LEAST, _MOST])
+        best = minimize_scalar(unlikely, bounds=tuple(span), method="bounded", options={"xatol": _SETTLED})
+        share = float(np.exp(best.x))
+        innovations = _filtered(own, share * own.torque, sensors)[0][0]
+        without = _likelihood(_filtered(own, 0.0, sensors))
+        count = own.counts[_LEAD:].sum() * innovations.shape[2]
+        found.append((share * own.torque, share, *_size_and_colour(innovations), -best.fun, without, count))
+    std, share, size, predictable, likelihood, without, count = np.array(found).T
+    std, share = (float(np.sqrt(np.mean(np.square(values)))) for values in (std, share))
+    sums = float(np.sum(likelihood)), float(np.sum(without)), int(np.sum(count))
+    return NoiseModel(std, share, sensors, float(np.max(size)), float(np.max(predictable)), *sums)
+
+
+def _with_memory(steps: _Steps, start: NoiseModel) -> SensorNoise:
+    """The sensors' noise, with a memory, that makes the innovations likeliest beside noise of the torque: by the method
+    of scoring, with the information matrix as the sum of the scores' squares (Berndt et al. 1974)."""
+    from scipy.optimize import minimize
+
+    count = len(start.sensors.white)
+
+    def noise(unknowns: np.ndarray) -> tuple[Any, SensorNoise]:
+        white, slow, odds = (unknowns[..., 1 + i * count : 1 + (i + 1) * count] for i in range(3))
+        values = (np.exp(white), np.exp(slow), 1.0 / (1.0 + np.exp(-odds)))
+        return np.exp(unknowns[..., 0]) * steps.torque, SensorNoise(start.sensors.combined, *values)
+
+    def seen(unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        varied = unknowns + _STEP * np.eye(unknowns.size + 1, unknowns.size, -1)
+        std, sensors = noise(varied)
+        innovations, logarithms = _filtered(steps, std, sensors)
+        each = -0.5 * innovations**2 - logarithms
+        each = each[:, :, _LEAD:].reshape(len(varied), -1)
+        scores = (each[1:] - each[0]) / _STEP
+        size = each.shape[1]
+        return -float(each[0].sum()) / size, -scores.sum(axis=1) / size, scores @ scores.T / size
+
+    first = np.concatenate([[np.log(start.share)], *(np.full(count, v) for v in (_HALF, _HALF, _FIVE_SAMPLES))])
+    last: list[tuple[np.ndarray, tuple]] = []
+
+    def at(unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        if not last or not np.array_equal(last[0][0], unknowns):
+            last[:] = [(unknowns.copy(), seen(unknowns))]
+        return last[0][1]
+
+    solution = minimize(
+        lambda u: at(u)[0],
+        first,
+        jac=lambda u: at(u)[1],
+        hess=lambda u: at(u)[2],
+        method="trust-exact",
+        options={"gtol": _GROWS, "max_trust_radius": 3.0, "maxiter": 30},
+    )
+    return noise(solution.x)[1]
+
+
+def _steps(fit: Fit, problem: Problem, followed: Followed, own: Bool[np.ndarray, " segments"]) -> _Steps:
+    weight = np.asarray(problem.segments.weight)
+    used = np.flatnonzero(weight.any(axis=1) & own)
+    used = used[_spread(used.size, _SEGMENTS)]
+    read = followed.readout[used]
+    rms = np.sqrt(np.diag(np.asarray(fit.covariance)))
+    torque = np.asarray(problem.segments.torque.coefficients)[used, :, 0]
+
+    def in_time(values: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.swapaxes(values, 0, 1))
+
+    return _Steps(
+        in_time(followed.transition[used]),
+        in_time(torque_pushes(problem.model, followed)[used]),
+        in_time(read),
+        in_time(np.concatenate([np.asarray(fit.error)[used, ..., None], _by_parameter(fit)[used]], axis=3)),
+        in_time(weight[used] > 0),
+        np.diag(_freedom(problem.model, followed.states[used], read, rms) ** 2),
+        max(float(np.std(torque)), 1e-300),
+    )
+
+
+def _by_parameter(fit: Fit) -> Float[np.ndarray, "segments samples outputs parameters"]:
+    """Derivatives of the error. Simulations of a motion that the noise drives know parameters less well than the
+    filter does, so that it takes a step of its own."""
+    found = linearise(fit.problem, fit.unknowns)
+    segments, samples, outputs = fit.error.shape
+    rows = np.asarray(found.by_parameter)[:, : samples * outputs].reshape(segments, samples, outputs, -1)
+    return np.linalg.solve(np.asarray(fit.problem.whitening), rows)
+
+
+def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray) -> Float[np.ndarray, " states"]:
+    """By how much each state may be off where a segment begins."""
+    angles = len(model.motion_states) // 2
+    shown = np.abs(read[0, 0][:, :angles])
+    angle = _FREE * np.max(np.where(shown > 0, rms[:, None] / np.where(shown > 0, shown, 1.0), 0.0), axis=0)
+    hidden = np.std(states.reshape(-1, states.shape[-1]), axis=0)[2 * angles :]
+    return np.concatenate([angle, angle * float(model.drive.omega_0), hidden])
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """So many numbers below a count at most, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
+def _filtered(
+    steps: _Steps, std: float | np.ndarray, sensors: SensorNoise
+) -> tuple[
+    Float[np.ndarray, "settings segments samples outputs"], Float[np.ndarray, "settings segments samples outputs"]
+]:
+    """Standardised innovations at the parameters that suit them best, and logarithms of what standardised them, for
+    several settings of the noise at once.
+
+    Outputs whose noise is independent are taken one after the other (Anderson and Moore 1979, section 6.4); the slow
+    part of each one's noise is a further state.
+    """
+    variance = np.atleast_1d(np.square(std))
+    white, slow, correlation = (np.atleast_2d(v) for v in (sensors.white, sensors.slow, sensors.correlation))
+    apart = np.linalg.inv(sensors.combined)
+    readout, error = apart @ steps.readout, apart @ steps.error
+    samples, segments, outputs, columns = error.shape
+    settings, size = len(variance), steps.push.shape[2]
+    own = np.arange(size, size + outputs)
+    mean = np.zeros((settings, segments, size + outputs, columns))
+    spread = np.zeros((settings, segments, size + outputs, size + outputs))
+    spread[..., :size, :size] = steps.prior
+    spread[..., own, own] = slow[:, None]
+    transition = np.zeros_like(spread)
+    transition[..., own, own] = correlation[:, None]
+    fresh = (slow * (1.0 - correlation**2))[:, None]
+    found = np.zeros((settings, segments, samples, outputs, columns))
+    logarithms, read = np.zeros(found.shape[:-1]), np.zeros((segments, size + outputs))
+    for i in range(samples):
+        counts = steps.counts[i][:, None]
+        for j in range(outputs):
+            read[:, :size], read[:, size:] = readout[i, :, j], np.arange(outputs) == j
+            expected = (spread @ read[:, :, None])[..., 0]
+            total = np.sum(expected * read, axis=-1) + white[:, None, j]
+            new = error[i, :, j] - (read[:, None, :] @ mean)[..., 0, :]
+            gain = counts * expected / total[..., None]
+            mean += gain[..., None] * new[..., None, :]
+            spread -= gain[..., None] * expected[..., None, :]
+            found[:, :, i, j] = counts * new / np.sqrt(total)[..., None]
+            logarithms[:, :, i, j] = 0.5 * counts[:, 0] * np.log(total)
+        transition[..., :size, :size] = steps.transition[i]
+        mean = transition @ mean
+        spread = transition @ spread @ np.swapaxes(transition, 2, 3)
+        push = steps.push[i]
+        spread[..., :size, :size] += variance[:, None, None, None] * (push[:, :, None] * push[:, None, :])
+        spread[..., own, own] += fresh
+    used = found[:, :, _LEAD:].reshape(settings, -1, columns)
+    derivatives = used[..., 1:]
+    size_of = np.maximum(np.linalg.norm(derivatives, axis=1), 1e-300)
+    derivatives = derivatives / size_of[:, None]
+    across = np.swapaxes(derivatives, 1, 2)
+    moved = np.linalg.pinv(across @ derivatives, hermitian=True) @ (across @ used[..., :1])
+    moved = moved[..., 0] / size_of
+    return found[..., 0] - (found[..., 1:] @ moved[:, None, None, :, None])[..., 0], logarithms
+
+
+def _likelihood(filtered: tuple[np.ndarray, np.ndarray]) -> float:
+    """Log likelihood of the innovations of one setting, but for a constant."""
+    innovations, logarithms = (values[..., _LEAD:, :] for values in filtered)
+    return -float(np.sum(0.5 * innovations**2 + logarithms))
+
+
+def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:
+    """Rms of the output where it is largest; and the sum of squared autocorrelations, less what chance makes of it."""
+    kept = innovations[:, _LEAD:]
+    square, lags = np.sum(kept**2, axis=(0, 1)), min(_LAGS, kept.shape[1] - 1)
+    correlation = [np.sum(kept[:, lag:] * kept[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)]
+    count = kept.shape[0] * kept.shape[1]
+    colour = np.max(np.sum(np.square(correlation), axis=0)) - lags / count
+    return float(np.sqrt(np.max(square) / count)), max(0.0, float(colour))
+
+
+def spread_by_torque(problem: Problem, unknowns: Unknowns, std: float) -> Float[np.ndarray, "segments samples"]:
+    """Standard deviation of the last output that noise of the torque makes along each segment, from its start on.
+
+    Args:
+        problem: the segments.
+        unknowns: where they start.
+        std: of the noise of one sample.
+    """
+    followed = follow(problem, unknowns)
+    push = std * torque_pushes(problem.model, followed)
+    segments, samples, size = push.shape
+    spread, found = np.zeros((segments, size, size)), np.zeros((segments, samples))
+    for i in range(samples):
+        read = followed.readout[:, i, -1]
+        found[:, i] = np.einsum("si,sij,sj->s", read, spread, read)
+        transition = followed.transition[:, i]
+        spread = transition @ spread @ np.swapaxes(transition, 1, 2) + push[:, i, :, None] * push[:, i, None, :]
+    return np.sqrt(np.maximum(found, 0.0))

@@ -1,0 +1,151 @@
+"""How far a free run may be off: what parameters, initial state and encoder leave open."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from fitting.estimation.engines import linearise, with_engine
+from fitting.estimation.estimate import Fit, whitening
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_run import WINDOW, FreeRun, fitted_starts, free_run, whole_simulations
+from fitting.estimation.residual import Problem, Unknowns
+from fitting.uncertainty.noise_model import spread_by_torque
+from fitting.uncertainty.normal_law import NORMAL_95
+from fitting.uncertainty.standard_errors import Uncertainty
+
+
+class PredictionBand(eqx.Module):
+    """A free run and how well it is known, to first order.
+
+    What the model lacks is not in it: where a fit leaves more than measurement noise, so will its predictions. A run
+    that is found to begin at rest is known better than this.
+
+    Attributes:
+        run: the free run.
+        std_parameters: what the parameters' covariance does to the predicted dynamic error [rad]. The initial state
+            follows the parameters, as it does in the window that it is taken from.
+        std_state: what the noise in that window does [rad].
+        std_noise: of the measured dynamic error [rad].
+        std_torque: of the predicted one, by noise of the torque [rad].
+    """
+
+    run: FreeRun
+    std_parameters: Float[np.ndarray, " n"]
+    std_state: Float[np.ndarray, " n"]
+    std_noise: float
+    std_torque: Float[np.ndarray, " n"] | float = 0.0
+
+    @property
+    def std_predicted(self) -> Float[np.ndarray, " n"]:
+        """Standard error of the predicted dynamic error [rad]."""
+        return np.sqrt(self.std_parameters**2 + self.std_state**2 + self.std_torque**2)
+
+    @property
+    def std_measured(self) -> Float[np.ndarray, " n"]:
+        """Standard deviation of measured minus predicted [rad]."""
+        return np.hypot(self.std_predicted, self.std_noise)
+
+    @property
+    def band95(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Where 95 % of the measured samples are expected."""
+        reach = NORMAL_95 * self.std_measured
+        return self.run.predicted - reach, self.run.predicted + reach
+
+    @property
+    def inside(self) -> Bool[np.ndarray, " n"]:
+        """Which measured samples are in the band; none is where the run left the numbers."""
+        low, high = self.band95
+        return (low <= self.run.measured) & (self.run.measured <= high)
+
+
+def coverage(bands: Sequence[PredictionBand]) -> float:
+    """Share of the measured samples of several runs that lie in their bands; NaN where a band is not known."""
+    if not all(np.isfinite(b.std_predicted).all() for b in bands):
+        return np.nan
+    return float(np.mean(np.concatenate([b.inside for b in bands])))
+
+
+def prediction_bands(
+    fitted: Fit,
+    found: Uncertainty,
+    stretches: Sequence[Stretch],
+    *,
+    noise: Float[Array, "outputs outputs"],
+    halo: int = 0,
+    runs: Sequence[FreeRun] | None = None,
+    torque_noise: float = 0.0,
+) -> tuple[PredictionBand, ...]:
+    """Free runs along stretches, with their bands.
+
+    Args:
+        fitted: the fitted model.
+        found: its uncertainty.
+        stretches: where to run; no other logs than the fit's are needed, and outputs beyond the window that
+            tells the initial state are not used.
+        noise: covariance of the outputs' measurement noise.
+        halo: intervals of torque before the start, for delays.
+        runs: the free runs along the stretches, where they are at hand.
+        torque_noise: standard deviation of the noise of a torque sample [N m].
+    """
+    substeps = fitted.substeps
+    if runs is None:
+        runs = free_run(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
+    starts = fitted_starts(fitted.model, stretches, covariance=noise, halo=halo, substeps=substeps, like=fitted)
+    whole = whole_simulations(fitted.model, fitted.free, stretches, halo, substeps)
+    states = jnp.asarray(np.asarray(starts.unknowns.states)[: len(stretches)])
+    by_parameter, by_state = _slopes(whole, Unknowns(fitted.free.pack(fitted.model), states))
+    white = np.asarray(whitening(noise))
+    driven = np.zeros(by_parameter.shape[:2])
+    if torque_noise > 0.0:
+        driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
+    return tuple(
+        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance)
+        for i, (run, n) in enumerate(zip(runs, map(len, stretches), strict=True))
+    )
+
+
+def _slopes(problem: Problem, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative of the simulated outputs by sample and output: with respect to parameters, and to initial states."""
+    found = linearise(with_engine(problem), unknowns)
+    count, samples, outputs = problem.segments.measured.shape
+    shape = (count, samples, outputs, -1)
+    by_parameter, by_state = (
+        np.asarray(a)[:, : samples * outputs].reshape(shape) for a in (found.by_parameter, found.by_state)
+    )
+    # The residual is measured minus simulated.
+    return -by_parameter, -by_state
+
+
+def _band(
+    run: FreeRun,
+    by_parameter: np.ndarray,
+    by_state: np.ndarray,
+    driven: np.ndarray,
+    white: np.ndarray,
+    covariance: np.ndarray,
+) -> PredictionBand:
+    """The band of one run, from the derivatives of its outputs, and what noise of the torque drives; it has no width
+    where they left the numbers."""
+    variance = np.linalg.inv(white)
+    std_noise = float(np.sqrt((variance @ variance.T)[-1, -1]))
+    if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
+        unknown = np.full(len(by_parameter), np.nan)
+        return PredictionBand(run, unknown, unknown, std_noise, driven)
+    seen = np.einsum("ij,njs->nis", white, by_state[:WINDOW]).reshape(-1, by_state.shape[2])
+    moved = np.einsum("ij,njp->nip", white, by_parameter[:WINDOW]).reshape(-1, by_parameter.shape[2])
+    # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
+    size = np.linalg.norm(seen, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    inverse = np.linalg.pinv(seen / size, rcond=1e-10) / size[:, None]
+    total = by_parameter[:, -1] - by_state[:, -1] @ (inverse @ moved)
+    spread = by_state[:, -1] @ inverse
+    return PredictionBand(
+        run=run,
+        std_parameters=np.sqrt(np.maximum(np.einsum("np,pq,nq->n", total, covariance, total), 0.0)),
+        std_state=np.linalg.norm(spread, axis=1),
+        std_noise=std_noise,
+        std_torque=driven,
+    )

@@ -1,0 +1,142 @@
+"""How well the data determine each parameter, also where the model is not quite right."""
+
+from dataclasses import replace
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.special import stdtrit
+
+from fitting.estimation.estimate import Fit
+from fitting.uncertainty.input_noise import torque_noise_covariance
+from fitting.uncertainty.normal_law import NORMAL_95
+from fitting.uncertainty.sandwich import Covariance, Linearised, covariance, linearised
+from hdjax.parameters import ParameterInfo
+
+_DISSIPATIVE = ("B_sp", "mu")
+
+
+class Estimate(eqx.Module):
+    """One fitted parameter.
+
+    Attributes:
+        path: dotted path.
+        value: in SI units.
+        std: standard error, robust against coloured residuals (sandwich), and no less than the classical one.
+        std_classical: standard error from J^T J alone, which takes the residual for white noise.
+        ci95: 95 % interval; wider than 1.96 standard errors where those rest on few data.
+        unit: SI unit.
+        identifiable: whether the data tell the parameter from zero; of a positive parameter, whether they know it
+            to better than a factor of about two.
+        degrees_of_freedom: of Student's t behind the interval.
+        interval: whether `ci95` is from the curvature at the optimum or from the likelihood's profile.
+    """
+
+    path: str = eqx.field(static=True)
+    value: float
+    std: float
+    std_classical: float
+    ci95: tuple[float, float]
+    unit: str = eqx.field(static=True)
+    identifiable: bool
+    degrees_of_freedom: float = np.inf
+    interval: Literal["curvature", "profile"] = eqx.field(static=True, default="curvature")
+
+
+class Uncertainty(eqx.Module):
+    """Standard errors of all free parameters, and how they go together.
+
+    Attributes:
+        estimates: by dotted path.
+        correlation: of the free parameters, in the order of `estimates`.
+        covariance: robust, of the free vector (logarithms, or units of the parameters' scales).
+        unit_covariance: the same for white noise of the variance that weighs the outputs, (J^T J)^-1.
+    """
+
+    estimates: dict[str, Estimate]
+    correlation: Float[np.ndarray, "parameters parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    unit_covariance: Float[np.ndarray, "parameters parameters"]
+
+    def of_effect(self, name: str) -> tuple[list[str], Float[np.ndarray, "own own"]]:
+        """The dotted paths of an effect's parameters, and their covariance in SI units."""
+        known = list(self.estimates)
+        own = [i for i, path in enumerate(known) if path.startswith(f"{name}.")]
+        paths = [known[i] for i in own]
+        std = np.array([self.estimates[path].std for path in paths])
+        return paths, self.correlation[np.ix_(own, own)] * np.outer(std, std)
+
+
+def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise: bool = True) -> Uncertainty:
+    """Standard errors and intervals of a fit.
+
+    The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
+    The robust one holds whatever the colour of the residual, see [`fitting.uncertainty.sandwich`][]. Its own uncertainty enters
+    the intervals as Student's t. Where noise of the torque describes the residual's colour, that gives a third one
+    ([`fitting.uncertainty.input_noise`][]). The largest counts.
+
+    Args:
+        fit: the fit.
+        regression: the fit as a linear regression, where it is at hand.
+        torque_noise: whether to look for noise of the torque; that compiles a program for each form of a model.
+    """
+    free = fit.free
+    if not free.paths:
+        empty = np.zeros((0, 0))
+        return Uncertainty({}, empty, empty, empty)
+    regression = linearised(fit) if regression is None else regression
+    found = covariance(regression)
+    if torque_noise:
+        found = _described(found, torque_noise_covariance(fit, regression, found.unit))
+    slopes = np.abs(np.asarray(free.slopes(fit.model)))
+    known = fit.model.parameters()
+    estimates = {
+        path: _estimate(path, float(known[path][0]), known[path][1], found, i, float(slopes[i]), free.logarithmic[i])
+        for i, path in enumerate(free.paths)
+    }
+    spread = np.sqrt(np.diag(found.robust))
+    return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
+
+
+def _described(found: Covariance, other: Float[np.ndarray, "parameters parameters"] | None) -> Covariance:
+    """The covariance with longer intervals where noise of the torque, of which two or three numbers are known, makes
+    them so."""
+    if other is None:
+        return found
+    reach = stdtrit(found.degrees_of_freedom, 0.975) * np.sqrt(np.diag(found.robust))
+    longer = NORMAL_95 * np.sqrt(np.diag(other)) > reach
+    stretch = np.where(longer, np.sqrt(np.diag(other) / np.diag(found.robust)), 1.0)
+    return replace(
+        found,
+        robust=found.robust * np.outer(stretch, stretch),
+        degrees_of_freedom=np.where(longer, np.inf, found.degrees_of_freedom),
+    )
+
+
+def _estimate(
+    path: str, value: float, info: ParameterInfo, found: Covariance, i: int, slope: float, logarithmic: bool
+) -> Estimate:
+    freedom = float(found.degrees_of_freedom[i])
+    robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
+    # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
+    error = max(robust, classical)
+    reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * classical)
+    if logarithmic:
+        factor = float(np.exp(min(reach, 700.0)))
+        interval = (value / factor, value * factor)
+        identifiable = reach < 1.0
+    else:
+        interval = (value - slope * reach, value + slope * reach)
+        # Damping below zero would be energy from nowhere: that a log tells it from zero does not make it known.
+        identifiable = interval[0] > 0.0 if path in _DISSIPATIVE else not interval[0] <= 0.0 <= interval[1]
+    return Estimate(
+        path=path,
+        value=value,
+        std=slope * error,
+        std_classical=slope * classical,
+        ci95=interval,
+        unit=info.unit,
+        identifiable=bool(identifiable),
+        degrees_of_freedom=freedom,
+    )

@@ -1,0 +1,1 @@
+"""Free runs, before and after, and tests of residuals."""

@@ -1,0 +1,64 @@
+"""Whether what explains short segments explains whole stretches too: each segment may start anew, and what drifts apart
+from one to the next shows in free runs alone."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from fitting.attribution.decisions import RULES
+from fitting.estimation.estimate import Fit
+from fitting.estimation.free_run import FreeRun, rms_error
+from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
+from fitting.uncertainty.standard_errors import uncertainty
+
+
+def surprise(
+    final: Fit,
+    before: Sequence[FreeRun],
+    after: Sequence[FreeRun],
+    held_out: Fit,
+    *,
+    noise: Float[Array, "outputs outputs"],
+    halo: int,
+    torque_noise: float = 0.0,
+) -> float | None:
+    """Rms by which free runs of held-out stretches are off, over the rms that their bands allow: what short segments
+    leave, and what it leaves open of parameters and initial state.
+
+    Near one where the model is right, a chaotic one as well: its bands grow as its errors do. None where the model
+    explains the free runs' error (no form is exact, and bands know nothing of that), or where its bands leave the
+    numbers, since nothing was promised then.
+
+    Args:
+        final: the model with its effects.
+        before: free runs of the base model along the held-out stretches.
+        after: likewise of the final model.
+        held_out: the final model on short segments of the held-out stretches, which show noise with a memory whole.
+        noise: covariance of the measurement noise, as shorter pieces tell it.
+        halo: intervals of torque before a stretch.
+        torque_noise: standard deviation of the noise of a torque sample [N m].
+    """
+    short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
+    variance = float(short[-1, -1])
+    at_first = rms_error(before) ** 2 - variance
+    if rms_error(after) ** 2 - variance <= (1.0 - RULES.free_run_explained) * at_first:
+        return None
+    bands = prediction_bands(
+        final,
+        uncertainty(final),
+        held_out.stretches,
+        noise=short,
+        halo=halo,
+        runs=after,
+        torque_noise=torque_noise,
+    )
+    return over_bands(bands)
+
+
+def over_bands(bands: Sequence[PredictionBand]) -> float | None:
+    """Rms error of several runs over the rms that their bands allow; None where these left the numbers."""
+    allowed = np.concatenate([band.std_measured[band.run.counts] ** 2 for band in bands])
+    seen = np.concatenate([band.run.squared_error for band in bands])
+    ratio = np.sqrt(np.sum(seen) / np.sum(allowed))
+    return float(ratio) if np.isfinite(allowed).all() else None

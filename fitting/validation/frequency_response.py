@@ -1,0 +1,216 @@
+"""The frequency response from torque to dynamic error: as the log shows it, and as the fitted model has it."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.linalg import expm
+
+from fitting.estimation.experiment import Experiment
+from fitting.validation.welch import cross_density, density
+from hdjax import Drive, Hold, Model
+
+# Averages that a coherence needs to mean something, and the window that they leave at least.
+_AVERAGES = 8
+_SHORTEST, _LONGEST = 128, 1 << 15
+# Lines across the width of the resonance.
+_LINES = 8
+# Deviation of a sample from its place on the grid, as a share of the step, that is no matter.
+_JITTER = 0.01
+# Power, relative to the strongest line, from which on the input counts as strong.
+_STRONG = 1e-2
+HIGH_COHERENCE, LOW_COHERENCE = 0.9, 0.6
+# Share of the strong lines that must lack coherence to be worth a word.
+_WORTH_A_WORD = 0.05
+# Above it there is no peak to see.
+_OVERDAMPED = 0.6
+# Lines that a band may lack.
+_GAP = 3
+# Where a peak of the log counts as the model's, as a factor of frequency.
+_NEAR = 2.0
+
+
+class FrequencyResponse(eqx.Module):
+    """Frequency response from motor torque (or forcing) to dynamic error.
+
+    Attributes:
+        frequency: without zero [Hz].
+        measured: H1 estimate, cross-spectrum over input spectrum.
+        coherence: share of the dynamic error's power that follows linearly from the input.
+        input_density: power spectral density of the input.
+        noise_coherence: what the coherence would be if measurement noise were all that disturbs it.
+        model: of the fitted drive, linearised, with the hold of the torque.
+        resonance: natural frequency of the linearised drive [Hz].
+        width: of its peak at half power [Hz].
+        averages: windows behind the estimate.
+        source: what the input is called.
+    """
+
+    frequency: Float[np.ndarray, " frequencies"]
+    measured: Complex[np.ndarray, " frequencies"]
+    coherence: Float[np.ndarray, " frequencies"]
+    input_density: Float[np.ndarray, " frequencies"]
+    noise_coherence: Float[np.ndarray, " frequencies"]
+    model: Complex[np.ndarray, " frequencies"]
+    resonance: float
+    width: float
+    averages: int = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+
+    @property
+    def resolution(self) -> float:
+        """Distance of the lines [Hz]."""
+        return float(self.frequency[0])
+
+
+def frequency_response(
+    model: Model, experiments: Sequence[Experiment], *, hold: Hold, noise: float
+) -> FrequencyResponse | None:
+    """Estimate the frequency response of the logs, with the model's beside it.
+
+    Welch's method with Hann windows that overlap by half; a log with irregular stamps is interpolated linearly onto a
+    grid, for this view only. Constant parts are taken off window by window.
+
+    Args:
+        model: fitted; its stiffness is linearised as its mean slope over the measured twist.
+        experiments: the logs.
+        hold: what the torque does between samples.
+        noise: rms measurement noise of the dynamic error.
+
+    Returns:
+        The responses; None where the logs are too short, or the input does not move.
+    """
+    step = max(e.time_step for e in experiments)
+    signals = [_on_grid(e, step) for e in experiments]
+    slope = _mean_slope(model, experiments)
+    resonance = math.sqrt(slope) / (2 * math.pi)
+    width = abs(float(model.drive.mu)) / (2 * math.pi)
+    window = _window([u.size for u, _ in signals], step, width)
+    signals = [(u, x) for u, x in signals if u.size >= window]
+    if window < _SHORTEST or not any(np.ptp(u) > 0 for u, _ in signals):
+        return None
+    windows = [2 * u.size // window - 1 for u, _ in signals]
+    share = np.array(windows) / sum(windows)
+    frequency, _ = density(signals[0][0], step=step, window=window)
+    S_uu = share @ np.array([density(u, step=step, window=window)[1] for u, _ in signals])
+    S_xx = share @ np.array([density(x, step=step, window=window)[1] for _, x in signals])
+    S_ux = share @ np.array([cross_density(u, x, step=step, window=window)[1] for u, x in signals])
+    kept = slice(1, -1 if window % 2 == 0 else None)
+    frequency, S_uu, S_xx, S_ux = frequency[kept], S_uu[kept], S_xx[kept], S_ux[kept]
+    tiny = np.finfo(float).tiny
+    noise_density = 2.0 * step * noise**2
+    return FrequencyResponse(
+        frequency=frequency,
+        measured=S_ux / np.maximum(S_uu, tiny),
+        coherence=np.clip(np.abs(S_ux) ** 2 / np.maximum(S_uu * S_xx, tiny), 0.0, 1.0),
+        input_density=S_uu,
+        noise_coherence=np.clip(1.0 - noise_density / np.maximum(S_xx, tiny), 0.0, 1.0),
+        model=_linear_response(frequency, slope, float(model.drive.mu), _input_gain(model), hold=hold, step=step),
+        resonance=resonance,
+        width=width,
+        averages=sum(windows),
+        source="torque" if isinstance(model.drive, Drive) else "forcing",
+    )
+
+
+def _on_grid(experiment: Experiment, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Input and dynamic error at even distances."""
+    time = experiment.time
+    u, x = np.asarray(experiment.torque.coefficients)[:, 0], experiment.measured[:, -1]
+    grid = time[0] + step * np.arange(int((time[-1] - time[0]) / step + 1e-6) + 1)
+    if grid.size == time.size and np.max(np.abs(grid - time)) < _JITTER * step:
+        return u, x
+    return np.interp(grid, time, u), np.interp(grid, time, x)
+
+
+def _window(samples: Sequence[int], step: float, width: float) -> int:
+    """Samples in a window: as many as resolve the resonance, as few as leave enough to average over."""
+    wanted = _LINES / (width * step) if width > 0 else math.inf
+    averaged = 2.0 * sum(samples) / (_AVERAGES + len(samples))
+    allowed = min(max(wanted, 1024.0), averaged, max(samples), _LONGEST)
+    return 1 << int(math.log2(max(allowed, 1.0)))
+
+
+def _mean_slope(model: Model, experiments: Sequence[Experiment]) -> float:
+    """Square of the natural frequency, of the stiffness averaged over the measured twist."""
+    x = np.concatenate([e.measured[:, -1] for e in experiments])
+    hardening = max(1.0 + 3.0 * float(model.drive.alpha) * float(np.mean(x**2)), 0.0)
+    return float(model.drive.omega_0) ** 2 * hardening
+
+
+def _input_gain(model: Model) -> float:
+    """Acceleration of the dynamic error per unit of input."""
+    drive = model.drive
+    return float(drive.reduced().gain if isinstance(drive, Drive) else drive.gain)
+
+
+def _linear_response(
+    frequency: np.ndarray, slope: float, mu: float, gain: float, *, hold: Hold, step: float
+) -> np.ndarray:
+    """Response of `x'' + mu x' + slope x = gain u` to a sampled input, from sample to sample."""
+    s = 2j * np.pi * frequency
+    if hold not in ("zero-order", "linear"):
+        # Smooth between samples: what is sampled is what acts.
+        return gain / (s**2 + mu * s + slope)
+    # One step of x, v, u and the change of u, which a zero-order hold ignores (Franklin, Powell and Workman 1998, 6.3).
+    rates = np.zeros((4, 4))
+    rates[0, 1], rates[1, :3], rates[2, 3] = step, step * np.array([-slope, -mu, gain]), 1.0
+    across = expm(rates)
+    z = np.exp(s * step)[:, None, None]
+    change = 0.0 if hold == "zero-order" else z - 1.0
+    driven = across[:2, 2:3] + across[:2, 3:] * change
+    return np.linalg.solve(z * np.eye(2) - across[:2, :2], driven)[:, 0, 0]
+
+
+def strong_lines(found: FrequencyResponse) -> np.ndarray:
+    """Which lines the input excites."""
+    return found.input_density > _STRONG * np.max(found.input_density)
+
+
+def excites_resonance(found: FrequencyResponse) -> bool:
+    """Whether the log holds the resonance: a line near it where the dynamic error follows the input."""
+    reach = max(found.width, 2.0 * found.resolution)
+    near = np.abs(found.frequency - found.resonance) <= reach
+    return bool(np.any(found.coherence[near] > LOW_COHERENCE))
+
+
+def resonance_seen(found: FrequencyResponse) -> float | None:
+    """Frequency of the measured peak [Hz] near the model's resonance; None where there is none to see."""
+    if not excites_resonance(found) or found.width > 2 * _OVERDAMPED * found.resonance:
+        return None
+    # A line beyond the excited ones is coherent by chance now and then; what holds the resonance is in one piece.
+    near = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / found.resonance)) < math.log(_NEAR))
+    band = min(_bands(near), key=lambda b: float(np.min(np.abs(found.frequency[b] - found.resonance))))
+    peak = int(band[np.argmax(np.abs(found.measured[band]))])
+    return float(found.frequency[peak]) if band[0] < peak < band[-1] else None
+
+
+def coherent_band(found: FrequencyResponse) -> tuple[float, float] | None:
+    """The widest band of high coherence [Hz], over gaps of a few lines."""
+    return _widest(found, found.coherence > HIGH_COHERENCE)
+
+
+def unexplained_band(found: FrequencyResponse) -> tuple[float, float] | None:
+    """The widest band where the input is strong and the coherence low though noise would not make it so [Hz]; None
+    where there are few such lines."""
+    strong = strong_lines(found)
+    lacking = strong & (found.coherence < LOW_COHERENCE) & (found.noise_coherence > HIGH_COHERENCE)
+    if np.sum(lacking) <= _WORTH_A_WORD * np.sum(strong):
+        return None
+    return _widest(found, lacking)
+
+
+def _widest(found: FrequencyResponse, chosen: np.ndarray) -> tuple[float, float] | None:
+    """Ends of the band of most lines."""
+    if not chosen.any():
+        return None
+    longest = max(_bands(chosen), key=len)
+    return float(found.frequency[longest[0]]), float(found.frequency[longest[-1]])
+
+
+def _bands(chosen: np.ndarray) -> list[np.ndarray]:
+    """Chosen lines in bands, over gaps of a few lines."""
+    index = np.flatnonzero(chosen)
+    return np.split(index, np.flatnonzero(np.diff(index) > _GAP) + 1)
