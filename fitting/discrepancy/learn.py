@@ -1,8 +1,8 @@
 """What is missing where the catalogue does not say: learned inside the equations, as a function of what matters.
 
-Which place and which variables is decided on training data alone ([`fitting.discrepancy.variable_selection`][]); the held-out stretches
-then judge one learned function, like any other effect. What no function of the present motion explains may have a
-memory ([`fitting.discrepancy.dynamic_laws`][]).
+Which place and which variables is decided on training data alone ([`fitting.discrepancy.variable_selection`][]); the
+held-out stretches then judge one learned function, like any other effect. What no function of the present motion
+explains may have a memory ([`fitting.discrepancy.dynamic_laws`][]).
 """
 
 from collections.abc import Sequence

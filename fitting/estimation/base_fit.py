@@ -96,7 +96,8 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
 def _fitted(
     model: Model, *, training: Sequence[Stretch], segmentation: Segmentation, strategy: Strategy = Strategy()
 ) -> Fit:
-    """Fit all that the model has of its own, from where it stands; arguments as in [`fitting.estimation.estimate.fit`][]."""
+    """Fit all that the model has of its own, from where it stands; arguments as in
+    [`fitting.estimation.estimate.fit`][]."""
     return fit(model, training, base_paths(model), segmentation, strategy=strategy)
 
 

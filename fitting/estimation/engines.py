@@ -122,16 +122,16 @@ _simulate_by_xla = jit_lanes(simulate_segments)
 
 
 def residual_and_products(unknowns: Unknowns, problem: Problem) -> tuple[LinearisedResidual, Products]:
-    """What [`fitting.estimation.levenberg_marquardt.ArrowLevenbergMarquardt`][] minimises: the residual with weighted gaps; and what it needs
-    of it."""
+    """What [`fitting.estimation.levenberg_marquardt.ArrowLevenbergMarquardt`][] minimises: the residual with weighted
+    gaps; and what it needs of it."""
     found = blocks_inside(problem, unknowns)
     return seen_residual(found, problem.gap_weight), Products.of(found)
 
 
 @eqx.filter_custom_jvp
 def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> LinearisedResidual:
-    """[`fitting.estimation.residual.residual`][] with weighted gaps, inside a program of JAX; its derivative is a product with
-    the blocks rather than a second simulation."""
+    """[`fitting.estimation.residual.residual`][] with weighted gaps, inside a program of JAX; its derivative is a
+    product with the blocks rather than a second simulation."""
     rows, gap = residual_inside(problem, unknowns)
     return LinearisedResidual(rows, gap * problem.gap_weight[None])
 

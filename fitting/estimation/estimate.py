@@ -51,7 +51,8 @@ class Strategy:
 
     Attributes:
         max_steps: iterations of each pass at most; no further pass begins after twice as many in all.
-        least_progress: share of the sum of squares that a few steps must take off it, see [`fitting.estimation.solve.solve`][].
+        least_progress: share of the sum of squares that a few steps must take off it, see
+            [`fitting.estimation.solve.solve`][].
         reweigh: whether to weigh by what is left over; with False the covariance at the start is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
         begin_anew_above: an objective above which a first pass that does not converge is begun anew, from the first

@@ -223,8 +223,8 @@ class Iteration(eqx.Module):
 
 class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """Levenberg-Marquardt of optimistix for arrow-shaped problems: damped Gauss-Newton steps by elimination of the
-    segments' states. All that it uses of its function are the [`Products`][fitting.estimation.residual.Products] that this returns
-    as a second result.
+    segments' states. All that it uses of its function are the [`Products`][fitting.estimation.residual.Products] that
+    this returns as a second result.
 
     A step is taken where it lowers the sum of squares by a share of what it promised. Two more kinds are taken in any
     case: one that hardly changes the sum of squares, and one that closes most of the gaps for a little more residual.

@@ -1,5 +1,5 @@
-"""The residual by machine code: the same numbers as [`fitting.estimation.residual`][] gives by XLA, without compiling a program
-for each model."""
+"""The residual by machine code: the same numbers as [`fitting.estimation.residual`][] gives by XLA, without compiling a
+program for each model."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -153,7 +153,8 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | No
 
 
 def rows_by_machine_code(problem: Problem, unknowns: Unknowns) -> Float[np.ndarray, "segments rows"]:
-    """The rows of [`fitting.estimation.residual.residual`][] by the machine code that has derivatives, without computing them."""
+    """The rows of [`fitting.estimation.residual.residual`][] by the machine code that has derivatives, without
+    computing them."""
     kernel = problem.kernel
     assert kernel is not None
     return np.asarray(

@@ -44,7 +44,8 @@ class Problem(eqx.Module):
             it ends.
         solver: explicit Runge-Kutta solver of diffrax.
         substeps: its steps in each sample interval; data, so that finer steps need no other program.
-        kernel: machine code that does the same faster, see [`fitting.estimation.machine_code`][]; None where XLA does it.
+        kernel: machine code that does the same faster, see [`fitting.estimation.machine_code`][]; None where XLA does
+            it.
         engine: what evaluates the residual, where it is not to be machine code if that can be.
     """
 
@@ -254,7 +255,8 @@ def seen_residual(found: Blocks, gap_weight: Float[Array, " states"]) -> Lineari
 def moved_residual(
     found: Blocks, gap_weight: Float[Array, " states"], joined: Bool[Array, " segments"], tangent: Unknowns
 ) -> LinearisedResidual:
-    """How [`fitting.estimation.engines.residual_with_blocks`][] changes there along a tangent, parts of which may be None."""
+    """How [`fitting.estimation.engines.residual_with_blocks`][] changes there along a tangent, parts of which may be
+    None."""
     rows = jnp.zeros_like(found.residual)
     if tangent.parameters is not None:
         rows = rows + jnp.einsum("srp,p->sr", found.by_parameter, tangent.parameters)

@@ -135,7 +135,8 @@ def experiment_for_ties(
 
     Args:
         loop: the outcome.
-        limits: any of [`fitting.next_experiment.excitation.Limits`][] by name; what is missing is what the logs have reached.
+        limits: any of [`fitting.next_experiment.excitation.Limits`][] by name; what is missing is what the logs have
+            reached.
         progress: told what is being done.
 
     Returns:

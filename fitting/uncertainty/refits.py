@@ -34,8 +34,8 @@ def refits(
             is left to do.
 
     Returns:
-        The free vector (see [`fitting.estimation.free_parameters.FreeParameters`][]) by draw, and how far the last step still moved it, in
-        standard errors of the joint estimate.
+        The free vector (see [`fitting.estimation.free_parameters.FreeParameters`][]) by draw, and how far the last step
+        still moved it, in standard errors of the joint estimate.
     """
     problem = with_engine(found.at_solution, values=True)
     return _refits(problem, found.unknowns, linearise(problem, found.unknowns), jnp.asarray(measured), steps)

@@ -72,9 +72,9 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
     """Standard errors and intervals of a fit.
 
     The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
-    The robust one holds whatever the colour of the residual, see [`fitting.uncertainty.sandwich`][]. Its own uncertainty enters
-    the intervals as Student's t. Where noise of the torque describes the residual's colour, that gives a third one
-    ([`fitting.uncertainty.input_noise`][]). The largest counts.
+    The robust one holds whatever the colour of the residual, see [`fitting.uncertainty.sandwich`][]. Its own
+    uncertainty enters the intervals as Student's t. Where noise of the torque describes the residual's colour, that
+    gives a third one ([`fitting.uncertainty.input_noise`][]). The largest counts.
 
     Args:
         fit: the fit.
