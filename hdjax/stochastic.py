@@ -42,7 +42,7 @@ class AdditiveRK4(dfx.AbstractSRK, dfx.AbstractStratonovichSolver):
 
     References:
         Conditions: Roessler, SIAM J. Numer. Anal. 48 (2010) 922; Foster, dos Reis, Strange, arXiv:2210.17543. The
-        coefficients are ours; `tests/test_stochastic.py` tests them against the exact law of one step.
+        coefficients are ours; `tests/simulator/test_stochastic.py` tests them against the exact law of one step.
     """
 
     tableau: ClassVar[dfx.StochasticButcherTableau] = dfx.StochasticButcherTableau(

@@ -113,7 +113,7 @@ class DecisionRules:
         0.03,
         "share of variance",
         "of a Kalman filter's innovations that earlier ones may predict where all that is left is noise",
-        "below 0.01 under noise, above 0.06 where an effect is missing (`tests/test_noise_model.py`)",
+        "below 0.01 under noise, above 0.06 where an effect is missing (`tests/uncertainty/test_noise_model.py`)",
     )
     free_run_explained: float = _rule(
         0.9,
@@ -125,7 +125,7 @@ class DecisionRules:
         1.25,
         "times the band",
         "free runs that are farther off than this are not what the model promised",
-        "a right model stays within 1.2 (`tests/test_surprise.py`)",
+        "a right model stays within 1.2 (`tests/validation/test_free_run_check.py`)",
     )
 
     line_errors: float = _rule(
@@ -135,7 +135,7 @@ class DecisionRules:
         0.25,
         "share of squares",
         "of what is left that a line must explain for the clocks of several logs to be set by it",
-        "lines that a multisine leaves behind explain less each (`tests/test_clocks.py`)",
+        "lines that a multisine leaves behind explain less each (`tests/attribution/test_log_alignment.py`)",
     )
     line_in_phase: float = _rule(
         0.9,

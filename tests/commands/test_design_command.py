@@ -212,7 +212,7 @@ def test_a_spread_is_relative_and_of_the_value():
 
 
 def test_the_example_of_the_documentation_is_understood(tmp_path: Path):
-    page = (Path(__file__).parents[1] / "docs" / "design.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "design.md").read_text(encoding="utf-8")
     asked = read_design_file(written(tmp_path, page.split("```toml")[1].split("```")[0]))
     assert [v.path for v in asked.study.variables] == ["size", "N"]
     assert [limit.label for limit in asked.study.limits] == ["motor_speed"] and asked.search.starts == 8

@@ -267,7 +267,7 @@ def test_the_derivative_of_a_lag_is_finite_down_to_almost_none():
 
 
 def test_every_form_stands_in_the_docs():
-    text = (Path(__file__).parents[1] / "docs" / "effects.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
     for form in CATALOGUE:
         assert f"`{form.family}`" in text
         assert f"`{form.name}`" in text
