@@ -113,13 +113,22 @@ def read_logs(
     both = {path.resolve() for path in paths} & {path.resolve() for path in test}
     if both:
         raise InputError(f"{min(both)}: the log is both fitted and test data; name it once")
-    logs = _with_own_names([read_log(path, drive_file) for path in (*paths, *test)])
+    logs = together([read_log(path, drive_file) for path in (*paths, *test)])
+    return logs[: len(paths)], logs[len(paths) :]
+
+
+def together(logs: Sequence[Log]) -> tuple[Log, ...]:
+    """Logs of one kind, each with a name of its own.
+
+    Raises:
+        InputError: They are of several kinds.
+    """
     kinds = sorted({log.kind for log in logs})
     if len(kinds) > 1:
         raise InputError(
-            f"{paths[0]} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
+            f"{logs[0].path} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
         )
-    return logs[: len(paths)], logs[len(paths) :]
+    return _with_own_names(logs)
 
 
 def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:

@@ -78,7 +78,7 @@ def fit_only(
     seed: int | None = None,
     progress: Progress = silent,
 ) -> FitOnly:
-    """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.close_loop`][].
+    """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.loop.close_loop`][].
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.

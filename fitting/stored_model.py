@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.errors import InputError
-from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
+from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, Trajectory, TwoInertiaModel, sampled, simulate
 from hdjax.effects import BY_NAME, Effect
 from hdjax.effects.learned import LEARNED, Learned, LearnedFriction, LearnedPeriodic
 from hdjax.effects.learned_axes import (
@@ -52,6 +52,16 @@ class StoredModel(eqx.Module):
     substeps: int = eqx.field(static=True)
     halo: int = eqx.field(static=True)
     noise: Float[Array, "outputs outputs"]
+
+    def simulate(self, torque: Float[Array | np.ndarray, " n"], times: Float[Array | np.ndarray, " n"]) -> Trajectory:
+        """Simulate the drive under a sampled torque, from rest.
+
+        Args:
+            torque: of the motor [N m], or the forcing of a reduced model; held between samples as in the logs.
+            times: stamps of the samples [s], rising; the motion is saved there.
+        """
+        forcing = sampled(np.asarray(times), np.asarray(torque), hold=self.hold)
+        return simulate(self.model, forcing, jnp.asarray(times))
 
 
 def to_json(stored: StoredModel) -> str:

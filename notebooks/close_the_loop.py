@@ -21,9 +21,9 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from fitting.close_loop import close_loop
 from fitting.commands.demo import hidden_truth, write_demo_logs
 from fitting.drive_data import read_rig
+from fitting.loop import close_loop
 
 # %% [markdown]
 # ## The logs

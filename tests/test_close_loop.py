@@ -12,9 +12,9 @@ import rig
 from fitting.attribution.case_evidence import ChallengeEvidence
 from fitting.attribution.effect_search import _holds_given_up
 from fitting.attribution.selection_round import Round, Verdict
-from fitting.close_loop import close_loop
 from fitting.discrepancy.challenge import Challenge, model_evidence
 from fitting.estimation.experiment import Experiment, experiment_from_log
+from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.search_options import SearchOptions
 from hdjax import Hold
@@ -206,7 +206,7 @@ def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatc
 def test_what_explains_whole_stretches_is_learned_in_place_of_names_that_do_not(monkeypatch: pytest.MonkeyPatch):
     """Damping by the rate's square, made to pass for an explanation, stands for dry friction; a learned jump explains
     more."""
-    module, loop_module = import_module("fitting.conclusion"), import_module("fitting.close_loop")
+    module, loop_module = import_module("fitting.conclusion"), import_module("fitting.loop")
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
     explains = {"excess": (1.0,), "excess_at_first": (9.0,), "learned": False}
     final = module._final_evidence

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from fitting.attribution.decisions import RULES
-from fitting.close_loop import close_loop
 from fitting.drive_data import Rig, experiments, read_rig, ready_log
 from fitting.errors import DataError
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_run import WINDOW, free_run
 from fitting.files import finite
 from fitting.logs.drive_file import DriveFile, read_drive_file
+from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.report import report_dict
 from fitting.search_options import SearchOptions

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fitting.close_loop import close_loop
 from fitting.commands.demo import write_demo_logs
 from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_limits
 from fitting.commands.options import ExperimentLimits
@@ -11,6 +10,7 @@ from fitting.commands.spinner import Spinner
 from fitting.drive_data import Rig, read_logs, read_rig, rig_of
 from fitting.errors import InputError
 from fitting.logs.drive_file import read_drive_file
+from fitting.loop import close_loop
 from fitting.next_experiment.proposal import experiment_for_ties
 from fitting.report import rig_text, write_rig_report
 from fitting.search_options import SearchOptions
@@ -48,12 +48,12 @@ def close_loop_on_logs(
                 f"{test[0]}: --test is for logs of a motion, but {read[0].path} is quasi-static; leave it out"
             )
         # Loaded here: most logs are of other kinds.
-        from fitting.quasi_static.commands import close_quasi_static_loop
+        from fitting.quasi_static.told import close_quasi_static_loop
 
         with Spinner() as progress:
-            options = {"max_effects": search.max_effects, "seed": search.seed, "progress": progress}
-            shown = close_quasi_static_loop(read, drive_file, out, **options)
-        print(shown)
+            told = close_quasi_static_loop(read, drive_file, search=search, progress=progress)
+        page = told.write(out)
+        print(f"{told.text}\nReport: {page}")
     else:
         _close_loop(rig_of(read, drive_file, test=tests), out, search, limits)
 

@@ -33,11 +33,12 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
     read, _ = read_logs(logs, drive_file)
     if is_quasi_static(read, limits):
         # Loaded here: most logs are of other kinds.
-        from fitting.quasi_static.commands import fit_quasi_static_logs
+        from fitting.quasi_static.told import fit_quasi_static_logs
 
         with Spinner() as progress:
-            shown = fit_quasi_static_logs(read, drive_file, out, progress=progress)
-        print(shown)
+            told = fit_quasi_static_logs(read, drive_file, progress=progress)
+        page = told.write(out)
+        print(f"{told.text}\nReport: {page}")
     else:
         _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed, limits)
 

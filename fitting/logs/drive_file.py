@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from os import PathLike
@@ -113,8 +113,16 @@ def read_drive_file(path: str | PathLike[str]) -> DriveFile:
     Raises:
         InputError: The file is missing, is not TOML, or says something that is not understood.
     """
-    path = Path(path)
-    tables = _load(path)
+    return drive_of(_load(Path(path)), Path(path))
+
+
+def drive_of(tables: Mapping[str, Any], path: Path) -> DriveFile:
+    """The drive that tables describe; as [`read_drive_file`][].
+
+    Args:
+        tables: [drive], [signals] and [columns] by name.
+        path: Where they are from, for messages.
+    """
     _refuse_unknown(path, "table", tables, _KEYS)
     for table, known in _KEYS.items():
         if not isinstance(tables.get(table, {}), dict):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -105,14 +105,17 @@ class Log:
         return replace(self, pieces=None if self.pieces is None else kept, **columns)
 
 
-def read_log(path: str | PathLike[str], drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
-    """The log that a file holds, in SI units.
+def read_log(
+    path: str | PathLike[str], drive_file: DriveFile, *, outputs_until: int | None = None, table: Any = None
+) -> Log:
+    """The log that a file or a table in memory holds, in SI units.
 
     Args:
-        path: File of any format of [`fitting.logs.read_table`][].
+        path: File of any format of [`fitting.logs.read_table`][], or what messages call a table.
         drive_file: Says which column is which signal, and in which unit.
         outputs_until: The angles and the dynamic error need to be known in the first so many
             rows only, and the input in all of them; None asks for what a fit needs.
+        table: What takes the place of the file: a frame, a dataset, or arrays by name ([`fitting.logs.frames`][]).
 
     Returns:
         The log; what was mended, masked or left out stands in its findings.
@@ -123,12 +126,13 @@ def read_log(path: str | PathLike[str], drive_file: DriveFile, *, outputs_until:
     """
     # Numbers of any size may stand in a file; what overflows is counted as blank.
     with np.errstate(all="ignore"):
-        return _read(Path(path), drive_file, outputs_until)
+        return _read(Path(path), drive_file, outputs_until, table)
 
 
-def _read(path: Path, drive_file: DriveFile, outputs_until: int | None) -> Log:
+def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: Any) -> Log:
     places = [drive_file.column_of(signal) for signal in SIGNALS]
-    table = read_table(path, [name for place in places for name in (place.column, place.time) if name is not None])
+    wanted = [name for place in places for name in (place.column, place.time) if name is not None]
+    table = read_table(path, wanted) if source is None else _in_memory(path, source, wanted)
     raw = {s: table.columns[c] for s in SIGNALS if (c := drive_file.column_of(s).column) in table.columns}
     kind = _kind(path, drive_file, table, raw)
     required = _needed(kind, raw)
@@ -182,6 +186,13 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None) -> Log:
     for array in (log.time, log.dynamic_error, *signals.values()):
         array.setflags(write=False)
     return log
+
+
+def _in_memory(path: Path, source: Any, wanted: list[str]) -> RawTable:
+    # Loaded here: tables in memory need polars, which takes long to load.
+    from fitting.logs.frames import table_of
+
+    return table_of(path, source, wanted)
 
 
 def _needed(kind: Kind, raw: Mapping[str, RawColumn]) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ def read_parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) ->
         names = tuple(pl.read_parquet_schema(source))
         found = [name for name in wanted if name in names]
         frame = pl.read_parquet(source, columns=found, use_statistics=False)
-    return RawTable(names, {n: _column_from_series(path, frame[n]) for n in found})
+    return RawTable(names, {n: column_from_series(path, frame[n]) for n in found})
 
 
 @contextmanager
@@ -44,7 +44,16 @@ def _quiet() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _column_from_series(path: Path, series: pl.Series) -> RawColumn:
+def column_from_series(path: Path, series: pl.Series) -> RawColumn:
+    """A series as numbers.
+
+    Args:
+        path: named in messages.
+        series: of numbers, text, times or durations.
+
+    Raises:
+        InputError: It is of another type.
+    """
     kind = series.dtype
     if kind in (pl.String, pl.Categorical, pl.Enum):
         return column_from_text(series.cast(pl.String), comma_parts_cells=False)

@@ -104,7 +104,8 @@ def _errors(loop: QuasiStaticLoop) -> Plot:
         _drawn(points.time + ends[points.log], factor * trial.held_out, mode="lines", color=None, name=f"with {added}")
         for added, trial in loop.steps
     ]
-    traces[0] |= {"name": "straight line", "line": {"width": 1.6, "color": AFTER}}
+    traces[-1] |= {"line": {"width": 1.6, "color": AFTER}}
+    traces[0] |= {"name": "straight line", "line": {"width": 1.6, "color": BEFORE}}
     return Plot(
         "errors",
         "left_over",

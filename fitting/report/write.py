@@ -59,7 +59,7 @@ def write_report(
     """
     report = report_dict(outcome, units=units, health=health, name=name, next_experiment=next_experiment)
     contents: dict[str, str | bytes] = {
-        "report.html": report_page(report, _pictures(outcome, report, next_experiment)),
+        "report.html": report_page(report, pictures(outcome, report, next_experiment)),
         "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
         "model.json": model_json,
     }
@@ -81,15 +81,15 @@ def write_rig_report(
     next_experiment: NextExperiment | None = None,
 ) -> dict[str, Path]:
     """[`write_report`][] of a rig's logs."""
-    return write_report(out_dir, outcome, model_json=model_json, next_experiment=next_experiment, **_of_rig(rig))
+    return write_report(out_dir, outcome, model_json=model_json, next_experiment=next_experiment, **of_rig(rig))
 
 
 def rig_text(outcome: Outcome, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
     """[`report_text`][] of a rig's logs."""
-    return report_text(report_dict(outcome, next_experiment=next_experiment, **_of_rig(rig)))
+    return report_text(report_dict(outcome, next_experiment=next_experiment, **of_rig(rig)))
 
 
-def _of_rig(rig: Rig) -> dict[str, Any]:
+def of_rig(rig: Rig) -> dict[str, Any]:
     """What a report says of the drive and its logs."""
     return {
         "name": rig.name,
@@ -98,7 +98,14 @@ def _of_rig(rig: Rig) -> dict[str, Any]:
     }
 
 
-def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperiment | None) -> list[Plot]:
+def pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperiment | None = None) -> list[Plot]:
+    """All pictures of a report, in the order of the page.
+
+    Args:
+        outcome: of the loop or of a fit.
+        report: from [`report_dict`][].
+        proposed: the next experiment, where one is proposed.
+    """
     units, last = report["units"], []
     if proposed is not None:
         last.append(next_experiment_plot(proposed, unit=units["dynamic_error"], forcing_unit=units["forcing"]))

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 import rig
 from fitting.attribution.effect_search import base_trial
 from fitting.attribution.screening import Screen
-from fitting.close_loop import close_loop
 from fitting.discrepancy.dynamic_laws import remembering
 from fitting.discrepancy.dynamic_stiffness import learned_response
 from fitting.discrepancy.learn import share_of
 from fitting.discrepancy.variable_selection import learned_look
 from fitting.estimation.experiment import experiment_from_log, split
 from fitting.first_order.motion import place_of
+from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.report import write_report
 from fitting.report.plots import response_plot

@@ -12,13 +12,13 @@ import pytest
 import rig
 from fitting.attribution.candidate_fit import Trial, attempt
 from fitting.attribution.study import Setting, Study
-from fitting.close_loop import close_loop
 from fitting.discrepancy.closed_forms import shapes
 from fitting.discrepancy.curve import LearnedCurve, learned_curve
 from fitting.discrepancy.learn import Unknown, is_supported, learn, share_of
 from fitting.estimation.experiment import Stretch, experiment_from_log, split
 from fitting.estimation.free_run import free_run
 from fitting.estimation.problem import Segmentation
+from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.report import report_dict, write_report
 from fitting.report.plots import learned_plot

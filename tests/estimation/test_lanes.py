@@ -30,7 +30,7 @@ print(json.dumps([devices, found.unknowns.parameters.tolist(), float(found.dynam
 
 @pytest.fixture(scope="module")
 def fits(request):
-    folder = str(request.path.parent)
+    folder = str(request.path.parents[1])
 
     def fitted(devices: int):
         command = [sys.executable, "-c", SCRIPT, str(devices), folder]

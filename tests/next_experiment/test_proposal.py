@@ -12,11 +12,11 @@ import plotly.graph_objects as go
 import pytest
 
 import rig
-from fitting.close_loop import close_loop
 from fitting.estimation.estimate import Start, Strategy, fit
 from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log, split
 from fitting.estimation.problem import Segmentation
 from fitting.fit_drive import fit_only
+from fitting.loop import close_loop
 from fitting.next_experiment import command_search, discrimination
 from fitting.next_experiment.command_search import Candidate, search
 from fitting.next_experiment.discrimination import Bench, Explanation, explanation, refit, respond, signals, start

@@ -21,12 +21,12 @@ from scipy import stats
 import rig
 from fitting import formatting
 from fitting.attribution.selection_round import Verdict
-from fitting.close_loop import close_loop
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.starting_values import starting_models
 from fitting.fit_drive import FitOnly, fit_only
 from fitting.logs.findings import Finding
+from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.report import (
     explained_share,

@@ -13,13 +13,13 @@ from scipy.stats import multivariate_normal
 import rig
 from fitting.attribution.decisions import RULES
 from fitting.attribution.support import is_noise, noise_of_torque
-from fitting.close_loop import close_loop
 from fitting.estimation.engines import with_engine
 from fitting.estimation.estimate import Fit, fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.residual import Unknowns
+from fitting.loop import close_loop
 from fitting.uncertainty.measurement_noise import measurement_noise
 from fitting.uncertainty.noise_model import NoiseModel, SensorNoise, _filtered, _Steps, noise_model, spread_by_torque
 from fitting.uncertainty.prediction_band import prediction_bands

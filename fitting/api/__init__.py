@@ -1,0 +1,1 @@
+"""What `fitting` offers: logs in, results out."""

@@ -1,0 +1,192 @@
+"""Free runs of identified models along logs, and models side by side."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fitting.api.data import Data
+from fitting.api.results import Result
+from fitting.drive_data import WHY_NOT_QUASI_STATIC, experiments
+from fitting.errors import DataError, InputError
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_run import WINDOW, FreeRun, free_run
+from fitting.files import write_whole
+from fitting.logs.findings import Finding
+from fitting.logs.log import Log
+from fitting.stored_model import StoredModel, read_model
+from fitting.validation.goodness_of_fit import fit_percent
+from hdjax import TwoInertiaModel
+
+AnyModel = str | PathLike[str] | StoredModel | Result
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A model's free run along a log, which started it and then gave nothing but its inputs.
+
+    Attributes:
+        run: Predicted and measured.
+        rows: Of the run that stand in the log.
+        zero: What was taken off the measured dynamic error, and is a part of the predicted one.
+        findings: What was seen in the log.
+    """
+
+    run: FreeRun
+    rows: np.ndarray | slice
+    zero: float
+    findings: tuple[Finding, ...]
+
+    @property
+    def table(self) -> pl.DataFrame:
+        """Time [s] and predicted dynamic error [rad, or the log's unit], one row a sample."""
+        return pl.DataFrame(
+            {"time": self.run.time[self.rows], "dynamic_error": self.run.predicted[self.rows] + self.zero}
+        )
+
+    def save(self, path: str | PathLike[str]) -> Path:
+        """Write the table as CSV."""
+        write_whole({Path(path): self.table.write_csv(float_precision=None)})
+        return Path(path)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw measured and predicted dynamic error on axes of matplotlib; made where not given."""
+        import matplotlib.pyplot as plt
+
+        place = plt.subplots()[1] if axes is None else axes
+        place.plot(self.run.time, self.run.measured, color="#8c8c8c", linewidth=3.0, label="measured")
+        place.plot(self.run.time, self.run.predicted, color="#0072B2", linewidth=1.2, label="predicted")
+        place.set(xlabel="time [s]", ylabel="dynamic error", title=self.run.name)
+        place.legend(frameon=False)
+        return place
+
+    def summary(self) -> str:
+        """The error in a sentence."""
+        return f"{self.run.name}: rms error {self.run.rmse:.4g}, fit {fit_percent([self.run]):.4g} %"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{self.summary()}</p>{self.table._repr_html_()}"
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Models side by side on the same logs.
+
+    Attributes:
+        runs: Free runs by model, one a log.
+        noise: Rms measurement noise of the dynamic error that each model knows of.
+    """
+
+    runs: dict[str, tuple[FreeRun, ...]]
+    noise: dict[str, float]
+
+    @property
+    def table(self) -> pl.DataFrame:
+        """One row a model and log: rms error, fit in percent, and the error over the noise."""
+        rows = [
+            [name, run.name, run.rmse, fit_percent([run]), run.rmse / self.noise[name]]
+            for name, runs in self.runs.items()
+            for run in runs
+        ]
+        columns = ("model", "log", "rmse", "fit_percent", "times_noise")
+        return pl.DataFrame(rows, schema=columns, orient="row")
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the first log and each model's prediction on axes of matplotlib; made where not given."""
+        import matplotlib.pyplot as plt
+
+        place = plt.subplots()[1] if axes is None else axes
+        first = next(iter(self.runs.values()))[0]
+        place.plot(first.time, first.measured, color="#8c8c8c", linewidth=3.0, label="measured")
+        for name, runs in self.runs.items():
+            place.plot(runs[0].time, runs[0].predicted, linewidth=1.2, label=name)
+        place.set(xlabel="time [s]", ylabel="dynamic error", title=first.name)
+        place.legend(frameon=False)
+        return place
+
+    def summary(self) -> str:
+        """The table as text."""
+        return str(self.table)
+
+    def _repr_html_(self) -> str:
+        return self.table._repr_html_()
+
+
+def predict(model: AnyModel, data: Data) -> Prediction:
+    """Run a model freely along a log.
+
+    The log's outputs are used in the first 50 samples only, which give the initial state.
+
+    Args:
+        model: A `model.json` of a report, a result, or its model.
+        data: One log, and its drive.
+
+    Raises:
+        InputError: The log does not suit the model.
+        DataError: The log can't be used, or the model runs away.
+    """
+    if len(data.logs) != 1:
+        raise InputError(f"a prediction follows one log, but there are {len(data.logs)}; load it alone")
+    stored, name = _stored(model)
+    log = data.ready(data.logs[0], outputs_until=WINDOW)
+    (run,), rows = _runs(stored, name, data, log)
+    if not np.isfinite(run.predicted).all():
+        raise DataError(f"{log.path}: the model's free run leaves the numbers; check the torque column's unit and sign")
+    return Prediction(run, rows, log.zero, log.findings)
+
+
+def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
+    """Run several models freely along the same logs.
+
+    Args:
+        models: Each as in [`predict`][], by name.
+        data: The logs; what was used to fit a model tells little of it.
+
+    Raises:
+        InputError: A log does not suit a model.
+        DataError: A log can't be used.
+    """
+    logs = [data.ready(log) for log in (*data.logs, *data.test)]
+    stored = {name: _stored(model)[0] for name, model in models.items()}
+    runs = {name: tuple(run for log in logs for run in _runs(one, name, data, log)[0]) for name, one in stored.items()}
+    return Comparison(runs, {name: float(np.sqrt(np.asarray(one.noise)[-1, -1])) for name, one in stored.items()})
+
+
+def _stored(model: AnyModel) -> tuple[StoredModel, str]:
+    """A model, and what messages call it."""
+    if isinstance(model, StoredModel):
+        return model, "the model"
+    if isinstance(model, Result):
+        if model.model is None:
+            raise InputError(WHY_NOT_QUASI_STATIC)
+        return model.model, "the model"
+    return read_model(Path(model)), str(model)
+
+
+def _runs(stored: StoredModel, name: str, data: Data, log: Log) -> tuple[tuple[FreeRun, ...], np.ndarray | slice]:
+    if log.kind == "quasi-static":
+        raise InputError(f"{log.path}: {WHY_NOT_QUASI_STATIC}")
+    if (log.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
+        raise InputError(
+            f"{log.path}: a {log.kind} log, but {name} is a model of the other kind; give a log like those fitted"
+        )
+    warm = [e.name for e in stored.model.effects if e.needs_temperature]
+    if warm and log.temperature is None:
+        raise InputError(
+            f"{log.path}: there is no temperature, on which {warm[0]} of {name} depends; add the column, or name it in "
+            f"[columns] temperature of {data.drive.path}"
+        )
+    ready = experiments(log, data.drive, stored.hold)
+    runs = free_run(
+        stored.model,
+        [Stretch(part, 0, len(part)) for part in ready],
+        covariance=stored.noise,
+        halo=stored.halo,
+        substeps=stored.substeps,
+    )
+    rows = ready[0].rows
+    return runs, slice(None) if rows is None else rows

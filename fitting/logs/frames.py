@@ -1,0 +1,53 @@
+"""Tables in memory as logs: data frames, datasets, and arrays by name."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fitting.errors import InputError
+from fitting.logs.parquet import column_from_series
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, split_unit
+
+
+def is_table(source: Any) -> bool:
+    """Whether something is a table in memory: it has columns (pandas, polars), variables (xarray), or is a mapping."""
+    return hasattr(source, "columns") or hasattr(source, "variables") or isinstance(source, Mapping)
+
+
+def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
+    """The wanted columns of a table in memory.
+
+    Args:
+        path: What messages call it.
+        source: A frame of pandas or polars, a dataset of xarray, or arrays by name. Its columns may state their unit as
+            in "torque [N m]", variables of xarray in the attribute `units`.
+        wanted: Names of columns; those that the table lacks are left out of the answer.
+
+    Raises:
+        InputError: A wanted column is not a vector of numbers.
+    """
+    found = source.variables if hasattr(source, "variables") else source
+    names = [str(name) for name in (source.columns if hasattr(source, "columns") else found)]
+    in_full = {split_unit(name)[0]: name for name in reversed(names)} | {name: name for name in names}
+    asked = {name: in_full[name] for name in dict.fromkeys(wanted) if name in in_full}
+    return RawTable(tuple(names), {name: _column(path, full, found[full]) for name, full in asked.items()})
+
+
+def _column(path: Path, name: str, values: Any) -> RawColumn:
+    unit = getattr(values, "attrs", {}).get("units") or split_unit(name)[1]
+    series = values if isinstance(values, pl.Series) else _series(path, name, values)
+    column = column_from_series(path, series)
+    return column if column.unit is not None else RawColumn(column.values, unit, None, column.text_rows, column.text)
+
+
+def _series(path: Path, name: str, values: Any) -> pl.Series:
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise not_numbers(path, name, f"has {array.ndim} dimensions")
+    try:
+        return pl.Series(name, array.tolist() if array.dtype == object else array)
+    except (TypeError, pl.exceptions.PolarsError) as error:
+        raise InputError(f"{path}: the column '{name}' mixes numbers with other things; keep numbers only") from error

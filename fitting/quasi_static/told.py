@@ -1,0 +1,72 @@
+"""From quasi-static logs to a report."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.log import Log
+from fitting.quasi_static.content import report_dict
+from fitting.quasi_static.fit import fit_quasi_static
+from fitting.quasi_static.loop import close_loop
+from fitting.quasi_static.loop_content import loop_report
+from fitting.quasi_static.plots import fit_pictures, loop_pictures
+from fitting.quasi_static.points import points_of
+from fitting.quasi_static.preparation import prepare
+from fitting.quasi_static.report import report_text, write_report
+from fitting.report.plots import Plot
+from fitting.search_options import SearchOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What was found on quasi-static logs, ready to be shown.
+
+    Attributes:
+        report: What `report.json` has.
+        pictures: Of the page.
+    """
+
+    report: dict[str, Any]
+    pictures: list[Plot]
+
+    @property
+    def text(self) -> str:
+        """For a terminal."""
+        return report_text(self.report)
+
+    def write(self, out: Path) -> Path:
+        """Write `report.html` and `report.json`; the page's path."""
+        return write_report(out, self.report, self.pictures)
+
+
+def fit_quasi_static_logs(logs: Sequence[Log], drive_file: DriveFile, *, progress: Callable[[str], None]) -> Told:
+    """Fit all torque-twist curves.
+
+    Args:
+        logs: Of kind "quasi-static", of one drive.
+        drive_file: Of the drive.
+        progress: Told what is being done.
+    """
+    progress("fitting torque-twist curves")
+    data = prepare(logs, drive_file)
+    found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
+    return Told(report_dict(data, found), fit_pictures(found))
+
+
+def close_quasi_static_loop(
+    logs: Sequence[Log], drive_file: DriveFile, *, search: SearchOptions, progress: Callable[[str], None]
+) -> Told:
+    """Look for what the torque-twist line lacks.
+
+    Args:
+        logs: Of kind "quasi-static", of one drive.
+        drive_file: Of the drive.
+        search: How effects are searched for.
+        progress: Told what is being done.
+    """
+    data = prepare(logs, drive_file, at_rest=True)
+    points = points_of(data.logs, data.motion, drive_file.reduction_ratio)
+    loop = close_loop(points, max_effects=search.max_effects, seed=search.seed, progress=progress)
+    return Told(loop_report(data, loop), loop_pictures(loop))

@@ -1,0 +1,198 @@
+"""`import fitting`, and what a notebook does with it: logs in from anywhere, results out."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import matplotlib
+import numpy as np
+import polars as pl
+import pytest
+import torque_cycles
+
+import fitting
+import rig
+from fitting import DataError, InputError
+
+matplotlib.use("Agg")
+
+COUNT = 1200
+DRIVE = {
+    "drive": {"name": "rig", "reduction_ratio": rig.N, "motor_inertia": rig.J_M, "load_inertia": rig.J_L},
+    "signals": {"torque_hold": "zero-order"},
+}
+
+
+def arrays(*, seed: int = 0, count: int = COUNT, **physics) -> dict[str, np.ndarray]:
+    """A drive log by name."""
+    torque = rig.drive_torque(count, seed=seed)
+    log = rig.drive_log(rig.drive_motion(torque, **physics), torque, seed=seed)
+    assert log.motor_angle is not None and log.load_angle is not None
+    return {
+        "time": log.time,
+        "motor_angle": log.motor_angle,
+        "load_angle": log.load_angle,
+        "motor_torque": torque,
+    }
+
+
+@pytest.fixture(scope="module")
+def fitted() -> fitting.FitResult:
+    return fitting.fit(fitting.load(arrays(), drive=DRIVE))
+
+
+@pytest.fixture(scope="module")
+def closed() -> fitting.LoopResult:
+    data = fitting.load([arrays(seed=s, torque_bias=0.02) for s in (0, 1)], drive=DRIVE)
+    return fitting.close_loop(data, test="log 2")
+
+
+def same(one: fitting.Data, other: fitting.Data) -> bool:
+    pairs = [(a, b) for name in arrays(count=50) for a, b in [(getattr(d.logs[0], name) for d in (one, other))]]
+    return all(np.allclose(a, b, rtol=1e-12, atol=0) for a, b in pairs)
+
+
+def test_logs_come_from_anywhere(tmp_path: Path):
+    columns = arrays()
+    by_name = fitting.load(columns, drive=DRIVE)
+    assert by_name.kind == "drive" and by_name.table["rows"].to_list() == [COUNT]
+    frame = pl.DataFrame(columns)
+    path, drive = tmp_path / "run.csv", tmp_path / "drive.toml"
+    frame.write_csv(path)
+    drive.write_text(
+        f'[drive]\nname = "rig"\nreduction_ratio = {rig.N}\nmotor_inertia = {rig.J_M}\nload_inertia = {rig.J_L}\n'
+        '[signals]\ntorque_hold = "zero-order"\n'
+    )
+    assert same(by_name, fitting.load(frame, drive=DRIVE))
+    assert same(by_name, fitting.load(path, drive=drive))
+    several = fitting.load([frame, path], drive=drive)
+    assert [log.name for log in several.logs] == ["log 1", "run"]
+
+
+def test_frames_of_pandas_and_datasets_of_xarray_are_logs():
+    pandas, xarray = (pytest.importorskip(name, reason=f"{name} is not installed") for name in ("pandas", "xarray"))
+    columns = arrays()
+    by_name = fitting.load(columns, drive=DRIVE)
+    assert same(by_name, fitting.load(pandas.DataFrame(columns), drive=DRIVE))
+    degrees = xarray.Dataset({name: ("sample", values) for name, values in columns.items()})
+    degrees["load_angle"] = np.rad2deg(degrees["load_angle"])
+    degrees["load_angle"].attrs["units"] = "deg"
+    assert same(by_name, fitting.load(degrees, drive=DRIVE))
+
+
+def test_units_stand_in_the_names_of_columns():
+    columns = arrays()
+    named = {("load_angle [mrad]" if n == "load_angle" else n): v for n, v in columns.items()}
+    named["load_angle [mrad]"] = 1e3 * named["load_angle [mrad]"]
+    assert same(fitting.load(columns, drive=DRIVE), fitting.load(named, drive=DRIVE))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"motor_torque": None}, "motor_torque"),
+        ({"load_angle": np.zeros((COUNT, 2))}, "has 2 dimensions"),
+        ({"load_angle": np.array([1.0, "a"] * (COUNT // 2), dtype=object)}, "load_angle"),
+    ],
+    ids=["absent", "matrix", "mixed"],
+)
+def test_a_bad_table_is_refused_by_its_name(change: dict, says: str):
+    columns = {name: value for name, value in (arrays() | change).items() if value is not None}
+    with pytest.raises((InputError, DataError), match=says) as told:
+        fitting.load(columns, drive=DRIVE)
+    assert "log 1" in str(told.value)
+
+
+def test_a_fit_is_a_table_a_text_and_a_picture(fitted: fitting.FitResult, tmp_path: Path):
+    table = fitted.parameters
+    stiffness = table.row(by_predicate=pl.col("parameter") == "K", named=True)
+    assert stiffness["low"] < rig.K < stiffness["high"] and stiffness["unit"] == "N m/rad"
+    assert "K" in fitted.summary() and str(fitted) == fitted.summary()
+    assert "<table" in fitted._repr_html_()
+    for name in fitted.plots:
+        fitted.plot(name)
+        matplotlib.pyplot.close("all")
+    with pytest.raises(ValueError, match="prediction-0"):
+        fitted.plot("no such picture")
+    folder = fitted.save(tmp_path / "report")
+    stored = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert stored["before"]["parameters"] == fitted.to_dict()["before"]["parameters"]
+
+
+def test_a_loop_tells_what_was_missing(closed: fitting.LoopResult):
+    assert closed.decision == "effect_found"
+    assert closed.effects["family"].to_list() == ["torque_sensor"]
+    assert set(closed.rmse) == {"training", "selection", "test"}
+    assert {"statistic", "threshold"} <= set(closed.rules.columns)
+    assert closed.effect_parameters.height > 0
+    axes = closed.plot("prediction")
+    assert [place.get_xlabel() for place in axes][-1] == "time [s]"
+    matplotlib.pyplot.close("all")
+
+
+def test_predictions_use_the_first_samples_of_the_outputs_alone(closed: fitting.LoopResult, tmp_path: Path):
+    unseen = arrays(seed=5, torque_bias=0.02)
+    blank = unseen | {n: np.where(np.arange(COUNT) < 50, unseen[n], np.nan) for n in ("motor_angle", "load_angle")}
+    known = fitting.predict(closed, fitting.load(unseen, drive=DRIVE))
+    guessed = fitting.predict(closed, fitting.load(blank, drive=DRIVE, outputs_until=50))
+    assert np.allclose(known.run.predicted, guessed.run.predicted, rtol=1e-9, atol=1e-15)
+    assert known.run.rmse < 5e-6
+    folder = closed.save(tmp_path / "report")
+    again = fitting.predict(folder / "model.json", fitting.load(unseen, drive=DRIVE))
+    assert np.allclose(again.run.predicted, known.run.predicted, rtol=1e-6, atol=1e-12)
+    assert pl.read_csv(again.save(tmp_path / "prediction.csv")).height == COUNT
+
+
+def test_models_are_compared_side_by_side(fitted: fitting.FitResult, closed: fitting.LoopResult):
+    data = fitting.load(arrays(seed=6, torque_bias=0.02), drive=DRIVE)
+    table = fitting.compare({"without": fitted, "with": closed}, data).table
+    without, with_it = table["rmse"].to_list()
+    assert with_it < 0.5 * without
+
+
+def test_a_model_is_simulated_under_any_torque(closed: fitting.LoopResult):
+    assert closed.model is not None
+    times = rig.STEP * np.arange(200)
+    motion = closed.model.simulate(np.full(200, 0.1), times)
+    assert motion.dynamic_error.shape == (200,) and np.isfinite(motion.dynamic_error).all()
+
+
+def test_test_logs_are_named(closed: fitting.LoopResult):
+    data = fitting.load([arrays(), arrays(seed=1)], drive=DRIVE)
+    assert [log.name for log in data.with_test("log 2").test] == ["log 2"]
+    with pytest.raises(InputError, match="no log 'log 9'"):
+        fitting.close_loop(data, test="log 9")
+    with pytest.raises(InputError, match="leave one"):
+        data.with_test(["log 1", "log 2"])
+
+
+def test_quasi_static_logs_go_through_the_same_verbs(tmp_path: Path):
+    log = torque_cycles.cycles(torque_cycles.line, torque_cycles.no_friction)
+    columns = {"time": log.time, "twist": log.dynamic_error, "joint_torque": log.joint_torque}
+    data = fitting.load(columns, drive={"drive": {"name": "joint"}})
+    assert data.kind == "quasi-static"
+    found = fitting.fit(data)
+    assert found.model is None and "K" in found.parameters["parameter"].to_list()
+    assert {path.name for path in found.save(tmp_path / "report").iterdir()} == {"report.html", "report.json"}
+    with pytest.raises(InputError, match="quasi-static"):
+        fitting.predict(found, data)
+
+
+def test_single_precision_is_refused_with_the_remedy():
+    data = fitting.load(arrays(), drive=DRIVE)
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match="jax_enable_x64"):
+            fitting.fit(data)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+def test_the_package_loads_without_jax():
+    code = "import sys, fitting; print(fitting.__version__, 'jax' in sys.modules, sorted(dir(fitting))[:2])"
+    told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert "False" in told
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = fitting.nothing  # pyright: ignore[reportAttributeAccessIssue]
