@@ -121,12 +121,9 @@ class Standing:
         self.before, self.base, self.noise = before, base, noise
 
     @cached_property
-    def left(self) -> NoiseModel | None:
-        """What the current model leaves as noise of the sensors, with a memory, and of the torque; None where that is
-        hardly more than white measurement noise."""
-        outputs = np.asarray(self.noise.covariance)
-        left = np.diag(np.asarray(self.before.training.covariance)) / np.diag(outputs)
-        return _noise_of(self.before, outputs) if np.max(left) > RULES.excess**2 else None
+    def left(self) -> NoiseModel:
+        """What the current model leaves as noise of the sensors, with a memory, and of the torque."""
+        return _noise_of(self.before, np.asarray(self.noise.covariance))
 
     def over_noise(self, trial: Trial) -> float:
         """Log likelihood [nats] by which a model betters the current one, where each has a noise model of its own, less
@@ -137,7 +134,7 @@ class Standing:
             trial: the model.
         """
         left = self.left
-        if left is None or not is_noise(left):
+        if not is_noise(left):
             return np.inf
         own = _noise_of(trial, np.asarray(self.noise.covariance))
         further = len(trial.training.free.paths) - len(self.before.training.free.paths)
