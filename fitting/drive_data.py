@@ -134,7 +134,11 @@ def together(logs: Sequence[Log]) -> tuple[Log, ...]:
 def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
     """A log that was read, its wrong samples masked, and its dynamic error zeroed; arguments as in
     [`fitting.logs.log.read_log`][]. The fit of a quasi-static log finds its zero itself."""
-    log = read_log(path, drive_file, outputs_until=outputs_until)
+    return ready(read_log(path, drive_file, outputs_until=outputs_until), drive_file)
+
+
+def ready(log: Log, drive_file: DriveFile) -> Log:
+    """A log as it was read, with its wrong samples masked and its dynamic error zeroed."""
     return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file)
 
 

@@ -14,6 +14,7 @@ from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import Finding
 from fitting.progress import Progress, silent
+from fitting.stored_model import StoredModel
 from fitting.uncertainty.measurement_noise import measurement_noise
 from fitting.uncertainty.posterior import Posterior, posterior
 from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
@@ -57,6 +58,11 @@ class FitOnly(eqx.Module):
     findings: ClassVar[tuple[Finding, ...]] = ()
     rounds: ClassVar[tuple[Round, ...]] = ()
     dropped: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def stored(self) -> StoredModel:
+        """The model, as `model.json` has it."""
+        return StoredModel(self.account.model, self.hold, self.goodness.substeps, 0, self.noise)
 
     @property
     def before(self) -> Account:

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
-
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import CaseEvidence
 from fitting.attribution.decisions import decide
@@ -17,6 +15,7 @@ from fitting.attribution.support import noise_of_torque
 from fitting.clock import Clock
 from fitting.conclusion import Conclusion, draw_conclusion
 from fitting.discrepancy.challenge import Challenge, challenge_names
+from fitting.estimation.base_fit import need_double_precision
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, Stretch, split, whole
 from fitting.estimation.free_run import FreeRun, rms_error
@@ -58,8 +57,7 @@ def close_loop(
     Raises:
         DataError: where no oscillator fits the data.
     """
-    if jnp.zeros(0).dtype != jnp.float64:
-        raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
+    need_double_precision()
     clock = Clock()
     progress("finding starting values")
     base, read = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)

@@ -10,6 +10,7 @@ from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Setting
 from fitting.discrepancy.learn import Unknown
 from fitting.estimation.experiment import Stretch
+from fitting.stored_model import StoredModel
 from fitting.validation.account import Account
 from fitting.validation.residual_diagnostics import ResidualDiagnostics
 from hdjax import Hold
@@ -93,6 +94,11 @@ class Loop(eqx.Module):
     surprise: float | None
     put_back: tuple[float, ...] = eqx.field(static=True)
     seconds: dict[str, float]
+
+    @property
+    def stored(self) -> StoredModel:
+        """The final model, as `model.json` has it."""
+        return StoredModel(self.after.model, self.hold, self.after_substeps, self.setting.halo, self.noise)
 
     @property
     def times_noise(self) -> float:

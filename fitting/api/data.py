@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fitting.drive_data import Rig, rig_of, together
+from fitting.drive_data import Rig, ready, rig_of, together
 from fitting.errors import InputError
 from fitting.logs.drive_file import DriveFile, drive_of, read_drive_file
 from fitting.logs.frames import is_table
 from fitting.logs.log import Log, read_log
-from fitting.logs.masks import masked
-from fitting.logs.zeroing import zeroed
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ class Data:
         table = self.tables.get(log.path)
         if outputs_until != self.outputs_until:
             log = replace(read_log(log.path, self.drive, outputs_until=outputs_until, table=table), name=log.name)
-        return log if log.kind == "quasi-static" else zeroed(masked(log), self.drive)
+        return ready(log, self.drive)
 
     @property
     def table(self) -> pl.DataFrame:

@@ -18,6 +18,7 @@ from fitting.estimation.free_run import WINDOW, FreeRun, free_run
 from fitting.files import write_whole
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
+from fitting.report.plots.axes import MEASURED
 from fitting.stored_model import StoredModel, read_model
 from fitting.validation.goodness_of_fit import fit_percent
 from hdjax import TwoInertiaModel
@@ -55,14 +56,7 @@ class Prediction:
 
     def plot(self, axes: Any = None) -> Any:
         """Draw measured and predicted dynamic error on axes of matplotlib; made where not given."""
-        import matplotlib.pyplot as plt
-
-        place = plt.subplots()[1] if axes is None else axes
-        place.plot(self.run.time, self.run.measured, color="#8c8c8c", linewidth=3.0, label="measured")
-        place.plot(self.run.time, self.run.predicted, color="#0072B2", linewidth=1.2, label="predicted")
-        place.set(xlabel="time [s]", ylabel="dynamic error", title=self.run.name)
-        place.legend(frameon=False)
-        return place
+        return _drawn({"predicted": self.run}, axes)
 
     def summary(self) -> str:
         """The error in a sentence."""
@@ -97,16 +91,7 @@ class Comparison:
 
     def plot(self, axes: Any = None) -> Any:
         """Draw the first log and each model's prediction on axes of matplotlib; made where not given."""
-        import matplotlib.pyplot as plt
-
-        place = plt.subplots()[1] if axes is None else axes
-        first = next(iter(self.runs.values()))[0]
-        place.plot(first.time, first.measured, color="#8c8c8c", linewidth=3.0, label="measured")
-        for name, runs in self.runs.items():
-            place.plot(runs[0].time, runs[0].predicted, linewidth=1.2, label=name)
-        place.set(xlabel="time [s]", ylabel="dynamic error", title=first.name)
-        place.legend(frameon=False)
-        return place
+        return _drawn({name: runs[0] for name, runs in self.runs.items()}, axes)
 
     def summary(self) -> str:
         """The table as text."""
@@ -154,6 +139,20 @@ def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
     stored = {name: _stored(model)[0] for name, model in models.items()}
     runs = {name: tuple(run for log in logs for run in _runs(one, name, data, log)[0]) for name, one in stored.items()}
     return Comparison(runs, {name: float(np.sqrt(np.asarray(one.noise)[-1, -1])) for name, one in stored.items()})
+
+
+def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:
+    """The measured dynamic error of one log, and what models predict of it."""
+    import matplotlib.pyplot as plt
+
+    place = plt.subplots()[1] if axes is None else axes
+    first = next(iter(runs.values()))
+    place.plot(first.time, first.measured, color=MEASURED, linewidth=3.0, label="measured")
+    for name, run in runs.items():
+        place.plot(run.time, run.predicted, linewidth=1.2, label=name)
+    place.set(xlabel="time [s]", ylabel="dynamic error", title=first.name)
+    place.legend(frameon=False)
+    return place
 
 
 def _stored(model: AnyModel) -> tuple[StoredModel, str]:

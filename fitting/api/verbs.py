@@ -3,11 +3,10 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-import jax.numpy as jnp
-
 from fitting.api.data import Data
 from fitting.api.results import FitResult, LoopResult
 from fitting.drive_data import Rig
+from fitting.estimation.base_fit import need_double_precision
 from fitting.fit_drive import FitOnly, fit_only
 from fitting.loop import close_loop as close_loop_of_drive
 from fitting.outcome import Loop
@@ -15,7 +14,6 @@ from fitting.progress import Progress, silent
 from fitting.quasi_static.told import Told, close_quasi_static_loop, fit_quasi_static_logs
 from fitting.report import of_rig, pictures, report_dict, report_text, write_rig_report
 from fitting.search_options import SearchOptions
-from fitting.stored_model import StoredModel, to_json
 
 
 def fit(data: Data, *, draws: int | None = None, progress: Progress = silent) -> FitResult:
@@ -31,13 +29,14 @@ def fit(data: Data, *, draws: int | None = None, progress: Progress = silent) ->
         ImportError: Draws are asked for and blackjax is not installed.
         ValueError: JAX computes in single precision.
     """
-    _need_double_precision()
+    need_double_precision()
     if data.kind == "quasi-static":
-        return FitResult(*_quasi_static(fit_quasi_static_logs(data.logs, data.drive, progress=progress)))
+        return FitResult(
+            *_quasi_static(fit_quasi_static_logs(data.logs, data.drive, test=data.test, progress=progress))
+        )
     rig = data.rig(other_holds=False)
     found = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold, seed=draws, progress=progress)
-    stored = StoredModel(found.account.model, found.hold, found.goodness.substeps, 0, found.noise)
-    return FitResult(*_of_drive(found, rig, stored))
+    return FitResult(*_of_drive(found, rig))
 
 
 def close_loop(
@@ -60,33 +59,27 @@ def close_loop(
         DataError: The logs can't support a fit.
         ValueError: JAX computes in single precision.
     """
-    _need_double_precision()
+    need_double_precision()
     named = [test] if isinstance(test, str) else list(test)
     if named:
         data = data.with_test(named)
     if data.kind == "quasi-static":
-        told = close_quasi_static_loop(data.logs, data.drive, search=search, progress=progress)
+        told = close_quasi_static_loop(data.logs, data.drive, test=data.test, search=search, progress=progress)
         return LoopResult(*_quasi_static(told))
     rig = data.rig()
     found = close_loop_of_drive(
         rig.model, rig.experiments, test=rig.test, hold=rig.hold, search=search, progress=progress
     )
-    stored = StoredModel(found.after.model, found.hold, found.after_substeps, found.setting.halo, found.noise)
-    return LoopResult(*_of_drive(found, rig, stored))
+    return LoopResult(*_of_drive(found, rig))
 
 
-def _need_double_precision() -> None:
-    if jnp.zeros(0).dtype != jnp.float64:
-        raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
-
-
-def _of_drive(outcome: Loop | FitOnly, rig: Rig, stored: StoredModel) -> tuple:
+def _of_drive(outcome: Loop | FitOnly, rig: Rig) -> tuple:
     report = report_dict(outcome, **of_rig(rig))
 
     def write(folder: Path) -> None:
-        write_rig_report(folder, outcome, rig=rig, model_json=to_json(stored))
+        write_rig_report(folder, outcome, rig=rig)
 
-    return report, report_text(report), tuple(pictures(outcome, report)), stored, write
+    return report, report_text(report), tuple(pictures(outcome, report)), outcome.stored, write
 
 
 def _quasi_static(told: Told) -> tuple:

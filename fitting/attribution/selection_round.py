@@ -1,6 +1,6 @@
 """Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Generic
 
@@ -121,10 +121,17 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     found.sort(key=lambda v: (v.trial is None, -v.gain))
     found, behind = _with_ties(found)
     rivals: tuple[Rival, ...] = ()
-    verdicts, asked, accepted = _supported_first(found, standing)
+    known: dict[str, EffectEvidence] = {}
+
+    def ask(verdict: Verdict) -> EffectEvidence:
+        if verdict.name not in known:
+            known[verdict.name] = _evidence(verdict, standing)
+        return known[verdict.name]
+
+    verdicts, asked, accepted = _supported_first(found, ask)
     if accepted:
         found, rivals = _simplest_first(found, before, study)
-        verdicts, asked, accepted = _supported_first(found, standing)
+        verdicts, asked, accepted = _supported_first(found, ask)
     return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
 
 
@@ -200,7 +207,7 @@ class _Refits:
 
 
 def _supported_first(
-    verdicts: list[Verdict], standing: Standing
+    verdicts: list[Verdict], ask: Callable[[Verdict], EffectEvidence]
 ) -> tuple[list[Verdict], tuple[EffectEvidence, ...], bool]:
     """The list from its first supported competitor on, the unsupported ones behind it, unchanged where none is; what
     the data say of each that was asked; and whether there is one."""
@@ -208,7 +215,7 @@ def _supported_first(
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None:
             break
-        asked.append(_evidence(verdict, standing))
+        asked.append(ask(verdict))
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
         if verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:

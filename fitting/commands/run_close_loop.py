@@ -8,13 +8,11 @@ from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_li
 from fitting.commands.options import ExperimentLimits
 from fitting.commands.spinner import Spinner
 from fitting.drive_data import Rig, read_logs, read_rig, rig_of
-from fitting.errors import InputError
 from fitting.logs.drive_file import read_drive_file
 from fitting.loop import close_loop
 from fitting.next_experiment.proposal import experiment_for_ties
 from fitting.report import rig_text, write_rig_report
 from fitting.search_options import SearchOptions
-from fitting.stored_model import StoredModel, to_json
 
 
 def close_loop_on_logs(
@@ -43,15 +41,11 @@ def close_loop_on_logs(
     drive_file = read_drive_file(drive)
     read, tests = read_logs(logs, drive_file, test=test)
     if is_quasi_static(read, limits):
-        if test:
-            raise InputError(
-                f"{test[0]}: --test is for logs of a motion, but {read[0].path} is quasi-static; leave it out"
-            )
         # Loaded here: most logs are of other kinds.
         from fitting.quasi_static.told import close_quasi_static_loop
 
         with Spinner() as progress:
-            told = close_quasi_static_loop(read, drive_file, search=search, progress=progress)
+            told = close_quasi_static_loop(read, drive_file, test=tests, search=search, progress=progress)
         page = told.write(out)
         print(f"{told.text}\nReport: {page}")
     else:
@@ -83,7 +77,6 @@ def _close_loop(rig: Rig, out: Path, search: SearchOptions, limits: ExperimentLi
             progress=progress,
         )
         proposed = None if stated is None else experiment_for_ties(loop, stated, progress=progress)
-    stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
-    paths = write_rig_report(out, loop, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    paths = write_rig_report(out, loop, rig=rig, next_experiment=proposed)
     print(rig_text(loop, rig=rig, next_experiment=proposed))
     print(f"Report: {paths['report.html']}")

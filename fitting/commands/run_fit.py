@@ -10,7 +10,6 @@ from fitting.errors import InputError
 from fitting.fit_drive import fit_only
 from fitting.logs.drive_file import read_drive_file
 from fitting.report import rig_text, write_rig_report
-from fitting.stored_model import StoredModel, to_json
 
 
 def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
@@ -62,8 +61,7 @@ def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits |
             from fitting.next_experiment.proposal import experiment_for_alpha
 
             proposed = experiment_for_alpha(fitted, rig.experiments[fitted.hold], stated, progress=progress)
-    stored = StoredModel(fitted.account.model, fitted.hold, fitted.goodness.substeps, 0, fitted.noise)
-    paths = write_rig_report(out, fitted, rig=rig, model_json=to_json(stored), next_experiment=proposed)
+    paths = write_rig_report(out, fitted, rig=rig, next_experiment=proposed)
     print(rig_text(fitted, rig=rig, next_experiment=proposed))
     if limits is not None and proposed is None:
         print(

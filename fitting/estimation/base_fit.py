@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
@@ -149,6 +150,16 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     )
     states = initial_states(best.model, segmentation.of(as_followed(best)))
     return fit(best.model, training, paths, segmentation, start=Start(states=states))
+
+
+def need_double_precision() -> None:
+    """Refuse to go on in single precision, which fits do not converge in.
+
+    Raises:
+        ValueError: JAX computes in single precision.
+    """
+    if jnp.zeros(0).dtype != jnp.float64:
+        raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
 
 
 def leaves_white_noise(found: Fit) -> bool:

@@ -1,6 +1,7 @@
 """Tables in memory as logs: data frames, datasets, and arrays by name."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def _column(path: Path, name: str, values: Any) -> RawColumn:
     unit = getattr(values, "attrs", {}).get("units") or split_unit(name)[1]
     series = values if isinstance(values, pl.Series) else _series(path, name, values)
     column = column_from_series(path, series)
-    return column if column.unit is not None else RawColumn(column.values, unit, None, column.text_rows, column.text)
+    return column if column.unit is not None else replace(column, unit=unit)
 
 
 def _series(path: Path, name: str, values: Any) -> pl.Series:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fitting.errors import InputError
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.log import Log
 from fitting.quasi_static.content import report_dict
@@ -41,14 +42,21 @@ class Told:
         return write_report(out, self.report, self.pictures)
 
 
-def fit_quasi_static_logs(logs: Sequence[Log], drive_file: DriveFile, *, progress: Callable[[str], None]) -> Told:
+def fit_quasi_static_logs(
+    logs: Sequence[Log], drive_file: DriveFile, *, test: Sequence[Log] = (), progress: Callable[[str], None]
+) -> Told:
     """Fit all torque-twist curves.
 
     Args:
         logs: Of kind "quasi-static", of one drive.
         drive_file: Of the drive.
+        test: Logs of test data, which are refused.
         progress: Told what is being done.
+
+    Raises:
+        InputError: There are test logs.
     """
+    _refuse_test(logs, test)
     progress("fitting torque-twist curves")
     data = prepare(logs, drive_file)
     found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
@@ -56,17 +64,35 @@ def fit_quasi_static_logs(logs: Sequence[Log], drive_file: DriveFile, *, progres
 
 
 def close_quasi_static_loop(
-    logs: Sequence[Log], drive_file: DriveFile, *, search: SearchOptions, progress: Callable[[str], None]
+    logs: Sequence[Log],
+    drive_file: DriveFile,
+    *,
+    test: Sequence[Log] = (),
+    search: SearchOptions,
+    progress: Callable[[str], None],
 ) -> Told:
     """Look for what the torque-twist line lacks.
 
     Args:
         logs: Of kind "quasi-static", of one drive.
         drive_file: Of the drive.
+        test: Logs of test data, which are refused.
         search: How effects are searched for.
         progress: Told what is being done.
+
+    Raises:
+        InputError: There are test logs.
     """
+    _refuse_test(logs, test)
     data = prepare(logs, drive_file, at_rest=True)
     points = points_of(data.logs, data.motion, drive_file.reduction_ratio)
     loop = close_loop(points, max_effects=search.max_effects, seed=search.seed, progress=progress)
     return Told(loop_report(data, loop), loop_pictures(loop))
+
+
+def _refuse_test(logs: Sequence[Log], test: Sequence[Log]) -> None:
+    """A rest at the end of a log is what creep is told by, so that no part of these logs is test data."""
+    if test:
+        raise InputError(
+            f"{test[0].path}: --test is for logs of a motion, but {logs[0].path} is quasi-static; leave it out"
+        )

@@ -29,6 +29,7 @@ from fitting.report.posterior import DRAWS_FILE, draws_table
 from fitting.report.proposal import COMMAND_FILE, command_table
 from fitting.report.text import report_text
 from fitting.report.unknown import curve_of, unit_in_log
+from fitting.stored_model import to_json
 from hdjax.effects.learned_axes import UNITS
 
 
@@ -77,11 +78,11 @@ def write_rig_report(
     outcome: Outcome,
     *,
     rig: Rig,
-    model_json: str,
     next_experiment: NextExperiment | None = None,
 ) -> dict[str, Path]:
-    """[`write_report`][] of a rig's logs."""
-    return write_report(out_dir, outcome, model_json=model_json, next_experiment=next_experiment, **of_rig(rig))
+    """[`write_report`][] of a rig's logs, with the final model."""
+    model = to_json(outcome.stored)
+    return write_report(out_dir, outcome, model_json=model, next_experiment=next_experiment, **of_rig(rig))
 
 
 def rig_text(outcome: Outcome, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:

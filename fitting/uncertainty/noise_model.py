@@ -35,8 +35,10 @@ _HALF, _FIVE_SAMPLES, _STEP, _GROWS = np.log(0.5), 1.5, 1e-4, 1e-5
 
 
 class SensorNoise(eqx.Module):
-    """Noise of the outputs, each the sum of a white part and of one whose correlation decays by a constant share from
-    sample to sample, where the outputs are combined so that their noise is independent.
+    """Noise of the outputs, in combinations of them whose noise is independent.
+
+    Each is the sum of a white part and of a slow one, whose correlation decays by a constant share from sample to
+    sample.
 
     Attributes:
         combined: the outputs by independent ones of unit variance.
