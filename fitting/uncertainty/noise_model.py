@@ -31,9 +31,11 @@ _LOGS, _SEGMENTS, _SEGMENTS_OF_MEMORY = 4, 24, 24
 # Lags over which innovations are tested for whiteness.
 _LAGS = 20
 # Where the search for the sensors' noise begins: nine tenths of what short pieces tell (log odds); halves with and
-# without memory, one of five samples. Steps of its differences, and by how much the likelihood may still grow at its
-# end [nats a sample].
-_MOST_OF_IT, _HALF, _FIVE_SAMPLES, _STEP, _GROWS = 2.2, np.log(0.5), 1.5, 1e-4, 1e-5
+# without memory, one of five samples.
+_MOST_OF_IT, _HALF, _FIVE_SAMPLES = 2.2, np.log(0.5), 1.5
+# Step of its differences, the slope of the likelihood at which it ends [nats a sample], and iterations at most: where
+# noise is what is left, it ends after ten.
+_STEP, _FLAT, _ITERATIONS = 1e-4, 1e-4, 15
 
 
 class SensorNoise(eqx.Module):
@@ -129,10 +131,6 @@ class _Steps(eqx.Module):
         fewer = (*(place[:, chosen] for place in places), self.log[chosen])
         return eqx.tree_at(lambda s: (s.transition, s.push, s.readout, s.error, s.counts, s.log), self, fewer)
 
-    def by_log(self, values: Float[np.ndarray, "settings samples_"]) -> Float[np.ndarray, "settings logs"]:
-        """Sums over the segments of each log, of values by segment."""
-        return values @ (self.log[:, None] == np.arange(self.torque.size))
-
 
 def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float) -> NoiseModel:
     """The noise that a fit's residual shows.
@@ -171,11 +169,11 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
 
 def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoise) -> NoiseModel:
     """What is left under noise of given size."""
-    innovations, terms = _filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
+    innovations, logarithms = _filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
     std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
     each = [_size_and_colour(innovations[0, steps.log == log]) for log in range(shares.size)]
     size, colour = np.max(each, axis=0)
-    likelihood, without = -np.sum(terms, axis=(1, 2, 3))
+    likelihood, without = -np.sum(0.5 * innovations**2 + logarithms, axis=(1, 2, 3))
     count = int(steps.counts[steps.lead :].sum()) * innovations.shape[3]
     return NoiseModel(std, share, sensors, float(size), float(colour), float(likelihood), float(without), count)
 
@@ -183,8 +181,10 @@ def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNo
 def _first_shares(steps: _Steps, sensors: SensorNoise) -> Float[np.ndarray, " logs"]:
     """The likeliest of some shares of the torque, for each log."""
     shares = np.geomspace(_LEAST, 1.0, _SHARES)
-    terms = _filtered(steps, shares[:, None] * steps.torque, sensors)[1]
-    return shares[np.argmin(steps.by_log(terms.sum(axis=(2, 3))), axis=0)]
+    innovations, logarithms = _filtered(steps, shares[:, None] * steps.torque, sensors)
+    unlikely = np.sum(0.5 * innovations**2 + logarithms, axis=(2, 3))
+    by_log = unlikely @ (steps.log[:, None] == np.arange(steps.torque.size))
+    return shares[np.argmin(by_log, axis=0)]
 
 
 def _likeliest(
@@ -194,7 +194,7 @@ def _likeliest(
     first: Float[np.ndarray, " unknowns"],
 ) -> tuple[Float[np.ndarray, " logs"], SensorNoise]:
     """Noise of the torque of each log, and of the sensors, that make the innovations likeliest: by the method of
-    scoring, with the information matrix as the sum of the scores' squares (Berndt et al. 1974).
+    scoring (Ljung 1999, section 10.2), with the information of Gaussian innovations.
 
     Args:
         steps: the motion.
@@ -217,11 +217,18 @@ def _likeliest(
         apart = np.concatenate([np.zeros((1, first.size)), np.eye(first.size)])
         varied = unknowns + _STEP * np.concatenate([0.0 * unknowns[None], np.hstack([together, apart])])
         varied_shares, sensors = at(varied)
-        each = -_filtered(steps, varied_shares * steps.torque, sensors)[1]
-        size = each[0].size
-        scores = (each[1:] - each[0]) / _STEP
-        scores = np.concatenate([own[..., None, None] * scores[0], scores[1:]]).reshape(unknowns.size, size)
-        return -float(each[0].sum()) / size, -scores.sum(axis=1) / size, scores @ scores.T / size
+        innovations, logarithms = _filtered(steps, varied_shares * steps.torque, sensors)
+
+        def slopes(values: np.ndarray) -> np.ndarray:
+            found = (values[1:] - values[0]) / _STEP
+            return np.concatenate([own[..., None, None] * found[0], found[1:]]).reshape(unknowns.size, -1)
+
+        now, size = innovations[0].ravel(), innovations[0].size
+        moved, grown = slopes(innovations), slopes(logarithms)
+        value = 0.5 * float(now @ now) + float(logarithms[0].sum())
+        errors = moved + now * grown
+        information = 2.0 * grown @ grown.T + errors @ errors.T
+        return value / size, (moved @ now + grown.sum(axis=1)) / size, information / size
 
     last: list[tuple[np.ndarray, tuple]] = []
 
@@ -236,7 +243,7 @@ def _likeliest(
         jac=lambda u: once(u)[1],
         hess=lambda u: once(u)[2],
         method="trust-exact",
-        options={"gtol": _GROWS, "max_trust_radius": 3.0, "maxiter": 30},
+        options={"gtol": _FLAT, "max_trust_radius": 3.0, "maxiter": _ITERATIONS},
     )
     return at(solution.x)
 
@@ -294,10 +301,10 @@ def _spread(count: int, most: int) -> np.ndarray:
 def _filtered(
     steps: _Steps, std: Float[np.ndarray, "settings logs"], sensors: SensorNoise
 ) -> tuple[
-    Float[np.ndarray, "settings segments samples outputs"], Float[np.ndarray, "settings segments samples_ outputs"]
+    Float[np.ndarray, "settings segments samples outputs"], Float[np.ndarray, "settings segments samples outputs"]
 ]:
-    """Standardised innovations at the parameters that suit them best, for several settings of the noise at once; and
-    what each takes off the log likelihood, but for a constant, after the lead.
+    """Standardised innovations after the lead, at the parameters that suit them best, and logarithms of what
+    standardised them, for several settings of the noise at once.
 
     Outputs whose noise is independent are taken one after the other (Anderson and Moore 1979, section 6.4); the slow
     part of each one's noise is a further state.
@@ -337,23 +344,24 @@ def _filtered(
         push = steps.push[i]
         spread[..., :size, :size] += variance * (push[:, :, None] * push[:, None, :])
         spread[..., own, own] += fresh
-    used = found[:, :, steps.lead :].reshape(settings, -1, columns)
+    found, logarithms = found[:, :, steps.lead :], logarithms[:, :, steps.lead :]
+    used = found.reshape(settings, -1, columns)
     derivatives = used[..., 1:]
     size_of = np.maximum(np.linalg.norm(derivatives, axis=1), 1e-300)
     derivatives = derivatives / size_of[:, None]
     across = np.swapaxes(derivatives, 1, 2)
     moved = np.linalg.pinv(across @ derivatives, hermitian=True) @ (across @ used[..., :1])
     moved = moved[..., 0] / size_of
-    innovations = found[..., 0] - (found[..., 1:] @ moved[:, None, None, :, None])[..., 0]
-    return innovations, (0.5 * innovations**2 + logarithms)[:, :, steps.lead :]
+    return found[..., 0] - (found[..., 1:] @ moved[:, None, None, :, None])[..., 0], logarithms
 
 
 def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:
     """Rms of the output where it is largest; and the sum of squared autocorrelations, less what chance makes of it."""
-    kept = innovations[:, _LEAD:]
-    square, lags = np.sum(kept**2, axis=(0, 1)), min(_LAGS, kept.shape[1] - 1)
-    correlation = [np.sum(kept[:, lag:] * kept[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)]
-    count = kept.shape[0] * kept.shape[1]
+    square, lags = np.sum(innovations**2, axis=(0, 1)), min(_LAGS, innovations.shape[1] - 1)
+    correlation = [
+        np.sum(innovations[:, lag:] * innovations[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)
+    ]
+    count = innovations.shape[0] * innovations.shape[1]
     colour = np.max(np.sum(np.square(correlation), axis=0)) - lags / count
     return float(np.sqrt(np.max(square) / count)), max(0.0, float(colour))
 

@@ -128,7 +128,7 @@ def test_the_likelihood_is_that_of_the_gaussian_law():
     stacked = {name: np.broadcast_to(v, (samples, 1, *v.shape)) for name, v in shapes.items()}
     one = {"log": np.zeros(1, int), "prior": np.eye(size), "torque": np.ones(1), "lead": 0}
     steps = _Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), **one)
-    _, terms = _filtered(steps, np.array([[std]]), sensors)
+    innovations, logarithms = _filtered(steps, np.array([[std]]), sensors)
     spread = np.zeros((samples, size, samples, size))
     variance = np.eye(size)
     for i in range(samples):
@@ -144,7 +144,7 @@ def test_the_likelihood_is_that_of_the_gaussian_law():
     law = multivariate_normal(cov=seen.reshape(2 * samples, -1))
     # In units of the sensors' independent combinations.
     units = samples * np.log(np.linalg.det(sensors.combined)) + samples * np.log(2.0 * np.pi)
-    likelihood = -np.sum(terms) - units
+    likelihood = -np.sum(0.5 * innovations**2 + logarithms) - units
     assert likelihood == pytest.approx(law.logpdf(error[:, 0, :, 0].ravel()), rel=1e-9)
 
 
