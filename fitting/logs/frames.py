@@ -1,6 +1,6 @@
 """Tables in memory as logs: data frames, datasets, and arrays by name."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,6 @@ import polars as pl
 from fitting.errors import InputError
 from fitting.logs.parquet import column_from_series
 from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, split_unit
-
-
-def is_table(source: Any) -> bool:
-    """Whether something is a table in memory: it has columns (pandas, polars), variables (xarray), or is a mapping."""
-    return hasattr(source, "columns") or hasattr(source, "variables") or isinstance(source, Mapping)
 
 
 def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
