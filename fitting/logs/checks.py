@@ -7,7 +7,8 @@ import numpy as np
 from fitting.errors import DataError
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
-from fitting.logs.log import OUTPUTS, Log
+from fitting.logs.log import Log
+from fitting.logs.log_kind import OUTPUTS
 from fitting.logs.masks import clipped, glitches
 from fitting.logs.plausibility import mix_ups
 
