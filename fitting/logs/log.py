@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from fitting.errors import DataError, InputError
-from fitting.logs.channels import SI, Channel, channel
-from fitting.logs.drive_file import SIGNALS, DriveFile, did_you_mean
+from fitting.logs.channels import Channel, channel
+from fitting.logs.drive_file import SIGNALS, DriveFile
 from fitting.logs.filling import input_rows, interpolated, trusted_rows
 from fitting.logs.findings import Finding
 from fitting.logs.gaps import SHORTEST
@@ -26,12 +26,14 @@ from fitting.logs.log_kind import (
     kind_of,
     listing,
     needed_signals,
+    refuse_repeated,
 )
+from fitting.logs.own_clocks import later_names, mended_base, with_own_clocks
 from fitting.logs.raw_table import RawColumn, RawTable
 from fitting.logs.read_table import read_table
 from fitting.logs.resampling import angles_together, on_one_grid
-from fitting.logs.time_stamps import TimeBase, time_base
-from fitting.logs.units import convert
+from fitting.logs.split_stamps import partners, with_joined_stamps
+from fitting.logs.time_stamps import TimeBase
 
 _SLOWEST = 60.0  # s between samples; no drive's resonance is that slow, but nanoseconds taken for seconds are
 _UNTIMED = Finding(
@@ -132,11 +134,15 @@ def read_log(
 def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: Any) -> Log:
     places = [drive_file.column_of(signal) for signal in SIGNALS]
     wanted = [name for place in places for name in (place.column, place.time) if name is not None]
+    stamps = drive_file.column_of("time")
+    wanted += [*partners(stamps), *later_names(stamps.column)]
     table = read_table(path, wanted) if source is None else _in_memory(path, source, wanted)
+    table, drive_file, joined = with_joined_stamps(table, drive_file)
     raw = {s: table.columns[c] for s in SIGNALS if (c := drive_file.column_of(s).column) in table.columns}
+    refuse_repeated(path, drive_file, table)
     kind = kind_of(path, drive_file, table, raw)
     required = needed_signals(kind, raw)
-    raw, start, stop, blank = _inhabited(path, drive_file, table, raw, required)
+    raw, start, stop, told = _inhabited(path, drive_file, table, raw, required)
     channels = {}
     for signal in raw:
         if signal != "time":
@@ -151,7 +157,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
         base = _time(path, drive_file, table, raw.get("time"), channels, start, stop)
     if len(base.time) < SHORTEST:
         raise DataError(f"{path}: only {len(base.time)} rows have a stamp of their own; a fit needs {SHORTEST}")
-    findings = [*blank, *(f for c in channels.values() for f in c.findings), *base.findings]
+    findings = [*joined, *told, *(f for c in channels.values() for f in c.findings), *base.findings]
     signals = {name: found.values[base.rows] for name, found in channels.items()}
     ratio = drive_file.reduction_ratio or 1.0
     if "motor_angle" in signals and "load_angle" in signals and outputs_until is None:
@@ -210,26 +216,6 @@ def _twist(path: Path, drive_file: DriveFile, kind: Kind, signals: Mapping[str, 
     return signals["motor_angle"] / drive_file.reduction_ratio - signals["load_angle"]
 
 
-def _with_own_clock(path: Path, drive_file: DriveFile, table: RawTable, signal: str, column: RawColumn) -> RawColumn:
-    """The column with the stamps [s] that the drive file gives it."""
-    name = drive_file.column_of(signal).time
-    if name is None or signal == "time":
-        return column
-    if name not in table.columns:
-        raise InputError(
-            f"{path}: there is no column '{name}'{did_you_mean(name, table.names)}, which "
-            f"time in [columns] {signal} of {drive_file.path} names; {listing(table)}"
-        )
-    clock = channel(path, drive_file, "time", table.columns[name]).values
-    # In a table of text, the shorter channel ends in blanks.
-    filled = np.isfinite(clock)
-    return (
-        replace(column, values=column.values[filled], time=clock[filled])
-        if len(clock) == len(column.values)
-        else (replace(column, time=clock))
-    )
-
-
 def _cut(column: RawColumn, start: int, stop: int, known_until: int) -> RawColumn:
     """Rows `start` to `stop` of a column, blank from `known_until` on."""
     values = column.values[start:stop].copy()
@@ -256,7 +242,8 @@ def _inhabited(
     used = [s for s in (*required, *OPTIONAL_SIGNALS) if s in raw]
     velocities = () if "forcing" in required else VELOCITIES
     raw = {s: raw[s] for s in (*used, *velocities, "time") if s in raw}
-    raw = on_one_grid({s: _with_own_clock(path, drive_file, table, s, c) for s, c in raw.items()}, path)
+    raw, mended = with_own_clocks(path, drive_file, table, raw)
+    raw = on_one_grid(raw, required, path)
     _refuse_unequal(path, drive_file, raw, used)
     filled = np.zeros(len(raw[used[0]].values), dtype=bool)
     for signal in used:
@@ -271,7 +258,7 @@ def _inhabited(
             f"{path}: the log has {stop - start} rows, which is fewer than the {SHORTEST} that "
             "a fit needs; record a longer one"
         )
-    return raw, start, stop, _blank_rows(start, len(filled) - stop)
+    return raw, start, stop, (*mended, *_blank_rows(start, len(filled) - stop))
 
 
 def _blank_rows(leading: int, trailing: int) -> tuple[Finding, ...]:
@@ -304,17 +291,13 @@ def _time(
             )
         rows = np.arange(start, stop)
         return TimeBase(rows - start, rows / rate, np.zeros(0, dtype=int), ())
+    if column.time is not None:
+        rows = np.arange(start, stop)
+        return TimeBase(rows - start, column.time[start:stop], np.zeros(0, dtype=int), ())
     stamps = channel(path, drive_file, "time", _cut(column, start, stop, stop), first_row=start)
-    unit = drive_file.column_of("time").unit or column.unit or "s"
     name = drive_file.column_of("time").column
-    found = time_base(
-        stamps.values,
-        np.stack([c.values for c in channels.values()], axis=1),
-        path=path,
-        name=name,
-        second=1.0 / float(convert(np.array(1.0), unit, SI["time"])),
-        first_row=start,
-    )
+    samples = np.stack([c.values for c in channels.values()], axis=1)
+    found = mended_base(path, drive_file, stamps.values, samples, name, column.unit, start)
     median = float(np.median(np.diff(found.time)))
     if rate is not None and abs(median * rate - 1) > 0.1:
         raise InputError(

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from fitting.errors import InputError
-from fitting.logs.drive_file import DriveFile, did_you_mean
+from fitting.logs.drive_file import SIGNALS, DriveFile, did_you_mean
 from fitting.logs.raw_table import RawColumn, RawTable
 
 DRIVE_SIGNALS = ("motor_angle", "load_angle", "motor_torque")
@@ -18,6 +18,17 @@ VELOCITIES = ("motor_velocity", "load_velocity")
 Kind = Literal["drive", "reduced", "quasi-static"]
 
 _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
+
+
+def refuse_repeated(path: Path, drive_file: DriveFile, table: RawTable) -> None:
+    """Refuse signals whose column's name several columns have; of time columns, each is a clock."""
+    for signal in SIGNALS[1:]:
+        name = drive_file.column_of(signal).column
+        if name in table.repeated:
+            raise InputError(
+                f"{path}: the column '{name}' appears twice; give [columns] {signal} of {drive_file.path} its number, "
+                f"or the name '{name} (2)' for the second one"
+            )
 
 
 def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, RawColumn]) -> Kind:

@@ -11,8 +11,10 @@ from fitting.logs.findings import Finding
 # All thresholds are assumed: no timer or logger states them.
 _COUNTERS = tuple(2.0**bits for bits in (16, 24, 31, 32, 53))
 _DAY = 86400.0
+_PARTS = (1.0, 60.0, 3600.0)  # s
 _SCALES = (1.0, 1e-3, 1e-6, 1e-9)
 _FAR = 20.0  # typical steps; as close to the counter's ends a wrap must begin and end
+_NEAR = 0.1  # likewise, of the counter's span
 _LONG = 50  # rows of a recording that starts anew, rather than of a packet that came late
 _IRREGULAR = 0.3
 _WORST = 0.2  # share of rows that may be lost before the column is no clock at all
@@ -116,15 +118,21 @@ def _unwrap(mender: _Mender, second: float) -> None:
     back = np.flatnonzero(step < 0)
     if typical == 0 or len(back) == 0:
         return
-    reach = _FAR * typical
-    for span in (*(c * s for c in _COUNTERS for s in _SCALES), *(_DAY * s for s in (1.0, 1e3, 1e6, 1e9))):
-        if span < 10 * reach:
+    clocks = [c * s for c in _COUNTERS for s in _SCALES] + [_DAY * s for s in (1.0, 1e3, 1e6, 1e9)]
+    # What shows the seconds of a minute, or the parts of a second.
+    parts = [span * second for span in _PARTS]
+    for span in (*clocks, *parts):
+        reach = min(_FAR * typical, _NEAR * span)
+        if reach < 2 * typical:
             continue
         for low in (0.0, -span / 2):
             from_end = np.abs(ticks[back] - (low + span)) < reach
             to_begin = np.abs(ticks[back + 1] - low) < reach
             wraps = back[from_end & to_begin]
             if len(wraps) == 0 or np.nanmin(ticks) < low - 1 or np.nanmax(ticks) > low + span:
+                continue
+            # Recordings of a second each, behind one another, begin at zero, too.
+            if span in parts and (low < 0 or ticks[np.isfinite(ticks)][0] < reach):
                 continue
             turns = np.zeros(len(ticks))
             turns[wraps + 1] = 1.0

@@ -121,7 +121,7 @@ def test_packed_and_misnamed_files(tmp_path: Path, kind: str):
 
 @pytest.mark.parametrize(
     ("head", "words"),
-    [(b"PK\x03\x04", "zip archive"), (b"\x89MCAP0\r\n", "MCAP"), (b"\x1f\x8b", "cannot be read")],
+    [(b"PK\x03\x04", "zip archive"), (b"\x89MCAP0\r\n", "MCAP|mcap"), (b"\x1f\x8b", "cannot be read")],
 )
 def test_what_other_formats_are_told(tmp_path: Path, head: bytes, words: str):
     path = tmp_path / ("log.csv.gz" if head == b"\x1f\x8b" else "log.csv")
