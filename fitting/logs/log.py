@@ -72,6 +72,7 @@ class Log:
         zero: What was taken off the dynamic error, since no torque explains it.
         joint_torque: That the drive passes on [N m], positive where it twists the drive positively, (n,), or None
             but for a quasi-static log.
+        rate_std: Relative standard deviation of the sample interval, as far as rounded stamps leave it open.
     """
 
     name: str
@@ -95,6 +96,7 @@ class Log:
     pieces: tuple[tuple[int, int], ...] | None = None
     zero: float = 0.0
     joint_torque: np.ndarray | None = None
+    rate_std: float = 0.0
 
     def __len__(self) -> int:
         return len(self.time)
@@ -188,6 +190,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
         input_known=None if known.all() else known,
         pieces=None if [*spans] == [(0, len(known))] or outputs_until is not None else spans,
         joint_torque=signals.get("joint_torque"),
+        rate_std=base.rate_std,
     )
     for array in (log.time, log.dynamic_error, *signals.values()):
         array.setflags(write=False)
@@ -293,7 +296,7 @@ def _time(
         return TimeBase(rows - start, rows / rate, np.zeros(0, dtype=int), ())
     if column.time is not None:
         rows = np.arange(start, stop)
-        return TimeBase(rows - start, column.time[start:stop], np.zeros(0, dtype=int), ())
+        return TimeBase(rows - start, column.time[start:stop], np.zeros(0, dtype=int), (), column.rate_std)
     stamps = channel(path, drive_file, "time", _cut(column, start, stop, stop), first_row=start)
     name = drive_file.column_of("time").column
     samples = np.stack([c.values for c in channels.values()], axis=1)

@@ -115,7 +115,13 @@ def _clocked(
     places = np.full(len(column.values), -1)
     places[base.rows] = np.arange(len(base.rows))
     text = places[column.text_rows]
-    own = replace(column, values=column.values[base.rows], time=base.time, text_rows=np.sort(text[text >= 0]))
+    own = replace(
+        column,
+        values=column.values[base.rows],
+        time=base.time,
+        text_rows=np.sort(text[text >= 0]),
+        rate_std=base.rate_std,
+    )
     return own, base.findings
 
 

@@ -20,6 +20,7 @@ class RawColumn:
         time: own stamps [s], (n,), of a channel that brings its own clock; None for the table's rows.
         text_rows: rows that hold text where a number was expected.
         text: of the first of them.
+        rate_std: relative standard deviation of the sample interval of `time`, as far as the stamps leave it open.
     """
 
     values: np.ndarray
@@ -27,6 +28,7 @@ class RawColumn:
     time: np.ndarray | None = None
     text_rows: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     text: str = ""
+    rate_std: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,7 +52,8 @@ def on_one_grid(columns: Mapping[str, RawColumn], required: Sequence[str], path:
             "their stamps one clock"
         )
     kept = slice(*np.searchsorted(grid, [begin, end + apart]))
-    found = {"time": RawColumn(grid[kept], unit="s", time=grid[kept])}
+    least_known = max(columns[signal].rate_std for signal in clocks)
+    found = {"time": RawColumn(grid[kept], unit="s", time=grid[kept], rate_std=least_known)}
     for signal, clock in clocks.items():
         values = np.full(len(grid), np.nan)
         place = number[np.searchsorted(every, clock)]

@@ -7,6 +7,7 @@ import numpy as np
 
 from fitting.errors import InputError
 from fitting.logs.findings import Finding
+from fitting.logs.steady_clock import steady_clock
 
 # All thresholds are assumed: no timer or logger states them.
 _COUNTERS = tuple(2.0**bits for bits in (16, 24, 31, 32, 53))
@@ -33,12 +34,14 @@ class TimeBase:
         time: [s], like `rows`.
         restarts: places in `rows` where a recording starts anew, with no known time since the one before.
         findings: what was mended.
+        rate_std: relative standard deviation of the sample interval, as far as the stamps leave it open.
     """
 
     rows: np.ndarray
     time: np.ndarray
     restarts: np.ndarray
     findings: tuple[Finding, ...]
+    rate_std: float = 0.0
 
 
 class _Mender:
@@ -51,6 +54,7 @@ class _Mender:
         self.restarts = np.zeros(0, dtype=int)
         self.findings: list[Finding] = []
         self.lost = 0
+        self.rate_std = 0.0
 
     def say(self, severity, what: str, place: int | None, consequence: str) -> None:
         where = (
@@ -102,7 +106,7 @@ def time_base(
             f"{100 * lost:.0f} % of its rows; name the right column in [columns] time, export its stamps with all "
             "their digits, or remove it and give [signals] sample_rate"
         )
-    return TimeBase(mender.rows, mender.time, mender.restarts, tuple(mender.findings))
+    return TimeBase(mender.rows, mender.time, mender.restarts, tuple(mender.findings), mender.rate_std)
 
 
 def _typical(time: np.ndarray) -> float:
@@ -260,26 +264,24 @@ def _spread_coarse(mender: _Mender) -> None:
     # A pause has a length that the stamps know to their rounding only, so that the count starts anew behind it.
     late = step > (mean + 1.2 * quantum if quantum > 0.4 * mean else 1.5 * mean)
     run = np.concatenate(([0], np.cumsum(late)))
-    count = np.arange(len(time), dtype=float)
-    length = np.bincount(run)
-    time_off = time - (np.bincount(run, time - time[0]) / length)[run] - time[0]
-    count_off = count - (np.bincount(run, count) / length)[run]
-    mean = float(count_off @ time_off / max(1.0, count_off @ count_off))
-    off = time_off - mean * count_off
+    clock = steady_clock(time, run, quantum)
+    if clock is None:
+        return
+    off = time - clock.time
     # Steps of one and two quanta may also be those of an exact clock with samples missing, here and there.
     missing = (step > 0).all() and quantum > 0.75 * np.median(step)
-    loosest = 1.02 if missing else 1.3
-    if mean <= 0 or np.ptp(off) > loosest * quantum or np.max(np.abs(off)) < _COARSE * mean:
+    loosest = 0.01 if missing else 0.15
+    if clock.slack > loosest * quantum or np.max(np.abs(off)) < _COARSE * clock.interval:
         return
-    steady = time - off
-    if missing and (late.any() or np.sum(step > 1.5 * quantum) < 5) or (np.diff(steady) <= 0).any():
+    if missing and (late.any() or np.sum(step > 1.5 * quantum) < 5) or (np.diff(clock.time) <= 0).any():
         return
-    mender.time = steady
+    mender.time, mender.rate_std = clock.time, clock.rate_std
     mender.say(
         "note",
-        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {mean:.7g} s",
+        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {clock.interval:.7g} s, which "
+        f"they tell to {100 * clock.rate_std:.1g} %",
         None,
-        "the steady clock was used",
+        "the steady clock was used, and standard errors allow for its rate",
     )
 
 
