@@ -1,6 +1,7 @@
 """The steady clock behind rounded stamps, and how well they tell its rate."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
         low, high = bounds(interval)
         return high - low
 
-    best = minimize_scalar(
+    best: Any = minimize_scalar(
         lambda interval: -np.min(room(interval)) / quantum,
         bounds=(mean - reach, mean + reach),
         method="bounded",
@@ -71,7 +72,8 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
     wider = 4 * slack + 1e-9 * quantum
 
     def edge(far: float) -> float:
-        return brentq(lambda interval: np.min(room(interval)) + wider, best.x, far) if far != best.x else far
+        found: Any = brentq(lambda interval: np.min(room(interval)) + wider, best.x, far)
+        return found
 
     low, high = edge(mean - 2 * reach - wider / (last - first)), edge(mean + 2 * reach + wider / (last - first))
     grid = np.linspace(low, high, _GRID)
