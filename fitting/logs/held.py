@@ -55,7 +55,7 @@ def without_repeats(log: Log) -> Log:
         return log
     if log.kind == "drive" and log.outputs_until is None:
         ratio = _ratio(log)
-        motor, load, moved = angles_together(log.time, *channels.values(), ratio, log.path)
+        motor, load, moved = angles_together(log.time, channels["motor_angle"], channels["load_angle"], ratio, log.path)
         channels = {"motor_angle": motor, "load_angle": load}
     trusted = known & np.all([np.isfinite(values) | (np.arange(len(log)) >= until) for values in channels.values()], 0)
     filled = {
