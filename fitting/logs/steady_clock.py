@@ -7,6 +7,8 @@ import numpy as np
 
 # Points at which the density of the interval is evaluated.
 _GRID = 401
+# Room for the clock, as a share of the rounding, below which it is one that rounding alone would not leave.
+_EXACT = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +33,8 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
 
     A stamp rounded to `quantum` confines `t_0 + i dt` to an interval of that width, so that what stamps allow of
     `(t_0, dt)` is a polygon. All of it is equally likely: the density of `dt` is the polygon's height in `t_0`, and a
-    product of these where pauses of unknown length part the stamps. Where no steady clock explains the stamps, their
-    errors are taken to be up to twice the least that are needed.
+    product of these where pauses of unknown length part the stamps. Where no steady clock explains the stamps, they are
+    taken to be wrong by up to twice the least that is needed, and a sample interval or the rounding.
 
     Args:
         stamps: [s], (n,), not falling.
@@ -68,8 +70,8 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
         options={"xatol": 1e-6 * reach},
     )
     slack = max(0.0, 0.5 * best.fun * quantum)
-    # The least error leaves one clock only, and what moves all stamps by half of the errors is none.
-    wider = 4 * slack + 1e-9 * quantum
+    # The least error leaves one clock only; that it is small, even none, says little of errors below a sample interval.
+    wider = 4 * slack + 2 * min(mean, quantum) if best.fun > -_EXACT else 0.0
 
     def edge(far: float) -> float:
         found: Any = brentq(lambda interval: np.min(room(interval)) + wider, best.x, far)

@@ -256,9 +256,9 @@ def _spread_coarse(mender: _Mender) -> None:
     step = np.diff(time)
     if len(step) < 2 or (step < 0).any() or len(mender.restarts):
         return
-    quantum = _quantum(step)
-    mean = float(np.mean(step[step <= np.median(step) + 2 * quantum]))
     as_good_as_it_gets = 4 * np.spacing(np.max(np.abs(time)))
+    quantum = _quantum(step, as_good_as_it_gets)
+    mean = float(np.mean(step[step <= np.median(step) + 2 * quantum]))
     if quantum <= as_good_as_it_gets or mean <= 0 or quantum < _COARSE * mean:
         return
     # A pause has a length that the stamps know to their rounding only, so that the count starts anew behind it.
@@ -285,20 +285,22 @@ def _spread_coarse(mender: _Mender) -> None:
     )
 
 
-def _quantum(step: np.ndarray) -> float:
-    """The grid on which the steps lie, or 0 where they lie on none."""
+def _quantum(step: np.ndarray, digits: float) -> float:
+    """The grid on which the steps lie, or 0 where they lie on none; `digits` is what the stamps' last digits are worth."""
     scale = float(np.median(np.abs(step))) or float(np.mean(np.abs(step)))
     if not scale > 0:
         return 0.0
     # Differences closer than a fraction of the step are one, and the rounding of a double.
     gaps = np.diff(np.unique(step))
-    gaps = gaps[gaps > _COARSE * scale]
+    gaps = gaps[gaps > max(_COARSE * scale, digits)]
     if not 1 <= len(gaps) < _MOST_STEPS:
         return 0.0
     quantum = float(gaps.min())
-    off = np.abs(step / quantum - np.rint(step / quantum))
+    count = np.rint(step / quantum)
     # Of a very fine grid the steps say no more than how far they lie apart.
-    return quantum if quantum < 0.01 * scale or np.mean(off < 0.05) > 0.98 else 0.0
+    if quantum < 0.01 * scale:
+        return quantum
+    return float(step.sum() / count.sum()) if np.mean(np.abs(step / quantum - count) < 0.05) > 0.98 else 0.0
 
 
 def _drop_repeated(mender: _Mender) -> None:
