@@ -16,9 +16,17 @@ _FEWEST_INPUTS = 50
 
 
 def trusted_rows(
-    path: Path, drive_file: DriveFile, signals: dict[str, np.ndarray], outputs_until: int | None
+    path: Path, drive_file: DriveFile, signals: dict[str, np.ndarray], outputs_until: int | None, own_clocks: bool
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
-    """Rows in which all outputs are known; the others are filled, so that nothing meets a NaN."""
+    """Rows in which all outputs are known; the others are filled, so that nothing meets a NaN.
+
+    Args:
+        path: The log, for messages.
+        drive_file: Names the columns, for messages.
+        signals: By name; outputs that are unknown are filled.
+        outputs_until: Rows in which the outputs are known, or None for all.
+        own_clocks: Whether rows are the stamps of all channels, so that each lacks those of the others.
+    """
     outputs = [name for name in OUTPUTS if name in signals]
     count = len(signals[outputs[0]])
     trusted, findings = np.ones(count, dtype=bool), []
@@ -34,9 +42,10 @@ def trusted_rows(
             )
         blank = np.flatnonzero(~known[:until])
         if len(blank):
-            what = f"{name} is blank or not finite in {len(blank)} rows ({100 * len(blank) / until:.2g} %)"
+            seen = "was not sampled" if own_clocks else "is blank or not finite"
+            what = f"{name} {seen} in {len(blank)} rows ({100 * len(blank) / until:.2g} %)"
             where = f"{drive_file.column_of(name).column}, first in row {blank[0] + 1}"
-            findings.append(Finding("warning", what, where, "they have no weight in the fit"))
+            findings.append(Finding("note" if own_clocks else "warning", what, where, "they have no weight in the fit"))
         signals[name] = signals[name] if known.all() else np.interp(rows, rows[known], signals[name][known])
         trusted &= known
     if trusted.sum() < min(SHORTEST, (until + 1) // 2):

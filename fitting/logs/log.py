@@ -166,7 +166,8 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
         motor, load, moved = angles_together(base.time, signals["motor_angle"], signals["load_angle"], ratio, path)
         signals |= {"motor_angle": motor, "load_angle": load}
         findings += moved
-    trusted, untold = trusted_rows(path, drive_file, signals, outputs_until)
+    own_clocks = "time" in raw and raw["time"].time is not None
+    trusted, untold = trusted_rows(path, drive_file, signals, outputs_until, own_clocks)
     known, spans, gaps = input_rows(path, drive_file, base, signals, required[-1], outputs_until)
     findings += [*untold, *gaps, *interpolated(path, drive_file, base.time, signals)]
     log = Log(

@@ -32,8 +32,7 @@ def partners(place: ColumnMap) -> tuple[str, ...]:
     if ending is None:
         return ()
     words = tuple(_UNIT) if ending[2].lower() in _WHOLE else _WHOLE
-    as_written = str.upper if ending[2].isupper() and len(ending[1]) + len(ending[2]) > 1 else str.lower
-    return tuple(ending[1] + as_written(word) for word in words)
+    return tuple(ending[1] + spelled for word in words for spelled in (word, word.upper()))
 
 
 def with_joined_stamps(table: RawTable, drive_file: DriveFile) -> tuple[RawTable, DriveFile, tuple[Finding, ...]]:

@@ -172,9 +172,10 @@ def _dialect(lines: list[str]) -> _Dialect | None:
         width = max(shares, key=lambda w: (shares[w], w), default=0)
         if not shares.get(width):
             continue
-        found = _Dialect(
-            delimiter, width, _longest_run([(i, cells == width and share > 0) for i, cells, share in rows])
-        )
+        # Most rows leave out comments, some have one.
+        fits = range(width, width + _MOST_LEFT_OUT + 1)
+        run = _longest_run([(i, cells in fits and share > 0) for i, cells, share in rows])
+        found = _Dialect(delimiter, width, run)
         # A decimal comma taken for the delimiter gives cells that are no numbers, and no header.
         score = (width > 1 and bool(_heads(lines, found)), shares[width] if width > 1 else 0.0, width, -rank)
         if score > most:

@@ -286,7 +286,7 @@ def _spread_coarse(mender: _Mender) -> None:
 
 
 def _quantum(step: np.ndarray, digits: float) -> float:
-    """The grid on which the steps lie, or 0 where they lie on none; `digits` is what the stamps' last digits are worth."""
+    """The grid on which the steps lie, or 0 where they lie on none; `digits` is the worth of the stamps' last digit."""
     scale = float(np.median(np.abs(step))) or float(np.mean(np.abs(step)))
     if not scale > 0:
         return 0.0
