@@ -10,6 +10,7 @@ from fitting.errors import InputError
 from fitting.logs.lvm import MAGIC, lvm_table
 from fitting.logs.plain_numbers import plain_columns
 from fitting.logs.raw_table import RawColumn, RawTable, numbered, places_of, split_unit
+from fitting.logs.units import USUAL
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
@@ -25,7 +26,8 @@ _STAMP = re.compile(
     r"(?:[0-9./-]+[T _]|[0-9]+ days?,? )?[0-9]{1,4}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]*)?(?:Z|UTC|[-+][0-9:]{4,5})?"
 )
 # A duration, or a number with a blank before its unit: 0.001 sec, 12ms, 3.5 N m.
-_QUANTITY = re.compile(r"[-+\u2212]?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?(?:[nuµμm]?s(?:ecs?)?| [a-zA-Zµμ°%][^0-9]{0,12})")
+_UNITS = "|".join(map(re.escape, sorted((*USUAL, "sec", "msec", "usec", "°", "A", "mA", "V", "mV", "%"), reverse=True)))
+_QUANTITY = re.compile(rf"[-+\u2212]?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?(?:[nuµμm]?s| ?(?:{_UNITS}))")
 
 
 @dataclass(frozen=True)
