@@ -20,6 +20,8 @@ from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import Problem
 from hdjax import Hold, PiecewisePolynomial
 
+# A shift of less than this, in standard errors of parameters and intervals, is not worth another fit (assumed).
+_SEEN = 0.1
 # By which share intervals are changed for a difference: rounding and curvature are then far below what is fitted.
 _CHANGE = 1e-5
 
@@ -73,7 +75,8 @@ def rate_columns(found: Fit) -> RateColumns | None:
 
 
 def refined_intervals(found: Fit) -> dict[str, float]:
-    """Factors by which a fit, with the stamps, would change the sample intervals of its logs; only those left open.
+    """Factors by which a fit, with the stamps, would change the sample intervals of its logs; only those left open, and
+    none where nothing would move by what could be seen.
 
     A Gauss-Newton step: intervals differ by so little that a second one would move nothing.
     """
@@ -86,7 +89,11 @@ def refined_intervals(found: Fit) -> dict[str, float]:
     prior = np.diag(np.concatenate([np.zeros(columns.shape[1] - count), 1.0 / seen.std**2]))
     information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    step = -scale * (np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) @ (scale * slope))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True)
+    step = -scale * (inverse @ (scale * slope))
+    spread = scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    if np.all(np.abs(step / spread) < _SEEN):
+        return {}
     return {log: float(np.exp(s)) for log, s in zip(seen.logs, step[-count:], strict=True)}
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 # Points at which the density of the interval is evaluated.
-_GRID = 401
+_GRID = 101
 # Room for the clock, as a share of the rounding, below which it is one that rounding alone would not leave.
 _EXACT = 1e-5
 
@@ -79,9 +79,11 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
 
     low, high = edge(mean - 2 * reach - wider / (last - first)), edge(mean + 2 * reach + wider / (last - first))
     grid = np.linspace(low, high, _GRID)
-    density = np.prod([np.maximum(room(interval) + wider, 0.0) / quantum for interval in grid], axis=1)
-    if not np.sum(density) > 0:
+    with np.errstate(divide="ignore"):
+        likely = np.array([np.sum(np.log(np.maximum(room(dt) + wider, 0.0) / quantum)) for dt in grid])
+    if not np.isfinite(likely.max()):
         return None
+    density = np.exp(likely - likely.max())
     interval = float(grid @ density / np.sum(density))
     spread = float(np.sqrt((grid - interval) ** 2 @ density / np.sum(density)))
     if interval <= 0:
