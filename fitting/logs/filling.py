@@ -16,7 +16,13 @@ _FEWEST_INPUTS = 50
 
 
 def trusted_rows(
-    path: Path, drive_file: DriveFile, signals: dict[str, np.ndarray], outputs_until: int | None, own_clocks: bool
+    path: Path,
+    drive_file: DriveFile,
+    signals: dict[str, np.ndarray],
+    outputs_until: int | None,
+    asked: int | None,
+    *,
+    own_clocks: bool,
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
     """Rows in which all outputs are known; the others are filled, so that nothing meets a NaN.
 
@@ -25,6 +31,7 @@ def trusted_rows(
         drive_file: Names the columns, for messages.
         signals: By name; outputs that are unknown are filled.
         outputs_until: Rows in which the outputs are known, or None for all.
+        asked: How many samples of each output are wanted there, or None for all.
         own_clocks: Whether rows are the stamps of all channels, so that each lacks those of the others.
     """
     outputs = [name for name in OUTPUTS if name in signals]
@@ -32,9 +39,9 @@ def trusted_rows(
     trusted, findings = np.ones(count, dtype=bool), []
     rows = np.arange(count)
     until = count if outputs_until is None else min(outputs_until, count)
+    needed = min(SHORTEST, ((count if asked is None else min(asked, count)) + 1) // 2)
     for name in outputs:
         known = np.isfinite(signals[name])
-        needed = min(SHORTEST, (until + 1) // 2)
         if known.sum() < needed:
             raise InputError(
                 f"{path}: {_column(drive_file, name)} is a number in {known.sum()} rows only, where {needed} are "
@@ -48,7 +55,7 @@ def trusted_rows(
             findings.append(Finding("note" if own_clocks else "warning", what, where, "they have no weight in the fit"))
         signals[name] = signals[name] if known.all() else np.interp(rows, rows[known], signals[name][known])
         trusted &= known
-    if trusted.sum() < min(SHORTEST, (until + 1) // 2):
+    if trusted.sum() < needed:
         raise DataError(f"{path}: only {trusted.sum()} rows hold all of {', '.join(outputs)}; a fit needs {SHORTEST}")
     return trusted, tuple(findings)
 

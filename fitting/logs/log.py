@@ -145,6 +145,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     kind = kind_of(path, drive_file, table, raw)
     required = needed_signals(kind, raw)
     raw, start, stop, told = _inhabited(path, drive_file, table, raw, required)
+    asked, outputs_until = outputs_until, _rows_until(outputs_until, raw, start)
     channels = {}
     for signal in raw:
         if signal != "time":
@@ -162,12 +163,15 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     findings = [*joined, *told, *(f for c in channels.values() for f in c.findings), *base.findings]
     signals = {name: found.values[base.rows] for name, found in channels.items()}
     ratio = drive_file.reduction_ratio or 1.0
-    if "motor_angle" in signals and "load_angle" in signals and outputs_until is None:
-        motor, load, moved = angles_together(base.time, signals["motor_angle"], signals["load_angle"], ratio, path)
-        signals |= {"motor_angle": motor, "load_angle": load}
+    if "motor_angle" in signals and "load_angle" in signals:
+        seen = slice(outputs_until)
+        motor, load = signals["motor_angle"], signals["load_angle"]
+        *angles, moved = angles_together(base.time[seen], motor[seen], load[seen], ratio, path)
+        for name, values in zip(("motor_angle", "load_angle"), angles, strict=True):
+            signals[name] = np.concatenate([values, signals[name][len(values) :]])
         findings += moved
     own_clocks = "time" in raw and raw["time"].time is not None
-    trusted, untold = trusted_rows(path, drive_file, signals, outputs_until, own_clocks)
+    trusted, untold = trusted_rows(path, drive_file, signals, outputs_until, asked, own_clocks=own_clocks)
     known, spans, gaps = input_rows(path, drive_file, base, signals, required[-1], outputs_until)
     findings += [*untold, *gaps, *interpolated(path, drive_file, base.time, signals)]
     log = Log(
@@ -196,6 +200,14 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     for array in (log.time, log.dynamic_error, *signals.values()):
         array.setflags(write=False)
     return log
+
+
+def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], start: int) -> int | None:
+    """Rows in which so many samples of each output are: more than these where a channel is slower than the log."""
+    if asked is None:
+        return None
+    known = [np.flatnonzero(np.isfinite(raw[s].values[start:])) for s in OUTPUTS if s in raw]
+    return max((int(rows[asked - 1]) + 1 for rows in known if len(rows) >= asked), default=asked)
 
 
 def _in_memory(path: Path, source: Any, wanted: list[str]) -> RawTable:

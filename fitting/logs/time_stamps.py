@@ -16,6 +16,7 @@ _PARTS = (1.0, 60.0, 3600.0)  # s
 _SCALES = (1.0, 1e-3, 1e-6, 1e-9)
 _FAR = 20.0  # typical steps; as close to the counter's ends a wrap must begin and end
 _NEAR = 0.1  # likewise, of the counter's span
+_DOUBLED = 0.9  # of the rows that share a stamp; more rarely alike, they are samples of their own
 _LONG = 50  # rows of a recording that starts anew, rather than of a packet that came late
 _IRREGULAR = 0.3
 _WORST = 0.2  # share of rows that may be lost before the column is no clock at all
@@ -153,6 +154,10 @@ def _drop_doubled(mender: _Mender, samples: np.ndarray) -> None:
     order = known[np.argsort(mender.time[known], kind="stable")]
     same = np.diff(mender.time[order]) == 0
     alike = np.all((samples[order][1:] == samples[order][:-1]) | np.isnan(samples[order][1:]), axis=1)
+    # Stamps too coarse to tell rows apart are common to rows that differ, and to some that don't, as at rest.
+    told = same & np.all(np.isfinite(samples[order][1:]), axis=1)
+    if told.any() and np.mean(alike[told]) < _DOUBLED:
+        return
     doubled = order[1:][same & alike]
     if len(doubled) == 0:
         return

@@ -135,3 +135,16 @@ def test_mistakes_are_told(tmp_path: Path):
     again = save(tmp_path, [(TIME, MOTOR), (restarted, LOAD), (TIME, TORQUE)])
     with pytest.raises(InputError, match="clock of load_angle, starts anew"):
         read_log(again, drive(tmp_path))
+
+
+def test_a_prediction_asks_for_so_many_samples_of_each(tmp_path: Path):
+    late = TIME[::2] + 0.4 * rig.STEP
+    motor, load = MOTOR.copy(), LOAD[::2].copy()
+    path = save(tmp_path, [(TIME, motor), (late, load), (TIME, TORQUE)])
+    log = read_log(path, drive(tmp_path), outputs_until=50)
+    assert log.outputs_until is not None and log.trusted is not None
+    assert 48 <= log.trusted.sum() <= 50 and not log.trusted[log.outputs_until :].any()
+    # What comes later is not looked at.
+    motor[103:], load[51:] = 0.0, 0.0
+    again = read_log(save(tmp_path, [(TIME, motor), (late, load), (TIME, TORQUE)]), drive(tmp_path), outputs_until=50)
+    np.testing.assert_array_equal(again.dynamic_error[again.trusted], log.dynamic_error[log.trusted])

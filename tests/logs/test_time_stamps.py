@@ -218,3 +218,13 @@ def test_what_is_no_clock_is_refused(stamps: np.ndarray):
     with np.errstate(all="ignore"), pytest.raises(InputError, match="is no clock") as error:
         base(stamps)
     assert "log.csv" in str(error.value) and "'t'" in str(error.value) and "sample_rate" in str(error.value)
+
+
+def test_rows_that_coarse_stamps_do_not_tell_apart_are_not_doubled():
+    """At rest, rows of a coarse encoder are the same to the last digit, and so are those whose outputs are unknown."""
+    at_rest = np.where((np.arange(COUNT) % 500 < 200)[:, None], 0.0, SAMPLES)
+    unknown = np.where((np.arange(COUNT) < 300)[:, None], SAMPLES, [np.nan, 1.0])
+    for samples in (at_rest, unknown):
+        found = base(np.floor(CLOCK * 10.0) / 10.0, samples)
+        told(found, "note", "steady sampling")
+        assert len(found.time) == COUNT
