@@ -50,15 +50,22 @@ class Table:
 
     Attributes:
         path: Of the file, or what stands for a table in memory.
+        source: The table in memory, or None.
         columns: That hold numbers, in the file's order, all of one length but for own clocks.
         left_out: Why other columns are not among them, by name.
         sample_rate: Hz, where it stands beside the data, or None.
     """
 
     path: Path
+    source: Any
     columns: tuple[Column, ...]
     left_out: dict[str, str]
     sample_rate: float | None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Of all columns."""
+        return frozenset(column.name for column in self.columns)
 
     @property
     def rows(self) -> int:
@@ -101,7 +108,7 @@ def read_columns(path: Path, source: Any = None) -> Table:
             del kept[name]
     plain = [split_unit(name)[0] for name in names]
     columns = tuple(_column(name, column, plain) for name, column in kept.items())
-    return Table(path, columns, left_out, rate)
+    return Table(path, source, columns, left_out, rate)
 
 
 Read = Callable[[Sequence[str]], RawTable]

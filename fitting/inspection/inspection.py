@@ -1,16 +1,16 @@
 """What logs hold that nobody has described."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fitting.errors import InputError
-from fitting.inspection.columns import Column, Table, read_columns
+from fitting.inspection.columns import Column, Table
 from fitting.inspection.hypotheses import ANGLES, OTHERS, Evidence, hypotheses, readings, weighed
+from fitting.inspection.reasons import physical_reasons
 from fitting.inspection.relations import Relations
 from fitting.inspection.settling import SURE, RatioGuess, UnitGuess, ratio_of, signs_of, units_of
 from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time
@@ -121,40 +121,37 @@ class Inspection:
         return guess.sign * guess.size * (values if column.time is not None else values[self.clocks[log].base.rows])
 
 
-def inspect_logs(sources: Sequence[tuple[Path, Any]], *, joint: str | None = None) -> Inspection:
+def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Inspection:
     """Look at logs of one drive or robot.
 
     Args:
-        sources: Path and table in memory (None: the file) of each.
+        tables: All columns of each.
         joint: Label of the joint that matters; where None, the one that moves the most.
 
     Raises:
-        InputError: A file can't be read, the logs have different columns, or there is no such joint.
+        InputError: The logs have different columns, or there is no such joint.
     """
-    tables = tuple(read_columns(path, source) for path, source in sources)
-    for other in tables[1:]:
-        refuse_other_columns(tables[0], other)
-    # Channels that never move in one log may move in another.
-    time = guess_time(tables[0])
-    clocks = tuple(clock_of(table, time) for table in tables)
-    labels = joint_labels(tables[0].columns)
-    joints = tuple(_joint(tables, clocks, time, label, labels) for label in labels or (None,))
-    return Inspection(tables, clocks, time, joints, _chosen(joints, joint, tables[0].path))
-
-
-def refuse_other_columns(one: Table, other: Table) -> None:
-    """Refuse logs that can't be of one recording.
-
-    Raises:
-        InputError: They have different columns.
-    """
-    differing = {c.name for c in one.columns} ^ {c.name for c in other.columns}
-    if differing:
-        names = ", ".join(sorted(differing)[:4])
+    first = tables[0]
+    others = [table for table in tables[1:] if table.names != first.names]
+    if others:
+        differing = ", ".join(sorted(first.names ^ others[0].names)[:4])
         raise InputError(
-            f"{other.path}: its columns are not those of {one.path} ({names}); give logs of one drive that were "
-            "recorded alike, or one at a time"
+            f"{others[0].path}: its columns are not those of {first.path} ({differing}); give logs of one drive that "
+            "were recorded alike, or one at a time"
         )
+    time = guess_time(first)
+    clocks = tuple(clock_of(table, time) for table in tables)
+    labels = joint_labels(first.columns)
+    joints = tuple(_joint(tables, clocks, time, label, labels) for label in labels or (None,))
+    return Inspection(tuple(tables), clocks, time, joints, _chosen(joints, joint, first.path))
+
+
+def alike(tables: Sequence[Table]) -> list[tuple[Table, ...]]:
+    """Tables in groups that have the same columns."""
+    groups: dict[frozenset[str], list[Table]] = {}
+    for table in tables:
+        groups.setdefault(table.names, []).append(table)
+    return [tuple(group) for group in groups.values()]
 
 
 def joint_labels(columns: Sequence[Column]) -> tuple[str, ...]:
@@ -232,6 +229,10 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     names = _names(sure)
     signals = {
         names[s]: _signal(names[s], s, k, evidence, shares[k][s], units.get(s), signs.get(s)) for s, k in sure.items()
+    }
+    signals = {
+        name: replace(guess, reasons=(*guess.reasons, *physical_reasons(s, sure, evidence)))
+        for (name, guess), s in zip(signals.items(), sure, strict=True)
     }
     taken = set(sure.values())
     maybe = {}

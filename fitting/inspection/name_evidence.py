@@ -14,7 +14,7 @@ _SAME, _FIRST, _PERHAPS = 2.5, 1.5, 0.3  # quantity as the name's only one, the 
 _OTHER = -8.0  # another quantity
 _SILENT = -0.5  # a name that says nothing
 _SIDE, _WRONG_SIDE = 2.5, -6.0
-_JOINT_SIDE = 1.0  # "joint" is most often the output
+_JOINT_SIDE, _NO_MOTOR = 1.0, -2.0  # "joint" is most often the output
 _COMMAND, _COMMANDED_TORQUE = -6.0, -3.0
 _UNIT, _WRONG_UNIT = 1.5, -10.0
 _EXTERNAL = 2.0
@@ -108,7 +108,7 @@ def _of_side(sense: NameSense, signal: str) -> tuple[float, Iterable[str]]:
     if sense.side == wanted:
         return _SIDE, (f"of the {wanted} side",)
     if sense.side == "joint":
-        return (_JOINT_SIDE if wanted == "load" else 0.0), ()
+        return (_JOINT_SIDE if wanted == "load" else _NO_MOTOR), ()
     return _WRONG_SIDE, ()
 
 
