@@ -46,6 +46,8 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
         log = log if log.kind == "quasi-static" else masked(log)
     except (InputError, DataError) as error:
         return (Finding("refusal", str(error).removeprefix(f"{path}: "), path.name, "`hdjax fit` refuses this"),)
+    if ratio is None and log.motor_angle is not None and log.load_angle is not None:
+        return log.findings
     # Without inertias, nothing is held against them.
     return examine(log, drive_of({**tables, "drive": known, "signals": signals}, Path("drive.toml")))
 

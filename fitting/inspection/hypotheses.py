@@ -123,7 +123,9 @@ class Evidence:
             return self._of_motor(column, angles) if angles else _FAR_FETCHED
         if signal == "joint_torque":
             together = self.accelerated(column, angles[-1:]).odds + _AS_ONE_MASS[signal] if angles else 0.0
-            return max(self.held(column, motor, load, twist).odds, together, _WORST_RELATION)
+            # What accelerates the motor against the spring is no torque of the spring.
+            apart = self.accelerated(column, angles).odds if len(angles) == 2 else 0.0
+            return max(max(self.held(column, motor, load, twist).odds, together) - max(apart, 0.0), _WORST_RELATION)
         if signal == "forcing":
             if twist is None:
                 return _FAR_FETCHED

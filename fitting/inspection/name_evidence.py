@@ -15,10 +15,11 @@ _OTHER = -8.0  # another quantity
 _SILENT = -0.5  # a name that says nothing
 _SIDE, _WRONG_SIDE = 2.5, -6.0
 _JOINT_SIDE, _NO_MOTOR = 1.0, -2.0  # "joint" is most often the output
-_COMMAND, _COMMANDED_TORQUE = -6.0, -3.0
+_COMMAND, _COMMANDED_TORQUE = -12.0, -3.0  # a command is no measurement
 _UNIT, _WRONG_UNIT = 1.5, -10.0
 _EXTERNAL = 2.0
 _RARE = {"load_torque": -1.5}  # signals that few logs have
+_UNNAMED = {"motor_current": -2.0, "temperature": -2.0, "load_torque": -2.0}  # and that no relation tells from others
 _OF_THE_JOINT = -1.0  # a torque of the joint that is the motor's all the same
 _CONSTANT, _LOCKED = -5.0, -2.0  # a channel that never changes, or an angle: one side may be locked
 _BARE_TORQUE = {"motor_torque": 0.5, "joint_torque": -0.5, "load_torque": -2.5}  # that a torque of no side is which
@@ -74,7 +75,7 @@ def name_evidence(column: Column, sense: NameSense, signal: str) -> NameEvidence
     odds += _RARE.get(signal, 0.0)
     quantity = QUANTITY[signal]
     if not sense.quantities:
-        odds += _SILENT
+        odds += _SILENT + _UNNAMED.get(signal, 0.0)
     elif quantity in sense.quantities:
         first = _SAME if len(sense.quantities) == 1 else _FIRST
         odds += first if quantity == sense.quantities[0] else _PERHAPS

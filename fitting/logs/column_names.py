@@ -49,7 +49,7 @@ _SIDE_WORDS: dict[Side, str] = {
     "load": "load link output abtrieb abtriebs last arm flange flansch outputshaft lnk secondary",
 }
 _COMMAND_WORDS = (
-    "target targets cmd command commanded desired des ref reference setpoint soll demand goal planned feedforward ff msr_cmd"
+    "target targets set cmd command commanded desired des ref reference setpoint soll demand goal planned feedforward ff msr_cmd"
 )
 _MEASURED_WORDS = "actual act measured meas msr ist fbk feedback filtered filt raw value values data average averaged est estimate estimated sensor sens"  # noqa: E501
 _EXTERNAL_WORDS = "ext external extern disturbance brake bremse stoer hat"
