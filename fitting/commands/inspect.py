@@ -22,7 +22,7 @@ def inspect(logs: AnyLogs, /, *, joint: str | None = None) -> None:
 
 
 def init(logs: AnyLogs, /, *, out: Path, joint: str | None = None, force: bool = False) -> None:
-    """Write a drive file from logs of one drive: each guess with its reason, and lines to fill in for what is not known.
+    """Write a drive file from logs of one drive: each guess with its reason, and lines to fill in for the rest.
 
     Parameters
     ----------

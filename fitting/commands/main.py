@@ -1,5 +1,5 @@
-"""The command line: `hdjax inspect | init | fit | close-loop | predict | simulate | sweep | design | demo | amplitudes |
-seed-tables | speeds`."""
+"""The command line: `hdjax inspect | init | fit | close-loop | predict | simulate | sweep | design | demo |
+amplitudes | seed-tables | speeds`."""
 
 import atexit
 import gc

@@ -5,7 +5,6 @@ from collections.abc import Iterable
 from typing import Any
 
 from fitting.inspection.inspection import Inspection, SignalGuess
-from fitting.inspection.settling import SURE
 
 _ANGLES = ("motor_angle", "load_angle")
 _ORDER = (
@@ -155,7 +154,7 @@ def _ratio_lines(inspection: Inspection) -> list[str]:
     if ratio is not None and known:
         said = f"reduction_ratio = {_toml(_number(ratio.value))}"
         if ratio.value == 1:
-            why = "both angles turn alike, so that motor inertia and torque count as seen from the output (N^2, N times)"
+            why = "both angles turn alike, so that motor inertia and torque count as seen from the output"
         else:
             why = f"the angles leave {ratio.low:.4g} to {ratio.high:.4g}"
         return [f"{said}  # guess: {why}"]

@@ -19,6 +19,7 @@ from fitting.logs.masks import masked
 # What stands for what is not known yet; no finding hangs on it.
 _ANY_INERTIA = 1.0
 _ANY_RATE = 1.0
+_DRIVE_FILE = Path("the drive file")
 
 
 def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
@@ -41,15 +42,16 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
     known = dict(tables["drive"]) | ({} if ratio is None else {"reduction_ratio": float(ratio.value)})
     filled = {"reduction_ratio": 1.0, "motor_inertia": _ANY_INERTIA, "load_inertia": _ANY_INERTIA} | known
     signals = {} if inspection.rates[k] is not None else {"sample_rate": _ANY_RATE}
+    wanted = drive_of({**tables, "drive": filled, "signals": signals}, _DRIVE_FILE)
     try:
-        log = read_log(path, drive_of({**tables, "drive": filled, "signals": signals}, Path("drive.toml")), table=source)
+        log = read_log(path, wanted, table=source)
         log = log if log.kind == "quasi-static" else masked(log)
     except (InputError, DataError) as error:
         return (Finding("refusal", str(error).removeprefix(f"{path}: "), path.name, "`hdjax fit` refuses this"),)
     if ratio is None and log.motor_angle is not None and log.load_angle is not None:
         return log.findings
     # Without inertias, nothing is held against them.
-    return examine(log, drive_of({**tables, "drive": known, "signals": signals}, Path("drive.toml")))
+    return examine(log, drive_of({**tables, "drive": known, "signals": signals}, _DRIVE_FILE))
 
 
 def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:

@@ -249,9 +249,7 @@ def readings(evidence: Evidence, best: Hypothesis, column: int) -> dict[str, flo
     """What a column may be, given the angles, with the confidence of each, the likeliest first."""
     frame = tuple(best.columns.get(signal) for signal in ANGLES)
     idle = [s for s in OTHERS if s not in best.columns or best.columns[s] == column]
-    odds = {
-        s: evidence.other(s, column, *frame) for s in idle if evidence.names[s][column].odds > _WORST_NAME
-    }
+    odds = {s: evidence.other(s, column, *frame) for s in idle if evidence.names[s][column].odds > _WORST_NAME}
     total = 1.0 + sum(np.exp(list(odds.values())))
     shares = {s: float(np.exp(o) / total) for s, o in odds.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))

@@ -46,8 +46,8 @@ def _of_alpha(moved: Excitation) -> Iterator[str]:
     low, high = (100 * alpha * share for alpha in _ALPHAS)
     verdict = "may show" if high / 100 > _VISIBLE else "hardly shows"
     yield (
-        f"The twist spans {moved.twist:.2g} rad: alpha {verdict}, since that of catalogue gears changes the stiffness by "
-        f"{low:.2g} to {high:.2g} % there."
+        f"The twist spans {moved.twist:.2g} rad: alpha {verdict}, since that of catalogue gears changes the stiffness "
+        f"by {low:.2g} to {high:.2g} % there."
     )
 
 

@@ -55,8 +55,10 @@ def _of_oscillator(columns: Mapping[str, int], evidence: Evidence) -> tuple[str,
     twist, forcing = columns.get("dynamic_error"), columns.get("forcing")
     if twist is None or forcing is None:
         motor, load = columns.get("motor_angle"), columns.get("load_angle")
-        made = twist is not None and motor is not None and load is not None
-        return ("it is made of both angles",) if made and evidence.told("difference", motor, load)[twist].odds > _TOLD else ()
+        if twist is None or motor is None or load is None:
+            return ()
+        made = evidence.told("difference", motor, load)[twist].odds > _TOLD
+        return ("it is made of both angles",) if made else ()
     driven = [evidence.told(r, twist)[forcing].odds for r in ("accelerates", "pulled_back")]
     words = f"{_called(evidence, twist)} answers {_called(evidence, forcing)} as an oscillator does"
     return (words,) if max(driven) > _TOLD else ()

@@ -81,7 +81,6 @@ class Relations:
             (motor, load),
             lambda s: s.value[:, [load, motor]],
             lambda s: np.column_stack([s.rate[:, [motor, load]], s.direction[:, [motor, load]]]),
-            spared=lambda s: s.value[:, [motor]],
         )
 
     def holds(self, twist: int) -> tuple[Told, ...]:
@@ -107,21 +106,19 @@ class Relations:
             lambda s: s.rate[:, [load, motor]],
             lambda s: np.zeros((len(s.rate), 0)),
             target=lambda s: s.rate,
-            spared=lambda s: s.rate[:, [motor]],
         )
 
     def _motion(self, scale: Scale, angles: Sequence[int]) -> np.ndarray:
         chosen = list(angles)
         return np.column_stack([scale.value[:, chosen], scale.rate[:, chosen], scale.direction[:, chosen[:1]]])
 
-    def _partial(self, own, wanted, given, *, target=lambda s: s.value, spared=None) -> tuple[Told, ...]:
+    def _partial(self, own, wanted, given, *, target=lambda s: s.value) -> tuple[Told, ...]:
         """For each channel: what the wanted regressors explain of what the given ones leave.
 
         Args:
             own: channels that are no targets.
-            wanted, given: regressors at a scale, (windows, count).
+            wanted, given: regressors at a scale, (windows, count). Two wanted ones must explain more than either alone.
             target: all channels at a scale, (windows, channels).
-            spared: where given, the wanted ones must explain more than these do alone.
         """
         channels = len(self.moves)
         if not self.moves[list(own)].all() or not self.scales:
@@ -134,15 +131,13 @@ class Relations:
                 continue
             y = target(scale)
             full, coefficients = _left(np.column_stack([aside, asked]), y)
-            if spared is None:
+            if asked.shape[1] == 1:
                 bare, _ = _left(aside, y)
                 shifted, _ = _left(np.column_stack([aside, np.roll(asked, len(asked) // 2, axis=0)]), y)
                 null = _share(shifted, bare)
             else:
-                bare = np.minimum(
-                    _left(np.column_stack([aside, spared(scale)]), y)[0], _left(np.column_stack([aside, asked[:, :1]]), y)[0]
-                )
-                null = np.ones(channels)
+                alone = [_left(np.column_stack([aside, one]), y)[0] for one in asked.T]
+                bare, null = np.min(alone, axis=0), np.ones(channels)
             share = _share(full, bare)
             odds.append(_odds(share, null))
             shares.append(share)

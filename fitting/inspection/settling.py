@@ -174,7 +174,7 @@ def odd_ratio(ratio: RatioGuess) -> bool:
 
 
 def signs_of(columns: Mapping[str, int], evidence: Evidence) -> dict[str, tuple[int, str]]:
-    """The signs that make all signals count the same way, and why; of the motor's angle, or else the load's, it is +1."""
+    """The signs that make all signals count as the motor's angle does, or else the load's, and why."""
     motor, load, twist = (columns.get(s) for s in ("motor_angle", "load_angle", "dynamic_error"))
     signs: dict[str, tuple[int, str]] = {}
 
@@ -188,7 +188,9 @@ def signs_of(columns: Mapping[str, int], evidence: Evidence) -> dict[str, tuple[
 
     of_load = 1
     if motor is not None and load is not None:
-        of_load = tell("load_angle", evidence.relations.proportional(motor, load), 1, "it turns against the motor angle")
+        of_load = tell(
+            "load_angle", evidence.relations.proportional(motor, load), 1, "it turns against the motor angle"
+        )
     for signal, side, own in (("motor_velocity", motor, 1), ("load_velocity", load, of_load)):
         if signal in columns and side is not None:
             told = evidence.relations.is_rate_of(columns[signal], side)

@@ -23,7 +23,9 @@ def column_rows(inspection: Inspection) -> list[Row]:
     if time.column is not None:
         rows.append((time.column, "time", time.unit, "", _percent(time.confidence), "; ".join(time.reasons)))
     for signal, guess in joint.signals.items():
-        unit = guess.unit or ("?" if signal.endswith("_angle") else "as logged" if signal in _ANY_UNIT else "SI assumed")
+        unit = guess.unit or (
+            "?" if signal.endswith("_angle") else "as logged" if signal in _ANY_UNIT else "SI assumed"
+        )
         why = "; ".join((*guess.reasons, *guess.doubts))
         rows.append((guess.column, signal, unit, "-1" if guess.sign < 0 else "", _percent(guess.confidence), why))
     for column, shares in joint.open.items():

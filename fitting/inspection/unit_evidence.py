@@ -43,7 +43,17 @@ class UnitChoice:
 
 def is_counts(unit: str | None) -> bool:
     """Whether a unit is that of a counter of increments."""
-    return (unit or "").strip(".").lower() in ("counts", "count", "cnt", "cts", "inc", "incs", "increments", "ticks", "lsb")
+    return (unit or "").strip(".").lower() in (
+        "counts",
+        "count",
+        "cnt",
+        "cts",
+        "inc",
+        "incs",
+        "increments",
+        "ticks",
+        "lsb",
+    )
 
 
 def si_size(unit: str, target: str) -> float | None:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Literal, cast
 
 from fitting.logs.raw_table import split_unit
 
@@ -32,16 +32,31 @@ QUANTITY: dict[str, Quantity] = {
 
 # Words of logs in English, German and the symbols of papers, by what they say. Letters alone stand in `_LETTERS`.
 _QUANTITY_WORDS: dict[Quantity, str] = {
-    "time": "time timestamp stamp zeit zeitstempel sec secs seconds nsecs nanosec msec usec millis micros tout clock uhrzeit datetime elapsed date rosbagtimestamp",  # noqa: E501
+    "time": """
+        time timestamp stamp zeit zeitstempel sec secs seconds nsecs nanosec msec usec millis micros tout
+        clock uhrzeit datetime elapsed date rosbagtimestamp
+    """,
     "counter": "index idx seq sequence sample samples counter count row frame id",
-    "angle": "angle angles ang pos position positions theta phi enc encoder encoders inc incs increments counts ticks winkel stellung lage resolver rotation degrees",  # noqa: E501
-    "velocity": "velocity velocities vel velo speed speeds omega geschwindigkeit drehzahl rpm dq qd dtheta dphi qdot thetadot phidot winkelgeschwindigkeit",  # noqa: E501
+    "angle": """
+        angle angles ang pos position positions theta phi enc encoder encoders inc incs increments counts
+        ticks winkel stellung lage resolver rotation degrees
+    """,
+    "velocity": """
+        velocity velocities vel velo speed speeds omega geschwindigkeit drehzahl rpm dq qd dtheta dphi qdot
+        thetadot phidot winkelgeschwindigkeit
+    """,
     "torque": "torque torques trq tq tau effort efforts moment moments drehmoment mom trqs",
     "current": "current currents cur iq iqs strom amps ampere motorstrom",
     "temperature": "temperature temperatures temp temps temperatur",
     "twist": "twist torsion deflection windup verdrehung verdrillung dynamicerror torsionswinkel deformation",
     "input": "forcing force excitation input anregung kraft",
-    "other": "acceleration acc accel accelerations beschleunigung ddq qdd qddot ddtheta jerk ruck voltage volt volts spannung power leistung status state mode flag flags pose wrench tcp quaternion fts gripper digital analog error errors err fehler following schleppfehler control pwm duty id checksum comment bit bits name energy humidity pressure dtau elbow collision contact success rate brake bremse pid gain kp kd ki imu gyro vibration tx ty tz rx ry rz qw qx qy qz fx fy fz mx my mz",  # noqa: E501
+    "other": """
+        acceleration acc accel accelerations beschleunigung ddq qdd qddot ddtheta jerk ruck voltage volt
+        volts spannung power leistung status state mode flag flags pose wrench tcp quaternion fts gripper
+        digital analog error errors err fehler following schleppfehler control pwm duty id checksum comment
+        bit bits name energy humidity pressure dtau elbow collision contact success rate brake bremse pid
+        gain kp kd ki imu gyro vibration tx ty tz rx ry rz qw qx qy qz fx fy fz mx my mz
+    """,
 }
 _SIDE_WORDS: dict[Side, str] = {
     "motor": "motor mot mtr rotor antrieb antriebs drive wavegenerator wg inputshaft servo actuator",
@@ -49,9 +64,12 @@ _SIDE_WORDS: dict[Side, str] = {
     "load": "load link output abtrieb abtriebs last arm flange flansch outputshaft lnk secondary",
 }
 _COMMAND_WORDS = (
-    "target targets set cmd command commanded desired des ref reference setpoint soll demand goal planned feedforward ff msr_cmd"
+    "target targets set cmd command commanded desired des ref reference setpoint soll demand goal planned ff"
 )
-_MEASURED_WORDS = "actual act measured meas msr ist fbk feedback filtered filt raw value values data average averaged est estimate estimated sensor sens"  # noqa: E501
+_MEASURED_WORDS = """
+    actual act measured meas msr ist fbk feedback filtered filt raw value values data average averaged
+    est estimate estimated sensor sens
+"""
 _EXTERNAL_WORDS = "ext external extern disturbance brake bremse stoer hat"
 # One letter, or a letter with marks, is a symbol of a paper; upper and lower case differ.
 _LETTERS: dict[str, tuple[Quantity, ...]] = {
@@ -259,14 +277,14 @@ def _joint(tokens: list[str]) -> tuple[str | None, list[str]]:
 def _read(words: Sequence[str]) -> tuple[tuple[Quantity, ...], Side | None, set[str], str]:
     """Quantities, side, roles, and the word that could be a unit, from the words of a name."""
     quantities: tuple[Quantity, ...] = ()
-    sides: list[Side] = []
+    sides: list[str] = []
     roles: set[str] = set()
     for at, word in enumerate(words):
         kind, says = _vocabulary().get(word.lower(), ("", "")) if len(word) > 1 else ("", "")
         if kind == "quantity":
-            quantities = _stronger(quantities, (says,))  # pyright: ignore[reportArgumentType]
+            quantities = _stronger(quantities, (cast(Quantity, says),))
         elif kind == "side":
-            sides.append(says)  # pyright: ignore[reportArgumentType]
+            sides.append(says)
         elif kind == "role":
             roles.add(says)
         elif word in _LETTER_SIDES and quantities and quantities != ("time",):
@@ -282,7 +300,7 @@ def _read(words: Sequence[str]) -> tuple[tuple[Quantity, ...], Side | None, set[
             quantities = _LETTERS[word]
     # A named side says more than the joint that it belongs to.
     side = next((s for s in sides if s != "joint"), sides[0] if sides else None)
-    return quantities, side, roles, words[-1] if words else ""
+    return quantities, cast(Side | None, side), roles, words[-1] if words else ""
 
 
 def _stronger(old: tuple[Quantity, ...], new: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
@@ -314,13 +332,6 @@ def is_likely(name: str, signal: str) -> bool:
     )
 
 
-def likely_columns(signal: str, names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """The columns of a file whose names say that they could be a signal.
-
-    Args:
-        signal: what is wanted.
-        names: of all columns.
-        taken: columns that are something else.
-    """
-    used = set(taken)
-    return [name for name in names if name not in used and is_likely(name, signal)]
+def likely_columns(signal: str, names: Iterable[str]) -> list[str]:
+    """The columns of a file whose names say that they could be a signal."""
+    return [name for name in names if is_likely(name, signal)]
