@@ -57,7 +57,7 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
 def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:
     """What can be said of columns of which no log is made."""
     table, time = inspection.tables[k], inspection.time
-    found = [] if time.column is None else [*sampling_findings(table.path, table.column(time.column), time.unit)]
+    found = [] if time.column is None else [*sampling_findings(table, table.column(time.column), time.unit)]
     for guess in inspection.joint.signals.values():
         values = table.column(guess.column).values
         blank = int((~np.isfinite(values)).sum())

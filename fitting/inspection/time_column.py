@@ -1,7 +1,6 @@
 """Which column of a log is its clock, and in which unit."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -79,7 +78,7 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
     if guess.column is not None:
         column = table.column(guess.column)
         try:
-            return Clock(_base(table.path, column, guess.unit), True)
+            return Clock(_base(table, column, guess.unit), True)
         except InputError:
             pass
     step = 1.0 / table.sample_rate if table.sample_rate else 1.0
@@ -91,18 +90,18 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
     return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None)
 
 
-def _base(path: Path, column: Column, unit: str) -> TimeBase:
-    second = convert(np.array(1.0), unit, "s")
-    nothing = np.full((len(column.values), 0), np.nan)
+def _base(table: Table, column: Column, unit: str) -> TimeBase:
+    second = float(convert(np.array(1.0), unit, "s"))
+    samples = np.stack([other.values for other in table.columns if other is not column], axis=1)
     return time_base(
-        column.values * float(second), nothing, path=path, name=column.name, second=1.0 / float(second), first_row=0
+        column.values * second, samples, path=table.path, name=column.name, second=1.0 / second, first_row=0
     )
 
 
-def sampling_findings(path: Path, column: Column, unit: str) -> tuple[Finding, ...]:
+def sampling_findings(table: Table, column: Column, unit: str) -> tuple[Finding, ...]:
     """What was mended of the stamps, or why they are none."""
     try:
-        return _base(path, column, unit).findings
+        return _base(table, column, unit).findings
     except InputError as error:
         return (Finding("refusal", str(error).partition(": ")[2], column.name, "there is no time base"),)
 
