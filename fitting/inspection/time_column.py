@@ -92,7 +92,8 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
 
 def _base(table: Table, column: Column, unit: str) -> TimeBase:
     second = float(convert(np.array(1.0), unit, "s"))
-    samples = np.stack([other.values for other in table.columns if other is not column], axis=1)
+    others = [other.values for other in table.columns if other is not column]
+    samples = np.stack(others or [np.arange(len(column.values))], axis=1)
     return time_base(
         column.values * second, samples, path=table.path, name=column.name, second=1.0 / second, first_row=0
     )
