@@ -88,9 +88,7 @@ class InspectionResult:
             height = 1.6 * len(signals) + 0.8
             axes = plt.subplots(len(signals), 1, sharex=True, squeeze=False, figsize=(8.0, height))[1][:, 0]
         for place, signal in zip(np.atleast_1d(axes), signals, strict=True):
-            column = self.inspection.tables[log].column(self.inspection.joint.signals[signal].column)
-            time = self.inspection.clocks[log].base.time if column.time is None else column.time
-            place.plot(time, self.inspection.values(signal, log), linewidth=0.8)
+            place.plot(*self.inspection.samples(signal, log), linewidth=0.8)
             place.set_ylabel(signal, fontsize="small")
         np.atleast_1d(axes)[-1].set_xlabel("time [s]" if self.inspection.clocks[log].known else "row")
         return axes

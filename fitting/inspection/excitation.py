@@ -53,46 +53,44 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
     rate = inspection.rates[log]
     band = coherent = None
     if driver is not None and rate is not None:
-        torque = _even(inspection, inspection.values(driver, log), log)
-        answer = twist if twist is not None else None if response is None else inspection.values(response, log)
+        torque = _even(*inspection.samples(driver, log), rate)
+        answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
         if len(torque) >= _FEWEST and np.ptp(torque) > 0:
             band = _band(torque, rate)
-            if answer is not None:
-                coherent = _coherent(torque, _even(inspection, answer, log), rate)
-    spread = None if twist is None else float(np.nanmax(twist) - np.nanmin(twist))
+            coherent = None if answer is None else _coherent(torque, answer, rate)
+    spread = None if twist is None else float(np.ptp(twist))
     return Excitation(ranges, driver, response, band, coherent, spread)
 
 
 def _range(inspection: Inspection, signal: str, log: int) -> tuple[float, float, str]:
-    values = inspection.values(signal, log)
+    _, values = inspection.samples(signal, log)
     guess = inspection.joint.signals[signal]
     unit = SI.get(signal, "A" if signal == "motor_current" else "")
     if guess.unit is None and signal.endswith("_angle"):
         unit = "as logged"
-    return float(np.nanmin(values)), float(np.nanmax(values)), unit
+    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)), unit
 
 
 def _twist(inspection: Inspection, log: int) -> np.ndarray | None:
-    """theta_m/N - theta_l [rad] where both angles and the ratio are known."""
-    joint = inspection.joint
+    """theta_m/N - theta_l [rad] less its mean, evenly sampled, where both angles and the ratio are known."""
+    joint, rate = inspection.joint, inspection.rates[log]
     both = {"motor_angle", "load_angle"} <= set(joint.signals)
-    if not both or joint.ratio is None or not joint.ratio.sure:
+    if not both or rate is None or joint.ratio is None or not joint.ratio.sure:
         return None
-    if joint.signals["load_angle"].unit is None or inspection.tables[log].columns[0].time is not None:
+    if joint.signals["load_angle"].unit is None:
         return None
-    twist = inspection.values("motor_angle", log) / joint.ratio.value - inspection.values("load_angle", log)
-    return twist - np.nanmean(twist)
+    motor, load = (_even(*inspection.samples(s, log), rate) for s in ("motor_angle", "load_angle"))
+    count = min(len(motor), len(load))
+    twist = motor[:count] / joint.ratio.value - load[:count]
+    return twist - twist.mean()
 
 
-def _even(inspection: Inspection, values: np.ndarray, log: int) -> np.ndarray:
-    """A channel on an even grid of the median step."""
-    time = inspection.clocks[log].base.time
-    if len(time) != len(values):
-        return values[np.isfinite(values)]
-    known = np.isfinite(values)
-    step = float(np.median(np.diff(time)))
-    count = min(int((time[-1] - time[0]) / step) + 1, 4 * len(time))
-    return np.interp(time[0] + step * np.arange(count), time[known], values[known])
+def _even(time: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """A channel on an even grid."""
+    if len(time) < 2:
+        return values
+    count = min(int((time[-1] - time[0]) * rate) + 1, 4 * len(time))
+    return np.interp(time[0] + np.arange(count) / rate, time, values)
 
 
 def _band(values: np.ndarray, rate: float) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from fitting.inspection.hypotheses import ANGLES, OTHERS, Evidence, hypotheses, 
 from fitting.inspection.reasons import physical_reasons
 from fitting.inspection.relations import Relations
 from fitting.inspection.settling import SURE, RatioGuess, UnitGuess, ratio_of, signs_of, units_of
-from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time
+from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time, own_stamps
 from fitting.inspection.unit_evidence import si_size
 from fitting.inspection.windows import Uniform, scales, uniform
 from fitting.logs.channels import SI
@@ -113,12 +113,13 @@ class Inspection:
         """Samples per second of each log [Hz]; None where no seconds are known."""
         return tuple(1.0 / float(np.median(np.diff(c.base.time))) if c.known else None for c in self.clocks)
 
-    def values(self, signal: str, log: int = 0) -> np.ndarray:
-        """A signal of the chosen joint in SI as guessed, less its mean, (n,), by the rows of the clock."""
+    def samples(self, signal: str, log: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps [s] and values of a signal of the chosen joint, in SI as guessed, (n,) each, where both are known."""
         guess = self.joint.signals[signal]
-        column = self.tables[log].column(guess.column)
-        values = _unwrapped(column)
-        return guess.sign * guess.size * (values if column.time is not None else values[self.clocks[log].base.rows])
+        values, own = _samples(self.tables[log], guess.column, self.clocks[log], self.time)
+        stamps = self.clocks[log].base.time if own is None else own
+        known = np.isfinite(values) & np.isfinite(stamps)
+        return stamps[known], guess.sign * guess.size * values[known]
 
 
 def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Inspection:
@@ -196,9 +197,10 @@ def _unwrapped(column: Column) -> np.ndarray:
 def _joint(
     tables: Sequence[Table], clocks: Sequence[Clock], time: TimeGuess, label: str | None, labels: tuple[str, ...]
 ) -> JointInspection:
-    columns = [c for c in tables[0].columns if c.name != time.column and _is_of(c, label, labels)]
+    clocks_of = {time.column, *time.clocks.values()}
+    columns = [c for c in tables[0].columns if c.name not in clocks_of and _is_of(c, label, labels)]
     logs = [
-        uniform(clock.base.time, [_samples(table.column(c.name), clock) for c in columns])
+        uniform(clock.base.time, [_samples(table, c.name, clock, time) for c in columns])
         for table, clock in zip(tables, clocks, strict=True)
     ]
     moves = np.array([any(not table.column(c.name).constant for table in tables) for c in columns], dtype=bool)
@@ -206,9 +208,11 @@ def _joint(
     return _settled(label, evidence, logs)
 
 
-def _samples(column: Column, clock: Clock) -> tuple[np.ndarray, np.ndarray | None]:
-    values = _unwrapped(column)
-    return (values, column.time) if column.time is not None else (values[clock.base.rows], None)
+def _samples(table: Table, name: str, clock: Clock, time: TimeGuess) -> tuple[np.ndarray, np.ndarray | None]:
+    """The values of a column and its own stamps, or those of its rows that the clock has."""
+    column = table.column(name)
+    values, own = _unwrapped(column), own_stamps(table, column, time)
+    return (values, own) if own is not None else (values[clock.base.rows], None)
 
 
 def _is_of(column: Column, label: str | None, labels: tuple[str, ...]) -> bool:

@@ -1,6 +1,7 @@
 """Which column of a log is its clock, and in which unit."""
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,6 +32,7 @@ class TimeGuess:
         confidence: Of the column, 0 to 1.
         reasons: For both.
         unit_stated: Whether the file states the unit.
+        clocks: Where a table repeats its time column: the clock of each column that has another one, by name.
     """
 
     column: str | None
@@ -38,6 +40,7 @@ class TimeGuess:
     confidence: float
     reasons: tuple[str, ...]
     unit_stated: bool = True
+    clocks: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,8 @@ def guess_time(table: Table) -> TimeGuess:
     """The column of a table that is its clock."""
     if any(column.time is not None for column in table.columns):
         return TimeGuess(None, "s", 1.0, ("each channel has stamps of its own",))
-    scored = [(_log_odds(column), column) for column in table.columns]
+    # Of a time column that is repeated, the first stands for all.
+    scored = [(_log_odds(column), column) for column in table.columns if _first_name(column.name, table) is None]
     weights = np.exp(np.clip([0.0, *(score for score, _ in scored)], -30.0, 30.0))
     score, column = max(scored, key=lambda pair: pair[0], default=(-np.inf, None))
     if column is None or score <= 0.0:
@@ -69,7 +73,32 @@ def guess_time(table: Table) -> TimeGuess:
         reasons.insert(0, f"the name '{column.name}'")
     unit, why = _unit(column)
     stated = _stated(column) is not None
-    return TimeGuess(column.name, unit, float(np.exp(min(score, 30.0)) / weights.sum()), (*reasons, why), stated)
+    confidence = float(np.exp(min(score, 30.0)) / weights.sum())
+    return TimeGuess(column.name, unit, confidence, (*reasons, why), stated, _clocks(table, column.name))
+
+
+def _first_name(name: str, table: Table) -> str | None:
+    """The name that a column repeats, as readers and frames number columns of one name; None where it repeats none."""
+    match = re.fullmatch(r"(.+?)(?: \([0-9]+\)|\.[0-9]+|_duplicated_[0-9]+)", name)
+    return match[1] if match is not None and match[1] in table.names else None
+
+
+def _clocks(table: Table, first: str) -> dict[str, str]:
+    """The clock of each column behind a repeated time column."""
+    clocks, clock = {}, first
+    for column in table.columns:
+        if _first_name(column.name, table) == first:
+            clock = column.name
+        elif clock != first:
+            clocks[column.name] = clock
+    return clocks
+
+
+def own_stamps(table: Table, column: Column, guess: TimeGuess) -> np.ndarray | None:
+    """The stamps [s] of a column that has a clock of its own, NaN where blank; None where it has the table's."""
+    if column.name not in guess.clocks:
+        return column.time
+    return table.column(guess.clocks[column.name]).values * float(convert(np.array(1.0), guess.unit, "s"))
 
 
 def clock_of(table: Table, guess: TimeGuess) -> Clock:

@@ -63,7 +63,7 @@ def uniform(time: np.ndarray, columns: Sequence[tuple[np.ndarray, np.ndarray | N
     filled = np.zeros((count, len(columns)))
     for k, (values, own) in enumerate(columns):
         stamps = time if own is None else own
-        known = np.isfinite(values)
+        known = np.isfinite(values) & np.isfinite(stamps)
         if known.sum() >= 2:
             filled[:, k] = np.interp(grid, stamps[known], values[known])
     late = np.flatnonzero(np.diff(time) > _GAP * step)
