@@ -143,8 +143,7 @@ def _why_not_written(guess: SignalGuess) -> str:
 
 
 def _with_reason(line: str, guess: SignalGuess) -> str:
-    why = "; ".join((*guess.reasons, *guess.doubts)) or "what is left"
-    return f"{line}  # guess, {_percent(guess.confidence)}: {_plain(why)}"
+    return f"{line}  # guess, {_percent(guess.confidence)}: {_plain(guess.why)}"
 
 
 def _ratio_lines(inspection: Inspection) -> list[str]:

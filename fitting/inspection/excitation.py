@@ -57,7 +57,7 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
         answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
         if len(torque) >= _FEWEST and np.ptp(torque) > 0:
             band = _band(torque, rate)
-            coherent = None if answer is None else _coherent(torque, answer, rate)
+            coherent = None if answer is None else _coherent(torque, answer, rate, band)
     spread = None if twist is None else float(np.ptp(twist))
     return Excitation(ranges, driver, response, band, coherent, spread)
 
@@ -100,16 +100,19 @@ def _band(values: np.ndarray, rate: float) -> tuple[float, float]:
     return low, high
 
 
-def _coherent(driver: np.ndarray, response: np.ndarray, rate: float) -> tuple[float, float] | None:
+def _coherent(
+    driver: np.ndarray, response: np.ndarray, rate: float, band: tuple[float, float]
+) -> tuple[float, float] | None:
     count = min(len(driver), len(response))
     length = count // _SEGMENTS * 2
     if length < 32:
         return None
     frequencies, share = scipy.signal.coherence(driver[:count], response[:count], rate, nperseg=length)
-    follows = np.concatenate(([False], share[1:] >= COHERENT, [False]))
+    driven = (frequencies >= band[0]) & (frequencies <= band[1])
+    follows = np.concatenate(([False], (share >= COHERENT) & driven, [False]))
     edges = np.flatnonzero(np.diff(follows.astype(int)))
     starts, stops = edges[::2], edges[1::2]
     if len(starts) == 0:
         return None
     widest = int(np.argmax(stops - starts))
-    return float(frequencies[starts[widest] + 1]), float(frequencies[stops[widest]])
+    return float(frequencies[starts[widest]]), float(frequencies[stops[widest] - 1])

@@ -21,6 +21,7 @@ from fitting.logs.unwrapping import unwrapped_angle
 
 _COPY = 5.0  # log odds of proportionality above which a column is said to follow another
 _RIVAL, _WORTH_A_WORD = 0.05, 0.3  # confidence below which a reading is not told, and a column is said to be none
+_TOLD_UNIT = 0.5  # confidence below which a unit is not told at all
 _SHARED = ("angle", "velocity", "torque", "current", "twist")
 
 
@@ -37,7 +38,8 @@ class SignalGuess:
         sign: +1 or -1.
         confidence: 0 to 1.
         reasons: In words.
-        doubts: What can't be told of unit and sign.
+        unit_reason: For the unit, where it is guessed.
+        doubts: What can't be told of the unit.
     """
 
     signal: str
@@ -48,7 +50,14 @@ class SignalGuess:
     sign: int
     confidence: float
     reasons: tuple[str, ...]
+    unit_reason: str = ""
     doubts: tuple[str, ...] = ()
+
+    @property
+    def why(self) -> str:
+        """All that speaks for the guess and against it."""
+        unit = (f"{self.unit}: {self.unit_reason}",) if self.unit_reason and self.unit else ()
+        return "; ".join((*self.reasons, *unit, *self.doubts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +153,7 @@ def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Insp
     clocks = tuple(clock_of(table, time) for table in tables)
     labels = joint_labels(first.columns)
     joints = tuple(_joint(tables, clocks, time, label, labels) for label in labels or (None,))
+    joints = tuple(_as_others(joint, joints, first) for joint in joints)
     return Inspection(tuple(tables), clocks, time, joints, _chosen(joints, joint, first.path))
 
 
@@ -208,6 +218,20 @@ def _joint(
     return _settled(label, evidence, logs)
 
 
+def _as_others(joint: JointInspection, joints: Sequence[JointInspection], table: Table) -> JointInspection:
+    """A joint whose unknown units are those of the same channel of another joint."""
+
+    def known(guess: SignalGuess) -> SignalGuess:
+        others = [other.signals[guess.signal] for other in joints if guess.signal in other.signals]
+        stem = table.column(guess.column).sense.stem
+        like = next((o for o in others if o.unit is not None and table.column(o.column).sense.stem == stem), None)
+        if like is None or guess.unit is not None or not guess.signal.endswith("_angle"):
+            return guess
+        return replace(guess, unit=like.unit, size=like.size, unit_reason=f"as '{like.column}'", doubts=())
+
+    return replace(joint, signals={name: known(guess) for name, guess in joint.signals.items()})
+
+
 def _samples(table: Table, name: str, clock: Clock, time: TimeGuess) -> tuple[np.ndarray, np.ndarray | None]:
     """The values of a column and its own stamps, or those of its rows that the clock has."""
     column = table.column(name)
@@ -232,11 +256,8 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     ratio = ratio_of(sure, units, evidence, logs) if {"motor_angle", "load_angle"} <= set(sure) else None
     names = _names(sure)
     signals = {
-        names[s]: _signal(names[s], s, k, evidence, shares[k][s], units.get(s), signs.get(s)) for s, k in sure.items()
-    }
-    signals = {
-        name: replace(guess, reasons=(*guess.reasons, *physical_reasons(s, sure, evidence)))
-        for (name, guess), s in zip(signals.items(), sure, strict=True)
+        names[s]: _signal(names[s], s, sure, evidence, shares[k][s], (units.get(s), signs.get(s)))
+        for s, k in sure.items()
     }
     taken = set(sure.values())
     maybe = {}
@@ -275,28 +296,30 @@ def _copies(evidence: Evidence, taken: set[int]) -> dict[str, tuple[str, float]]
 def _signal(
     name: str,
     signal: str,
-    k: int,
+    columns: dict[str, int],
     evidence: Evidence,
     confidence: float,
-    unit: UnitGuess | None,
-    sign: tuple[int, str] | None,
+    settled: tuple[UnitGuess | None, tuple[int, str] | None],
 ) -> SignalGuess:
+    (unit, sign), k = settled, columns[signal]
     column = evidence.columns[k]
-    reasons = list(evidence.names[signal][k].reasons)
-    doubts: list[str] = []
-    told_unit, size, stated = column.unit, 1.0, column.unit is not None
-    if unit is not None:
-        told_unit, size, stated = unit.unit, unit.size, unit.reason == "stated"
-        if not stated:
-            reasons.append(f"{unit.unit}: {unit.reason}")
-            if unit.confidence < SURE and unit.rivals:
-                doubts.append(f"unit {unit.unit} is assumed; it could be {' or '.join(unit.rivals)}")
-            if unit.confidence < 0.5:
-                told_unit = None
-    elif column.unit is not None:
-        size = si_size(column.unit, SI.get(signal, "A")) or 1.0
+    reasons = [*evidence.names[signal][k].reasons, *physical_reasons(signal, columns, evidence)]
     if sign is not None and sign[1]:
         reasons.append(sign[1])
-    return SignalGuess(
-        name, column.name, told_unit, stated, size, sign[0] if sign else 1, confidence, tuple(reasons), tuple(doubts)
+    guess = SignalGuess(
+        signal=name,
+        column=column.name,
+        unit=column.unit,
+        unit_stated=column.unit is not None,
+        size=1.0 if column.unit is None else si_size(column.unit, SI.get(signal, "A")) or 1.0,
+        sign=sign[0] if sign else 1,
+        confidence=confidence,
+        reasons=tuple(reasons),
     )
+    if unit is None or unit.reason == "stated":
+        return guess
+    open_units = " or ".join((unit.unit, *unit.rivals))
+    if unit.confidence < _TOLD_UNIT:
+        return replace(guess, unit=None, unit_stated=False, size=unit.size, doubts=(f"its unit may be {open_units}",))
+    doubts = (f"{unit.unit} is assumed, {' or '.join(unit.rivals)} would do",) if unit.confidence < SURE else ()
+    return replace(guess, unit=unit.unit, unit_stated=False, size=unit.size, unit_reason=unit.reason, doubts=doubts)

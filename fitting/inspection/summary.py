@@ -26,8 +26,8 @@ def column_rows(inspection: Inspection) -> list[Row]:
         unit = guess.unit or (
             "?" if signal.endswith("_angle") else "as logged" if signal in _ANY_UNIT else "SI assumed"
         )
-        why = "; ".join((*guess.reasons, *guess.doubts))
-        rows.append((guess.column, signal, unit, "-1" if guess.sign < 0 else "", _percent(guess.confidence), why))
+        sign = "-1" if guess.sign < 0 else ""
+        rows.append((guess.column, signal, unit, sign, _percent(guess.confidence), guess.why))
     for column, shares in joint.open.items():
         could_be = " or ".join(f"{s} ({_percent(w)})" for s, w in shares.items())
         rows.append((column, "?", "", "", "", f"could be {could_be}"))
