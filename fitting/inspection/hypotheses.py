@@ -38,6 +38,7 @@ _RATIO_FITS, _RATIO_BESIDE, _RATIO_ONE, _RATIO_WRONG = 0.0, -2.0, -2.5, -6.0
 _NO_WHOLE_RATIO = -1.5
 _MIXED = -4.0
 _RATE_FITS, _RATE_CONTRADICTS = 0.0, -4.0
+_TWIST_UNITS = (1.0, float(np.pi / 180.0), 1e-3)  # rad, deg, mrad
 _USUAL_RATIOS, _POSSIBLE_RATIOS = (25.0, 330.0), (4.0, 1100.0)
 _RATE_TOLERANCE = 0.03
 _ABOUT_ONE = 0.15  # no gear has such a ratio
@@ -100,8 +101,17 @@ class Evidence:
             if told.odds > 0:
                 odds += max(self.ratios(motor, load, told.slope), key=lambda choice: choice[2])[2]
             if twist is not None:
-                odds += max(self.told("difference", motor, load)[twist].odds, _WORST_RELATION)
+                made = self.told("difference", motor, load)[twist]
+                odds += max(made.odds, _WORST_RELATION) + self._scale_of_twist(made, told, load)
         return odds
+
+    def _scale_of_twist(self, made: Told, together: Told, load: int) -> float:
+        """Log odds of the scale of a twist: it counts the load's angle once, in units of its own."""
+        if made.odds <= 0 or together.odds <= 0:
+            return 0.0
+        times = abs(made.slope * together.slope)
+        units = [f.size / t for f in self.angle_choices[load] for t in _TWIST_UNITS]
+        return 0.0 if min(abs(times / unit - 1.0) for unit in units) < _RATE_TOLERANCE else _RATE_CONTRADICTS
 
     def ratios(self, motor: int, load: int, slope: float) -> list[tuple[UnitChoice, UnitChoice, float]]:
         """Units of both angles with the log odds of the reduction ratio that they make."""
@@ -125,11 +135,12 @@ class Evidence:
             together = self.accelerated(column, angles[-1:]).odds + _AS_ONE_MASS[signal] if angles else 0.0
             # What accelerates the motor against the spring is no torque of the spring.
             apart = self.accelerated(column, angles).odds if len(angles) == 2 else 0.0
-            return max(max(self.held(column, motor, load, twist).odds, together) - max(apart, 0.0), _WORST_RELATION)
+            held = max(self.held(column, motor, load, twist).odds, together)
+            return max(held - max(apart, 0.0), 0.0)
         if signal == "forcing":
             if twist is None:
                 return _FAR_FETCHED
-            driven = self.told("accelerates", twist)[column].odds, self.told("pulled_back", twist)[column].odds
+            driven = self.told("drives", twist)[column].odds, self.told("pulled_back", twist)[column].odds
             # An oscillator has both an inertia and a spring: the two tests tell different things.
             return sum(max(odds, 0.0) for odds in driven) + (_FAR_FETCHED if angles else 0.0)
         return 0.0
@@ -137,7 +148,7 @@ class Evidence:
     def _of_motor(self, column: int, angles: Sequence[int]) -> float:
         apart = self.accelerated(column, angles).odds
         together = self.accelerated(column, angles[:1]).odds
-        odds = max(apart, together + _AS_ONE_MASS["motor_torque"], _WORST_RELATION)
+        odds = max(apart, together + _AS_ONE_MASS["motor_torque"], 0.0)
         # Alone, an angle that a spring pulls back is a twist, and what drives it a forcing.
         return odds - (max(self.told("pulled_back", angles[0])[column].odds, 0.0) if len(angles) == 1 else 0.0)
 

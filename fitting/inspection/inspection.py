@@ -21,7 +21,8 @@ from fitting.logs.unwrapping import unwrapped_angle
 
 _COPY = 5.0  # log odds of proportionality above which a column is said to follow another
 _RIVAL, _WORTH_A_WORD = 0.05, 0.3  # confidence below which a reading is not told, and a column is said to be none
-_TOLD_UNIT = 0.5  # confidence below which a unit is not told at all
+_TOLD_UNIT, _SURE_UNIT = 0.5, 0.95  # confidence below which a unit is not told at all, or said to be assumed
+_WITHOUT_SIGN = ("temperature", "load_torque")
 _SHARED = ("angle", "velocity", "torque", "current", "twist")
 
 
@@ -252,8 +253,9 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     found = hypotheses(evidence)
     best, shares = found[0].columns, weighed(found, evidence)
     sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}
-    units, signs = units_of(sure, evidence, logs), signs_of(sure, evidence)
-    ratio = ratio_of(sure, units, evidence, logs) if {"motor_angle", "load_angle"} <= set(sure) else None
+    # What is not sure enough to be told still bears on the units and signs of the rest.
+    units, signs = units_of(best, evidence, logs), signs_of(best, evidence)
+    ratio = ratio_of(sure, units, evidence, logs)
     names = _names(sure)
     signals = {
         names[s]: _signal(names[s], s, sure, evidence, shares[k][s], (units.get(s), signs.get(s)))
@@ -302,6 +304,7 @@ def _signal(
     settled: tuple[UnitGuess | None, tuple[int, str] | None],
 ) -> SignalGuess:
     (unit, sign), k = settled, columns[signal]
+    reference = next((s for s in ANGLES if s in columns), None)
     column = evidence.columns[k]
     reasons = [*evidence.names[signal][k].reasons, *physical_reasons(signal, columns, evidence)]
     if sign is not None and sign[1]:
@@ -316,10 +319,13 @@ def _signal(
         confidence=confidence,
         reasons=tuple(reasons),
     )
+    doubts = () if sign is not None or signal in _WITHOUT_SIGN or signal == reference else ("its sign does not show",)
     if unit is None or unit.reason == "stated":
-        return guess
-    open_units = " or ".join((unit.unit, *unit.rivals))
+        return replace(guess, doubts=doubts)
+    rivals = " or ".join(unit.rivals)
     if unit.confidence < _TOLD_UNIT:
-        return replace(guess, unit=None, unit_stated=False, size=unit.size, doubts=(f"its unit may be {open_units}",))
-    doubts = (f"{unit.unit} is assumed, {' or '.join(unit.rivals)} would do",) if unit.confidence < SURE else ()
+        doubts = (f"its unit may be {unit.unit} or {rivals}", *doubts)
+        return replace(guess, unit=None, unit_stated=False, size=unit.size, doubts=doubts)
+    if unit.confidence < _SURE_UNIT:
+        doubts = (f"{unit.unit} is assumed, {rivals} would do", *doubts)
     return replace(guess, unit=unit.unit, unit_stated=False, size=unit.size, unit_reason=unit.reason, doubts=doubts)

@@ -59,6 +59,6 @@ def _of_oscillator(columns: Mapping[str, int], evidence: Evidence) -> tuple[str,
             return ()
         made = evidence.told("difference", motor, load)[twist].odds > _TOLD
         return ("it is made of both angles",) if made else ()
-    driven = [evidence.told(r, twist)[forcing].odds for r in ("accelerates", "pulled_back")]
+    driven = [evidence.told(r, twist)[forcing].odds for r in ("drives", "pulled_back")]
     words = f"{_called(evidence, twist)} answers {_called(evidence, forcing)} as an oscillator does"
     return (words,) if max(driven) > _TOLD else ()

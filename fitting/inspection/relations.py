@@ -72,7 +72,21 @@ class Relations:
     def accelerates(self, angles: Sequence[int]) -> tuple[Told, ...]:
         """Whether each channel is a torque that accelerates the first angle: T = J theta'' and what depends on angles
         and rates. Slope: J."""
-        return self._partial(angles, lambda s: s.acceleration[:, angles[:1]], lambda s: self._motion(s, angles))
+        # The other angle is nearly this one, and its twist goes with the acceleration.
+        return self._partial(
+            angles,
+            lambda s: s.acceleration[:, angles[:1]],
+            lambda s: self._motion(s, angles),
+            apart=len(angles) == 1,
+        )
+
+    def drives(self, twist: int) -> tuple[Told, ...]:
+        """Whether each channel accelerates a twist that a bent spring holds. Slope: the inertia."""
+        return self._partial(
+            (twist,),
+            lambda s: s.acceleration[:, [twist]],
+            lambda s: np.column_stack([s.value[:, [twist]], s.rate[:, [twist]], s.cube[:, [twist]]]),
+        )
 
     def springs(self, motor: int, load: int) -> tuple[Told, ...]:
         """Whether each channel needs the difference of two angles, as a torque through the gear does. Slope: torque
@@ -106,19 +120,24 @@ class Relations:
             lambda s: s.rate[:, [load, motor]],
             lambda s: np.zeros((len(s.rate), 0)),
             target=lambda s: s.rate,
+            over_scales=_over_scales,
         )
 
     def _motion(self, scale: Scale, angles: Sequence[int]) -> np.ndarray:
         chosen = list(angles)
         return np.column_stack([scale.value[:, chosen], scale.rate[:, chosen], scale.direction[:, chosen[:1]]])
 
-    def _partial(self, own, wanted, given, *, target=lambda s: s.value) -> tuple[Told, ...]:
+    def _partial(
+        self, own, wanted, given, *, target=lambda s: s.value, over_scales=None, apart=False
+    ) -> tuple[Told, ...]:
         """For each channel: what the wanted regressors explain of what the given ones leave.
 
         Args:
             own: channels that are no targets.
             wanted, given: regressors at a scale, (windows, count). Two wanted ones must explain more than either alone.
             target: all channels at a scale, (windows, channels).
+            over_scales: what makes one of the odds, slopes and shares of all scales; that of the best where None.
+            apart: whether a channel that the given regressors explain proves little.
         """
         channels = len(self.moves)
         if not self.moves[list(own)].all() or not self.scales:
@@ -133,8 +152,11 @@ class Relations:
             full, coefficients = _left(np.column_stack([aside, asked]), y)
             if asked.shape[1] == 1:
                 bare, _ = _left(aside, y)
+                total = np.mean(y**2, axis=0)
                 shifted, _ = _left(np.column_stack([aside, np.roll(asked, len(asked) // 2, axis=0)]), y)
                 null = _share(shifted, bare)
+                if apart:
+                    null = np.minimum(null, _share(bare, total))
             else:
                 alone = [_left(np.column_stack([aside, one]), y)[0] for one in asked.T]
                 bare, null = np.min(alone, axis=0), np.ones(channels)
@@ -144,7 +166,7 @@ class Relations:
             slopes.append(coefficients[-1])
         if not odds:
             return (NOTHING,) * channels
-        told = _best_scale(np.array(odds), np.array(slopes), np.array(shares))
+        told = (over_scales or _best_scale)(np.array(odds), np.array(slopes), np.array(shares))
         return tuple(
             Told(*(float(of[k]) for of in told)) if self.moves[k] and k not in own else NOTHING for k in range(channels)
         )
@@ -166,9 +188,10 @@ def _share(left: np.ndarray, bare: np.ndarray) -> np.ndarray:
 
 def _odds(share: np.ndarray, null: np.ndarray) -> np.ndarray:
     """Log odds of a share left unexplained."""
-    least = FLOOR * null
-    odds = np.log(null / (_SPAN * np.maximum(share, least)))
-    return np.where(null > _UNTESTABLE, np.clip(odds, -np.log(_SPAN), None), 0.0)
+    tested = null > _UNTESTABLE
+    null = np.where(tested, null, 1.0)
+    odds = np.log(null / (_SPAN * np.maximum(share, FLOOR * null)))
+    return np.where(tested, np.clip(odds, -np.log(_SPAN), None), 0.0)
 
 
 def _best_scale(odds: np.ndarray, slopes: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, ...]:

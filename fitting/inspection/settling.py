@@ -213,5 +213,5 @@ def _of_torques(columns: Mapping[str, int], evidence: Evidence, of_load: int, te
         k = columns["joint_torque"]
         tell("joint_torque", evidence.held(k, motor, load, twist), 1, "it falls where the twist rises")
     if "forcing" in columns and twist is not None:
-        driven = [evidence.told(r, twist)[columns["forcing"]] for r in ("accelerates", "pulled_back")]
+        driven = [evidence.told(r, twist)[columns["forcing"]] for r in ("drives", "pulled_back")]
         tell("forcing", max(driven, key=lambda t: t.odds), 1, "it acts against the motion that it makes")
