@@ -57,7 +57,7 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
         answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
         if len(torque) >= _FEWEST and np.ptp(torque) > 0:
             band = _band(torque, rate)
-            coherent = None if answer is None else _coherent(torque, answer, rate, band)
+            coherent = None if answer is None or np.ptp(answer) == 0 else _coherent(torque, answer, rate, band)
     spread = None if twist is None else float(np.ptp(twist))
     return Excitation(ranges, driver, response, band, coherent, spread)
 

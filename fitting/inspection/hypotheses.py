@@ -27,6 +27,8 @@ OTHERS = (
     "temperature",
     "forcing",
 )
+# A reduced log has a forcing, a quasi-static one a joint torque.
+_EITHER = ("forcing", "joint_torque")
 
 # Log odds, assumed; what each is for stands beside it.
 _WORST_NAME = -5.0  # a column whose name contradicts a signal more than this is no candidate for it
@@ -140,9 +142,9 @@ class Evidence:
         if signal == "forcing":
             if twist is None:
                 return _FAR_FETCHED
-            driven = self.told("drives", twist)[column].odds, self.told("pulled_back", twist)[column].odds
-            # An oscillator has both an inertia and a spring: the two tests tell different things.
-            return sum(max(odds, 0.0) for odds in driven) + (_FAR_FETCHED if angles else 0.0)
+            # What holds both ways tells no direction: so do the two angles of a drive.
+            driven = max(self._oscillates(twist, column) - self._oscillates(column, twist), 0.0)
+            return driven + (_FAR_FETCHED if angles else 0.0)
         return 0.0
 
     def _of_motor(self, column: int, angles: Sequence[int]) -> float:
@@ -163,6 +165,11 @@ class Evidence:
         if motor is not None and load is not None:
             return self.told("springs", motor, load)[column]
         return NOTHING
+
+    def _oscillates(self, twist: int, forcing: int) -> float:
+        """Log odds that a channel is an oscillator under a forcing: it has an inertia, and it has a spring."""
+        told = (self.told(relation, twist)[forcing].odds for relation in ("drives", "pulled_back"))
+        return sum(max(odds, 0.0) for odds in told)
 
     def _of_velocity(self, column: int, side: int | None, angles: Sequence[int]) -> float:
         if side is None:
@@ -226,6 +233,12 @@ def _rest(evidence: Evidence, motor: int | None, load: int | None, twist: int | 
         for column, k in enumerate(free):
             if evidence.names[signal][k].odds > _WORST_NAME:
                 odds[row, column] = max(0.0, evidence.other(signal, k, motor, load, twist))
+    return max((_assigned(odds, free, without) for without in _EITHER), key=lambda found: found[0])
+
+
+def _assigned(odds: np.ndarray, free: Sequence[int], without: str) -> tuple[float, dict[str, int]]:
+    """The best assignment that leaves one signal out."""
+    odds = odds * (np.array(OTHERS) != without)[:, None]
     rows, columns = linear_sum_assignment(odds, maximize=True)
     chosen = {OTHERS[r]: free[c] for r, c in zip(rows, columns, strict=True) if odds[r, c] > 0}
     return float(odds[rows, columns].sum()), chosen

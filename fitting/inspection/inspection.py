@@ -71,7 +71,7 @@ class JointInspection:
         open: Columns that could be several signals, with the confidence of each.
         copies: Columns that follow another one, with what they follow and how many times it.
         ratio: The reduction ratio, or None where it can't be seen.
-        travel: Range of the output, or of the motor where there is no other angle, in SI where the unit is known.
+        span: Range of the output's angle, or else of the motor's or the twist, in the column's own unit.
     """
 
     label: str | None
@@ -79,7 +79,13 @@ class JointInspection:
     open: dict[str, dict[str, float]]
     copies: dict[str, tuple[str, float]]
     ratio: RatioGuess | None
-    travel: float
+    span: float
+
+    @property
+    def travel(self) -> float:
+        """Range of the output's angle, or else of the motor's or the twist, in SI as far as the unit is known."""
+        found = [self.signals[s].size for s in ("load_angle", "motor_angle") if s in self.signals]
+        return self.span * (found or [1.0])[0]
 
     @property
     def kind(self) -> str | None:
@@ -184,7 +190,7 @@ def joint_labels(columns: Sequence[Column]) -> tuple[str, ...]:
 
 def _chosen(joints: tuple[JointInspection, ...], wanted: str | None, path: Path) -> JointInspection:
     if wanted is None:
-        return max(joints, key=lambda j: (j.kind is not None, len(j.signals) > 0, j.travel))
+        return max(joints, key=lambda j: (len(j.signals) > 0, j.travel))
     found = next((j for j in joints if j.label == wanted), None)
     if found is None:
         known = ", ".join(j.label for j in joints if j.label) or "no joints, since the log is of one drive"
@@ -271,9 +277,8 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     copies = _copies(evidence, taken)
     maybe = {name: own for name, own in maybe.items() if own and name not in copies}
     angle = sure.get("load_angle", sure.get("motor_angle", sure.get("dynamic_error")))
-    travel = max(float(np.ptp(log.values[:, angle])) for log in logs) if angle is not None else 0.0
-    guess = units.get("load_angle") or units.get("motor_angle")
-    return JointInspection(label, signals, maybe, copies, ratio, travel * (guess.size if guess else 1.0))
+    span = max(float(np.ptp(log.values[:, angle])) for log in logs) if angle is not None else 0.0
+    return JointInspection(label, signals, maybe, copies, ratio, span)
 
 
 def _names(sure: dict[str, int]) -> dict[str, str]:

@@ -18,8 +18,10 @@ _JOINT_SIDE, _NO_MOTOR = 1.0, -2.0  # "joint" is most often the output
 _COMMAND, _COMMANDED_TORQUE = -12.0, -3.0  # a command is no measurement
 _UNIT, _WRONG_UNIT = 1.5, -10.0
 _EXTERNAL = 2.0
-_RARE = {"load_torque": -1.5}  # signals that few logs have
-_UNNAMED = dict.fromkeys(("motor_current", "load_torque", "temperature"), -6.0)  # that only a name or a unit tells
+_RARE: dict[str, float] = {"load_torque": -1.5}  # signals that few logs have
+_UNNAMED: dict[str, float] = dict.fromkeys(
+    ("motor_current", "load_torque", "temperature"), -6.0
+)  # that only a name or a unit tells
 _OF_THE_JOINT = -1.0  # a torque of the joint that is the motor's all the same
 _CONSTANT, _LOCKED = -5.0, -2.0  # a channel that never changes, or an angle: one side may be locked
 _BARE_TORQUE = {"motor_torque": 0.5, "joint_torque": -0.5, "load_torque": -2.5}  # that a torque of no side is which

@@ -16,6 +16,8 @@ SURE = 0.8
 
 _NOTED = 0.02  # share of a unit that is worth a word
 _SIGN_ODDS = 1.0  # of a relation, for its sign to be told
+_COPIES = ("load_angle", "motor_velocity", "load_velocity")  # that move as an angle does, or its rate
+_CORRELATED = 0.3  # unexplained share below which the sign of a plain correlation is told
 _SEEN_RATIO = 0.02  # share of the motion that may be no common motion, for the ratio to be seen
 _LARGEST_TWIST, _SOFT_TWIST = 0.02, 0.2  # rad; no gear twists more, a series elastic joint does
 _TWIST_ODDS = (0.0, -0.5, -5.0)
@@ -180,7 +182,7 @@ def signs_of(columns: Mapping[str, int], evidence: Evidence) -> dict[str, tuple[
 
     def tell(signal: str, told: Told, reference: int, words: str) -> int:
         """The sign of a signal from a relation, 1 where it says nothing."""
-        if told is NOTHING or told.odds < _SIGN_ODDS:
+        if told is NOTHING or (told.odds < _SIGN_ODDS and not (signal in _COPIES and told.unexplained < _CORRELATED)):
             return 1
         sign = int(np.sign(told.slope) * reference) or 1
         signs[signal] = (sign, words if sign < 0 else "")
