@@ -43,11 +43,12 @@ def _of_alpha(moved: Excitation) -> Iterator[str]:
     if moved.twist is None:
         return
     share = (0.5 * moved.twist) ** 2
-    low, high = (100 * alpha * share for alpha in _ALPHAS)
-    verdict = "may show" if high / 100 > _VISIBLE else "hardly shows"
+    low, high = (alpha * share for alpha in _ALPHAS)
+    verdict = "may show" if high > _VISIBLE else "hardly shows"
+    low, high = (float(f"{100 * change:.2g}") for change in (low, high))
     yield (
         f"The twist spans {moved.twist:.2g} rad: alpha {verdict}, since that of catalogue gears changes the stiffness "
-        f"by {low:.2g} to {high:.2g} % there."
+        f"by {low:g} to {high:g} % there."
     )
 
 
