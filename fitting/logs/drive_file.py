@@ -89,18 +89,19 @@ class DriveFile:
         return self.columns.get(signal, ColumnMap(signal, None, 1.0))
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
     """A suggestion in brackets, or nothing when no known name is close.
 
     Args:
         word: What was written.
         known: Names that would have been understood.
+        cutoff: How alike they must be, 0 to 1.
 
     Returns:
         " (did you mean 'time'?)" or "".
     """
     by_lower = {name.lower(): name for name in known}
-    close = get_close_matches(word.lower(), list(by_lower), n=1, cutoff=0.6)
+    close = get_close_matches(word.lower(), list(by_lower), n=1, cutoff=cutoff)
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
 
 
