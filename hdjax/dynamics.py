@@ -255,3 +255,33 @@ class ReducedModel(Model):
 
     def outputs(self, state: State) -> Float[Array, "1"]:
         return state[:1]
+
+
+class MotorDrivenModel(Model):
+    """The load behind the mesh where the motor's motion is given, whatever moves the motor.
+
+        x'' = theta_m''/N - (tau + T_l)/J_l
+
+    The motor's acceleration over N [rad/s^2] takes the place of the torque. States: x, v.
+    """
+
+    drive: Drive
+    effects: tuple[Effect, ...] = ()
+    motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
+
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
+        return Motion(x=state[0], v=state[1], **vars(conditions))
+
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
+        motion = self.motion(state, conditions)
+        own = self._own_states(state)
+        rates = [state[1], torque - (self._mesh_torque(motion, own) + load_torque) / self.drive.J_l]
+        return self._with_own_rates(motion, rates, own)
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        return 1.0 / self.drive.J_l
+
+    def outputs(self, state: State) -> Float[Array, "1"]:
+        return state[:1]

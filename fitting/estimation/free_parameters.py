@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from hdjax import Model, TwoInertiaModel
+from hdjax import Drive, Model
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
@@ -101,7 +101,7 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
 
 def base_paths(model: Model) -> tuple[str, ...]:
     """What is fitted of a drive without effects."""
-    if isinstance(model, TwoInertiaModel):
+    if isinstance(model.drive, Drive):
         return ("K", "alpha", "B_sp")
     return ("mu", "omega_0", "alpha", "gain")
 

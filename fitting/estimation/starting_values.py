@@ -49,8 +49,17 @@ def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[M
     return _distinct(model, _estimates(model, stretches, blind=True))
 
 
-def _estimates(model: Model, stretches: Sequence[Stretch], *, blind: bool) -> list[dict[str, float]]:
-    forms = itertools.product(_WIDTHS, _equations(model))
+def starts_of_load_equation(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Those of the load's own equation, which holds whatever acts on the motor; there may be none. Arguments as in
+    [`starting_models`][]."""
+    found = (_estimates(model, stretches, blind=blind, equations=("load",)) for blind in (False, True))
+    return _distinct(model, list(itertools.chain(*found)))
+
+
+def _estimates(
+    model: Model, stretches: Sequence[Stretch], *, blind: bool, equations: tuple[str, ...] | None = None
+) -> list[dict[str, float]]:
+    forms = itertools.product(_WIDTHS, _equations(model) if equations is None else equations)
     estimates = (_weak_form(model, stretches, width, equation, blind=blind) for width, equation in forms)
     return [estimate for estimate in estimates if estimate is not None]
 
