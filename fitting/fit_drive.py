@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from fitting.attribution.selection_round import Round
 from fitting.clock import Clock
-from fitting.estimation.base_fit import base_fit
+from fitting.estimation.base_fit import base_fit, is_held, told_by_load
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import Finding
@@ -41,6 +41,8 @@ class FitOnly(eqx.Module):
         bands: how well the free runs are known, along test data where there are any.
         posterior: draws, where they were asked for.
         seconds: where the time went.
+        by_load: whether K, alpha and B_sp are those of the load's own equation, see
+            [`fitting.estimation.motor_driven`][], since the motion does not follow from the torque.
     """
 
     account: Account
@@ -54,6 +56,7 @@ class FitOnly(eqx.Module):
     bands: tuple[PredictionBand, ...]
     posterior: Posterior | None
     seconds: dict[str, float]
+    by_load: bool = eqx.field(static=True)
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()
     rounds: ClassVar[tuple[Round, ...]] = ()
@@ -108,10 +111,11 @@ def fit_only(
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    found = long_fit(base, must_explain=True)
+    found = base if is_held(base) else long_fit(base, must_explain=True)
+    told_by = told_by_load(base)
     clock.lap("final fit")
     progress("free runs")
-    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True)
+    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True, told_by=told_by)
     seen = found.stretches if not tests else tests
     bands = prediction_bands(found, result.uncertainty, seen, noise=noise, runs=result.judged)
     clock.lap("free runs and standard errors")
@@ -138,4 +142,5 @@ def fit_only(
         bands=bands,
         posterior=draws,
         seconds=clock.laps,
+        by_load=told_by is not None,
     )

@@ -88,7 +88,7 @@ def drawn(seed: int) -> Joint:
     reduced = 1.0 / (1.0 / J_l + 1.0 / (N**2 * J_m))
     K = reduced * (2 * np.pi * frequency) ** 2
     damping = float(10 ** random.uniform(-2.0, -1.0))
-    joint = Joint(N, J_m, J_l, K, 2 * damping * np.sqrt(K * reduced), rms=K * N ** -1.0 * 5e-3)
+    joint = Joint(N, J_m, J_l, K, 2 * damping * np.sqrt(K * reduced), rms=K * N**-1.0 * 5e-3)
     coulomb, viscous = random.uniform(0.0, 0.6, size=2)
     return with_friction(joint, float(coulomb), float(viscous), seed=seed)
 

@@ -21,7 +21,7 @@ from fitting.estimation.motor_driven import held_at, motor_driven_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.starting_values import apart, starting_models, starts_blind_to_loads
-from fitting.estimation.steady_load import SteadyLoad
+from fitting.estimation.steady_torque import SteadyLoad
 from fitting.estimation.whiteness import autocorrelation, left_over, ljung_box
 from hdjax import Drive, Model, TwoInertiaModel
 
@@ -142,7 +142,7 @@ def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
     model takes energy from the motor alone. So the fit brakes the motor by tying it to the load, with a damping B_sp so
     large that the twist stands still and K no longer matters.
     """
-    if driven is None or apart(best.model, driven.model) < _OFF:
+    if driven is None:
         return False
     return held_at(best.model, driven).objective - driven.objective > -np.log(_MUCH)
 
@@ -178,6 +178,16 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     )
     states = initial_states(best.model, segmentation.of(as_followed(best)))
     return fit(best.model, training, paths, segmentation, start=Start(states=states))
+
+
+def told_by_load(found: Fit) -> Fit | None:
+    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others."""
+    if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
+        return None
+    driven = motor_driven_fit(found.model, found.stretches)
+    if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in found.free.paths):
+        return None
+    return driven
 
 
 def need_double_precision() -> None:

@@ -33,7 +33,10 @@ def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fi
         The best of the fits from each start that the load's equation supplies; None where it supplies none.
     """
     driven = tuple(_driven(stretch) for stretch in stretches)
-    starts = [MotorDrivenModel(start.drive) for start in starts_of_load_equation(model, stretches)]
+    starts = [
+        MotorDrivenModel(model.drive).replace({p: start.get(p) for p in base_paths(model)})
+        for start in starts_of_load_equation(model, stretches)
+    ]
     if not starts:
         return None
     # Judged on equally short segments, a start with the wrong frequency can't hide.
@@ -43,7 +46,7 @@ def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fi
     return _fitted(best.model, driven, short_horizon(best.model, driven))
 
 
-def held_at(model: TwoInertiaModel, found: Fit) -> Fit:
+def held_at(model: Model, found: Fit) -> Fit:
     """A motor-driven fit with K, alpha and B_sp held at those of another model.
 
     Args:
@@ -51,7 +54,7 @@ def held_at(model: TwoInertiaModel, found: Fit) -> Fit:
         found: the fit with its own values.
     """
     return fit(
-        MotorDrivenModel(model.drive),
+        found.model.replace({path: model.get(path) for path in found.free.paths}),
         found.stretches,
         found.free.paths,
         found.segmentation,

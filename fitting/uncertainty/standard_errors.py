@@ -5,7 +5,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
 from fitting.estimation.estimate import Fit
@@ -58,6 +58,17 @@ class Uncertainty(eqx.Module):
     correlation: Float[np.ndarray, "parameters parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
     unit_covariance: Float[np.ndarray, "parameters parameters"]
+
+    def in_units_of(self, own: Float[Array, " parameters"], other: Float[Array, " parameters"]) -> "Uncertainty":
+        """The same for another free vector of the same parameters.
+
+        Args:
+            own: derivative of each parameter by its entry of this free vector.
+            other: likewise of the other one.
+        """
+        ratio = np.asarray(own) / np.asarray(other)
+        both = np.outer(ratio, ratio)
+        return replace(self, covariance=both * self.covariance, unit_covariance=both * self.unit_covariance)
 
     def of_effect(self, name: str) -> tuple[list[str], Float[np.ndarray, "own own"]]:
         """The dotted paths of an effect's parameters, and their covariance in SI units."""
