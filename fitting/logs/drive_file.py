@@ -27,7 +27,13 @@ SIGNALS = (
     "twist",
     "joint_torque",
 )
-_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2", "rated_torque": "N m"}
+_DRIVE_UNITS = {
+    "reduction_ratio": "1",
+    "motor_inertia": "kg m^2",
+    "load_inertia": "kg m^2",
+    "rated_torque": "N m",
+    "largest_twist": "rad",
+}
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
     "signals": ("torque_hold", "sample_rate"),
@@ -68,6 +74,7 @@ class DriveFile:
         sample_rate: Samples per second [Hz] of a log without time column, or None.
         columns: Signal name to its place in the log, only where the drive file states it.
         rated_torque: At the output [N m], or None; lost motion is defined by it.
+        largest_twist: That the joint may reach [rad], or None for what a strain-wave gear bears.
     """
 
     path: Path
@@ -79,6 +86,7 @@ class DriveFile:
     sample_rate: float | None
     columns: dict[str, ColumnMap]
     rated_torque: float | None = None
+    largest_twist: float | None = None
 
     def column_of(self, signal: str) -> ColumnMap:
         """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""
