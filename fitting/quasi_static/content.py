@@ -105,8 +105,8 @@ def summary(report: Mapping[str, Any]) -> str:
         loop = f"The loop is {_with_interval(width)} wide at zero torque"
     if not names:
         return (
-            "The logs do not determine a stiffness: what the twist does beside the torque outweighs what the torque does "
-            f"to it. On stretches that a straight line has not seen it errs by {validation} rms."
+            "The logs do not determine a stiffness: what the twist does beside the torque outweighs what the torque "
+            f"does to it. On stretches that a straight line has not seen it errs by {validation} rms."
         )
     stiffness = formatting.words([f"{name} {_with_interval(known[name])}" for name in names])
     article = "" if shape.endswith("slopes") else "a "
