@@ -161,7 +161,7 @@ class Model(eqx.Module):
 class TwoInertiaModel(Model):
     """Motor and load inertia with the mesh between them.
 
-        J_m theta_m'' = T_m + tau_m - (1/N + e') tau        J_l theta_l'' = tau + T_l + tau_l
+        J_m theta_m'' = k_T T_m + tau_m - (1/N + e') tau        J_l theta_l'' = tau + T_l + tau_l
 
     with the mesh torque at `x_s = theta_m/N + e(theta_m) - theta_l`. States: theta_m, theta_l, omega_m, omega_l.
     """
@@ -189,7 +189,7 @@ class TwoInertiaModel(Model):
         transmission = 1.0 / drive.N
         for effect in self._of(MeshGeometryEffect):
             transmission = transmission + effect.slope(state[0])
-        on_motor = torque - transmission * tau
+        on_motor = drive.k_T * torque - transmission * tau
         for effect in self._of(MeshTorqueEffect):
             if effect.reacts():
                 on_motor = on_motor + effect.reaction(motion, drive)

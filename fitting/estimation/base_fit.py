@@ -16,11 +16,16 @@ import numpy as np
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.free_parameters import MESH, base_paths
 from fitting.estimation.motor_driven import held_at, motor_driven_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
-from fitting.estimation.starting_values import apart, starting_models, starts_blind_to_loads
+from fitting.estimation.starting_values import (
+    apart,
+    starting_models,
+    starts_blind_to_loads,
+    with_starting_inertias,
+)
 from fitting.estimation.steady_torque import SteadyLoad
 from fitting.estimation.whiteness import autocorrelation, left_over, ljung_box
 from hdjax import Drive, Model, TwoInertiaModel
@@ -54,6 +59,8 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: where the data supply no starting values.
     """
     training = without_glitches(training)
+    if isinstance(model, TwoInertiaModel):
+        model = with_starting_inertias(model, training)
     best, start = _coarse_fit(starting_models(model, training), training, halo)
     if not is_held(best):
         best = _beside_loads(best, training, halo)
@@ -149,7 +156,7 @@ def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
 
 def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:
     """The base model with its parameters held at what the load's own equation tells."""
-    told = model.replace({path: driven.model.get(path) for path in base_paths(model)})
+    told = model.replace({path: driven.model.get(path) for path in MESH})
     horizon = short_horizon(told, training)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
     return _fitted(told, training=training, segmentation=segmentation, strategy=Strategy(hold_parameters=True))
@@ -181,8 +188,9 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
 
 
 def told_by_load(found: Fit) -> Fit | None:
-    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others."""
-    if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
+    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others, or where
+    inertias are fitted as well, of which that equation tells nothing."""
+    if not is_held(found) or not isinstance(found.model, TwoInertiaModel) or found.model.drive.priors:
         return None
     driven = motor_driven_fit(found.model, found.stretches)
     if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in found.free.paths):

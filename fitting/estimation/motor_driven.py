@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.free_parameters import MESH
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.starting_values import starts_of_load_equation
 from hdjax import Model, MotorDrivenModel, PiecewisePolynomial, TwoInertiaModel
@@ -34,7 +34,7 @@ def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fi
     """
     driven = tuple(_driven(stretch) for stretch in stretches)
     starts = [
-        MotorDrivenModel(model.drive).replace({p: start.get(p) for p in base_paths(model)})
+        MotorDrivenModel(model.drive).replace({p: start.get(p) for p in MESH})
         for start in starts_of_load_equation(model, stretches)
     ]
     if not starts:
@@ -65,7 +65,7 @@ def held_at(model: Model, found: Fit) -> Fit:
 
 def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
     segmentation = Segmentation(horizon, segment_length(horizon), substeps=suggested_substeps(model, driven))
-    return fit(model, driven, base_paths(model), segmentation)
+    return fit(model, driven, MESH, segmentation)
 
 
 def _driven(stretch: Stretch) -> Stretch:

@@ -32,6 +32,7 @@ VELOCITIES = ("motor_velocity", "load_velocity")
 Kind = Literal["drive", "reduced", "quasi-static"]
 
 _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
+_SYMBOLS = {"motor_inertia": "J_m", "load_inertia": "J_l"}
 _SLOWEST = 60.0  # s between samples; no drive's resonance is that slow, but nanoseconds taken for seconds are
 _FEWEST_INPUTS = 50
 _UNTIMED = Finding(
@@ -354,7 +355,7 @@ def _kind(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, Raw
             return "quasi-static"
     if is_drive:
         for key in _DRIVE_KEYS:
-            if getattr(drive_file, key) is None:
+            if getattr(drive_file, key) is None and _SYMBOLS.get(key) not in drive_file.tolerances:
                 raise InputError(
                     f"{drive_file.path}: [drive] {key} is missing, which a log with angles and "
                     f"torque such as {path} needs; add it"

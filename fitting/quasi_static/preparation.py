@@ -111,8 +111,8 @@ def _wide_twist(log: Log, most: float | None) -> tuple[Finding, ...]:
     remedy = (
         "check reduction_ratio, and the units and signs of the two angles in [columns]"
         if moved
-        else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, lock '
-        "the motor or log both angles"
+        else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, '
+        "lock the motor or log both angles"
     )
     if span > limit:
         known = "a full turn" if most is None else f"the largest_twist of {most:.3g} rad in [drive]"

@@ -116,8 +116,10 @@ def _described(found: Covariance, other: Float[np.ndarray, "parameters parameter
     if other is None:
         return found
     reach = stdtrit(found.degrees_of_freedom, 0.975) * np.sqrt(np.diag(found.robust))
-    longer = NORMAL_95 * np.sqrt(np.diag(other)) > reach
-    stretch = np.where(longer, np.sqrt(np.diag(other) / np.diag(found.robust)), 1.0)
+    # Of what only a prior tells, rounding may leave less than nothing.
+    variance = np.maximum(np.diag(other), 0.0)
+    longer = NORMAL_95 * np.sqrt(variance) > reach
+    stretch = np.where(longer, np.sqrt(variance / np.diag(found.robust)), 1.0)
     return replace(
         found,
         robust=found.robust * np.outer(stretch, stretch),
