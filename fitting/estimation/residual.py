@@ -124,7 +124,7 @@ class Products(eqx.Module):
         library: Any = np if isinstance(self.products, np.ndarray) else jnp
         more = self.products.shape[1] - off.size - 1
         rows = library.concatenate([library.diag(slope), library.zeros((off.size, more)), off[:, None]], axis=1)
-        first = (library.arange(self.products.shape[0]) == 0)[:, None, None]
+        first = (library.arange(self.products.shape[0]) == 0).astype(float)[:, None, None]
         return replace(self, products=self.products + first * (rows.T @ rows)[None])
 
     @property

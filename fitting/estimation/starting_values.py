@@ -12,13 +12,11 @@ zero do not see a constant load that the log does not contain.
 import itertools
 from collections.abc import Sequence
 
-import equinox as eqx
 import numpy as np
 
 from fitting.errors import DataError
 from fitting.estimation.experiment import Stretch
 from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
-from hdjax.parameters import as_scalar
 
 # Starts whose stiffness differs by less than this (in its logarithm) end in the same minimum.
 _DISTINCT = 0.1
@@ -58,7 +56,7 @@ def starts_of_load_equation(model: TwoInertiaModel, stretches: Sequence[Stretch]
     return _distinct(model, list(itertools.chain(*found)))
 
 
-def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> TwoInertiaModel:
+def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Model:
     """The model with starting values of the inertias of which nothing is known.
 
     Both inertias' momenta, in which the spring cancels, change as the torques from outside say,
@@ -82,7 +80,7 @@ def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch])
             "motor_torque, motor_angle and load_angle in the drive file, or state the inertias"
         )
     _, values = min(usable)
-    return eqx.tree_at(lambda m: [m.get(p) for p in wanted], model, [as_scalar(v) for v in values])
+    return model.replace(dict(zip(wanted, values, strict=True)))
 
 
 def _momentum(
