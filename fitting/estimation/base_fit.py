@@ -16,7 +16,7 @@ import numpy as np
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import MESH, base_paths
+from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.motor_driven import held_at, motor_driven_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
@@ -59,11 +59,20 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: where the data supply no starting values.
     """
     training = without_glitches(training)
+    priors = ()
     if isinstance(model, TwoInertiaModel):
-        model = with_starting_inertias(model, training)
+        # What the base model lacks would go into inertias that are free, before the load's equation is asked.
+        priors = model.drive.priors
+        model = with_priors(with_starting_inertias(model, training), ())
     best, start = _coarse_fit(starting_models(model, training), training, halo)
     if not is_held(best):
         best = _beside_loads(best, training, halo)
+    if priors:
+        start = with_priors(start, priors)
+        free = with_priors(best.model, priors)
+        strategy = Strategy(hold_parameters=is_held(best))
+        states = Start(states=best.unknowns.states)
+        best = fit(free, best.stretches, base_paths(free), best.segmentation, start=states, strategy=strategy)
     if is_held(best):
         return eqx.tree_at(lambda f: f.problem.model, best, start)
     horizon = short_horizon(best.model, training)
@@ -188,14 +197,15 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
 
 
 def told_by_load(found: Fit) -> Fit | None:
-    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others, or where
-    inertias are fitted as well, of which that equation tells nothing."""
-    if not is_held(found) or not isinstance(found.model, TwoInertiaModel) or found.model.drive.priors:
+    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others."""
+    if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
         return None
-    driven = motor_driven_fit(found.model, found.stretches)
-    if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in found.free.paths):
+    driven = motor_driven_fit(with_priors(found.model, ()), found.stretches)
+    if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
         return None
-    return driven
+    # The stiffness is known in proportion to the load's inertia, and no better.
+    known = tuple(p for p in found.model.drive.priors if p.path == "J_l" and np.isfinite(p.tolerance))
+    return motor_driven_fit(with_priors(found.model, known), found.stretches) if known else driven
 
 
 def need_double_precision() -> None:

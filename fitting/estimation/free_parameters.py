@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,6 +19,8 @@ from hdjax.parameters import own_parameters
 # A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
 LARGEST_LOG = 100.0
 
+
+ModelT = TypeVar("ModelT", bound=Model)
 
 MESH = ("K", "alpha", "B_sp")
 """What is fitted of the mesh."""
@@ -113,6 +116,12 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
     known_before = [priors.get(p, Prior(p, 1.0, math.inf)) for p in paths]
     numbers = units, [math.log(p.value) for p in known_before], [1.0 / p.tolerance for p in known_before]
     return FreeParameters(tuple(paths), logarithmic, *(jnp.asarray(np.array(n, dtype=float)) for n in numbers))
+
+
+def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:
+    """The model of a drive with other priors."""
+    assert isinstance(model.drive, Drive)
+    return replace(model, drive=replace(model.drive, priors=priors))
 
 
 def base_paths(model: Model) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import MESH
+from fitting.estimation.free_parameters import MESH, base_paths
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.starting_values import starts_of_load_equation
 from hdjax import Model, MotorDrivenModel, PiecewisePolynomial, TwoInertiaModel
@@ -26,7 +26,7 @@ def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fi
     """Fit K, alpha and B_sp to the load's motion under the motor's.
 
     Args:
-        model: the base model; its stiffness and damping are only placeholders.
+        model: the base model; its stiffness and damping are only placeholders. Of its priors, none may be of the motor.
         stretches: the data.
 
     Returns:
@@ -65,7 +65,7 @@ def held_at(model: Model, found: Fit) -> Fit:
 
 def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
     segmentation = Segmentation(horizon, segment_length(horizon), substeps=suggested_substeps(model, driven))
-    return fit(model, driven, MESH, segmentation)
+    return fit(model, driven, base_paths(model), segmentation)
 
 
 def _driven(stretch: Stretch) -> Stretch:

@@ -31,6 +31,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     g, account = fitted.goodness, fitted.account
     return {
         "parameters_from": "load equation" if fitted.by_load else "torque",
+        "assumed": dict(fitted.assumed),
         "goodness": {
             "fit_percent": dict(g.fit_percent),
             "rmse_over_noise": {part: rmse / noise for part, rmse in account.rmse.items()},
@@ -76,6 +77,11 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
             "alpha and B_sp are therefore those of the load's own equation, driven by the motor's motion as measured. "
             "The errors below are those of free runs under the torque. `hdjax close-loop` looks for what acts on the "
             "motor."
+        )
+    for path, value in report["assumed"].items():
+        notes.append(
+            f"{path} was not known, and was taken to be {formatting.number(value)} kg m^2, as the torque beside a simple "
+            "friction tells it. K and B_sp go in proportion to it, and their intervals don't hold its error."
         )
     if not report["goodness"]["converged"]:
         notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")

@@ -5,7 +5,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import stdtrit
 
 from fitting.estimation.estimate import Fit
@@ -59,16 +59,22 @@ class Uncertainty(eqx.Module):
     covariance: Float[np.ndarray, "parameters parameters"]
     unit_covariance: Float[np.ndarray, "parameters parameters"]
 
-    def in_units_of(self, own: Float[Array, " parameters"], other: Float[Array, " parameters"]) -> "Uncertainty":
-        """The same for another free vector of the same parameters.
+    def in_units_of(self, fit: Fit, told_by: Fit) -> "Uncertainty":
+        """The same for the parameters and the free vector of another fit.
 
         Args:
-            own: derivative of each parameter by its entry of this free vector.
-            other: likewise of the other one.
+            fit: the other fit; its parameters are among those that are known here.
+            told_by: the fit whose uncertainty this is.
         """
-        ratio = np.asarray(own) / np.asarray(other)
-        both = np.outer(ratio, ratio)
-        return replace(self, covariance=both * self.covariance, unit_covariance=both * self.unit_covariance)
+        own = [told_by.free.paths.index(path) for path in fit.free.paths]
+        ratio = np.asarray(told_by.free.slopes(told_by.model))[own] / np.asarray(fit.free.slopes(fit.model))
+        kept, both = np.ix_(own, own), np.outer(ratio, ratio)
+        return Uncertainty(
+            {path: self.estimates[path] for path in fit.free.paths},
+            self.correlation[kept],
+            both * self.covariance[kept],
+            both * self.unit_covariance[kept],
+        )
 
     def of_effect(self, name: str) -> tuple[list[str], Float[np.ndarray, "own own"]]:
         """The dotted paths of an effect's parameters, and their covariance in SI units."""

@@ -92,7 +92,7 @@ def account(
         found = with_profiles(judged, found)
     told = identifiability(judged, found)
     if told_by is not None:
-        found = found.in_units_of(told_by.free.slopes(told_by.model), fit.free.slopes(fit.model))
+        found = found.in_units_of(fit, told_by)
     return Account(fit.model, found, seen, selection, unseen, told, why_not(fit.problem))
 
 
