@@ -80,8 +80,8 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
         )
     for path, value in report["assumed"].items():
         notes.append(
-            f"{path} was not known, and was taken to be {formatting.number(value)} kg m^2, as the torque beside a simple "
-            "friction tells it. K and B_sp go in proportion to it, and their intervals don't hold its error."
+            f"{path} was not known, and was taken to be {formatting.number(value)} kg m^2, as the torque beside a "
+            "simple friction tells it. K and B_sp go in proportion to it, and their intervals don't hold its error."
         )
     if not report["goodness"]["converged"]:
         notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")
