@@ -6,6 +6,9 @@ from hdjax.dynamics import (
     Model as Model,
 )
 from hdjax.dynamics import (
+    MotorDrivenModel as MotorDrivenModel,
+)
+from hdjax.dynamics import (
     ReducedModel as ReducedModel,
 )
 from hdjax.dynamics import (
