@@ -51,10 +51,9 @@ def _held(found: Fit, horizon: int) -> Fit:
 
 def _criterion(found: Fit) -> float:
     """Akaike's, of the outputs' Gaussian errors and the initial states."""
-    states = int(np.sum(~np.asarray(found.problem.segments.joined)[: found.pieces.sum()])) * len(
-        found.model.state_names
-    )
-    return float(np.sum(np.asarray(found.problem.segments.weight))) * found.objective + states
+    segments = found.problem.segments
+    anew = int(np.sum(~np.asarray(segments.joined)[: found.pieces.sum()]))
+    return float(np.sum(np.asarray(segments.weight))) * found.objective + anew * len(found.model.state_names)
 
 
 def _in_segments_of(found: Fit, shorter: Fit) -> Followed:
