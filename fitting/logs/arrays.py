@@ -94,7 +94,11 @@ def read_numpy(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> R
     """
     try:
         loaded = np.load(source, allow_pickle=False)
-        arrays = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+        if isinstance(loaded, np.ndarray):
+            arrays = {"data": loaded}
+        else:
+            with loaded:
+                arrays = dict(loaded)
     except ValueError as error:
         if "allow_pickle" not in str(error):
             raise

@@ -41,6 +41,9 @@ def read_mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
 
         def messages(topics: Iterable[str] | None) -> Iterator[Message]:
             for schema, channel, message in reader.iter_messages(topics):
+                # Where fields are listed only, those of other encodings are left out.
+                if topics is None and not _is_readable(schema, channel):
+                    continue
                 if channel.id not in decoders:
                     decoders[channel.id] = _decoder(path, schema, channel)
                 yield channel.topic, message.log_time, decoders[channel.id](message.data)
@@ -88,16 +91,17 @@ def _needs_the_extra(path: Path) -> Iterator[None]:
         ) from error
 
 
+def _is_readable(schema: Any, channel: Any) -> bool:
+    """Whether a channel's messages are in an encoding that is read here."""
+    form = None if schema is None else schema.encoding
+    return channel.message_encoding == "json" or (channel.message_encoding, form) in _ENCODINGS
+
+
 def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
     """What turns the bytes of a channel's messages into a message."""
     if channel.message_encoding == "json":
         return json.loads
-    form = "" if schema is None else schema.encoding
-    if schema is None or (channel.message_encoding, form) not in (
-        ("cdr", "ros2msg"),
-        ("cdr", "ros2idl"),
-        ("ros1", "ros1msg"),
-    ):
+    if not _is_readable(schema, channel):
         raise InputError(
             f"{path}: the messages of '{channel.topic}' are encoded as {channel.message_encoding!r}, which is not read "
             "here; export the joint's topics as CSV"
@@ -107,7 +111,9 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
     store = typesys.get_typestore(typesys.Stores.EMPTY)
     text = schema.data.decode()
     store.register(
-        typesys.get_types_from_idl(text) if form == "ros2idl" else typesys.get_types_from_msg(text, schema.name)
+        typesys.get_types_from_idl(text)
+        if schema.encoding == "ros2idl"
+        else typesys.get_types_from_msg(text, schema.name)
     )
     read = store.deserialize_ros1 if channel.message_encoding == "ros1" else store.deserialize_cdr
     return lambda raw: read(raw, schema.name)
@@ -130,7 +136,10 @@ def _table(
         rows[topic].append((received, _stamp(message) or 0, [_value(message, field) for field in chosen[topic]]))
     # Stamps of the sensor are the better clock, if all topics have them.
     own = all(stamp > 0 for several in rows.values() for _, stamp, _ in several)
-    clocks = {t: np.array([row[own] for row in several], dtype=np.int64) for t, several in rows.items()}
+    clocks = {
+        topic: np.array([stamp if own else received for received, stamp, _ in several], dtype=np.int64)
+        for topic, several in rows.items()
+    }
     # A double holds no nanoseconds beside the seconds since 1970.
     origin = min((int(clock.min()) for clock in clocks.values() if len(clock)), default=0)
     columns = {}

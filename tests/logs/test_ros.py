@@ -129,6 +129,7 @@ def test_an_encoding_that_is_not_read_is_named(tmp_path: Path):
         out.finish()
     with pytest.raises(InputError, match="'/joint_states' are encoded as 'protobuf'"):
         read_table(path, WANTED)
+    assert read_table(path, ("/other/data",)).names == ()
 
 
 @pytest.mark.parametrize(("name", "head"), [("log.mcap", b"\x89MCAP0\r\n"), ("log.bag", b"#ROSBAG V2.0\n")])
