@@ -67,7 +67,7 @@ class InspectionResult:
             InputError: There is a file already.
         """
         if Path(path).exists() and not force:
-            raise InputError(f"{path}: there is a file already; give another name, or --force to overwrite it")
+            raise InputError(f"{path}: there is a file already; give another name, or overwrite it with force")
         write_whole({Path(path): self.drive_file()})
         return Path(path)
 

@@ -19,7 +19,8 @@ FLOOR = 1e-4
 _SPAN = float(np.log(1.0 / FLOOR))
 # Channels that even a shifted one explains (ramps, single sines) tell nothing.
 _UNTESTABLE = 0.05
-_MOST_ROWS_A_REGRESSOR = 3
+_SHIFTS = (0.382, 0.236)  # of a log; by the golden section, no multiples of one period
+_FEWEST_ROWS_A_REGRESSOR = 3
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ class Relations:
         odds, slopes, shares = [], [], []
         for scale in self.scales:
             aside, asked = given(scale), wanted(scale)
-            least = _MOST_ROWS_A_REGRESSOR * (aside.shape[1] + asked.shape[1] + 1)
+            least = _FEWEST_ROWS_A_REGRESSOR * (aside.shape[1] + asked.shape[1] + 1)
             if len(asked) < least:
                 continue
             y = target(scale)
@@ -153,8 +154,8 @@ class Relations:
             if asked.shape[1] == 1:
                 bare, _ = _left(aside, y)
                 total = np.mean(y**2, axis=0)
-                shifted, _ = _left(np.column_stack([aside, np.roll(asked, len(asked) // 2, axis=0)]), y)
-                null = _share(shifted, bare)
+                shifted = [_left(np.column_stack([aside, moved]), y)[0] for moved in _shifted(asked)]
+                null = _share(np.max(shifted, axis=0), bare)
                 if apart:
                     null = np.minimum(null, _share(bare, total))
             else:
@@ -170,6 +171,11 @@ class Relations:
         return tuple(
             Told(*(float(of[k]) for of in told)) if self.moves[k] and k not in own else NOTHING for k in range(channels)
         )
+
+
+def _shifted(windows: np.ndarray) -> list[np.ndarray]:
+    """The same windows at other times, where no relation is left; several, since an excitation may be periodic."""
+    return [np.roll(windows, round(share * len(windows)), axis=0) for share in _SHIFTS]
 
 
 def _left(regressors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +225,7 @@ def _pairwise(scales: Sequence[tuple[np.ndarray, np.ndarray]], moves: np.ndarray
     both = moves[:, None] & moves[None, :]
     for y, x in scales:
         share, slope = _correlated(y, x)
-        null, _ = _correlated(y, np.roll(x, len(x) // 2, axis=0))
+        null = np.max([_correlated(y, moved)[0] for moved in _shifted(x)], axis=0)
         odds.append(_odds(share, np.maximum(null, share)))
         slopes.append(slope)
         shares.append(share)

@@ -101,6 +101,15 @@ def test_excitation_and_promises_of_each_kind(motion: Motion):
         assert word in " ".join(told[name].told)
 
 
+def test_the_same_excitation_twice_tells_no_less(motion: Motion):
+    columns = SHAPES["symbols of papers"].columns(motion)
+    once, twice = (fitting.inspect(logs).inspection.joint for logs in (columns, [columns, columns]))
+    assert {s: g.column for s, g in once.signals.items()} == {s: g.column for s, g in twice.signals.items()}
+    # The name of the torque says nothing of its side.
+    columns["tau"] = columns.pop("T_m")
+    assert "motor_torque" in fitting.inspect([columns, columns]).inspection.joint.signals
+
+
 def test_several_logs_speak_together(drive_log: dict[str, np.ndarray], motion: Motion):
     # At rest in one log, the drive moves in the other.
     still = drive_log | {name: np.zeros(3000) for name in ("motor_angle", "load_angle", "motor_torque")}
