@@ -9,7 +9,7 @@ from hdjax.response.coexisting import from_both_ends
 from hdjax.response.continuation import Branch, Folds, FoldTrack, folds, follow, follow_fold, frequency_response
 from hdjax.response.critical_speeds import CriticalSpeed, SpeedBand, can_persist, critical_speeds, speeds_to_avoid
 from hdjax.response.floquet import is_stable, multipliers
-from hdjax.response.harmonic_balance import SteadyState, solve
+from hdjax.response.harmonic_balance import SteadyState, balance, solve
 from hdjax.response.lyapunov import PhasePortrait, critical_energy, energy, in_basin_estimate, phase_portrait, saddle
 from hdjax.response.multiple_scales import (
     PrimaryResonance,
@@ -54,6 +54,7 @@ __all__ = [
     "attractors",
     "backbone",
     "backbone_slope",
+    "balance",
     "bifurcation_diagram",
     "can_persist",
     "check_amplitudes",
