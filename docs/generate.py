@@ -6,7 +6,9 @@
 import inspect
 import math
 import re
+import sys
 from pathlib import Path
+from unittest import mock
 
 from fitting.commands.main import app
 from fitting.report.rules import rules_page
@@ -41,8 +43,10 @@ _UNTOLD = {"EFFECTS", "assumed"}
 
 def command_line() -> str:
     """The commands and their options, as `hdjax --help` has them."""
-    # The page has a title of its own, and one list of the commands is enough.
-    text = app.generate_docs().removeprefix("# hdjax\n")
+    # Usage lines begin with the name of the running program.
+    with mock.patch.object(sys, "argv", ["hdjax"]):
+        # The page has a title of its own, and one list of the commands is enough.
+        text = app.generate_docs().removeprefix("# hdjax\n")
     return re.sub(r"## Table of Contents\n.*?(?=\*\*Commands\*\*)", "", text, flags=re.DOTALL)
 
 
