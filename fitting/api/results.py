@@ -1,7 +1,7 @@
 """Results of the verbs: tables, a summary, pictures, a report on disk."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from fitting.stored_model import StoredModel
 _COLUMNS = ("value", "std", "low", "high", "unit", "identifiable", "flag")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """What a verb found.
 
@@ -28,11 +28,11 @@ class Result:
         write: Writes the report into a folder.
     """
 
-    report: dict[str, Any] = field(repr=False)
-    text: str = field(repr=False)
-    pictures: tuple[Plot, ...] = field(repr=False)
-    model: StoredModel | None = field(repr=False)
-    write: Callable[[Path], Any] = field(repr=False)
+    report: dict[str, Any]
+    text: str
+    pictures: tuple[Plot, ...]
+    model: StoredModel | None
+    write: Callable[[Path], Any]
 
     @property
     def parameters(self) -> pl.DataFrame:
@@ -85,17 +85,20 @@ class Result:
     def __str__(self) -> str:
         return self.text
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.report['name']}: {self.report['summary']})"
+
     def _repr_html_(self) -> str:
         sentence = self.report["summary"].replace("&", "&amp;").replace("<", "&lt;")
         return f"<p><b>{self.report['name']}</b>: {sentence}</p>{self.parameters._repr_html_()}"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FitResult(Result):
     """A fit of the base model."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LoopResult(Result):
     """A closed loop: what was missing, and the model with it."""
 
