@@ -44,8 +44,7 @@ fit
 # The residual is far from white noise: the base model lacks something.
 
 # %%
-fit.plot("spectrum");
-
+fit.plot("spectrum")
 # %% [markdown]
 # ## Close the loop
 # The last fifth of the log is test data, which only the figures at the end use.
@@ -61,8 +60,7 @@ loop.effects
 loop.rules
 
 # %%
-loop.plot("prediction");
-
+loop.plot("prediction")
 # %% [markdown]
 # ## Use the identified model
 # Both models run along the other log. Its outputs are used in the first 50 samples only.
