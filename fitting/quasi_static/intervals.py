@@ -35,7 +35,7 @@ class Known:
         std: Standard error, robust against coloured residuals, or None.
         ci95: 95 % interval, or None.
         unit: SI unit.
-        identifiable: Whether the logs tell it from zero or, if it must be positive, know it to a factor of about two.
+        identifiable: Whether the logs tell it from zero or, if it must be positive, within a factor of e to either side.
         description: What it is.
         reason: Why it is not identifiable; empty where it is.
     """
