@@ -29,7 +29,9 @@ app = cyclopts.App(
 )
 for command in (amplitudes, seed_tables, speeds, sweep, design, fit, close_loop, predict, simulate, demo):
     app.command(command)
-app.register_install_completion_command(help="Add the completion of commands and options to your shell.")
+app.register_install_completion_command(
+    "install-completion", help="Add the completion of commands and options to your shell."
+)
 
 
 def main(arguments: list[str] | None = None) -> None:
