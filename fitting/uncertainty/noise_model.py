@@ -5,33 +5,37 @@ noise although no effect is missing. Along a fitted motion the deviation from it
 Under the right variances the innovations of a Kalman filter are white, and their likelihood is largest.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
+from scipy.special import expit
 
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, segments_of_logs
-from fitting.estimation.linear_response import Followed, follow
+from fitting.estimation.linear_response import follow
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.uncertainty.input_noise import torque_pushes
 from hdjax import Model
 
 # Standard deviations, in units of what simulations leave, by which a segment's first state may be off.
 _FREE = 10.0
-# Samples of a segment in which the filter finds that state, which the likelihood leaves out.
+# Samples of a segment in which the filter finds that state.
 _LEAD = 12
-# Shares of its rms between which the torque's noise is sought, and how well its logarithm is wanted.
-_LEAST, _MOST, _SETTLED = 1e-5, 1.0, 0.02
+# Shares of the torque's rms where the search for its noise begins: the smallest, up to one, and how many.
+_LEAST, _SHARES = 1e-5, 11
 # Logs that are asked at most, and segments of each, evenly spread: some thousand samples know a variance to a few
-# percent. The sensors' noise is told from fewer of the first log.
-_LOGS, _SEGMENTS, _SEGMENTS_OF_MEMORY = 4, 24, 12
+# percent. A memory of the sensors' noise is told from fewer in all.
+_LOGS, _SEGMENTS, _SEGMENTS_OF_MEMORY = 4, 24, 24
 # Lags over which innovations are tested for whiteness.
 _LAGS = 20
-# Where the search for the sensors' noise begins: halves with and without memory, one of five samples. Steps of its
-# differences, and by how much the likelihood may still grow at its end [nats a sample].
-_HALF, _FIVE_SAMPLES, _STEP, _GROWS = np.log(0.5), 1.5, 1e-4, 1e-5
+# Where the search for the sensors' noise begins: nine tenths of what short pieces tell (log odds); halves with and
+# without memory, one of five samples.
+_MOST_OF_IT, _HALF, _FIVE_SAMPLES = 2.2, np.log(0.5), 1.5
+# Step of its differences, the slope of the likelihood at which it ends [nats a sample], and iterations at most: where
+# noise is what is left, it ends after ten.
+_STEP, _FLAT, _ITERATIONS = 1e-4, 1e-4, 15
 
 
 class SensorNoise(eqx.Module):
@@ -104,8 +108,10 @@ class _Steps(eqx.Module):
         readout: of the outputs.
         error: of the outputs, and its derivatives by the free parameters.
         counts: whether a sample has weight.
+        log: to which each segment belongs.
         prior: covariance of the first states.
-        torque: its rms.
+        torque: its rms in each log.
+        lead: samples in which the filter finds the first state, which the likelihood leaves out.
     """
 
     transition: Float[np.ndarray, "samples segments states states"]
@@ -113,22 +119,25 @@ class _Steps(eqx.Module):
     readout: Float[np.ndarray, "samples segments outputs states"]
     error: Float[np.ndarray, "samples segments outputs columns"]
     counts: Bool[np.ndarray, "samples segments"]
+    log: Int[np.ndarray, " segments"]
     prior: Float[np.ndarray, "states states"]
-    torque: float
+    torque: Float[np.ndarray, " logs"]
+    lead: int = eqx.field(static=True, default=_LEAD)
 
     def fewer(self, segments: int) -> "_Steps":
         """Of so many segments at most, evenly spread."""
-        chosen = _spread(self.counts.shape[1], segments)
+        chosen = _spread(self.log.size, segments)
         places = (self.transition, self.push, self.readout, self.error, self.counts)
-        return eqx.tree_at(
-            lambda s: (s.transition, s.push, s.readout, s.error, s.counts), self, tuple(p[:, chosen] for p in places)
-        )
+        fewer = (*(place[:, chosen] for place in places), self.log[chosen])
+        return eqx.tree_at(lambda s: (s.transition, s.push, s.readout, s.error, s.counts, s.log), self, fewer)
 
 
 def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float) -> NoiseModel:
     """The noise that a fit's residual shows.
 
-    The sensors' noise has a memory only where innovations can be predicted without one.
+    Each log has noise of the torque of its own, since its torque sensor may have been set to another range. The
+    sensors' white noise is at most what short pieces tell, in which noise of the torque counts as theirs. It has a
+    memory only where innovations can be predicted without one.
 
     Args:
         fit: of a model from which nothing is thought to be missing, over short horizons.
@@ -138,89 +147,118 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
     References:
         Ljung (1999), System Identification, 2nd edition, sections 7.3 and 16.6.
     """
-    problem = fit.at_solution
-    followed = follow(problem, fit.unknowns)
-    # Each log on its own: its torque sensor may have been set to another range.
-    logs = segments_of_logs(fit)
-    steps = [_steps(fit, problem, followed, logs[i]) for i in _spread(len(logs), _LOGS)]
-    white = _of_logs(steps, white_noise(np.asarray(outputs)))
-    if white.predictable <= predictable:
-        return white
-    return _of_logs(steps, _with_memory(steps[0].fewer(_SEGMENTS_OF_MEMORY), white))
+    steps = _steps(fit)
+    known = white_noise(np.asarray(outputs))
+    count = len(known.white)
+
+    def white(unknowns: np.ndarray) -> SensorNoise:
+        nothing = np.zeros_like(unknowns)
+        return SensorNoise(known.combined, expit(unknowns), nothing, nothing)
+
+    def with_memory(unknowns: np.ndarray) -> SensorNoise:
+        fast, slow, odds = np.split(unknowns, 3, axis=-1)
+        return SensorNoise(known.combined, np.exp(fast), np.exp(slow), expit(odds))
+
+    shares, sensors = _likeliest(steps, _first_shares(steps, known), white, np.full(count, _MOST_OF_IT))
+    found = _judged(steps, shares, sensors)
+    if found.predictable <= predictable:
+        return found
+    first = np.repeat([_HALF, _HALF, _FIVE_SAMPLES], count)
+    return _judged(steps, *_likeliest(steps.fewer(_SEGMENTS_OF_MEMORY), shares, with_memory, first))
 
 
-def _of_logs(steps: list[_Steps], sensors: SensorNoise) -> NoiseModel:
-    """The noise of the torque that suits each log best."""
+def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoise) -> NoiseModel:
+    """What is left under noise of given size."""
+    innovations, logarithms = _filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
+    std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
+    each = [_size_and_colour(innovations[0, steps.log == log]) for log in range(shares.size)]
+    size, colour = np.max(each, axis=0)
+    likelihood, without = -np.sum(0.5 * innovations**2 + logarithms, axis=(1, 2, 3))
+    count = int(steps.counts[steps.lead :].sum()) * innovations.shape[3]
+    return NoiseModel(std, share, sensors, float(size), float(colour), float(likelihood), float(without), count)
+
+
+def _first_shares(steps: _Steps, sensors: SensorNoise) -> Float[np.ndarray, " logs"]:
+    """The likeliest of some shares of the torque, for each log."""
+    shares = np.geomspace(_LEAST, 1.0, _SHARES)
+    innovations, logarithms = _filtered(steps, shares[:, None] * steps.torque, sensors)
+    unlikely = np.sum(0.5 * innovations**2 + logarithms, axis=(2, 3))
+    by_log = unlikely @ (steps.log[:, None] == np.arange(steps.torque.size))
+    return shares[np.argmin(by_log, axis=0)]
+
+
+def _likeliest(
+    steps: _Steps,
+    shares: Float[np.ndarray, " logs"],
+    noise: Callable[[np.ndarray], SensorNoise],
+    first: Float[np.ndarray, " unknowns"],
+) -> tuple[Float[np.ndarray, " logs"], SensorNoise]:
+    """Noise of the torque of each log, and of the sensors, that make the innovations likeliest: by the method of
+    scoring (Ljung 1999, section 10.2), with the information of Gaussian innovations.
+
+    Args:
+        steps: the motion.
+        shares: where the search begins, of the torque.
+        noise: of the sensors, from unknowns.
+        first: where they begin.
+    """
     # Loaded here: it takes as long as jax, and only what nothing else explains needs it.
-    from scipy.optimize import minimize_scalar
-
-    found = []
-    for own in steps:
-
-        def unlikely(logarithm: float, own: _Steps = own) -> float:
-            return -_likelihood(_filtered(own, np.exp(logarithm) * own.torque, sensors))
-
-        span = np.log([_LEAST, _MOST])
-        best = minimize_scalar(unlikely, bounds=tuple(span), method="bounded", options={"xatol": _SETTLED})
-        share = float(np.exp(best.x))
-        innovations = _filtered(own, share * own.torque, sensors)[0][0]
-        without = _likelihood(_filtered(own, 0.0, sensors))
-        count = own.counts[_LEAD:].sum() * innovations.shape[2]
-        found.append((share * own.torque, share, *_size_and_colour(innovations), -best.fun, without, count))
-    std, share, size, predictable, likelihood, without, count = np.array(found).T
-    std, share = (float(np.sqrt(np.mean(np.square(values)))) for values in (std, share))
-    sums = float(np.sum(likelihood)), float(np.sum(without)), int(np.sum(count))
-    return NoiseModel(std, share, sensors, float(np.max(size)), float(np.max(predictable)), *sums)
-
-
-def _with_memory(steps: _Steps, start: NoiseModel) -> SensorNoise:
-    """The sensors' noise, with a memory, that makes the innovations likeliest beside noise of the torque: by the method
-    of scoring, with the information matrix as the sum of the scores' squares (Berndt et al. 1974)."""
     from scipy.optimize import minimize
 
-    count = len(start.sensors.white)
+    logs = shares.size
+    own = steps.log == np.arange(logs)[:, None]
 
-    def noise(unknowns: np.ndarray) -> tuple[Any, SensorNoise]:
-        white, slow, odds = (unknowns[..., 1 + i * count : 1 + (i + 1) * count] for i in range(3))
-        values = (np.exp(white), np.exp(slow), 1.0 / (1.0 + np.exp(-odds)))
-        return np.exp(unknowns[..., 0]) * steps.torque, SensorNoise(start.sensors.combined, *values)
+    def at(unknowns: np.ndarray) -> tuple[np.ndarray, SensorNoise]:
+        return np.exp(unknowns[..., :logs]), noise(unknowns[..., logs:])
 
     def seen(unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        varied = unknowns + _STEP * np.eye(unknowns.size + 1, unknowns.size, -1)
-        std, sensors = noise(varied)
-        innovations, logarithms = _filtered(steps, std, sensors)
-        each = -0.5 * innovations**2 - logarithms
-        each = each[:, :, _LEAD:].reshape(len(varied), -1)
-        scores = (each[1:] - each[0]) / _STEP
-        size = each.shape[1]
-        return -float(each[0].sum()) / size, -scores.sum(axis=1) / size, scores @ scores.T / size
+        # A segment is of one log: the shares of all of them are varied at once.
+        together = np.concatenate([np.ones((1, logs)), np.zeros((first.size, logs))])
+        apart = np.concatenate([np.zeros((1, first.size)), np.eye(first.size)])
+        varied = unknowns + _STEP * np.concatenate([0.0 * unknowns[None], np.hstack([together, apart])])
+        varied_shares, sensors = at(varied)
+        innovations, logarithms = _filtered(steps, varied_shares * steps.torque, sensors)
 
-    first = np.concatenate([[np.log(start.share)], *(np.full(count, v) for v in (_HALF, _HALF, _FIVE_SAMPLES))])
+        def slopes(values: np.ndarray) -> np.ndarray:
+            found = (values[1:] - values[0]) / _STEP
+            return np.concatenate([own[..., None, None] * found[0], found[1:]]).reshape(unknowns.size, -1)
+
+        now, size = innovations[0].ravel(), innovations[0].size
+        moved, grown = slopes(innovations), slopes(logarithms)
+        value = 0.5 * float(now @ now) + float(logarithms[0].sum())
+        errors = moved + now * grown
+        information = 2.0 * grown @ grown.T + errors @ errors.T
+        return value / size, (moved @ now + grown.sum(axis=1)) / size, information / size
+
     last: list[tuple[np.ndarray, tuple]] = []
 
-    def at(unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    def once(unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         if not last or not np.array_equal(last[0][0], unknowns):
             last[:] = [(unknowns.copy(), seen(unknowns))]
         return last[0][1]
 
     solution = minimize(
-        lambda u: at(u)[0],
-        first,
-        jac=lambda u: at(u)[1],
-        hess=lambda u: at(u)[2],
+        lambda u: once(u)[0],
+        np.concatenate([np.log(shares), first]),
+        jac=lambda u: once(u)[1],
+        hess=lambda u: once(u)[2],
         method="trust-exact",
-        options={"gtol": _GROWS, "max_trust_radius": 3.0, "maxiter": 30},
+        options={"gtol": _FLAT, "max_trust_radius": 3.0, "maxiter": _ITERATIONS},
     )
-    return noise(solution.x)[1]
+    return at(solution.x)
 
 
-def _steps(fit: Fit, problem: Problem, followed: Followed, own: Bool[np.ndarray, " segments"]) -> _Steps:
+def _steps(fit: Fit) -> _Steps:
+    problem = fit.at_solution
+    followed = follow(problem, fit.unknowns)
     weight = np.asarray(problem.segments.weight)
-    used = np.flatnonzero(weight.any(axis=1) & own)
-    used = used[_spread(used.size, _SEGMENTS)]
+    logs = [np.flatnonzero(weight.any(axis=1) & own) for own in segments_of_logs(fit)]
+    logs = [logs[i] for i in _spread(len(logs), _LOGS)]
+    logs = [own[_spread(own.size, _SEGMENTS)] for own in logs]
+    used = np.concatenate(logs)
     read = followed.readout[used]
     rms = np.sqrt(np.diag(np.asarray(fit.covariance)))
-    torque = np.asarray(problem.segments.torque.coefficients)[used, :, 0]
+    torque = np.asarray(problem.segments.torque.coefficients)
 
     def in_time(values: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.swapaxes(values, 0, 1))
@@ -231,8 +269,9 @@ def _steps(fit: Fit, problem: Problem, followed: Followed, own: Bool[np.ndarray,
         in_time(read),
         in_time(np.concatenate([np.asarray(fit.error)[used, ..., None], _by_parameter(fit)[used]], axis=3)),
         in_time(weight[used] > 0),
+        np.repeat(np.arange(len(logs)), [own.size for own in logs]),
         np.diag(_freedom(problem.model, followed.states[used], read, rms) ** 2),
-        max(float(np.std(torque)), 1e-300),
+        np.array([max(float(np.std(torque[own, :, 0])), 1e-300) for own in logs]),
     )
 
 
@@ -260,36 +299,37 @@ def _spread(count: int, most: int) -> np.ndarray:
 
 
 def _filtered(
-    steps: _Steps, std: float | np.ndarray, sensors: SensorNoise
+    steps: _Steps, std: Float[np.ndarray, "settings logs"], sensors: SensorNoise
 ) -> tuple[
     Float[np.ndarray, "settings segments samples outputs"], Float[np.ndarray, "settings segments samples outputs"]
 ]:
-    """Standardised innovations at the parameters that suit them best, and logarithms of what standardised them, for
-    several settings of the noise at once.
+    """Standardised innovations after the lead, at the parameters that suit them best, and logarithms of what
+    standardised them, for several settings of the noise at once.
 
     Outputs whose noise is independent are taken one after the other (Anderson and Moore 1979, section 6.4); the slow
     part of each one's noise is a further state.
     """
-    variance = np.atleast_1d(np.square(std))
+    variance = np.square(std)[:, steps.log, None, None]
     white, slow, correlation = (np.atleast_2d(v) for v in (sensors.white, sensors.slow, sensors.correlation))
     apart = np.linalg.inv(sensors.combined)
     readout, error = apart @ steps.readout, apart @ steps.error
     samples, segments, outputs, columns = error.shape
     settings, size = len(variance), steps.push.shape[2]
-    own = np.arange(size, size + outputs)
-    mean = np.zeros((settings, segments, size + outputs, columns))
-    spread = np.zeros((settings, segments, size + outputs, size + outputs))
+    remembers = outputs if slow.any() else 0
+    own = np.arange(size, size + remembers)
+    mean = np.zeros((settings, segments, size + remembers, columns))
+    spread = np.zeros((settings, segments, size + remembers, size + remembers))
     spread[..., :size, :size] = steps.prior
-    spread[..., own, own] = slow[:, None]
+    spread[..., own, own] = slow[:, None, :remembers]
     transition = np.zeros_like(spread)
-    transition[..., own, own] = correlation[:, None]
-    fresh = (slow * (1.0 - correlation**2))[:, None]
+    transition[..., own, own] = correlation[:, None, :remembers]
+    fresh = (slow * (1.0 - correlation**2))[:, None, :remembers]
     found = np.zeros((settings, segments, samples, outputs, columns))
-    logarithms, read = np.zeros(found.shape[:-1]), np.zeros((segments, size + outputs))
+    logarithms, read = np.zeros(found.shape[:-1]), np.zeros((segments, size + remembers))
     for i in range(samples):
         counts = steps.counts[i][:, None]
         for j in range(outputs):
-            read[:, :size], read[:, size:] = readout[i, :, j], np.arange(outputs) == j
+            read[:, :size], read[:, size:] = readout[i, :, j], np.arange(remembers) == j
             expected = (spread @ read[:, :, None])[..., 0]
             total = np.sum(expected * read, axis=-1) + white[:, None, j]
             new = error[i, :, j] - (read[:, None, :] @ mean)[..., 0, :]
@@ -302,9 +342,10 @@ def _filtered(
         mean = transition @ mean
         spread = transition @ spread @ np.swapaxes(transition, 2, 3)
         push = steps.push[i]
-        spread[..., :size, :size] += variance[:, None, None, None] * (push[:, :, None] * push[:, None, :])
+        spread[..., :size, :size] += variance * (push[:, :, None] * push[:, None, :])
         spread[..., own, own] += fresh
-    used = found[:, :, _LEAD:].reshape(settings, -1, columns)
+    found, logarithms = found[:, :, steps.lead :], logarithms[:, :, steps.lead :]
+    used = found.reshape(settings, -1, columns)
     derivatives = used[..., 1:]
     size_of = np.maximum(np.linalg.norm(derivatives, axis=1), 1e-300)
     derivatives = derivatives / size_of[:, None]
@@ -314,18 +355,13 @@ def _filtered(
     return found[..., 0] - (found[..., 1:] @ moved[:, None, None, :, None])[..., 0], logarithms
 
 
-def _likelihood(filtered: tuple[np.ndarray, np.ndarray]) -> float:
-    """Log likelihood of the innovations of one setting, but for a constant."""
-    innovations, logarithms = (values[..., _LEAD:, :] for values in filtered)
-    return -float(np.sum(0.5 * innovations**2 + logarithms))
-
-
 def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:
     """Rms of the output where it is largest; and the sum of squared autocorrelations, less what chance makes of it."""
-    kept = innovations[:, _LEAD:]
-    square, lags = np.sum(kept**2, axis=(0, 1)), min(_LAGS, kept.shape[1] - 1)
-    correlation = [np.sum(kept[:, lag:] * kept[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)]
-    count = kept.shape[0] * kept.shape[1]
+    square, lags = np.sum(innovations**2, axis=(0, 1)), min(_LAGS, innovations.shape[1] - 1)
+    correlation = [
+        np.sum(innovations[:, lag:] * innovations[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)
+    ]
+    count = innovations.shape[0] * innovations.shape[1]
     colour = np.max(np.sum(np.square(correlation), axis=0)) - lags / count
     return float(np.sqrt(np.max(square) / count)), max(0.0, float(colour))
 

@@ -6,6 +6,7 @@ Runge-Kutta method around it ([`march`][hdjax.engine.march] with derivatives, fo
 [`transient`][hdjax.engine.transient] without, for sweeps).
 """
 
+from hdjax.engine.array_rules import UntranslatableError as UntranslatableError
 from hdjax.engine.kernel import Kernel as Kernel
 from hdjax.engine.kernel import Lanes as Lanes
 from hdjax.engine.kernel import Marched as Marched
@@ -14,4 +15,3 @@ from hdjax.engine.kernel import march_lanes as march_lanes
 from hdjax.engine.kernel import one_thread as one_thread
 from hdjax.engine.kernel import threads as threads
 from hdjax.engine.kernel import unusable as unusable
-from hdjax.engine.translate import UntranslatableError as UntranslatableError

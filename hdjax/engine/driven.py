@@ -84,7 +84,7 @@ def own_states_along(
     made = _DRIVEN[key]
     if made is None:
         return np.asarray(_by_jax(*jax.tree.map(jnp.asarray, (effect, before, after, width, start))))
-    from hdjax.engine.block import LOST
+    from hdjax.engine.rows import LOST
 
     chains, intervals = width.shape
     proposals, own = start.shape[1:]

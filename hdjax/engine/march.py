@@ -11,13 +11,14 @@ import diffrax as dfx
 import numpy as np
 from llvmlite import ir
 
-from hdjax.engine.block import Block, Emitted
+from hdjax.engine.block import write_block
 from hdjax.engine.code import LANES, Code
 from hdjax.engine.emission import F64, I64, Vectors, emitted, restored, storable
 from hdjax.engine.equations import Equations, Part
 from hdjax.engine.graph import VARYING, Node
 from hdjax.engine.handler import ENTRY, data, dimension
 from hdjax.engine.kernel import Mode
+from hdjax.engine.room import Emitted, Room
 from hdjax.engine.sharing import block_of, share, worker
 
 OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measured", "weight", "joined", "whitening")
@@ -193,7 +194,7 @@ class March:
         self.call = {name: i for i, name in enumerate(names)}
         self.gather = self._lane_by_lane("gather", reads=True)
         self.scatter = self._lane_by_lane("scatter", reads=False)
-        block = block_of(self.module, lambda code, call, index: Block(self, code, call, index).write())
+        block = block_of(self.module, lambda code, call, index: write_block(Room(self, code, call, index)))
         self._entry(prepare, worker(self.module, block, self.call))
 
     def _lane_by_lane(self, name: str, *, reads: bool) -> ir.Function:

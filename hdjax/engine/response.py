@@ -116,7 +116,7 @@ def response(
         solver: explicit Runge-Kutta solver of diffrax.
     """
     # What stands on llvmlite is loaded where it is there.
-    from hdjax.engine.block import LOST
+    from hdjax.engine.rows import LOST
 
     (segments, count), samples = states.shape, knots.shape[1] - 1
     zeros = (jnp.asarray(np.zeros(())),) * count

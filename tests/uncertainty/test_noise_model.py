@@ -104,6 +104,16 @@ def test_what_is_missing_does_not_pass_for_noise(missing: dict[str, Any]):
     assert not is_noise(left(fitted(noisy_experiment(correlation=0.95, std=0.0, count=8000, **missing))))
 
 
+def test_noise_that_the_torque_makes_in_short_pieces_is_not_the_sensors():
+    """Short pieces take the motor's answer to a very noisy torque for noise of its encoder."""
+    found = fitted(noisy_experiment(std=10.0 * STD, count=8000))
+    known = measurement_noise(found).covariance
+    assert known[0, 0] > 2.0 * OUTPUTS[0, 0]
+    seen = noise_model(found, known, predictable=RULES.innovations)
+    assert seen.std == pytest.approx(10.0 * STD, rel=0.05)
+    assert np.sqrt(np.diag(seen.sensors.covariance)) == pytest.approx(np.sqrt(np.diag(OUTPUTS)), rel=0.2)
+
+
 def test_the_likelihood_is_that_of_the_gaussian_law():
     """By the covariance of all samples at once."""
     random = np.random.default_rng(0)
@@ -116,8 +126,9 @@ def test_the_likelihood_is_that_of_the_gaussian_law():
     error = random.normal(size=(samples, 1, 2, 1))
     shapes = {"transition": transition, "push": push, "readout": readout}
     stacked = {name: np.broadcast_to(v, (samples, 1, *v.shape)) for name, v in shapes.items()}
-    steps = _Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), prior=np.eye(size), torque=1.0)
-    innovations, logarithms = _filtered(steps, std, sensors)
+    one = {"log": np.zeros(1, int), "prior": np.eye(size), "torque": np.ones(1), "lead": 0}
+    steps = _Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), **one)
+    innovations, logarithms = _filtered(steps, np.array([[std]]), sensors)
     spread = np.zeros((samples, size, samples, size))
     variance = np.eye(size)
     for i in range(samples):

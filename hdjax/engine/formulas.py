@@ -1,0 +1,113 @@
+"""Functions of scalars, made of such as the graph has words for."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from hdjax.where import where
+
+
+@jax.custom_jvp
+def power(base, exponent):
+    """A power; no number of a negative base, whatever the exponent."""
+    positive = base > 0.0
+    at_zero = where(exponent > 0.0, 0.0, where(exponent == 0.0, 1.0, math.inf))
+    beside = where(base == 0.0, at_zero, math.nan)
+    return where(positive, jnp.exp(exponent * jnp.log(where(positive, base, 1.0))), beside)
+
+
+@power.defjvp
+def _power_jvp(primals, tangents):
+    (base, exponent), (moved, bent) = primals, tangents
+    value = power(base, exponent)
+    # One power less than none is none, and a zero stays one whatever its exponent.
+    by_base = where(exponent == 0.0, 0.0, exponent * power(base, exponent - 1.0))
+    by_exponent = jnp.log(where(base == 0.0, 1.0, base)) * value
+    return value, by_base * moved + by_exponent * bent
+
+
+def with_slope(function: Callable[[Any], Any], slope: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+    """A function whose derivative is a formula of its argument and value: what its parts give would be less exact."""
+    found = jax.custom_jvp(function)
+
+    def rule(primals, tangents):
+        value = found(*primals)
+        return value, slope(primals[0], value) * tangents[0]
+
+    found.defjvp(rule)
+    return found
+
+
+# Beyond it the square of a number, or one beside it, is nothing worth having.
+_HUGE = 1e100
+
+
+def log1p(x):
+    """ln(1 + x)."""
+    # Kahan: the rounding of 1 + x is taken back.
+    u = 1.0 + x
+    huge = u > _HUGE
+    small = where((u == 1.0) | huge, 1.0, u - 1.0)
+    return where(u == 1.0, x, jnp.log(u) * where(huge, 1.0, where(u == 1.0, 1.0, x) / small))
+
+
+def asinh(x):
+    """Inverse of `sinh`."""
+    size = jnp.abs(x)
+    huge = size > _HUGE
+    a = where(huge, 1.0, size)
+    near = log1p(a + a * a / (1.0 + jnp.sqrt(1.0 + a * a)))
+    return jnp.sign(x) * where(huge, jnp.log(where(huge, size, 1.0)) + math.log(2.0), near)
+
+
+def acosh(x):
+    """Inverse of `cosh`."""
+    huge = x > _HUGE
+    a = where(huge, 2.0, x) - 1.0
+    near = log1p(a + jnp.sqrt(a * (a + 2.0)))
+    return where(huge, jnp.log(where(huge, x, 1.0)) + math.log(2.0), near)
+
+
+def sinh(x):
+    """Hyperbolic sine."""
+    return 0.5 * (jnp.expm1(x) - jnp.expm1(-x))
+
+
+def cosh(x):
+    """Hyperbolic cosine."""
+    return 0.5 * (jnp.exp(x) + jnp.exp(-x))
+
+
+def arctangent(x):
+    """Inverse of the tangent: by two halvings of the angle, then a series on tangents below tan(pi / 16)."""
+    a = jnp.abs(x)
+    large = a > 1.0
+    t = where(large, 1.0 / where(large, a, 1.0), a)
+    for _ in range(2):
+        t = t / (1.0 + jnp.sqrt(1.0 + t * t))
+    total = jnp.zeros_like(t)
+    for k in range(13, -1, -1):
+        total = total * (t * t) + (-1.0) ** k / (2 * k + 1)
+    angle = 4.0 * t * total
+    return jnp.sign(x) * where(large, math.pi / 2 - angle, angle)
+
+
+@jax.custom_jvp
+def arctangent2(y, x):
+    """Angle of the point (x, y)."""
+    swapped = jnp.abs(y) > jnp.abs(x)
+    over, under = where(swapped, x, y), where(swapped, y, x)
+    t = arctangent(over / where(under == 0.0, 1.0, under))
+    right = where(swapped, where(y >= 0.0, math.pi / 2, -math.pi / 2) - t, t)
+    turned = where(y >= 0.0, math.pi, -math.pi)
+    return where(swapped | (x >= 0.0), right, right + turned)
+
+
+@arctangent2.defjvp
+def _arctangent2_jvp(primals, tangents):
+    (y, x), (dy, dx) = primals, tangents
+    square = x * x + y * y
+    return arctangent2(y, x), dy * (x / square) - dx * (y / square)
