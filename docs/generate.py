@@ -51,8 +51,18 @@ def command_line() -> str:
 
 
 def effects() -> str:
-    """The families: signature, forms with their equations and parameters, look-alikes."""
-    return "\n".join(_family(family) for family in FAMILIES)
+    """A table of the families, and of each its signature, forms with equations and parameters, and look-alikes."""
+    rows = [f"| [{family}](#{family}) | {_names(family)} | {_places(family)} |" for family in FAMILIES]
+    table = ["| family | forms | enter at |", "|---|---|---|", *rows, "", ""]
+    return "\n".join(table) + "\n".join(_family(family) for family in FAMILIES)
+
+
+def _names(family: str) -> str:
+    return ", ".join(f"`{form.name}`" for form in CATALOGUE if form.family == family)
+
+
+def _places(family: str) -> str:
+    return ", ".join(dict.fromkeys(_place(form) for form in CATALOGUE if form.family == family))
 
 
 def _family(family: str) -> str:
@@ -60,15 +70,19 @@ def _family(family: str) -> str:
     alike = [f"- `{other}`: {experiment}" for other, experiment in look_alikes(family).items()]
     lines = [f"### {family}", "", f"*In the residual:* {SIGNATURES[family]}", ""]
     for form in forms:
-        lines += [f"**`{form.name}`** ({_place(form)}). {_law(form)}", "", *_parameters(form), ""]
+        lines += [
+            f"**`{form.name}`** ({_place(form)}{', with memory' if form.states else ''}). {_law(form)}",
+            "",
+            *_parameters(form),
+            "",
+        ]
     if alike:
         lines += ["*Look-alikes, and what separates them:*", "", *alike, ""]
     return "\n".join(lines)
 
 
 def _place(form: type[Effect]) -> str:
-    place = next(name for base, name in _PLACES.items() if issubclass(form, base))
-    return f"{place}, with memory" if form.states else place
+    return next(name for base, name in _PLACES.items() if issubclass(form, base))
 
 
 def _law(form: type[Effect]) -> str:

@@ -12,6 +12,9 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+import hdjax
+from hdjax.parameters import own_parameters
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PACKAGES = ("fitting", "hdjax", "hdjax.design", "hdjax.effects", "hdjax.response", "hdjax.sweep")
@@ -67,6 +70,16 @@ def test_pages_made_from_the_code_are_up_to_date(monkeypatch):
     monkeypatch.syspath_prepend(DOCS)
     for path, text in importlib.import_module("generate").generated().items():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is out of date: run `make docs`"
+
+
+def test_glossary_has_every_parameter_of_a_drive_with_its_unit():
+    rows = re.findall(r"^\| .* \|$", (DOCS / "glossary.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
+    told = {(symbol, unit) for *_, symbols, unit in cells for symbol in re.findall(r"`([^`]+)`", symbols)}
+    drive = hdjax.hdc_40_050()
+    # One row stands for alpha of both kinds of log; a reduced log has units of its own.
+    known = {(name, info.unit) for name, info in (*own_parameters(drive), *own_parameters(drive.reduced()))}
+    assert known - {("alpha", "1/[x]^2")} <= told
 
 
 def test_navigation_holds_every_page():
