@@ -110,11 +110,20 @@ def read_logs(
     Raises:
         InputError: They are of several kinds, or a log is to be fitted and to be test data.
     """
+    refuse_twice(paths, test)
+    logs = together([read_log(path, drive_file) for path in (*paths, *test)])
+    return logs[: len(paths)], logs[len(paths) :]
+
+
+def refuse_twice(paths: Sequence[Path], test: Sequence[Path]) -> None:
+    """Refuse a log that is to be fitted and to be test data.
+
+    Raises:
+        InputError: There is one.
+    """
     both = {path.resolve() for path in paths} & {path.resolve() for path in test}
     if both:
         raise InputError(f"{min(both)}: the log is both fitted and test data; name it once")
-    logs = together([read_log(path, drive_file) for path in (*paths, *test)])
-    return logs[: len(paths)], logs[len(paths) :]
 
 
 def together(logs: Sequence[Log]) -> tuple[Log, ...]:

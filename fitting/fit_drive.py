@@ -11,6 +11,7 @@ from fitting.attribution.selection_round import Round
 from fitting.clock import Clock
 from fitting.estimation.base_fit import base_fit
 from fitting.estimation.experiment import Experiment, whole
+from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import Finding
 from fitting.progress import Progress, silent
@@ -103,6 +104,10 @@ def fit_only(
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
+    factors = refined_intervals(fits[hold])
+    if factors:
+        experiments, test = with_intervals(experiments, factors), with_intervals(test or {}, factors)
+        fits[hold] = base_fit(model, whole(experiments[hold]))
     base, tests = fits[hold], whole((test or {}).get(hold, ()))
     clock.lap("base fit")
     noise = measurement_noise(base).covariance

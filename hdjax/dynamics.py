@@ -221,9 +221,9 @@ class TwoInertiaModel(Model):
         return sum(taken, jnp.zeros_like(self.drive.J_l))
 
     def outputs(self, state: State) -> Float[Array, "2"]:
-        theta_m, theta_l = state[0], state[1]
+        theta_m, theta_l, omega_m, omega_l = (state[i] for i in range(4))
         for effect in self._of(SensorEffect):
-            theta_m, theta_l = effect.reading(theta_m, theta_l)
+            theta_m, theta_l = effect.reading(theta_m, theta_l, omega_m, omega_l)
         return jnp.stack([theta_m / self.drive.N, theta_m / self.drive.N - theta_l])
 
 

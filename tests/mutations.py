@@ -1,18 +1,13 @@
 """Logs and drive files spoilt in every way that a seed picks: bytes, columns, units, types, sizes, shapes."""
 
-import gzip
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import h5py
 import numpy as np
-import polars as pl
-import scipy.io
+from mutated_files import Random, Table, damage, write
 
 import rig
-
-Table = dict[str, np.ndarray]
-Random = np.random.Generator
+from fitting.logs.drive_file import SIGNALS
 
 ROWS = 600
 DRIVE = {
@@ -132,6 +127,28 @@ def _clock(random: Random, table: Table) -> None:
         table["time"] = np.mod(ticks, random.choice([65536.0, 2.0**32, 2.0**16 * 1e-3]))
 
 
+def _hold(random: Random, table: Table) -> None:
+    """A channel that is refreshed in some rows only."""
+    fresh = random.uniform(size=ROWS) < random.choice([0.02, 0.1, 0.5, 0.9])
+    name = _some(random, table)
+    table[name] = table[name][np.maximum.accumulate(np.where(fresh, np.arange(ROWS), 0))]
+
+
+def _coarse(random: Random, table: Table) -> None:
+    if "time" in table:
+        quantum = random.choice([1e-3, 0.01, 0.1, 1.0, 1e-7])
+        table["time"] = np.floor((table["time"] + random.choice([0.0, 1.7e9])) / quantum) * quantum
+
+
+def _split(random: Random, table: Table) -> None:
+    """Stamps in two columns, or half of them alone."""
+    if "time" in table:
+        whole = np.floor(table["time"])
+        table["time_ns"] = np.rint((table.pop("time") - whole) * 1e9)
+        if random.random() < 0.7:
+            table["time_s"] = whole
+
+
 def _single(random: Random, table: Table) -> None:
     with np.errstate(all="ignore"):
         name = _some(random, table)
@@ -152,113 +169,16 @@ COLUMNS: tuple[Callable[[Random, Table], None], ...] = (
     _rows,
     _jitter,
     _clock,
+    _hold,
+    _coarse,
+    _split,
     _single,
 )
 
 
-def _text(random: Random, table: Table) -> bytes:
-    delimiter = str(random.choice([",", ";", "\t", "|", " "]))
-    comma = delimiter != "," and random.random() < 0.4
-    count = max((len(c) for c in table.values()), default=0)
-    lines = [delimiter.join(table)]
-    if random.random() < 0.2:
-        lines.append(delimiter.join(str(random.choice(["s", "rad", "deg", "N m", "?", "1"])) for _ in table))
-    for i in range(count):
-        cells = [f"{c[i]:.9g}" if i < len(c) else "" for c in table.values()]
-        lines.append(delimiter.join(c.replace(".", ",") if comma else c for c in cells))
-    for _ in range(int(random.choice([0, 0, 1, 5, 50]))):
-        odd = ["", "#", ",,,,,,", "overload", '"', "\x00", "1;2;3", "1" * 400, "é", "12:00:00", "'", "\t" * 50]
-        lines.insert(int(random.integers(0, len(lines) + 1)), str(random.choice(odd)))
-    ending = str(random.choice(["\n", "\r\n", "\r", delimiter + "\n"]))
-    return (ending.join(lines) + ending).encode(
-        str(random.choice(["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])), errors="replace"
-    )
-
-
-def _shape(random: Random, values: np.ndarray) -> object:
-    kind = int(random.integers(12))
-    shapes: dict[int, object] = {
-        0: values[None, :],
-        1: values[:, None],
-        2: np.stack([values, values], axis=1),
-        3: values.astype(complex),
-        4: values.astype("f4"),
-        5: "text",
-        6: {"a": {"b": values}},
-        7: values[: len(values) // 2],
-        8: np.zeros((0, 3)),
-    }
-    return shapes.get(kind, values)
-
-
-def _mat(random: Random, table: Table, path: Path) -> None:
-    held = {
-        k if k.isascii() and k.isidentifier() and not k.startswith("_") else f"v{i}": v
-        for i, (k, v) in enumerate(table.items())
-    }
-    content: dict[str, object] = {k[:31]: _shape(random, v) if random.random() < 0.2 else v for k, v in held.items()}
-    if random.random() < 0.3:
-        for _ in range(int(random.choice([1, 3, 20]))):
-            content = {"nest": content}
-    scipy.io.savemat(path, content | {"fs": float(random.choice([2000.0, 0.0, np.nan, 1e300]))})
-
-
-def _hdf5(random: Random, table: Table, path: Path) -> None:
-    group = "/".join(["g"] * int(random.choice([0, 0, 1, 40])))
-    with h5py.File(path, "w") as file:
-        for i, (name, values) in enumerate(table.items()):
-            value = _shape(random, values) if random.random() < 0.2 else values
-            plain = "".join(c for c in name if c.isalnum() or c == "_") or f"v{i}"
-            place = f"{group}/{plain[:60]}" if group else plain[:60]
-            if not isinstance(value, dict) and place not in file:
-                file[place] = value
-                file[place].attrs["unit"] = str(random.choice(["", "", "", "", "rad", "bogus", "9**9**9"]))
-
-
-def write(random: Random, table: Table, folder: Path) -> Path:
-    """A log file of any format."""
-    kind = str(random.choice(["csv", "csv", "csv", "tsv", "txt", "csv.gz", "mat", "h5", "parquet"]))
-    path = folder / f"log.{kind}"
-    if kind == "mat":
-        _mat(random, table, path)
-    elif kind == "h5":
-        _hdf5(random, table, path)
-    elif kind == "parquet":
-        count = min((len(c) for c in table.values()), default=0)
-        pl.DataFrame({k: v[:count] for k, v in table.items()}).write_parquet(path)
-    else:
-        raw = _text(random, table)
-        path.write_bytes(gzip.compress(raw) if kind.endswith("gz") else raw)
-    return path
-
-
-def damage(random: Random, path: Path) -> Path:
-    """Bytes flipped, cut, put in, or the suffix changed."""
-    raw = bytearray(path.read_bytes())
-    how = int(random.integers(6))
-    if how == 0 and raw:
-        for place in random.integers(0, len(raw), int(random.choice([1, 10, 200]))):
-            raw[place] = int(random.integers(256))
-    elif how == 1:
-        raw = raw[: int(random.integers(0, len(raw) + 1))]
-    elif how == 2:
-        place = int(random.integers(0, len(raw) + 1))
-        raw[place:place] = random.bytes(int(random.choice([1, 100, 5000])))
-    elif how == 3:
-        raw = raw[int(random.integers(0, len(raw) + 1)) :]
-    elif how == 4:
-        raw = bytearray(random.bytes(int(random.choice([0, 1, 2000]))))
-    path.write_bytes(bytes(raw))
-    if how == 5:
-        path = path.rename(
-            path.with_name(f"log{random.choice(['.csv', '.mat', '.h5', '.parquet', '.gz', '.xyz', ''])}")
-        )
-    return path
-
-
-def drive_text(random: Random, spoilt: bool) -> bytes:
+def drive_text(random: Random, spoilt: bool, columns: Mapping[str, str] = {}) -> bytes:
     """A drive file, with whatever nonsense in it."""
-    content = {table: dict(keys) for table, keys in DRIVE.items()}
+    content = {table: dict(keys) for table, keys in (DRIVE | {"columns": dict(columns)}).items()}
     odd = [
         "1e400",
         "-1",
@@ -284,6 +204,12 @@ def drive_text(random: Random, spoilt: bool) -> bytes:
         '{ time = "time" }',
         '"time"',
         '{ unit = "ms" }',
+        "3",
+        "0",
+        "{ column = 2, time = 1 }",
+        '{ column = "time_ns", unit = "ns" }',
+        '{ fraction = "time_ns" }',
+        '"column 99"',
     ]
     keys = ["reduction_ratio", "motor_inertia", "load_inertia", "name", "torque_hold", "sample_rate", "nonsense"]
     keys += ["time", "motor_angle", "load_angle", "motor_torque", "temperature", "motor_velocity", "forcing"]
@@ -318,5 +244,8 @@ def spoilt_case(seed: int, folder: Path) -> tuple[Path, Path]:
     if random.random() < 0.2:
         log = damage(random, log)
     drive = folder / "drive.toml"
-    drive.write_bytes(drive_text(random, random.random() < 0.25))
+    # A field of a topic is named in full.
+    named = {name: f'"/{name}/data"' for name in table if name in SIGNALS[1:]} if log.suffix == ".mcap" else {}
+    named |= {"time": '"time_ns"'} if "time_ns" in table else {}
+    drive.write_bytes(drive_text(random, random.random() < 0.25, named))
     return log, drive

@@ -4,16 +4,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import polars as pl
 
-from fitting.drive_data import Rig, ready, rig_of, together
+from fitting.drive_data import Rig, ready, refuse_twice, rig_of, together
 from fitting.errors import InputError
 from fitting.logs.drive_file import DriveFile, drive_of, read_drive_file
-from fitting.logs.frames import is_table
 from fitting.logs.log import Log, read_log
+
+if TYPE_CHECKING:
+    import polars as pl
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +72,10 @@ class Data:
         return ready(log, self.drive)
 
     @property
-    def table(self) -> pl.DataFrame:
+    def table(self) -> "pl.DataFrame":
         """One row a log."""
+        import polars as pl
+
         both = [(log, part) for part, logs in (("fitted", self.logs), ("test", self.test)) for log in logs]
         return pl.DataFrame(
             {
@@ -110,7 +113,7 @@ def load(
             what a fit needs.
 
     Raises:
-        InputError: A file can't be read, lacks a column, or the logs are of several kinds.
+        InputError: A file can't be read, lacks a column, is named twice, or the logs are of several kinds.
         DataError: A log is too short, or has too many gaps.
     """
     known = _drive(drive)
@@ -118,10 +121,11 @@ def load(
     tested = _several(test)
     if not sources:
         raise InputError("there is no log; give a path or a table")
+    refuse_twice(*([Path(s) for s in own if not _is_table(s)] for own in (sources, tested)))
     tables: dict[Path, Any] = {}
     read = []
     for number, source in enumerate((*sources, *tested), start=1):
-        path, table = (Path(f"log {number}"), source) if is_table(source) else (Path(source), None)
+        path, table = (Path(f"log {number}"), source) if _is_table(source) else (Path(source), None)
         if table is not None:
             tables[path] = table
         read.append(read_log(path, known, outputs_until=outputs_until, table=table))
@@ -136,6 +140,11 @@ def _drive(drive: str | PathLike[str] | Mapping[str, Any] | DriveFile) -> DriveF
 
 
 def _several(sources: Any) -> Sequence[Any]:
-    if isinstance(sources, str | PathLike) or is_table(sources):
+    if isinstance(sources, str | PathLike) or _is_table(sources):
         return [sources]
     return list(sources)
+
+
+def _is_table(source: Any) -> bool:
+    """Whether something is a table in memory: it has columns (pandas, polars), variables (xarray), or is a mapping."""
+    return hasattr(source, "columns") or hasattr(source, "variables") or isinstance(source, Mapping)

@@ -1,18 +1,13 @@
 """Fit a drive, close the loop on it: one verb, one result."""
 
 from collections.abc import Iterable
-from pathlib import Path
 
 from fitting.api.data import Data
 from fitting.api.results import FitResult, LoopResult
-from fitting.drive_data import Rig
 from fitting.estimation.base_fit import need_double_precision
-from fitting.fit_drive import FitOnly, fit_only
-from fitting.loop import close_loop as close_loop_of_drive
-from fitting.outcome import Loop
+from fitting.fit_drive import fit_only
 from fitting.progress import Progress, silent
-from fitting.quasi_static.told import Told, close_quasi_static_loop, fit_quasi_static_logs
-from fitting.report import of_rig, pictures, report_dict, report_text, write_rig_report
+from fitting.report import Report
 from fitting.search_options import SearchOptions
 
 
@@ -31,12 +26,13 @@ def fit(data: Data, *, draws: int | None = None, progress: Progress = silent) ->
     """
     need_double_precision()
     if data.kind == "quasi-static":
-        return FitResult(
-            *_quasi_static(fit_quasi_static_logs(data.logs, data.drive, test=data.test, progress=progress))
-        )
+        # Loaded here, as what follows: each takes long, and most logs need one of them.
+        from fitting.quasi_static.told import fit_quasi_static_logs
+
+        return FitResult(fit_quasi_static_logs(data.logs, data.drive, test=data.test, progress=progress))
     rig = data.rig(other_holds=False)
     found = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold, seed=draws, progress=progress)
-    return FitResult(*_of_drive(found, rig))
+    return FitResult(Report.of_rig(found, rig), rig)
 
 
 def close_loop(
@@ -64,23 +60,14 @@ def close_loop(
     if named:
         data = data.with_test(named)
     if data.kind == "quasi-static":
+        from fitting.quasi_static.told import close_quasi_static_loop
+
         told = close_quasi_static_loop(data.logs, data.drive, test=data.test, search=search, progress=progress)
-        return LoopResult(*_quasi_static(told))
+        return LoopResult(told)
+    from fitting.loop import close_loop as close_loop_of_drive
+
     rig = data.rig()
     found = close_loop_of_drive(
         rig.model, rig.experiments, test=rig.test, hold=rig.hold, search=search, progress=progress
     )
-    return LoopResult(*_of_drive(found, rig))
-
-
-def _of_drive(outcome: Loop | FitOnly, rig: Rig) -> tuple:
-    report = report_dict(outcome, **of_rig(rig))
-
-    def write(folder: Path) -> None:
-        write_rig_report(folder, outcome, rig=rig)
-
-    return report, report_text(report), tuple(pictures(outcome, report)), outcome.stored, write
-
-
-def _quasi_static(told: Told) -> tuple:
-    return told.report, told.text, tuple(told.pictures), None, told.write
+    return LoopResult(Report.of_rig(found, rig), rig)

@@ -112,8 +112,8 @@ def _done(state: Array, named: tuple[str, Model], motion: Motion) -> Array:
     assert isinstance(model.drive, Drive) and motion.theta_m is not None and motion.theta_l is not None
     if isinstance(effect, MeshGeometryEffect):
         return effect.error(motion.theta_m)
-    assert isinstance(effect, SensorEffect)
-    theta_m, theta_l = effect.reading(motion.theta_m, motion.theta_l)
+    assert isinstance(effect, SensorEffect) and motion.omega_m is not None and motion.omega_l is not None
+    theta_m, theta_l = effect.reading(motion.theta_m, motion.theta_l, motion.omega_m, motion.omega_l)
     return (theta_m - motion.theta_m) / model.drive.N - (theta_l - motion.theta_l)
 
 

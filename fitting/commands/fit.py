@@ -98,7 +98,7 @@ def close_loop(
         raise InputError(f"--max-effects must be 0 or more, but is {search.max_effects}")
     asked = wanted(limits, next_experiment)
     start_jax()
-    from fitting.commands.run_close_loop import close_loop_on_logs
+    from fitting.commands.run_fit import close_loop_on_logs
 
     close_loop_on_logs(logs, drive, out, search, test=test, limits=asked)
 
@@ -114,6 +114,6 @@ def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
         Of torque and noise.
     """
     start_jax()
-    from fitting.commands.run_close_loop import demonstrate
+    from fitting.commands.run_fit import demonstrate
 
     demonstrate(out, seed)

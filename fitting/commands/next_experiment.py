@@ -1,26 +1,28 @@
 """What logs allow the next experiment to be, as stated on the command line."""
 
-from collections.abc import Sequence
+import numpy as np
 
+from fitting.api.data import Data
 from fitting.commands.options import ExperimentLimits
-from fitting.drive_data import WHY_NOT_QUASI_STATIC, Rig
+from fitting.drive_data import WHY_NOT_QUASI_STATIC
 from fitting.errors import InputError
-from fitting.estimation.experiment import Experiment
-from fitting.logs.log import Log
 
 _FEWEST_SAMPLES = 200
 
 
-def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) -> dict[str, float]:
+def stated_limits(options: ExperimentLimits, data: Data) -> dict[str, float]:
     """The limits that the user states, by their names in [`fitting.next_experiment.excitation.Limits`][].
 
     Args:
         options: as given.
-        experiments: the logs.
+        data: the logs.
 
     Raises:
-        InputError: where a limit makes no sense.
+        InputError: where a limit makes no sense, or the logs hold nothing of the resonance.
     """
+    log = data.logs[0]
+    if data.kind == "quasi-static":
+        raise InputError(f"{log.path}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
     given = {
         "torque": ("--largest-torque", options.largest_torque),
         "speed": ("--largest-speed", options.largest_speed),
@@ -28,17 +30,16 @@ def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) 
         "twist": ("--largest-twist", options.largest_twist),
         "duration": ("--duration", options.duration),
     }
-    drive = experiments[0].motor_angle is not None
     for name, (option, value) in given.items():
         if value is not None and not 0 < value < float("inf"):
             raise InputError(f"{option} must be positive and finite, but is {value}")
-        if value is not None and not drive and name in ("speed", "travel"):
+        if value is not None and data.kind == "reduced" and name in ("speed", "travel"):
             raise InputError(f"{option} is for drives, but a reduced log has no motor; leave it out")
     if options.duration is not None:
         # Loaded here: few fits look for a next experiment.
         from fitting.next_experiment.proposal import MOST_SAMPLES
 
-        step = experiments[0].time_step
+        step = float(np.median(np.diff(log.time)))
         shortest, longest = _FEWEST_SAMPLES * step, MOST_SAMPLES * step
         if not shortest <= options.duration <= longest:
             raise InputError(
@@ -46,21 +47,3 @@ def stated_limits(options: ExperimentLimits, experiments: Sequence[Experiment]) 
                 f"samples of the logs), but is {options.duration} s"
             )
     return {name: value for name, (_, value) in given.items() if value is not None}
-
-
-def is_quasi_static(logs: tuple[Log, ...], asked: ExperimentLimits | None) -> bool:
-    """Whether logs hold nothing of the resonance, for which no next experiment can be looked for.
-
-    Raises:
-        InputError: where one is asked for.
-    """
-    if logs[0].kind != "quasi-static":
-        return False
-    if asked is not None:
-        raise InputError(f"{logs[0].path}: --next-experiment needs a motion to simulate, but {WHY_NOT_QUASI_STATIC}")
-    return True
-
-
-def logs_of(rig: Rig) -> tuple[Experiment, ...]:
-    """The logs, under whichever hold."""
-    return next(iter(rig.experiments.values()))

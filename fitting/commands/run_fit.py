@@ -1,15 +1,19 @@
-"""What `hdjax fit` does with log files of one drive."""
+"""What `hdjax fit`, `hdjax close-loop` and `hdjax demo` do with the logs of one drive."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from fitting.commands.next_experiment import is_quasi_static, logs_of, stated_limits
+from fitting.api.data import load
+from fitting.api.results import Result
+from fitting.api.verbs import close_loop, fit
+from fitting.commands.demo import write_demo_logs
+from fitting.commands.next_experiment import stated_limits
 from fitting.commands.options import ExperimentLimits
 from fitting.commands.spinner import Spinner
-from fitting.drive_data import Rig, read_logs, rig_of
 from fitting.errors import InputError
-from fitting.fit_drive import fit_only
-from fitting.logs.drive_file import read_drive_file
-from fitting.report import rig_text, write_rig_report
+from fitting.search_options import SearchOptions
+
+_NOTHING = "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
 
 
 def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
@@ -28,18 +32,61 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
     """
     if seed is not None:
         _check_posterior()
-    drive_file = read_drive_file(drive)
-    read, _ = read_logs(logs, drive_file)
-    if is_quasi_static(read, limits):
-        # Loaded here: most logs are of other kinds.
-        from fitting.quasi_static.told import fit_quasi_static_logs
+    data = load(logs, drive)
+    stated = None if limits is None else stated_limits(limits, data)
+    with Spinner() as progress:
+        found = fit(data, draws=seed, progress=progress)
+        if stated is not None:
+            found = found.with_next_experiment(stated, progress=progress)
+    nothing = (
+        "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
+    )
+    _show(found, out, *([nothing] if stated is not None and found.report["next_experiment"] is None else []))
 
-        with Spinner() as progress:
-            told = fit_quasi_static_logs(read, drive_file, progress=progress)
-        page = told.write(out)
-        print(f"{told.text}\nReport: {page}")
-    else:
-        _fit_drive(rig_of(read, drive_file, other_holds=False), out, seed, limits)
+
+def close_loop_on_logs(
+    logs: list[Path],
+    drive: Path,
+    out: Path,
+    search: SearchOptions = SearchOptions(),
+    *,
+    test: Sequence[Path] = (),
+    limits: ExperimentLimits | None = None,
+) -> None:
+    """Close the loop on logs of one drive, write the report, and show it.
+
+    Args:
+        logs: files.
+        drive: drive file.
+        out: folder of the report.
+        search: how effects are searched for.
+        test: files of test data.
+        limits: of the next experiment; None where none is asked for.
+
+    Raises:
+        InputError: for bad files.
+        DataError: where the logs can't support a fit.
+    """
+    data = load(logs, drive, test=test)
+    stated = None if limits is None else stated_limits(limits, data)
+    with Spinner() as progress:
+        found = close_loop(data, search=search, progress=progress)
+        if stated is not None:
+            found = found.with_next_experiment(stated, progress=progress)
+    _show(found, out)
+
+
+def demonstrate(out: Path, seed: int) -> None:
+    """Simulate a drive with an effect that nobody declared, and close the loop on its logs.
+
+    Args:
+        out: folder for the logs and the report.
+        seed: of torque and noise.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    logs, drive = write_demo_logs(out, seed=seed)
+    print(f"Logs with an undeclared effect: {', '.join(str(p) for p in logs)}")
+    close_loop_on_logs(logs, drive, out, SearchOptions(seed=seed))
 
 
 def _check_posterior() -> None:
@@ -51,20 +98,6 @@ def _check_posterior() -> None:
         raise InputError(f"--posterior: {error}") from error
 
 
-def _fit_drive(rig: Rig, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
-    stated = None if limits is None else stated_limits(limits, logs_of(rig))
-    with Spinner() as progress:
-        fitted = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold, seed=seed, progress=progress)
-        proposed = None
-        if stated is not None:
-            # Loaded here: few fits look for a next experiment.
-            from fitting.next_experiment.proposal import experiment_for_alpha
-
-            proposed = experiment_for_alpha(fitted, rig.experiments[fitted.hold], stated, progress=progress)
-    paths = write_rig_report(out, fitted, rig=rig, next_experiment=proposed)
-    print(rig_text(fitted, rig=rig, next_experiment=proposed))
-    if limits is not None and proposed is None:
-        print(
-            "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
-        )
-    print(f"Report: {paths['report.html']}")
+def _show(found: Result, out: Path, further: Sequence[str] = ()) -> None:
+    folder = found.save(out)
+    print("\n".join([found.summary(), *further, f"Report: {folder / 'report.html'}"]))

@@ -36,6 +36,7 @@ class Experiment(eqx.Module):
         temperature: of the drive [K], or None.
         origin: when the log starts, on the clock of `time` [s].
         log: the name of the log that it is a part of.
+        rate_std: relative standard deviation of the sample interval, as far as the log's stamps leave it open.
     """
 
     name: str = eqx.field(static=True)
@@ -49,6 +50,7 @@ class Experiment(eqx.Module):
     temperature: PiecewisePolynomial | None = None
     origin: float = eqx.field(static=True, default=0.0)
     log: str = eqx.field(static=True, default="")
+    rate_std: float = eqx.field(static=True, default=0.0)
 
     def __len__(self) -> int:
         return self.time.size
@@ -199,6 +201,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         temperature=_channel(log, log.temperature, time, "linear"),
         origin=float(log.time[0]),
         log=log.name,
+        rate_std=log.rate_std,
     )
 
 

@@ -128,8 +128,8 @@ def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: A
     effect = _with(effect, strengths)
     if isinstance(effect, SensorEffect):
         assert motion.theta_m is not None and motion.theta_l is not None
-        still = jnp.zeros_like(motion.x)
-        state = jnp.stack([motion.theta_m, motion.theta_l, still, still])
+        assert motion.omega_m is not None and motion.omega_l is not None
+        state = jnp.stack([motion.theta_m, motion.theta_l, motion.omega_m, motion.omega_l])
         return {_READING: bare.with_effects(effect).outputs(state)}
     if isinstance(effect, MeshGeometryEffect):
         assert motion.theta_m is not None

@@ -1,4 +1,4 @@
-"""Logs as named arrays: MATLAB files of all versions, and HDF5."""
+"""Logs as named arrays: MATLAB files of all versions, HDF5, and NumPy's own."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -83,6 +83,31 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
         return _table(path, held, wanted, "/", load, unit)
 
 
+def read_numpy(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    """The wanted vectors of a file of NumPy.
+
+    Args:
+        path: named in messages.
+        source: what is read.
+        wanted: names of arrays (NPZ), of the fields of a structured array, or "data(:,3)"; in a file of one matrix
+            "column 3".
+    """
+    try:
+        loaded = np.load(source, allow_pickle=False)
+        arrays = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+        raise InputError(f"{path}: the file holds objects of Python; save arrays of numbers in it") from error
+    held: dict[str, Any] = {}
+    for name, array in arrays.items():
+        if array.dtype.names is None:
+            held[name] = array
+        for field in array.dtype.names or ():
+            held[field if len(arrays) == 1 else f"{name}/{field}"] = array[field]
+    return _table(path, held, wanted, "/", lambda name: held[name], lambda name: None)
+
+
 def _text(value: object) -> str | None:
     value = np.asarray(value).reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
     value = value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
@@ -126,7 +151,9 @@ def _table(
         name, column = _place(path, asked, held, parting)
         if name is None:
             continue
-        columns[asked] = RawColumn(_vector(path, asked, load(name), column), unit(name))
+        array = np.asarray(load(name))
+        stamps = array.dtype.kind in "mM"
+        columns[asked] = RawColumn(_vector(path, asked, array, column), "s" if stamps else unit(name))
         beside = name.rpartition(parting)[0]
         around = [beside + parting if beside else "", ""]
         rate = rate or _rate(lambda key, at=around: next((load(a + key) for a in at if a + key in held), None))
@@ -137,6 +164,13 @@ def _place(path: Path, asked: str, held: Mapping[str, Any], parting: str) -> tup
     """The array of that name, or the only one with that last name; and its column, counted from zero."""
     if asked in held:
         return asked, None
+    # Of one matrix, or of the arrays in their order.
+    number = re.fullmatch(r"column ([0-9]{1,4})", asked)
+    names = list(held)
+    if number and len(names) == 1:
+        return names[0], int(number[1]) - 1
+    if number:
+        return (names[int(number[1]) - 1] if int(number[1]) <= len(names) else None), None
     match = re.fullmatch(r"(.*)\(\s*:\s*,\s*([0-9]{1,6})\s*\)", asked)
     plain, column = (match[1], int(match[2]) - 1) if match else (asked, None)
     plain = plain.strip("/")
@@ -158,7 +192,7 @@ def _place(path: Path, asked: str, held: Mapping[str, Any], parting: str) -> tup
 def _vector(path: Path, name: str, data: Any, column: int | None) -> np.ndarray:
     if type(data).__name__ in ("MatlabOpaque", "MatlabFunction") or _is_cell(data):
         raise not_numbers(path, name, "is a cell, table or object of MATLAB's own", "store it with double()")
-    array = np.asarray(data)
+    array = _seconds(np.asarray(data))
     if array.dtype.names is not None or array.dtype.kind not in "biuf":
         raise not_numbers(path, name, "is a struct, text or complex")
     if column is not None:
@@ -172,6 +206,14 @@ def _vector(path: Path, name: str, data: Any, column: int | None) -> np.ndarray:
     if array.size != max(array.shape, default=1):
         raise not_numbers(path, name, f"has shape {array.shape}", f'pick a column as "{name}(:,1)"')
     return array.reshape(-1).astype(np.float64)
+
+
+def _seconds(array: np.ndarray) -> np.ndarray:
+    """Dates, since 1970, and durations in seconds; any other array as it is."""
+    if array.dtype.kind not in "mM":
+        return array
+    whole = array.astype(f"{array.dtype.kind}8[ns]")
+    return np.where(np.isnat(whole), np.nan, whole.astype(np.int64) * 1e-9)
 
 
 def _rate(get: Callable[[str], Any]) -> float | None:

@@ -7,7 +7,8 @@ import numpy as np
 from fitting.errors import DataError
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
-from fitting.logs.log import OUTPUTS, Log
+from fitting.logs.log import Log
+from fitting.logs.log_kind import OUTPUTS
 from fitting.logs.masks import clipped, glitches
 from fitting.logs.plausibility import mix_ups
 
@@ -67,7 +68,8 @@ def _is_constant(values: np.ndarray | None) -> bool:
 
 
 def _jitter(log: Log) -> Iterator[Finding]:
-    step = np.diff(log.time)
+    # Channels with clocks of their own meet in rows at all of their stamps; those of the input say how it was sampled.
+    step = np.diff(log.time if log.input_known is None else log.time[log.input_known])
     median = float(np.median(step))
     # A gap is told by the reader and would hide how regular the rest is.
     spread = float(np.std(step[step <= 5 * median])) / median

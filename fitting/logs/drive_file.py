@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fitting.errors import InputError
+from fitting.logs.raw_table import numbered
 from fitting.logs.units import UnitError, parse_number
 from hdjax import HOLDS, Hold
 
@@ -28,6 +29,7 @@ SIGNALS = (
     "joint_torque",
 )
 _DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2", "rated_torque": "N m"}
+_MOST_COLUMNS = 9999
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
     "signals": ("torque_hold", "sample_rate"),
@@ -40,11 +42,12 @@ class ColumnMap:
     """Where a signal stands in the log.
 
     Attributes:
-        column: Name of the column; in HDF5 the path of the dataset.
+        column: Name of the column; in HDF5 the path of the dataset; "column 3" is the third one.
         unit: Unit of the column's numbers, or None for the file's own, or else SI.
         sign: +1.0 or -1.0, multiplies the column.
         offset: What is subtracted before, in the column's own numbers.
         time: Name of the column with this channel's own stamps, in the unit of [columns] time, or None.
+        fraction: Of stamps in two columns: where the parts of a second stand, or None.
     """
 
     column: str
@@ -52,6 +55,7 @@ class ColumnMap:
     sign: float
     offset: float = 0.0
     time: str | None = None
+    fraction: "ColumnMap | None" = None
 
 
 @dataclass(frozen=True)
@@ -208,16 +212,17 @@ def _hold(path: Path, value: object) -> Hold | None:
     raise InputError(f"{path}: [signals] torque_hold must be one of {', '.join(HOLDS)}, but is {_short(value)}{hint}")
 
 
-def _column_map(path: Path, signal: str, entry: object) -> ColumnMap:
-    where = f"[columns] {signal}"
-    if isinstance(entry, str):
-        return ColumnMap(_text(path, where, entry), None, 1.0)
+def _column_map(path: Path, signal: str, entry: object, key: str = "") -> ColumnMap:
+    where = f"[columns] {signal}{key}"
     if not isinstance(entry, dict):
+        if isinstance(entry, str | int) and not isinstance(entry, bool):
+            return ColumnMap(_column_name(path, where, entry), None, 1.0)
         raise InputError(
-            f"{path}: {where} must be a column name or a table such as "
+            f"{path}: {where} must be a column's name, its number, or a table such as "
             f'{{ column = "name", unit = "deg", sign = 1 }}, but is {_short(entry)}'
         )
-    _refuse_unknown(path, f"key in {where}", entry, ("column", "unit", "sign", "offset", "time"))
+    known = ("column", "unit") if key else ("column", "unit", "sign", "offset", "time")
+    _refuse_unknown(path, f"key in {where}", entry, (*known, "fraction") if signal == "time" and not key else known)
     sign = entry.get("sign", 1)
     if isinstance(sign, bool) or not isinstance(sign, int | float) or sign not in (1, -1):
         raise InputError(f"{path}: sign in {where} must be 1 or -1, but is {_short(sign)}")
@@ -227,11 +232,21 @@ def _column_map(path: Path, signal: str, entry: object) -> ColumnMap:
         raise InputError(
             f"{path}: offset in {where} must be a number in the column's own unit, but is {_short(offset)}"
         )
-    unit, time = entry.get("unit"), entry.get("time")
+    unit, time, fraction = entry.get("unit"), entry.get("time"), entry.get("fraction")
     return ColumnMap(
-        column=_text(path, f"column in {where}", entry.get("column", signal)),
+        column=_column_name(path, f"column in {where}", entry.get("column", signal)),
         unit=None if unit is None else _text(path, f"unit in {where}", unit),
         sign=float(sign),
         offset=float(offset),
-        time=None if time is None else _text(path, f"time in {where}", time),
+        time=None if time is None else _column_name(path, f"time in {where}", time),
+        fraction=None if fraction is None else _column_map(path, signal, fraction, " fraction"),
     )
+
+
+def _column_name(path: Path, where: str, value: object) -> str:
+    """A column's name, also of one that is given by its number, counted from one."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        return _text(path, where, value)
+    if not 0 < value <= _MOST_COLUMNS:
+        raise InputError(f"{path}: {where} must be a column's number from 1 on, but is {_short(value)}")
+    return numbered(value)

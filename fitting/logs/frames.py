@@ -1,6 +1,6 @@
 """Tables in memory as logs: data frames, datasets, and arrays by name."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,7 @@ import polars as pl
 
 from fitting.errors import InputError
 from fitting.logs.parquet import column_from_series
-from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, split_unit
-
-
-def is_table(source: Any) -> bool:
-    """Whether something is a table in memory: it has columns (pandas, polars), variables (xarray), or is a mapping."""
-    return hasattr(source, "columns") or hasattr(source, "variables") or isinstance(source, Mapping)
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of, split_unit
 
 
 def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
@@ -31,10 +26,10 @@ def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
         InputError: A wanted column is not a vector of numbers.
     """
     found = source.variables if hasattr(source, "variables") else source
-    names = [str(name) for name in (source.columns if hasattr(source, "columns") else found)]
-    in_full = {split_unit(name)[0]: name for name in reversed(names)} | {name: name for name in names}
-    asked = {name: in_full[name] for name in dict.fromkeys(wanted) if name in in_full}
-    return RawTable(tuple(names), {name: _column(path, full, found[full]) for name, full in asked.items()})
+    labels = list(source.columns if hasattr(source, "columns") else found)
+    names = tuple(map(str, labels))
+    places = places_of(dict.fromkeys(wanted), names)
+    return RawTable(names, {name: _column(path, names[at], found[labels[at]]) for name, at in places.items()})
 
 
 def _column(path: Path, name: str, values: Any) -> RawColumn:

@@ -8,6 +8,7 @@ import numpy as np
 from fitting.errors import DataError
 from fitting.logs.findings import Finding
 from fitting.logs.gaps import SHORTEST
+from fitting.logs.held import without_repeats
 from fitting.logs.log import Log
 
 # All thresholds are assumed: they part the practice logs from their faults by a wide margin.
@@ -36,6 +37,7 @@ def masked(log: Log) -> Log:
     Raises:
         DataError: Hardly an output can be believed.
     """
+    log = without_repeats(log)
     wrong, findings = np.zeros(len(log), dtype=bool), []
     for rows, finding in _untrusted(log):
         findings.append(finding)

@@ -3,13 +3,14 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from fitting.logs.raw_table import RawColumn, RawTable, not_numbers
+from fitting.logs.raw_table import RawColumn, RawTable, not_numbers, places_of, split_unit
 from fitting.logs.text_cells import column_from_text
 
 
@@ -26,9 +27,9 @@ def read_parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) ->
     """
     with _quiet():
         names = tuple(pl.read_parquet_schema(source))
-        found = [name for name in wanted if name in names]
-        frame = pl.read_parquet(source, columns=found, use_statistics=False)
-    return RawTable(names, {n: column_from_series(path, frame[n]) for n in found})
+        found = {name: names[place] for name, place in places_of(wanted, names).items()}
+        frame = pl.read_parquet(source, columns=list(dict.fromkeys(found.values())), use_statistics=False)
+    return RawTable(names, {name: column_of(path, full, frame[full]) for name, full in found.items()})
 
 
 @contextmanager
@@ -42,6 +43,12 @@ def _quiet() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+
+
+def column_of(path: Path, name: str, series: pl.Series) -> RawColumn:
+    """A series as numbers, in the unit that its name states where it has none of its own."""
+    column = column_from_series(path, series)
+    return column if column.unit is not None else replace(column, unit=split_unit(name)[1])
 
 
 def column_from_series(path: Path, series: pl.Series) -> RawColumn:

@@ -1,6 +1,7 @@
 """What a log file holds, before anyone says what it means: columns of numbers in the file's own names and units."""
 
 import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,6 +20,7 @@ class RawColumn:
         time: own stamps [s], (n,), of a channel that brings its own clock; None for the table's rows.
         text_rows: rows that hold text where a number was expected.
         text: of the first of them.
+        rate_std: relative standard deviation of the sample interval of `time`, as far as the stamps leave it open.
     """
 
     values: np.ndarray
@@ -26,6 +28,7 @@ class RawColumn:
     time: np.ndarray | None = None
     text_rows: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     text: str = ""
+    rate_std: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +38,39 @@ class RawTable:
     Attributes:
         names: All columns of the file.
         columns: The asked columns that the file has, by the name asked for.
-        sample_rate: Hz, a scalar `fs` beside the data (MAT and HDF5 only), or None.
+        sample_rate: Hz, a scalar `fs` beside the data or a step in a header, or None.
+        repeated: Names that several columns of the file have; in `names`, a number tells them apart.
     """
 
     names: tuple[str, ...]
     columns: dict[str, RawColumn] = field(default_factory=dict)
     sample_rate: float | None = None
+    repeated: frozenset[str] = frozenset()
 
 
 def not_numbers(path: Path, name: str, what: str, mend: str = "save it as one") -> InputError:
     """The refusal of a column that is no vector."""
     return InputError(f"{path}: the column '{name}' {what}, where a plain vector of numbers is needed; {mend}")
+
+
+def numbered(number: int) -> str:
+    """The name under which a column is asked for by its number, counted from one."""
+    return f"column {number}"
+
+
+def places_of(wanted: Iterable[str], names: Sequence[str]) -> dict[str, int]:
+    """Where the wanted columns stand, counted from zero; those that are not there are left out.
+
+    Args:
+        wanted: Names such as "torque", which also finds "torque [N m]", or numbers such as "column 3".
+        names: Of all columns, in order.
+    """
+    known: dict[str, int] = {}
+    forms = (names, [split_unit(name)[0] for name in names], [numbered(i + 1) for i in range(len(names))])
+    for form in forms:
+        for place, name in enumerate(form):
+            known.setdefault(name, place)
+    return {name: known[name] for name in wanted if name in known}
 
 
 def split_unit(name: str) -> tuple[str, str | None]:

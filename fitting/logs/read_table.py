@@ -1,16 +1,19 @@
 """The raw columns of a log file, in the file's own names and units, whatever its format."""
 
+import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
 
 from fitting.errors import InputError
-from fitting.logs.arrays import read_hdf5, read_mat
+from fitting.logs.arrays import read_hdf5, read_mat, read_numpy
 from fitting.logs.mdf import read_mdf
 from fitting.logs.raw_table import RawTable
+from fitting.logs.ros import read_bag, read_mcap
 from fitting.logs.text import read_text
 
+SHEET_SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
 # A packed file of more than this is no log of a drive but a mistake, or a trap.
 _LARGEST = 2 << 30
 
@@ -19,8 +22,8 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
     """The wanted columns of a log file.
 
     Args:
-        path: CSV, TSV, TXT, DAT, MAT (v5 to v7.3), HDF5, Parquet or MDF4, told by the first bytes where they say it and
-            by the suffix otherwise; also packed by gzip.
+        path: CSV, TSV, TXT, DAT, LVM, MAT (v5 to v7.3), HDF5, Parquet, MDF4, NPY, NPZ, a spreadsheet, MCAP or a ROS
+            bag, told by the first bytes where they say it and by the suffix otherwise; also packed by gzip.
         wanted: Names of columns; those that the file lacks are left out of the answer.
 
     Returns:
@@ -38,10 +41,11 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
         if known is None:
             raise _unknown(path, suffix)
         raise InputError(f"{path}: there is no such log file; check the path")
+    kind = suffix[1:].upper()
     try:
         source: Path | BytesIO = _unpacked(path) if path.suffix.lower() == ".gz" else path
         head = source.getvalue()[:1024] if isinstance(source, BytesIO) else _head(path)
-        reader = next((r for magic, r in _MAGIC.items() if head.startswith(magic)), known)
+        kind, reader = next((found for magic, found in _MAGIC.items() if head.startswith(magic)), (kind, known))
         if reader is None:
             raise _unknown(path, suffix)
         return reader(path, source, tuple(dict.fromkeys(wanted)))
@@ -50,21 +54,21 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
     except OSError as error:
         if error.strerror:
             raise InputError(f"{path}: the log cannot be read ({error.strerror}); check its permissions") from error
-        raise _unreadable(path, suffix, error) from error
+        raise _unreadable(path, kind, error) from error
     except BaseException as error:
         # Readers of binary formats meet corrupt bytes with whatever exception is at hand; polars' is no `Exception`.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        raise _unreadable(path, suffix, error) from error
+        raise _unreadable(path, kind, error) from error
 
 
 def _unknown(path: Path, suffix: str) -> InputError:
     return InputError(f"{path}: the format '{suffix}' is not known; save the log as one of {', '.join(_READERS)}")
 
 
-def _unreadable(path: Path, suffix: str, error: BaseException) -> InputError:
+def _unreadable(path: Path, kind: str, error: BaseException) -> InputError:
     reason = " ".join(str(error).split())[:200].rstrip(". ") or type(error).__name__
-    return InputError(f"{path}: the file cannot be read as {suffix[1:].upper()}, export it again or mend it: {reason}")
+    return InputError(f"{path}: the file cannot be read as {kind}, export it again or mend it: {reason}")
 
 
 def _head(path: Path) -> bytes:
@@ -93,15 +97,23 @@ def _parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
     return read_parquet(path, source, wanted)
 
 
-def _mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    raise InputError(
-        f"{path}: MCAP files hold messages of many encodings, which this program does not decode; "
-        "export the joint's topics as CSV or Parquet"
-    )
+def _sheets(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
+    from fitting.logs.sheets import read_sheets
+
+    return read_sheets(path, source, wanted)
 
 
 def _zip(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    raise InputError(f"{path}: this is a zip archive or a spreadsheet; unpack it or save the table as CSV")
+    """NumPy's archives and spreadsheets are zip archives."""
+    with zipfile.ZipFile(source) as archive:
+        inside = archive.namelist()
+    if isinstance(source, BytesIO):
+        source.seek(0)
+    if "xl/workbook.xml" in inside or "xl/workbook.bin" in inside or "content.xml" in inside:
+        return _sheets(path, source, wanted)
+    if inside and all(name.endswith(".npy") for name in inside):
+        return read_numpy(path, source, wanted)
+    raise InputError(f"{path}: this is a zip archive; unpack it and give the log that is inside")
 
 
 Reader = Callable[[Path, Path | BytesIO, tuple[str, ...]], RawTable]
@@ -111,20 +123,31 @@ _READERS: dict[str, Reader] = {
     ".txt": _text,
     ".dat": _text,
     ".asc": _text,
+    ".lvm": _text,
     ".mat": read_mat,
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,
     ".parquet": _parquet,
     ".mf4": read_mdf,
     ".mdf": read_mdf,
+    ".npz": read_numpy,
+    ".npy": read_numpy,
+    ".mcap": read_mcap,
+    ".bag": read_bag,
+    ".db3": read_bag,
+    **dict.fromkeys(SHEET_SUFFIXES, _sheets),
 }
-_MAGIC: dict[bytes, Reader] = {
-    b"\x89HDF\r\n\x1a\n": read_hdf5,
-    b"PAR1": _parquet,
-    b"MATLAB ": read_mat,
-    b"MDF     ": read_mdf,
-    b"\x89MCAP0\r\n": _mcap,
-    b"PK\x03\x04": _zip,
+_MAGIC: dict[bytes, tuple[str, Reader]] = {
+    b"\x89HDF\r\n\x1a\n": ("HDF5", read_hdf5),
+    b"PAR1": ("Parquet", _parquet),
+    b"MATLAB ": ("MAT", read_mat),
+    b"MDF     ": ("MDF", read_mdf),
+    b"\x89MCAP0\r\n": ("MCAP", read_mcap),
+    b"#ROSBAG V2": ("ROS bag", read_bag),
+    b"SQLite format 3": ("ROS bag", read_bag),
+    b"\x93NUMPY": ("NPY", read_numpy),
+    b"PK\x03\x04": ("zip archive", _zip),
+    b"\xd0\xcf\x11\xe0": ("spreadsheet", _sheets),
 }
 LOG_SUFFIXES = tuple(_READERS)
 """How the names of log files end."""

@@ -1,6 +1,6 @@
 """Channels with clocks of their own, on one grid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,17 +13,20 @@ from fitting.logs.raw_table import RawColumn
 _NOTICED = 0.01
 _SPOILT = 0.2
 _RESOLVED = 0.3
+_SAME = 1e-4  # of a step; so much nearer stamps move nothing that a fit sees
 
 
-def on_one_grid(columns: Mapping[str, RawColumn], path: object) -> dict[str, RawColumn]:
+def on_one_grid(columns: Mapping[str, RawColumn], required: Sequence[str], path: object) -> dict[str, RawColumn]:
     """Columns of one length, on the union of their stamps; each is unknown where it was not sampled.
 
     Args:
-        columns: by signal; all or none with stamps of their own.
+        columns: by signal; all or none with stamps of their own, which rise.
+        required: signals that must be there at a time; nothing is kept from before or after.
         path: the log, for messages.
 
     Raises:
-        InputError: where only some columns have stamps, or a clock does not rise.
+        InputError: where only some columns have stamps.
+        DataError: where the signals were not logged at the same time.
     """
     clocks = {s: c.time for s, c in columns.items() if c.time is not None}
     if not clocks:
@@ -34,21 +37,30 @@ def on_one_grid(columns: Mapping[str, RawColumn], path: object) -> dict[str, Raw
             f"{path}: {bare[0]} has no time column of its own while {next(iter(clocks))} has one; "
             f'give [columns] {bare[0]} time = "..." as well'
         )
-    for signal, clock in clocks.items():
-        if len(clock) != len(columns[signal].values):
-            raise InputError(
-                f"{path}: {signal} has {len(columns[signal].values)} rows and its time column {len(clock)}; "
-                "export them with one stamp a sample"
-            )
-        if not np.isfinite(clock).all() or (np.diff(clock) <= 0).any():
-            raise InputError(f"{path}: the time column of {signal} is blank or does not rise; sort it and mend it")
-    grid = np.unique(np.concatenate(list(clocks.values())))
-    found = {"time": RawColumn(grid, unit="s")}
+    every = np.unique(np.concatenate(list(clocks.values())))
+    # Stamps that two loggers of one clock rounded differently are one.
+    apart = _SAME * min(float(np.median(np.diff(clock))) if len(clock) > 1 else np.inf for clock in clocks.values())
+    own = np.diff(every, prepend=-np.inf) > apart
+    grid, number = every[own], np.cumsum(own) - 1
+    # A sample stands for the step around it.
+    reach = {s: float(np.median(np.diff(clocks[s]))) if len(clocks[s]) > 1 else 0.0 for s in required}
+    begin, end = max(clocks[s][0] - reach[s] for s in required), min(clocks[s][-1] + reach[s] for s in required)
+    if begin >= end:
+        early, late = min(required, key=lambda s: clocks[s][-1]), max(required, key=lambda s: clocks[s][0])
+        raise DataError(
+            f"{path}: {early} ends at {clocks[early][-1]:g} s, before {late} begins at {clocks[late][0]:g} s; give "
+            "their stamps one clock"
+        )
+    kept = slice(*np.searchsorted(grid, [begin, end + apart]))
+    least_known = max(columns[signal].rate_std for signal in clocks)
+    found = {"time": RawColumn(grid[kept], unit="s", time=grid[kept], rate_std=least_known)}
     for signal, clock in clocks.items():
         values = np.full(len(grid), np.nan)
-        place = np.searchsorted(grid, clock)
+        place = number[np.searchsorted(every, clock)]
         values[place] = columns[signal].values
-        found[signal] = replace(columns[signal], values=values, time=None, text_rows=place[columns[signal].text_rows])
+        text = place[columns[signal].text_rows] - kept.start
+        text = text[(text >= 0) & (text < kept.stop - kept.start)]
+        found[signal] = replace(columns[signal], values=values[kept], time=None, text_rows=text)
     return found
 
 

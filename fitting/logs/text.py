@@ -2,22 +2,32 @@
 
 import csv
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fitting.errors import InputError
+from fitting.logs.lvm import MAGIC, lvm_table
 from fitting.logs.plain_numbers import plain_columns
-from fitting.logs.raw_table import RawColumn, RawTable, split_unit
+from fitting.logs.raw_table import RawColumn, RawTable, numbered, places_of, split_unit
+from fitting.logs.units import USUAL
 
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
 _LETTER = re.compile(r"[^\W\d_]")
 # Lines above the table that are worth reading; a file whose numbers begin later is no log.
 _PREAMBLE = 2000
+_LINES_ABOVE = 4
+_MOST_LEFT_OUT = 3
 _NUMBER = re.compile(
     r"[-+\u2212]?(?:[0-9][0-9.,'’]*|\.[0-9]+)(?:[eEdD][-+]?[0-9]+)?|[-+]?(?:nan|inf(?:inity)?)", re.IGNORECASE
 )
-_STAMP = re.compile(r"(?:[0-9./-]+[T _])?[0-9]{1,2}:[0-9]{2}(?::[0-9]{2}(?:[.,][0-9]*)?)?(?:Z|UTC|[-+][0-9:]{4,5})?")
+_STAMP = re.compile(
+    r"(?:[0-9./-]+[T _]|[0-9]+ days?,? )?[0-9]{1,4}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]*)?(?:Z|UTC|[-+][0-9:]{4,5})?"
+)
+# A duration, or a number with a blank before its unit: 0.001 sec, 12ms, 3.5 N m.
+_UNITS = "|".join(map(re.escape, sorted((*USUAL, "sec", "msec", "usec", "°", "A", "mA", "V", "mV", "%"), reverse=True)))
+_QUANTITY = re.compile(rf"[-+\u2212]?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?(?:[nuµμm]?s| ?(?:{_UNITS}))")
 
 
 @dataclass(frozen=True)
@@ -35,37 +45,85 @@ class _Dialect:
     first: int
 
 
+@dataclass(frozen=True)
+class Head:
+    """What stands above a table.
+
+    Attributes:
+        names: of the columns, each once; a number where the table has no name.
+        units: of the row of units, if there is one.
+        first: the first line of the table's rows.
+        delimiter: between cells.
+        width: cells in a row.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    first: int
+    delimiter: str
+    width: int
+
+    def places(self, wanted: tuple[str, ...]) -> dict[str, int]:
+        """Where the wanted columns stand."""
+        return places_of(wanted, self.names)
+
+    def table(self, wanted: tuple[str, ...], found: Mapping[int, RawColumn]) -> RawTable:
+        """The wanted columns, with the units that the head states.
+
+        Args:
+            wanted: names of columns.
+            found: columns by place.
+        """
+        columns = {}
+        for name, place in self.places(wanted).items():
+            stated = split_unit(self.names[place])[1] if self.names[place] != name else None
+            below = self.units[place] if place < len(self.units) else None
+            columns[name] = replace(found[place], unit=found[place].unit or stated or below or None)
+        plain = [split_unit(name)[0] for name in self.names]
+        repeated = frozenset(name for name in plain if f"{name} (2)" in plain)
+        return RawTable(self.names, columns, repeated=repeated)
+
+
 def read_text(path: Path, raw: bytes, wanted: tuple[str, ...]) -> RawTable:
     """The wanted columns of a text log.
 
     Args:
         path: named in messages.
         raw: the file's bytes.
-        wanted: names of columns; "torque" also finds "torque [N m]".
+        wanted: names of columns; "torque" also finds "torque [N m]", "torque (2)" the second of that name, and
+            "column 3" the third column.
 
     Raises:
-        InputError: The text holds no table with a header, or a wanted column twice.
+        InputError: The text holds no table, or one without a header of which columns are wanted by name.
     """
     lines = _decode(path, raw).splitlines()
     if not any(line.strip() for line in lines):
         raise InputError(f"{path}: the file is empty; export the log again")
+    lines, rate = lvm_table(lines) if lines[0].startswith(MAGIC) else (lines, None)
+    head = head_of(path, lines, wanted)
+    if head is None:
+        return RawTable(_header_alone(lines) if lines else ())
+    width = max(head.width, len(head.names))
+    places = sorted(set(head.places(wanted).values()))
+    return replace(head.table(wanted, _columns(lines[head.first :], head.delimiter, width, places)), sample_rate=rate)
+
+
+def head_of(path: Path, lines: list[str], wanted: tuple[str, ...]) -> "Head | None":
+    """Where the table is in a text and what its columns are called; None where no lines are rows of numbers.
+
+    Args:
+        path: named in messages.
+        lines: of the text.
+        wanted: names of columns.
+
+    Raises:
+        InputError: The table has no header, and columns are wanted by name.
+    """
     dialect = _dialect(lines)
     if dialect is None:
-        return RawTable(_header_alone(lines))
-    header, unit_row, first = _header(path, lines, dialect)
-    width = max(dialect.width, len(header))
-    places = [p for name in wanted if (p := _place(path, header, name)) is not None]
-    asked = [name for name in wanted if _place(path, header, name) is not None]
-    found = _columns(lines[first:], dialect.delimiter, width, sorted(set(places)))
-    columns = {}
-    for name, place in zip(asked, places, strict=True):
-        column = found[place]
-        stated = split_unit(header[place])[1] if header[place] != name else None
-        below = unit_row[place] if place < len(unit_row) else None
-        columns[name] = RawColumn(
-            column.values, column.unit or stated or below or None, None, column.text_rows, column.text
-        )
-    return RawTable(tuple(name for name in header if name), columns)
+        return None
+    names, units, first = _header(path, lines, dialect, wanted)
+    return Head(tuple(names), tuple(units), first, dialect.delimiter, dialect.width)
 
 
 def _decode(path: Path, raw: bytes) -> str:
@@ -95,7 +153,7 @@ def _split(line: str, delimiter: str) -> list[str]:
 
 
 def _is_number(cell: str) -> bool:
-    return bool(_NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell))
+    return bool(_NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell) or _QUANTITY.fullmatch(cell))
 
 
 def _numeric_share(cells: list[str]) -> float:
@@ -109,21 +167,17 @@ def _dialect(lines: list[str]) -> _Dialect | None:
     sample = list(enumerate(lines[: begin + _LOOKED_AT]))
     best, most = None, (False, 0.0, 0, 0)
     for rank, delimiter in enumerate(_DELIMITERS):
+        rows = [(index, *_row(line, delimiter)) for index, line in sample if _is_told(line)]
         shares: dict[int, float] = {}
-        where: dict[int, int] = {}
-        for index, line in sample:
-            if line.strip() == "" or line.lstrip().startswith("#"):
-                continue
-            cells = _split(line, delimiter)
-            share = _numeric_share(cells)
-            # A row of samples may have blanks and a word in it.
-            if share > 0.5:
-                shares[len(cells)] = shares.get(len(cells), 0.0) + share
-                where.setdefault(len(cells), index)
-        if not shares:
+        for _, cells, share in rows:
+            shares[cells] = shares.get(cells, 0.0) + share
+        width = max(shares, key=lambda w: (shares[w], w), default=0)
+        if not shares.get(width):
             continue
-        width = max(shares, key=lambda w: (shares[w], w))
-        found = _Dialect(delimiter, width, where[width])
+        # Most rows leave out comments, some have one.
+        fits = range(width, width + _MOST_LEFT_OUT + 1)
+        run = _longest_run([(i, cells in fits and share > 0) for i, cells, share in rows])
+        found = _Dialect(delimiter, width, run)
         # A decimal comma taken for the delimiter gives cells that are no numbers, and no header.
         score = (width > 1 and bool(_heads(lines, found)), shares[width] if width > 1 else 0.0, width, -rank)
         if score > most:
@@ -131,35 +185,95 @@ def _dialect(lines: list[str]) -> _Dialect | None:
     return best
 
 
-def _heads(lines: list[str], dialect: _Dialect) -> list[list[str]]:
-    """The one or two lines above the numbers that could name their columns."""
-    above = [line for line in lines[: dialect.first] if _LETTER.search(line)][-2:]
-    # numpy.savetxt and its like write the header as a comment.
-    rows = [_split(line.strip().lstrip("#%/!").strip(), dialect.delimiter) for line in above]
-    return [row for row in rows if _could_head(row, dialect.width)]
+def _is_told(line: str) -> bool:
+    """Whether a line is neither blank nor a comment."""
+    return line.strip() != "" and not line.lstrip().startswith("#")
 
 
-def _header(path: Path, lines: list[str], dialect: _Dialect) -> tuple[list[str], list[str], int]:
-    """Names of the columns, the row of units below them where there is one, and the first line behind both."""
-    above = [i for i, line in enumerate(lines[: dialect.first]) if _LETTER.search(line)]
+def _row(line: str, delimiter: str) -> tuple[int, float]:
+    """How many cells a line has, and which share of them are numbers; 0 for a line that is no row of samples."""
+    cells = _split(line, delimiter)
+    share = _numeric_share(cells)
+    # A row of samples may have blanks and a word in it.
+    return len(cells), share if share > 0.5 else 0.0
+
+
+def _longest_run(rows: list[tuple[int, bool]]) -> int:
+    """The first line of the longest run of rows: above a table, a line or two may look like its rows."""
+    best, longest, start, length = 0, 0, 0, 0
+    for index, fits in rows:
+        start = index if fits and length == 0 else start
+        length = length + 1 if fits else 0
+        if length > longest:
+            best, longest = start, length
+    return best
+
+
+def _heads(lines: list[str], dialect: _Dialect) -> list[tuple[int, list[str]]]:
+    """The lines shortly above the numbers that could name their columns, and their cells."""
+    found = []
+    for index in range(dialect.first - 1, -1, -1):
+        # numpy.savetxt and its like write the header as a comment.
+        line = lines[index].strip(" ").lstrip("#%/! ")
+        if not _LETTER.search(line) or (_is_told(lines[index]) and _row(line, dialect.delimiter)[1] > 0):
+            continue
+        found.append((index, _split(line, dialect.delimiter)))
+        if len(found) == _LINES_ABOVE:
+            break
+    return [(index, row) for index, row in reversed(found) if _could_head(row, dialect)]
+
+
+def _header(
+    path: Path, lines: list[str], dialect: _Dialect, wanted: tuple[str, ...]
+) -> tuple[list[str], list[str], int]:
+    """Names of the columns, each once; the row of units below them where there is one; the first line behind both."""
     rows = _heads(lines, dialect)
     if not rows:
-        last = len(_split(lines[above[-1]].lstrip("#%/! "), dialect.delimiter)) if above else 0
-        commas = dialect.delimiter == "," and 1 < last <= dialect.width // 2
-        mend = "export it with semicolons between cells, if its decimal sign is a comma" if commas else ""
-        raise InputError(
-            f"{path}: the file has no header line of {dialect.width} names above its {dialect.width} columns of "
-            f"numbers; {mend or 'write the column names into its first line'}"
-        )
-    if len(rows) == 2 and _are_units(rows[1]):
-        return rows[0], [cell.strip("[]()") for cell in rows[1]], above[-1] + 1
-    return rows[-1], [], above[-1] + 1
+        return _numbered(path, lines, dialect, wanted), [], dialect.first
+    has_units = len(rows) > 1 and _are_units(rows[-1][1])
+    units = [cell.strip("[]()") for cell in rows[-1][1]] if has_units else []
+    # A spoilt row of samples may be a word and blanks.
+    index, names = max(reversed(rows[:-1] if has_units else rows), key=lambda row: sum(map(bool, row[1])))
+    behind = range((rows[-1][0] if has_units else index) + 1, dialect.first)
+    rows_begin = (i for i in behind if not _LETTER.search(lines[i]) or _row(lines[i], dialect.delimiter)[1] > 0)
+    first = next(rows_begin, dialect.first)
+    return _each_once(names), units, first
 
 
-def _could_head(cells: list[str], width: int) -> bool:
-    # A delimiter at the end of rows or of the header alone makes them differ by one.
+def _numbered(path: Path, lines: list[str], dialect: _Dialect, wanted: tuple[str, ...]) -> list[str]:
+    """Names for the columns of a table without a header, where they are wanted by number."""
+    names = [numbered(i + 1) for i in range(dialect.width)]
+    if not wanted or set(names) & set(wanted):
+        return names
+    above = [line for line in lines[: dialect.first] if _LETTER.search(line)]
+    last = len(_split(above[-1].lstrip("#%/! "), dialect.delimiter)) if above else 0
+    commas = dialect.delimiter == "," and 1 < last <= dialect.width // 2
+    mend = "export it with semicolons between cells, if its decimal sign is a comma" if commas else ""
+    raise InputError(
+        f"{path}: the file has no header line of {dialect.width} names above its {dialect.width} columns of numbers; "
+        f"{mend or 'write the names into its first line, or give [columns] the numbers of the columns'}"
+    )
+
+
+def _each_once(names: list[str]) -> list[str]:
+    """The names, with a number behind the second and later ones of a kind: "time (2) [s]"."""
+    found: list[str] = []
+    seen: dict[str, int] = {}
+    last = max(i for i, name in enumerate(names) if name)
+    for i, name in enumerate(names[: last + 1]):
+        plain, unit = split_unit(name or numbered(i + 1))
+        seen[plain] = seen.get(plain, 0) + 1
+        again = f"{plain} ({seen[plain]})" + (f" [{unit}]" if unit else "")
+        found.append(again if seen[plain] > 1 else name or plain)
+    return found
+
+
+def _could_head(cells: list[str], dialect: _Dialect) -> bool:
+    # A delimiter at the end of rows or of the header alone makes them differ by one; rows may leave out comments.
     named = [cell for cell in cells if cell]
-    return len(named) > 0 and abs(len(cells) - width) <= 1 and not any(_is_number(cell) for cell in named)
+    spare = 1 if dialect.delimiter == " " else _MOST_LEFT_OUT
+    fits = dialect.width - 1 <= len(cells) <= dialect.width + spare
+    return len(named) > 0 and fits and not any(_is_number(cell) for cell in named)
 
 
 def _are_units(cells: list[str]) -> bool:
@@ -175,17 +289,6 @@ def _header_alone(lines: list[str]) -> tuple[str, ...]:
     line = next(line for line in reversed(lines) if line.strip()).lstrip("# ")
     delimiter = max(_DELIMITERS[:-1], key=line.count)
     return tuple(cell[:60] for cell in _split(line, delimiter) if cell)
-
-
-def _place(path: Path, header: list[str], wanted: str) -> int | None:
-    """The column of that name, or the only one of that name with a unit behind it."""
-    for match in (lambda name: name == wanted, lambda name: split_unit(name)[0] == wanted):
-        places = [i for i, name in enumerate(header) if match(name)]
-        if len(places) > 1:
-            raise InputError(f"{path}: the column '{wanted}' appears twice; rename one of the two")
-        if places:
-            return places[0]
-    return None
 
 
 def _columns(lines: list[str], delimiter: str, width: int, places: list[int]) -> dict[int, RawColumn]:

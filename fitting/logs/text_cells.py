@@ -6,10 +6,12 @@ import numpy as np
 import polars as pl
 
 from fitting.logs.raw_table import RawColumn
+from fitting.logs.units import UnitError, convert
 
 # What loggers write where they have no number.
 _BLANKS = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "?", "nil", "missing")
 _SECONDS_A_DAY = 86400.0
+_MOST_UNITS = 8
 # Day first is the custom wherever a dot parts day and month; a slash says nothing, so such stamps are refused.
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
 
@@ -18,21 +20,22 @@ def cells(lines: list[str], delimiter: str, width: int, places: list[int]) -> pl
     """The cells of some columns as text; rows that are too short end blank, longer ones are cut."""
     if delimiter == " ":
         lines = [" ".join(line.split()) for line in lines]
-    source = "\n".join(line for line in lines if line.strip()).encode()
+    lines = [line for line in lines if line.strip() and not line.startswith("#")]
+    # polars looks for the columns in the first row, which may leave out the last ones, or have more.
+    source = "\n".join([delimiter.join("0" * width), *lines]).encode()
     if b'"' in source:
-        rows = sum(bool(line.strip()) and not line.startswith("#") for line in lines)
         try:
             found = _parsed(source, delimiter, width, places, '"')
         except pl.exceptions.PolarsError:
             found = None
         # A quotation mark that stands alone swallows the rest of the file.
-        if found is not None and found.height == rows:
+        if found is not None and found.height == len(lines):
             return found
     return _parsed(source, delimiter, width, places, None)
 
 
 def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote: str | None) -> pl.DataFrame:
-    return pl.read_csv(
+    found = pl.read_csv(
         BytesIO(source),
         separator=delimiter,
         comment_prefix="#",
@@ -42,6 +45,7 @@ def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote:
         columns=places,
         truncate_ragged_lines=True,
     )
+    return found.slice(1)
 
 
 def column_from_text(text: pl.Series, *, comma_parts_cells: bool) -> RawColumn:
@@ -59,13 +63,20 @@ def column_from_text(text: pl.Series, *, comma_parts_cells: bool) -> RawColumn:
         np.isnan(values) & ~blank & ~cells.str.to_lowercase().is_in(("+nan", "-nan")).fill_null(value=False).to_numpy()
     )
     if wrong.sum() > 0.5 * max(1, (~blank).sum()):
-        stamps = _stamps(cells.filter(pl.Series(~blank)))
-        if stamps is not None:
+        filled = cells.filter(pl.Series(~blank))
+        stamps = _stamps(filled)
+        found, unit = (stamps, "s") if stamps is not None else _quantities(filled, comma_parts_cells)
+        if found is not None:
             values = np.full(len(cells), np.nan)
-            values[~blank] = stamps
-            return RawColumn(values, unit="s")
+            values[~blank] = found
+            wrong = ~blank & np.isnan(values)
+            return _column(cells, values, wrong, unit)
+    return _column(cells, values, wrong)
+
+
+def _column(cells: pl.Series, values: np.ndarray, wrong: np.ndarray, unit: str | None = None) -> RawColumn:
     rows = np.flatnonzero(wrong)
-    return RawColumn(values, text_rows=rows, text=str(cells[int(rows[0])])[:40] if len(rows) else "")
+    return RawColumn(values, unit, text_rows=rows, text=str(cells[int(rows[0])])[:40] if len(rows) else "")
 
 
 def _numbers(cells: pl.Series, comma_parts_cells: bool) -> np.ndarray:
@@ -96,16 +107,37 @@ def _point(cells: pl.Series, comma_parts_cells: bool) -> pl.Series:
     return cells.str.replace_all(grouping, "", literal=True).str.replace(",", ".", literal=True)
 
 
+def _quantities(cells: pl.Series, comma_parts_cells: bool) -> tuple[np.ndarray | None, str | None]:
+    """Numbers with a unit behind each, such as "12 ms", in the first one's unit, NaN where they are none; None where
+    few are."""
+    parts = cells.str.extract_groups(r"^([-+\u2212]?[0-9.,]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Zµμ°%].*)$")
+    number, unit = (parts.struct.field(f) for f in ("1", "2"))
+    units = unit.drop_nulls().unique(maintain_order=True).to_list()
+    if unit.null_count() > 0.5 * len(cells) or not 0 < len(units) <= _MOST_UNITS:
+        return None, None
+    values = _numbers(number, comma_parts_cells)
+    for other in units[1:]:
+        try:
+            factor = float(convert(np.array(1.0), other, units[0]))
+        except UnitError:
+            factor = np.nan
+        values = np.where((unit == other).fill_null(value=False).to_numpy(), values * factor, values)
+    return values, units[0]
+
+
 def _stamps(cells: pl.Series) -> np.ndarray | None:
-    """Seconds of dates, since 1970, or of times of day; None where they are neither."""
+    """Seconds of dates, since 1970, of times of day, or of durations; None where they are neither."""
     # Digits beyond the ninth are dropped, a zone is taken off: only differences matter.
     plain = cells.str.replace(",", ".", literal=True).str.replace(r"\s*(Z|UTC|[-+][0-9]{2}:?[0-9]{2})$", "")
-    parts = plain.str.extract_groups(r"^(?:([0-9./-]+)[T\s_]+)?([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}(?:\.[0-9]*)?))?$")
-    date, hour, minute, second = (parts.struct.field(f) for f in ("1", "2", "3", "4"))
+    plain = plain.str.replace(r"^([0-9]+):([0-9]{2}\.[0-9]*)$", "0:${1}:${2}")
+    parts = plain.str.extract_groups(
+        r"^(?:([0-9]+) days?\.?,?\s+)?(?:([0-9./-]+)[T\s_]+)?([0-9]{1,4}):([0-9]{1,2})(?::([0-9]{1,2}(?:\.[0-9]*)?))?$"
+    )
+    since, date, hour, minute, second = (parts.struct.field(f) for f in ("1", "2", "3", "4", "5"))
     if hour.null_count() or len(cells) == 0:
         return None
-    clock = [p.cast(pl.Float64, strict=False).fill_null(0.0).to_numpy() for p in (hour, minute, second)]
-    seconds = clock[0] * 3600.0 + clock[1] * 60.0 + clock[2]
+    clock = [p.cast(pl.Float64, strict=False).fill_null(0.0).to_numpy() for p in (since, hour, minute, second)]
+    seconds = clock[0] * _SECONDS_A_DAY + clock[1] * 3600.0 + clock[2] * 60.0 + clock[3]
     if date.null_count() == len(date):
         # The clock starts anew at midnight.
         return seconds + _SECONDS_A_DAY * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY)

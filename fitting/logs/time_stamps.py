@@ -7,12 +7,16 @@ import numpy as np
 
 from fitting.errors import InputError
 from fitting.logs.findings import Finding
+from fitting.logs.steady_clock import steady_clock
 
 # All thresholds are assumed: no timer or logger states them.
 _COUNTERS = tuple(2.0**bits for bits in (16, 24, 31, 32, 53))
 _DAY = 86400.0
+_PARTS = (1.0, 60.0, 3600.0)  # s
 _SCALES = (1.0, 1e-3, 1e-6, 1e-9)
 _FAR = 20.0  # typical steps; as close to the counter's ends a wrap must begin and end
+_NEAR = 0.1  # likewise, of the counter's span
+_DOUBLED = 0.9  # of the rows that share a stamp; more rarely alike, they are samples of their own
 _LONG = 50  # rows of a recording that starts anew, rather than of a packet that came late
 _IRREGULAR = 0.3
 _WORST = 0.2  # share of rows that may be lost before the column is no clock at all
@@ -31,12 +35,14 @@ class TimeBase:
         time: [s], like `rows`.
         restarts: places in `rows` where a recording starts anew, with no known time since the one before.
         findings: what was mended.
+        rate_std: relative standard deviation of the sample interval, as far as the stamps leave it open.
     """
 
     rows: np.ndarray
     time: np.ndarray
     restarts: np.ndarray
     findings: tuple[Finding, ...]
+    rate_std: float = 0.0
 
 
 class _Mender:
@@ -49,6 +55,7 @@ class _Mender:
         self.restarts = np.zeros(0, dtype=int)
         self.findings: list[Finding] = []
         self.lost = 0
+        self.rate_std = 0.0
 
     def say(self, severity, what: str, place: int | None, consequence: str) -> None:
         where = (
@@ -100,7 +107,7 @@ def time_base(
             f"{100 * lost:.0f} % of its rows; name the right column in [columns] time, export its stamps with all "
             "their digits, or remove it and give [signals] sample_rate"
         )
-    return TimeBase(mender.rows, mender.time, mender.restarts, tuple(mender.findings))
+    return TimeBase(mender.rows, mender.time, mender.restarts, tuple(mender.findings), mender.rate_std)
 
 
 def _typical(time: np.ndarray) -> float:
@@ -116,15 +123,21 @@ def _unwrap(mender: _Mender, second: float) -> None:
     back = np.flatnonzero(step < 0)
     if typical == 0 or len(back) == 0:
         return
-    reach = _FAR * typical
-    for span in (*(c * s for c in _COUNTERS for s in _SCALES), *(_DAY * s for s in (1.0, 1e3, 1e6, 1e9))):
-        if span < 10 * reach:
+    clocks = [c * s for c in _COUNTERS for s in _SCALES] + [_DAY * s for s in (1.0, 1e3, 1e6, 1e9)]
+    # What shows the seconds of a minute, or the parts of a second.
+    parts = [span * second for span in _PARTS]
+    for span in (*clocks, *parts):
+        reach = min(_FAR * typical, _NEAR * span)
+        if reach < 2 * typical:
             continue
         for low in (0.0, -span / 2):
             from_end = np.abs(ticks[back] - (low + span)) < reach
             to_begin = np.abs(ticks[back + 1] - low) < reach
             wraps = back[from_end & to_begin]
             if len(wraps) == 0 or np.nanmin(ticks) < low - 1 or np.nanmax(ticks) > low + span:
+                continue
+            # Recordings of a second each, behind one another, begin at zero, too.
+            if span in parts and (low < 0 or ticks[np.isfinite(ticks)][0] < reach):
                 continue
             turns = np.zeros(len(ticks))
             turns[wraps + 1] = 1.0
@@ -141,6 +154,10 @@ def _drop_doubled(mender: _Mender, samples: np.ndarray) -> None:
     order = known[np.argsort(mender.time[known], kind="stable")]
     same = np.diff(mender.time[order]) == 0
     alike = np.all((samples[order][1:] == samples[order][:-1]) | np.isnan(samples[order][1:]), axis=1)
+    # Stamps too coarse to tell rows apart are common to rows that differ, and to some that don't, as at rest.
+    told = same & np.all(np.isfinite(samples[order][1:]), axis=1)
+    if told.any() and np.mean(alike[told]) < _DOUBLED:
+        return
     doubled = order[1:][same & alike]
     if len(doubled) == 0:
         return
@@ -244,51 +261,51 @@ def _spread_coarse(mender: _Mender) -> None:
     step = np.diff(time)
     if len(step) < 2 or (step < 0).any() or len(mender.restarts):
         return
-    quantum = _quantum(step)
-    mean = float(np.mean(step[step <= np.median(step) + 2 * quantum]))
     as_good_as_it_gets = 4 * np.spacing(np.max(np.abs(time)))
+    quantum = _quantum(step, as_good_as_it_gets)
+    mean = float(np.mean(step[step <= np.median(step) + 2 * quantum]))
     if quantum <= as_good_as_it_gets or mean <= 0 or quantum < _COARSE * mean:
         return
     # A pause has a length that the stamps know to their rounding only, so that the count starts anew behind it.
     late = step > (mean + 1.2 * quantum if quantum > 0.4 * mean else 1.5 * mean)
     run = np.concatenate(([0], np.cumsum(late)))
-    count = np.arange(len(time), dtype=float)
-    length = np.bincount(run)
-    time_off = time - (np.bincount(run, time - time[0]) / length)[run] - time[0]
-    count_off = count - (np.bincount(run, count) / length)[run]
-    mean = float(count_off @ time_off / max(1.0, count_off @ count_off))
-    off = time_off - mean * count_off
+    clock = steady_clock(time, run, quantum)
+    if clock is None:
+        return
+    off = time - clock.time
     # Steps of one and two quanta may also be those of an exact clock with samples missing, here and there.
     missing = (step > 0).all() and quantum > 0.75 * np.median(step)
-    loosest = 1.02 if missing else 1.3
-    if mean <= 0 or np.ptp(off) > loosest * quantum or np.max(np.abs(off)) < _COARSE * mean:
+    loosest = 0.01 if missing else 0.15
+    if clock.slack > loosest * quantum or np.max(np.abs(off)) < _COARSE * clock.interval:
         return
-    steady = time - off
-    if missing and (late.any() or np.sum(step > 1.5 * quantum) < 5) or (np.diff(steady) <= 0).any():
+    if missing and (late.any() or np.sum(step > 1.5 * quantum) < 5) or (np.diff(clock.time) <= 0).any():
         return
-    mender.time = steady
+    mender.time, mender.rate_std = clock.time, clock.rate_std
     mender.say(
         "note",
-        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {mean:.7g} s",
+        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {clock.interval:.7g} s, which "
+        f"they tell to {100 * clock.rate_std:.1g} %",
         None,
-        "the steady clock was used",
+        "the steady clock was used, and standard errors allow for its rate",
     )
 
 
-def _quantum(step: np.ndarray) -> float:
-    """The grid on which the steps lie, or 0 where they lie on none."""
+def _quantum(step: np.ndarray, digits: float) -> float:
+    """The grid on which the steps lie, or 0 where they lie on none; `digits` is the worth of the stamps' last digit."""
     scale = float(np.median(np.abs(step))) or float(np.mean(np.abs(step)))
     if not scale > 0:
         return 0.0
     # Differences closer than a fraction of the step are one, and the rounding of a double.
     gaps = np.diff(np.unique(step))
-    gaps = gaps[gaps > _COARSE * scale]
+    gaps = gaps[gaps > max(_COARSE * scale, digits)]
     if not 1 <= len(gaps) < _MOST_STEPS:
         return 0.0
     quantum = float(gaps.min())
-    off = np.abs(step / quantum - np.rint(step / quantum))
+    count = np.rint(step / quantum)
     # Of a very fine grid the steps say no more than how far they lie apart.
-    return quantum if quantum < 0.01 * scale or np.mean(off < 0.05) > 0.98 else 0.0
+    if quantum < 0.01 * scale:
+        return quantum
+    return float(step.sum() / count.sum()) if np.mean(np.abs(step / quantum - count) < 0.05) > 0.98 else 0.0
 
 
 def _drop_repeated(mender: _Mender) -> None:

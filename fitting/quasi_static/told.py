@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +26,21 @@ class Told:
     """What was found on quasi-static logs, ready to be shown.
 
     Attributes:
-        report: What `report.json` has.
+        content: What `report.json` holds.
         pictures: Of the page.
     """
 
-    report: dict[str, Any]
+    content: dict[str, Any]
     pictures: list[Plot]
 
     @property
     def text(self) -> str:
         """For a terminal."""
-        return report_text(self.report)
+        return report_text(self.content)
 
-    def write(self, out: Path) -> Path:
+    def write(self, folder: str | PathLike[str]) -> Path:
         """Write `report.html` and `report.json`; the page's path."""
-        return write_report(out, self.report, self.pictures)
+        return write_report(Path(folder), self.content, self.pictures)
 
 
 def fit_quasi_static_logs(

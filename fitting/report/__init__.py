@@ -4,8 +4,4 @@ from fitting.report.content import report_dict as report_dict
 from fitting.report.separating import separating_experiment as separating_experiment
 from fitting.report.text import report_text as report_text
 from fitting.report.unexplained import explained_share as explained_share
-from fitting.report.write import of_rig as of_rig
-from fitting.report.write import pictures as pictures
-from fitting.report.write import rig_text as rig_text
-from fitting.report.write import write_report as write_report
-from fitting.report.write import write_rig_report as write_rig_report
+from fitting.report.write import Report as Report

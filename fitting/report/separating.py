@@ -111,6 +111,12 @@ _SEPARATING = {
     "repeats with it, the motor's with the motor.",
     ("motor_friction", "gravity_load"): "Run the same path in both directions: friction changes its sign, gravity does "
     "not.",
+    (
+        "sensor_delay",
+        "sensor_delay",
+    ): "Excite both sides at several times the natural frequency, where the two inertias move differently.",
+    ("sensor_delay", "nonlinear_damping"): "Repeat at another level: a delay does not depend on it.",
+    ("sensor_delay", "input_delay"): "Drive the load by hand: a delay of an encoder stays, one of the torque does not.",
     ("input_delay", "input_delay"): "Excite up to several times the natural frequency, log the torque faster, and "
     "state its hold in the drive file: a lag also weakens fast torques, a delay does not.",
 }
@@ -136,6 +142,7 @@ _REVEALING = {
     "torque_sensor": "reverse the direction, and check the sensor with a known torque",
     "input_delay": "excite up to several times the natural frequency",
     "encoder_eccentricity": "pass slowly through the natural frequency",
+    "sensor_delay": "move the unloaded drive slowly to and fro: both encoders must read the same motion",
     "creep": "stop under load and wait for minutes",
 }
 

@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ from fitting.discrepancy.curve import LearnedCurve
 from fitting.drive_data import Rig
 from fitting.files import write_whole
 from fitting.fit_drive import FitOnly
-from fitting.logs import findings
 from fitting.next_experiment.proposal import NextExperiment
 from fitting.outcome import Loop
 from fitting.report.content import report_dict
@@ -33,80 +33,71 @@ from fitting.stored_model import to_json
 from hdjax.effects.learned_axes import UNITS
 
 
-def write_report(
-    out_dir: str | os.PathLike[str],
-    outcome: Outcome,
-    *,
-    model_json: str,
-    units: Mapping[str, str] | None = None,
-    health: Sequence[tuple[str, findings.Finding]] = (),
-    name: str = "drive",
-    next_experiment: NextExperiment | None = None,
-) -> dict[str, Path]:
-    """Write `report.html`, `report.json` and `model.json`, `posterior.parquet` where draws were made, and
-    `next_experiment.csv` where one is proposed: all of them, whole, or none.
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What is told of an outcome: the same content as text, as a page, and as files.
 
-    Args:
-        out_dir: folder; made where absent.
+    Attributes:
         outcome: of the loop or of a fit.
-        model_json: the fitted model, as `hdjax predict` reads it.
-        units: see [`report_dict`][].
-        health: see [`report_dict`][].
-        name: the drive's.
+        content: what `report.json` holds.
+        pictures: in the order of the page.
         next_experiment: that would tell more.
-
-    Returns:
-        The files' paths, by name.
     """
-    report = report_dict(outcome, units=units, health=health, name=name, next_experiment=next_experiment)
-    contents: dict[str, str | bytes] = {
-        "report.html": report_page(report, pictures(outcome, report, next_experiment)),
-        "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
-        "model.json": model_json,
-    }
-    if isinstance(outcome, FitOnly) and outcome.posterior is not None:
-        contents[DRAWS_FILE] = draws_table(outcome.posterior)
-    if next_experiment is not None:
-        contents[COMMAND_FILE] = command_table(next_experiment)
-    paths = {file: Path(out_dir) / file for file in contents}
-    write_whole({paths[file]: content for file, content in contents.items()})
-    return paths
+
+    outcome: Outcome
+    content: dict[str, Any]
+    pictures: list[Plot]
+    next_experiment: NextExperiment | None
+
+    @classmethod
+    def of(cls, outcome: Outcome, *, next_experiment: NextExperiment | None = None, **told: Any) -> "Report":
+        """Tell an outcome.
+
+        Args:
+            outcome: of the loop or of a fit.
+            next_experiment: that would tell more.
+            told: units, health findings and name of the drive, see [`report_dict`][].
+        """
+        content = report_dict(outcome, next_experiment=next_experiment, **told)
+        return cls(outcome, content, _pictures(outcome, content, next_experiment), next_experiment)
+
+    @classmethod
+    def of_rig(cls, outcome: Outcome, rig: Rig, *, next_experiment: NextExperiment | None = None) -> "Report":
+        """Tell an outcome of a rig's logs."""
+        health = [(log, finding) for log, found in rig.findings.items() for finding in found]
+        told = {"units": rig.logs[0].units, "health": health, "name": rig.name}
+        return cls.of(outcome, next_experiment=next_experiment, **told)
+
+    @property
+    def text(self) -> str:
+        """For a terminal."""
+        return report_text(self.content)
+
+    def write(self, folder: str | os.PathLike[str]) -> dict[str, Path]:
+        """Write `report.html`, `report.json` and `model.json`, `posterior.parquet` where draws were made, and
+        `next_experiment.csv` where one is proposed: all of them, whole, or none.
+
+        Args:
+            folder: made where absent.
+
+        Returns:
+            The files' paths, by name.
+        """
+        contents: dict[str, str | bytes] = {
+            "report.html": report_page(self.content, self.pictures),
+            "report.json": json.dumps(self.content, indent=1, allow_nan=False) + "\n",
+            "model.json": to_json(self.outcome.stored),
+        }
+        if isinstance(self.outcome, FitOnly) and self.outcome.posterior is not None:
+            contents[DRAWS_FILE] = draws_table(self.outcome.posterior)
+        if self.next_experiment is not None:
+            contents[COMMAND_FILE] = command_table(self.next_experiment)
+        paths = {file: Path(folder) / file for file in contents}
+        write_whole({paths[file]: content for file, content in contents.items()})
+        return paths
 
 
-def write_rig_report(
-    out_dir: str | os.PathLike[str],
-    outcome: Outcome,
-    *,
-    rig: Rig,
-    next_experiment: NextExperiment | None = None,
-) -> dict[str, Path]:
-    """[`write_report`][] of a rig's logs, with the final model."""
-    model = to_json(outcome.stored)
-    return write_report(out_dir, outcome, model_json=model, next_experiment=next_experiment, **of_rig(rig))
-
-
-def rig_text(outcome: Outcome, *, rig: Rig, next_experiment: NextExperiment | None = None) -> str:
-    """[`report_text`][] of a rig's logs."""
-    return report_text(report_dict(outcome, next_experiment=next_experiment, **of_rig(rig)))
-
-
-def of_rig(rig: Rig) -> dict[str, Any]:
-    """What a report says of the drive and its logs."""
-    return {
-        "name": rig.name,
-        "units": rig.logs[0].units,
-        "health": [(log, finding) for log, found in rig.findings.items() for finding in found],
-    }
-
-
-def pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperiment | None = None) -> list[Plot]:
-    """All pictures of a report, in the order of the page.
-
-    Args:
-        outcome: of the loop or of a fit.
-        report: from [`report_dict`][].
-        proposed: the next experiment, where one is proposed.
-    """
+def _pictures(outcome: Outcome, report: Mapping[str, Any], proposed: NextExperiment | None) -> list[Plot]:
     units, last = report["units"], []
     if proposed is not None:
         last.append(next_experiment_plot(proposed, unit=units["dynamic_error"], forcing_unit=units["forcing"]))

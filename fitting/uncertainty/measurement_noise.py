@@ -94,7 +94,9 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     """
     count, length = found.problem.segments.weight.shape
     half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
-    piece = min(length, int(np.clip(np.round(half_period), 6, 24)))
+    # In samples that count: a slow channel leaves few rows in which all outputs were measured.
+    every = 1.0 / np.mean(np.concatenate([s.weight for s in found.stretches]))
+    piece = min(length, int(np.round(np.clip(half_period, 6 * every, 24 * every))))
     held = eqx.tree_at(lambda p: p.active, found.problem, zeros_like(found.problem.active))
     swing = float(scales(found.stretches).x)
     anew = smoothed = _Pieces(np.zeros(found.covariance.shape))
@@ -105,7 +107,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
             break
         segments = cut(shifted, length, halo=held.segments.halo, count=count)
         weight = np.asarray(segments.weight)
-        head = weight * weight[:, piece - 1 : piece] * (np.arange(length) < piece)[None]
+        head = weight * (np.arange(length) < piece)[None]
+        head = head * (np.sum(head, axis=1, keepdims=True) >= np.floor(piece / every))
         part = eqx.tree_at(lambda p: p.segments, held, eqx.tree_at(lambda s: s.weight, segments, jnp.asarray(head)))
         unknowns = Unknowns(found.unknowns.parameters, initial_states(found.model, segments))
         part, unknowns = on_all_devices(part, unknowns)
@@ -149,12 +152,11 @@ def _smoothed(problem: Problem, seen: Blocks, piece: int) -> tuple[Float[np.ndar
     fitted. Pieces whose simulation runs away tell nothing."""
     outputs = problem.segments.measured.shape[2]
     rows = np.asarray(seen.residual)[:, : piece * outputs]
-    kept = (np.asarray(problem.segments.weight)[:, piece - 1] > 0) & (np.abs(rows) < RUNAWAY).all(axis=1)
+    weight = np.asarray(problem.segments.weight)[:, :piece]
+    kept = weight.any(axis=1) & (np.abs(rows) < RUNAWAY).all(axis=1)
     time = np.linspace(-1.0, 1.0, piece)[:, None] ** np.arange(2 + len(_POWERS))
     powers = np.linalg.qr(time)[0][:, list(_POWERS)]
-    moves = np.broadcast_to(
-        np.kron(powers, np.eye(outputs)), (int(kept.sum()), rows.shape[1], powers.shape[1] * outputs)
-    )
+    moves = np.kron(powers, np.eye(outputs)) * np.repeat(weight[kept], outputs, axis=1)[:, :, None]
     columns = np.concatenate([np.asarray(seen.by_state)[kept, : rows.shape[1]], moves], axis=2)
     size = np.linalg.norm(columns, axis=1, keepdims=True)
     directions, sizes, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
@@ -162,4 +164,4 @@ def _smoothed(problem: Problem, seen: Blocks, piece: int) -> tuple[Float[np.ndar
     white = rows[kept]
     white = white - np.einsum("srd,sd->sr", directions, np.einsum("srd,sr->sd", directions, white))
     error = white.reshape(-1, outputs) @ np.linalg.inv(np.asarray(problem.whitening)).T
-    return error.T @ error, float(len(error)), float(np.sum(directions**2))
+    return error.T @ error, float(np.sum(weight[kept])), float(np.sum(directions**2))

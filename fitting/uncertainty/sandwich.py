@@ -124,6 +124,37 @@ def linearised(fit: Fit) -> Linearised:
     )
 
 
+def with_further(
+    fit: Fit,
+    found: Linearised,
+    columns: Float[np.ndarray, "segments rows further"],
+    prior: Float[np.ndarray, " further"],
+) -> Linearised:
+    """The regression with further unknowns behind the free vector.
+
+    Args:
+        fit: the fit.
+        found: its regression.
+        columns: derivative of the residual by them, without what the initial states could do as well.
+        prior: information about each beside the data.
+    """
+    _, samples, outputs = fit.problem.segments.measured.shape
+    rows = columns[:, : samples * outputs].reshape(len(columns), samples, outputs, -1)
+    further = fit.by_stretch(rows)
+    records = tuple(
+        replace(r, slopes=np.concatenate([r.slopes, f], axis=2)) for r, f in zip(found.records, further, strict=True)
+    )
+    slopes = [r.slopes.reshape(-1, r.slopes.shape[2]) for r in records]
+    information = np.sum([s.T @ s for s in slopes], axis=0)
+    own = len(found.information)
+    information[:own, :own] = found.information
+    further_prior = np.zeros_like(information)
+    further_prior[:own, :own] = found.prior
+    further_prior[own:, own:] = np.diag(prior)
+    information[own:, own:] += np.diag(prior)
+    return replace(found, records=records, information=information, prior=further_prior)
+
+
 def covariance(found: Linearised) -> Covariance:
     """Classical and robust covariance of a fit's free vector.
 

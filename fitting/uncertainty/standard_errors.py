@@ -9,9 +9,10 @@ from jaxtyping import Float
 from scipy.special import stdtrit
 
 from fitting.estimation.estimate import Fit
+from fitting.estimation.sample_rate import rate_columns
 from fitting.uncertainty.input_noise import torque_noise_covariance
 from fitting.uncertainty.normal_law import NORMAL_95
-from fitting.uncertainty.sandwich import Covariance, Linearised, covariance, linearised
+from fitting.uncertainty.sandwich import Covariance, Linearised, covariance, linearised, with_further
 from hdjax.parameters import ParameterInfo
 
 _DISSIPATIVE = ("B_sp", "mu")
@@ -86,7 +87,7 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
         empty = np.zeros((0, 0))
         return Uncertainty({}, empty, empty, empty)
     regression = linearised(fit) if regression is None else regression
-    found = covariance(regression)
+    found = _beside_rates(fit, regression)
     if torque_noise:
         found = _described(found, torque_noise_covariance(fit, regression, found.unit))
     slopes = np.abs(np.asarray(free.slopes(fit.model)))
@@ -97,6 +98,17 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
     }
     spread = np.sqrt(np.diag(found.robust))
     return Uncertainty(estimates, found.robust / np.outer(spread, spread), found.robust, found.unit)
+
+
+def _beside_rates(fit: Fit, regression: Linearised) -> Covariance:
+    """The covariance of the free vector, whatever the sample rates are that rounded stamps leave open."""
+    rates = rate_columns(fit)
+    if rates is None:
+        return covariance(regression)
+    own = regression.information.shape[0]
+    wide = covariance(with_further(fit, regression, rates.columns, 1.0 / rates.std**2))
+    robust, classical, unit = (matrix[:own, :own] for matrix in (wide.robust, wide.classical, wide.unit))
+    return Covariance(robust, classical, unit, wide.degrees_of_freedom[:own])
 
 
 def _described(found: Covariance, other: Float[np.ndarray, "parameters parameters"] | None) -> Covariance:

@@ -28,7 +28,12 @@ from hdjax.effects.position import (
 )
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
-from hdjax.effects.sensing import LoadEncoderEccentricity, MotorEncoderEccentricity
+from hdjax.effects.sensing import (
+    LoadEncoderDelay,
+    LoadEncoderEccentricity,
+    MotorEncoderDelay,
+    MotorEncoderEccentricity,
+)
 from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
@@ -56,6 +61,8 @@ CATALOGUE: tuple[type[Effect], ...] = (
     TorqueGain,
     InputDelay,
     InputLag,
+    MotorEncoderDelay,
+    LoadEncoderDelay,
     GravityLoad,
     ConstantLoad,
     LoadDisturbance,

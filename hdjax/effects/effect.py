@@ -252,8 +252,8 @@ class SensorEffect(Effect):
     needs_motor: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def reading(self, theta_m: Array, theta_l: Array) -> tuple[Array, Array]:
-        """What the motor's and the load's encoder read [rad] at the true angles."""
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
+        """What the motor's and the load's encoder read [rad] at the true angles [rad] and rates [rad/s]."""
 
 
 class ActuatorEffect(Effect):

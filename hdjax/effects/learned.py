@@ -284,7 +284,7 @@ class LearnedMotorReading(LearnedReading):
     name: ClassVar[str] = "learned_motor_reading"
     _reads: ClassVar[str] = "theta_m"
 
-    def reading(self, theta_m: Array, theta_l: Array) -> tuple[Array, Array]:
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m + self._error(theta_m), theta_l
 
 
@@ -294,7 +294,7 @@ class LearnedLoadReading(LearnedReading):
     name: ClassVar[str] = "learned_load_reading"
     _reads: ClassVar[str] = "theta_l"
 
-    def reading(self, theta_m: Array, theta_l: Array) -> tuple[Array, Array]:
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l + self._error(theta_l)
 
 

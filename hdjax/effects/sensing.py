@@ -1,4 +1,4 @@
-"""What the encoders add to the angles: an eccentric disc."""
+"""What the encoders make of the angles: an eccentric disc, a delay."""
 
 from typing import ClassVar
 
@@ -31,7 +31,7 @@ class MotorEncoderEccentricity(SensorEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n) for n in (1.0, 2.0))
 
-    def reading(self, theta_m: Array, theta_l: Array) -> tuple[Array, Array]:
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m + ripple(theta_m, self.n, self.cosine, self.sine), theta_l
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
@@ -56,8 +56,50 @@ class LoadEncoderEccentricity(SensorEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n) for n in (1.0, 2.0))
 
-    def reading(self, theta_m: Array, theta_l: Array) -> tuple[Array, Array]:
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l + ripple(theta_l, self.n, self.cosine, self.sine)
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "rad")
+
+
+class _EncoderDelay(SensorEffect):
+    """One encoder is read later than the other, by a filter or its way over a bus.
+
+    To first order in the delay, `theta(t - delay) = theta - delay theta'`: an oscillation at `w` is wrong by
+    `(w delay)^2 / 2` of itself. What both encoders are late by is an `input_delay`.
+    """
+
+    family: ClassVar[str] = "sensor_delay"
+
+    delay: Scalar = parameter(
+        0.0,
+        unit="s",
+        doc="by which the reading is older than its stamp says",
+        source="assumed: up to a cycle of a bus or of a filter at 1 kHz",
+        bounds=(0.0, 0.1),
+        plausible=(1e-5, 1e-3),
+        role="strength",
+    )
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+
+class MotorEncoderDelay(_EncoderDelay):
+    """The motor's encoder reads `theta_m(t - delay)`, to first order in the delay."""
+
+    name: ClassVar[str] = "motor_encoder_delay"
+
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
+        return theta_m - self.delay * omega_m, theta_l
+
+
+class LoadEncoderDelay(_EncoderDelay):
+    """The load's encoder reads `theta_l(t - delay)`, to first order in the delay."""
+
+    name: ClassVar[str] = "load_encoder_delay"
+
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
+        return theta_m, theta_l - self.delay * omega_l

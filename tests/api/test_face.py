@@ -179,6 +179,8 @@ def test_quasi_static_logs_go_through_the_same_verbs(tmp_path: Path):
     assert {path.name for path in found.save(tmp_path / "report").iterdir()} == {"report.html", "report.json"}
     with pytest.raises(InputError, match="quasi-static"):
         fitting.predict(found, data)
+    with pytest.raises(InputError, match="quasi-static"):
+        found.with_next_experiment()
     both = fitting.load(columns, drive={"drive": {"name": "joint"}}, test=columns)
     for verb in (fitting.fit, fitting.close_loop):
         with pytest.raises(InputError, match="log 2: --test is for logs of a motion"):

@@ -22,7 +22,7 @@ from fitting.estimation.experiment import experiment_from_log, split
 from fitting.first_order.motion import place_of
 from fitting.loop import close_loop
 from fitting.outcome import Loop
-from fitting.report import write_report
+from fitting.report import Report
 from fitting.report.plots import response_plot
 from fitting.search_options import SearchOptions
 from fitting.stored_model import StoredModel, read_model, to_json
@@ -234,9 +234,8 @@ def test_what_was_learned_comes_out_as_the_hysteresis_that_it_is(yielded: Loop):
 
 
 def test_the_report_tells_what_yields(yielded: Loop, tmp_path: Path):
-    stored = StoredModel(yielded.after.model, yielded.hold, yielded.after_substeps, yielded.setting.halo, yielded.noise)
     units = {"dynamic_error": "V", "forcing": "V"}
-    paths = write_report(tmp_path, yielded, model_json=to_json(stored), units=units)
+    paths = Report.of(yielded, units=units).write(tmp_path)
     report = json.loads(paths["report.json"].read_text())
     told = report["unknown"]
     assert (told["place"], told["variables"], told["memory"]) == ("mesh", ["x"], "yields")

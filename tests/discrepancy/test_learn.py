@@ -20,10 +20,10 @@ from fitting.estimation.free_run import free_run
 from fitting.estimation.problem import Segmentation
 from fitting.loop import close_loop
 from fitting.outcome import Loop
-from fitting.report import report_dict, write_report
+from fitting.report import Report, report_dict
 from fitting.report.plots import learned_plot
 from fitting.search_options import SearchOptions
-from fitting.stored_model import StoredModel, read_model, to_json
+from fitting.stored_model import read_model
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Model
 from hdjax.effects.actuation import TorqueBias, TorqueGain
@@ -352,9 +352,8 @@ def test_what_the_catalogue_lacks_is_unexplained(loop: Loop):
 
 
 def test_the_report_tells_it(loop: Loop, tmp_path: Path):
-    stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
     units = {"dynamic_error": "V", "forcing": "<b>V</b>"}
-    paths = write_report(tmp_path, loop, model_json=to_json(stored), units=units)
+    paths = Report.of(loop, units=units).write(tmp_path)
     report = json.loads(paths["report.json"].read_text())
     told = report["unknown"]
     assert told["family"] == "unknown" and told["place"] == "mesh" and "v" in told["variables"]
@@ -388,9 +387,8 @@ def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     # Of the gains the second begins where the first ends.
     left = loop.before.rmse["selection"] * np.prod([1.0 - f.gain for f in loop.findings])
     assert left == pytest.approx(loop.after.rmse["selection"], rel=1e-6)
-    stored = StoredModel(loop.after.model, loop.hold, loop.after_substeps, loop.setting.halo, loop.noise)
     units = {"dynamic_error": "V", "forcing": "V"}
-    paths = write_report(tmp_path, loop, model_json=to_json(stored), units=units)
+    paths = Report.of(loop, units=units).write(tmp_path)
     report = json.loads(paths["report.json"].read_text())
     assert "friction" in report["summary"] and "Something unknown is missing beside it" in report["summary"]
     assert report["unexplained"] is None and report["unknown"]["variables"] == ["x"]

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 import rig
-from fitting.commands.run_close_loop import close_loop_on_logs
+from fitting.commands.run_fit import close_loop_on_logs
 from fitting.estimation.test_part import parted
 from fitting.logs.drive_file import read_drive_file
 from fitting.logs.log import read_log

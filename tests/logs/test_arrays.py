@@ -121,7 +121,7 @@ def test_packed_and_misnamed_files(tmp_path: Path, kind: str):
 
 @pytest.mark.parametrize(
     ("head", "words"),
-    [(b"PK\x03\x04", "zip archive"), (b"\x89MCAP0\r\n", "MCAP"), (b"\x1f\x8b", "cannot be read")],
+    [(b"PK\x03\x04", "zip archive"), (b"\x89MCAP0\r\n", "MCAP|mcap"), (b"\x1f\x8b", "cannot be read")],
 )
 def test_what_other_formats_are_told(tmp_path: Path, head: bytes, words: str):
     path = tmp_path / ("log.csv.gz" if head == b"\x1f\x8b" else "log.csv")
@@ -168,3 +168,31 @@ def test_mdf_channels_bring_their_own_clocks(tmp_path: Path):
     np.testing.assert_allclose(found["torque"].time, A[::2] * 1e-3)
     with pytest.raises(InputError, match="several channels"):
         values(path, "twice")
+
+
+def test_arrays_of_numpy(tmp_path: Path):
+    stamps = np.datetime64("2026-11-28T12:00:00", "us") + np.arange(len(A)).astype("timedelta64[ms]")
+    np.savez(tmp_path / "log.npz", t=stamps, a=A, data=np.stack([A, B], axis=1))
+    table = read_table(tmp_path / "log.npz", ("t", "a", "data(:,2)", "column 2", "column 9"))
+    assert table.names == ("t", "a", "data") and "column 9" not in table.columns
+    for name, expected in (("a", A), ("column 2", A), ("data(:,2)", B)):
+        np.testing.assert_array_equal(table.columns[name].values, expected)
+    assert table.columns["t"].unit == "s"
+    np.testing.assert_allclose(np.diff(table.columns["t"].values), 1e-3, atol=1e-6)
+
+
+def test_a_matrix_and_a_structured_array_of_numpy(tmp_path: Path):
+    np.save(tmp_path / "matrix.npy", np.stack([A, B], axis=1))
+    np.testing.assert_array_equal(values(tmp_path / "matrix.npy", "column 1", "column 2"), [A, B])
+    made = np.zeros(len(A), dtype=[("a", "f8"), ("b", "f4")])
+    made["a"], made["b"] = A, A
+    np.save(tmp_path / "fields.npy", made)
+    np.testing.assert_array_equal(values(tmp_path / "fields.npy", "a", "b"), [A, A])
+    shutil.copy(tmp_path / "fields.npy", tmp_path / "log.csv")
+    np.testing.assert_array_equal(values(tmp_path / "log.csv", "b"), [A])
+
+
+def test_objects_of_python_are_refused(tmp_path: Path):
+    np.save(tmp_path / "log.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="objects of Python"):
+        read_table(tmp_path / "log.npy", ("a",))

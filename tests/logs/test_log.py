@@ -512,10 +512,10 @@ def test_long_listings_are_cut(tmp_path: Path) -> None:
 
 
 def test_unknown_format_and_missing_file(tmp_path: Path) -> None:
-    (tmp_path / "log.xlsx").touch()
+    (tmp_path / "log.docx").touch()
     with pytest.raises(InputError) as error:
-        read_log(tmp_path / "log.xlsx", drive(tmp_path))
-    one_sentence(error, ".xlsx", ".parquet")
+        read_log(tmp_path / "log.docx", drive(tmp_path))
+    one_sentence(error, ".docx", ".parquet")
     with pytest.raises(InputError) as error:
         read_log(tmp_path / "none.csv", drive(tmp_path))
     one_sentence(error, "none.csv", "no such")
@@ -618,8 +618,9 @@ def test_an_empty_drive_file_states_nothing(tmp_path: Path) -> None:
         ("sign = -1", "sign = 2", ["sign", "1 or -1"]),
         ("sign = -1", "sgn = -1", ["'sgn'", "did you mean 'sign'?"]),
         ('unit = "deg"', "unit = 3", ["unit", "string"]),
-        ('column = "a"', "column = 3", ["column", "string"]),
-        ('time = "t"', "time = 3", ["time"]),
+        ('column = "a"', "column = 0", ["column", "number from 1 on"]),
+        ('column = "a"', "column = 3.5", ["column", "string"]),
+        ('time = "t"', "time = -3", ["time", "number from 1 on"]),
         ("[columns]", "[columns", ["TOML"]),
         ("[drive]", "signals = 3\n[drive]", ["TOML"]),
         ("[signals]", "[other]", ["'other'"]),

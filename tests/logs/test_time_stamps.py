@@ -1,9 +1,12 @@
 """Whatever a logger did to its stamps, the clock behind them is found, or it is said that there is none."""
 
+import hypothesis
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 
 from fitting.errors import InputError
+from fitting.logs.steady_clock import steady_clock
 from fitting.logs.time_stamps import TimeBase, time_base
 
 COUNT, STEP = 4000, 5e-4
@@ -59,6 +62,69 @@ def test_coarse_stamps_of_a_steady_clock(step: float, rounded, quantum: float):
     np.testing.assert_allclose(np.diff(found.time), step, rtol=quantum / step / COUNT)
     # Whether stamps were cut or rounded can't be told: half a quantum of shift.
     np.testing.assert_allclose(found.time, clock, atol=0.6 * quantum)
+
+
+@hypothesis.settings(max_examples=60, deadline=None)
+@hypothesis.given(
+    interval=st.floats(3e-4, 3e-3),
+    width=st.floats(1.5, 800.0),
+    phase=st.floats(0.0, 1.0),
+    late=st.sampled_from([0.0, 0.0, 0.01, 0.1]),
+    cut=st.booleans(),
+    seed=st.integers(0, 99),
+)
+def test_the_rate_is_as_well_known_as_the_stamps_say(interval, width, phase, late, cut, seed):
+    quantum, count = width * interval, max(COUNT, int(6 * width))
+    clock = (phase * width + np.arange(count)) * interval
+    stamps = clock + late * quantum * np.random.default_rng(seed).uniform(size=count)
+    found = steady_clock(
+        np.maximum.accumulate((np.floor if cut else np.rint)(stamps / quantum) * quantum), np.zeros(count, int), quantum
+    )
+    assert found is not None
+    # Stamps confine the rate to a bounded interval: even its ends are no more standard deviations off than these.
+    assert abs(found.interval / interval - 1.0) < 3.5 * found.rate_std
+    # Over the log, the clock is then off by a fraction of the rounding, or of what stamps come late by.
+    assert found.rate_std * count * interval < (0.5 + 2.0 * late) * quantum + 3.0 * interval
+    np.testing.assert_allclose(np.diff(found.time), found.interval, rtol=1e-6)
+
+
+def test_standard_deviations_of_rates_are_those_of_their_errors():
+    random, errors = np.random.default_rng(0), []
+    for k in range(200):
+        interval, width = 10 ** random.uniform(-3.5, -2.5), 10 ** random.uniform(0.2, 2.8)
+        count = max(COUNT, int(6 * width))
+        clock = (random.uniform(0, width) + np.arange(count)) * interval
+        quantum = width * interval
+        stamps = (np.floor if k % 2 else np.rint)(clock / quantum) * quantum
+        found = steady_clock(stamps, np.zeros(count, int), quantum)
+        assert found is not None
+        errors.append((found.interval / interval - 1.0) / found.rate_std)
+    # The mean square of 200 such errors has a standard deviation of 0.1 at most (a normal law's).
+    assert abs(np.mean(np.square(errors)) - 1.0) < 0.3
+
+
+@pytest.mark.parametrize("quantum", [1.0, 0.1, 0.01])
+def test_whole_seconds_tenths_and_hundredths_of_a_kilohertz(quantum: float):
+    clock = 1e-3 * np.arange(5000)
+    found = base(np.floor((clock + 0.54) / quantum) * quantum + 1.7e9, np.random.default_rng(0).normal(size=(5000, 1)))
+    told(found, "note", "rounded", "standard errors")
+    # From the first change of the stamps to the last there are four seconds at least, each end within one sample.
+    assert 1e-6 < found.rate_std < 1.1e-3 / 4
+    assert abs(np.median(np.diff(found.time)) / 1e-3 - 1) < 1e-3
+
+
+def test_parts_of_a_second_alone_are_unwrapped():
+    for unit, second in ((1e-6, 1.0), (1.0, 1e6)):
+        stamps = np.rint(np.mod(CLOCK + 0.6789, 1.0) * 1e6) * unit / (1.0 if second == 1.0 else 1e6)
+        found = base(stamps, second=second)
+        told(found, "note", "wraps", "unwrapped")
+        np.testing.assert_allclose(np.diff(found.time), STEP, atol=1.1e-6)
+
+
+def test_recordings_of_a_second_each_are_no_wrapped_clock():
+    found = base(np.mod(np.arange(COUNT), 1000) * 1e-3)
+    told(found, "warning", "starts anew")
+    assert len(found.restarts) == 3
 
 
 def test_coarse_stamps_with_a_pause_and_a_few_samples_missing():
@@ -152,3 +218,13 @@ def test_what_is_no_clock_is_refused(stamps: np.ndarray):
     with np.errstate(all="ignore"), pytest.raises(InputError, match="is no clock") as error:
         base(stamps)
     assert "log.csv" in str(error.value) and "'t'" in str(error.value) and "sample_rate" in str(error.value)
+
+
+def test_rows_that_coarse_stamps_do_not_tell_apart_are_not_doubled():
+    """At rest, rows of a coarse encoder are the same to the last digit, and so are those whose outputs are unknown."""
+    at_rest = np.where((np.arange(COUNT) % 500 < 200)[:, None], 0.0, SAMPLES)
+    unknown = np.where((np.arange(COUNT) < 300)[:, None], SAMPLES, [np.nan, 1.0])
+    for samples in (at_rest, unknown):
+        found = base(np.floor(CLOCK * 10.0) / 10.0, samples)
+        told(found, "note", "steady sampling")
+        assert len(found.time) == COUNT

@@ -29,7 +29,7 @@ from fitting.next_experiment.proposal import (
     experiment_for_ties,
     tied,
 )
-from fitting.report import write_report
+from fitting.report import Report
 from fitting.report.plots import next_experiment_plot
 from fitting.report.proposal import command_table, proposal_dict
 from fitting.search_options import SearchOptions
@@ -355,6 +355,6 @@ def test_a_loop_proposes_what_tells_ties_apart(tmp_path: Path):
     (separation,) = found.separations
     assert separation.on_logs is not None and separation.proposed is not None
     assert max(separation.proposed) > 20 * max(separation.on_logs)
-    paths = write_report(tmp_path, loop, model_json="{}", next_experiment=found)
+    paths = Report.of(loop, next_experiment=found).write(tmp_path)
     assert (tmp_path / "next_experiment.csv").read_text() == command_table(found)
     assert "The next experiment" in paths["report.html"].read_text(encoding="utf-8")

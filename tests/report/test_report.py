@@ -29,11 +29,11 @@ from fitting.logs.findings import Finding
 from fitting.loop import close_loop
 from fitting.outcome import Loop
 from fitting.report import (
+    Report,
     explained_share,
     report_dict,
     report_text,
     separating_experiment,
-    write_report,
 )
 from fitting.report.intervals import say_what_intervals_hold
 from fitting.report.limits import limits, parameter_note
@@ -41,6 +41,7 @@ from fitting.report.plots import decimated, fit_plots, plots
 from fitting.report.summary import _change, _remembering
 from fitting.report.web_page import environment
 from fitting.search_options import SearchOptions
+from fitting.stored_model import to_json
 from fitting.uncertainty.posterior import Posterior
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
 from fitting.validation.residual_diagnostics import Dependence
@@ -55,7 +56,6 @@ HOSTILE = "<script>alert(1)</script>"
 HOLD: Hold = "zero-order"
 T_C = 0.03
 HEALTH = [(HOSTILE, Finding("warning", f"8 rows of {HOSTILE} repeat", "time", "they are left out"))]
-MODEL_JSON = '{"model": 1}\n'
 FILES = {"report.html", "report.json", "model.json"}
 ESTIMATE_KEYS = {"value", "std", "ci95", "unit", "identifiable"}
 
@@ -84,7 +84,7 @@ def page(loop: Loop, tmp_path: Path) -> str:
 
 def write_page(folder: Path, outcome: Loop | FitOnly) -> str:
     """The written page without plotly's own code, which mentions addresses that it does not visit."""
-    paths = write_report(folder, outcome, model_json=MODEL_JSON, health=HEALTH, name=HOSTILE)
+    paths = Report.of(outcome, health=HEALTH, name=HOSTILE).write(folder)
     text = paths["report.html"].read_text(encoding="utf-8")
     start, end = text.index("<script>"), text.index("</script>")
     assert "plotly.js" in text[start : start + 200]
@@ -119,7 +119,7 @@ def leaves(value: object) -> Iterator[object]:
 
 
 def test_json_is_the_schema_that_others_read(loop: Loop, tmp_path: Path):
-    paths = write_report(tmp_path, loop, model_json=MODEL_JSON, health=HEALTH, name="rig")
+    paths = Report.of(loop, health=HEALTH, name="rig").write(tmp_path)
     found = json.loads(paths["report.json"].read_text(encoding="utf-8"))
     assert found["schema"] == "hdjax-report/2"
     assert found["decision"] == "effect_found"
@@ -582,12 +582,12 @@ def test_nothing_is_left_when_writing_fails(loop: Loop, tmp_path: Path, monkeypa
 
     monkeypatch.setattr(failing, full)
     with pytest.raises(OSError, match="no space"):
-        write_report(tmp_path, loop, model_json=MODEL_JSON)
+        Report.of(loop).write(tmp_path)
     monkeypatch.undo()
     assert os.listdir(tmp_path) == []
-    write_report(tmp_path, loop, model_json=MODEL_JSON)
+    Report.of(loop).write(tmp_path)
     assert set(os.listdir(tmp_path)) == FILES
-    assert (tmp_path / "model.json").read_text(encoding="utf-8") == MODEL_JSON
+    assert (tmp_path / "model.json").read_text(encoding="utf-8") == to_json(loop.stored)
 
 
 def test_text_lists_parameters_and_decision(loop: Loop):

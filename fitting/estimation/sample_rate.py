@@ -1,0 +1,144 @@
+"""Sample rates that rounded stamps leave open: what a fit says of them, and what they do to its parameters.
+
+Where the sample interval of a log is known to a relative standard deviation, it is one more parameter with that prior.
+To a drive with known inertias a wrong rate looks like a torque that is too large or too small, so that it would pass
+for an error of the torque sensor.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from fitting.estimation.engines import linearise
+from fitting.estimation.estimate import Fit, segments_of_logs
+from fitting.estimation.experiment import Experiment
+from fitting.estimation.projection import FirstStates
+from fitting.estimation.residual import Problem
+from hdjax import Hold, PiecewisePolynomial
+
+# A shift of less than this, in standard errors of parameters and intervals, is not worth another fit (assumed).
+_SEEN = 0.1
+# By which share intervals are changed for a difference: rounding and curvature are then far below what is fitted.
+_CHANGE = 1e-5
+
+
+class RateColumns(eqx.Module):
+    """How a fit's residual answers to the sample intervals of its logs.
+
+    Attributes:
+        logs: those whose rate is open.
+        std: relative standard deviation of each log's interval, by its stamps alone.
+        residual: the fit's.
+        parameters: its derivative by the free vector, without what initial states could do as well.
+        columns: likewise by the logarithm of each log's interval.
+    """
+
+    logs: tuple[str, ...] = eqx.field(static=True)
+    std: Float[np.ndarray, " logs"]
+    residual: Float[np.ndarray, "segments rows"]
+    parameters: Float[np.ndarray, "segments rows parameters"]
+    columns: Float[np.ndarray, "segments rows logs"]
+
+
+def rate_columns(found: Fit) -> RateColumns | None:
+    """The answers of a fit to the rates of its logs; None where all are known."""
+    open_logs = _open_logs([s.experiment for s in found.stretches])
+    if not open_logs:
+        return None
+    problem = found.at_solution
+    seen = linearise(problem, found.unknowns)
+    states = FirstStates.of(seen, problem.segments.joined)
+    longer, shorter = (
+        linearise(_with_intervals(problem, factor), found.unknowns) for factor in (1.0 + _CHANGE, 1.0 - _CHANGE)
+    )
+    change, gap = (
+        (np.asarray(a) - np.asarray(b)) / (2.0 * _CHANGE)
+        for a, b in ((longer.residual, shorter.residual), (longer.gap, shorter.gap))
+    )
+    own = segments_of_logs(found)
+    of_log = np.stack(
+        [np.any(own[[s.experiment.log == log for s in found.stretches]], axis=0) for log in open_logs], axis=-1
+    )
+    # A gap is a segment's own initial state minus the end of the one before.
+    columns = states.without(change[:, :, None] * of_log[:, None], -gap[:, :, None] * of_log[:, None])
+    return RateColumns(
+        logs=tuple(open_logs),
+        std=np.array(list(open_logs.values())),
+        residual=np.asarray(seen.residual),
+        parameters=states.parameters_without(seen),
+        columns=columns,
+    )
+
+
+def refined_intervals(found: Fit) -> dict[str, float]:
+    """Factors by which a fit, with the stamps, would change the sample intervals of its logs; only those left open, and
+    none where nothing would move by what could be seen.
+
+    A Gauss-Newton step: intervals differ by so little that a second one would move nothing.
+    """
+    seen = rate_columns(found)
+    if seen is None:
+        return {}
+    columns = np.concatenate([seen.parameters, seen.columns], axis=2)
+    columns = columns.reshape(-1, columns.shape[2])
+    count = len(seen.logs)
+    prior = np.diag(np.concatenate([np.zeros(columns.shape[1] - count), 1.0 / seen.std**2]))
+    information, slope = columns.T @ columns + prior, columns.T @ seen.residual.reshape(-1)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True)
+    step = -scale * (inverse @ (scale * slope))
+    spread = scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    if np.all(np.abs(step / spread) < _SEEN):
+        return {}
+    return {log: float(np.exp(s)) for log, s in zip(seen.logs, step[-count:], strict=True)}
+
+
+def with_intervals(
+    experiments: Mapping[Hold, Sequence[Experiment]], factors: Mapping[str, float]
+) -> dict[Hold, tuple[Experiment, ...]]:
+    """Experiments with the sample intervals of their logs changed by factors, about the start of each log."""
+    return {h: tuple(_scaled(e, factors.get(e.log, 1.0)) for e in some) for h, some in experiments.items()}
+
+
+def _open_logs(experiments: Sequence[Experiment]) -> dict[str, float]:
+    """The logs whose rate is open, with its relative standard deviation."""
+    return {e.log: e.rate_std for e in experiments if e.rate_std > 0.0}
+
+
+def _scaled(experiment: Experiment, factor: float) -> Experiment:
+    if factor == 1.0:
+        return experiment
+    origin = experiment.origin
+
+    def signal(found: PiecewisePolynomial | None) -> PiecewisePolynomial | None:
+        return None if found is None else _stretched(found, factor, origin)
+
+    return replace(
+        experiment,
+        time=origin + factor * (experiment.time - origin),
+        torque=_stretched(experiment.torque, factor, origin),
+        load_torque=signal(experiment.load_torque),
+        temperature=signal(experiment.temperature),
+    )
+
+
+def _stretched(signal: PiecewisePolynomial, factor: float, origin: float = 0.0) -> PiecewisePolynomial:
+    """The signal on knots stretched about an origin."""
+    knots, coefficients = np.asarray(signal.knots), np.asarray(signal.coefficients)
+    powers = factor ** -np.arange(coefficients.shape[-1], dtype=float)
+    return PiecewisePolynomial(jnp.asarray(origin + factor * (knots - origin)), jnp.asarray(coefficients * powers))
+
+
+def _with_intervals(problem: Problem, factor: float) -> Problem:
+    """The problem with the sample intervals of all segments changed by a factor."""
+    segments = problem.segments
+    load, warmth = (
+        None if signal is None else _stretched(signal, factor)
+        for signal in (segments.load_torque, segments.temperature)
+    )
+    stretched = replace(segments, torque=_stretched(segments.torque, factor), load_torque=load, temperature=warmth)
+    return eqx.tree_at(lambda p: p.segments, problem, stretched)

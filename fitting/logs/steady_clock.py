@@ -1,0 +1,94 @@
+"""The steady clock behind rounded stamps, and how well they tell its rate."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+# Points at which the density of the interval is evaluated.
+_GRID = 101
+# Room for the clock, as a share of the rounding, below which it is one that rounding alone would not leave.
+_EXACT = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyClock:
+    """Equal sample intervals that explain rounded stamps.
+
+    Attributes:
+        interval: between samples [s], the mean over all that the stamps allow.
+        rate_std: standard deviation of the interval over them, relative.
+        time: of the samples [s], (n,).
+        slack: by how much stamps lie outside their rounding [s].
+    """
+
+    interval: float
+    rate_std: float
+    time: np.ndarray
+    slack: float
+
+
+def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyClock | None:
+    """The clock of steady sampling that rounded stamps allow; None where they allow none.
+
+    A stamp rounded to `quantum` confines `t_0 + i dt` to an interval of that width, so that what stamps allow of
+    `(t_0, dt)` is a polygon. All of it is equally likely: the density of `dt` is the polygon's height in `t_0`, and a
+    product of these where pauses of unknown length part the stamps. Where no steady clock explains the stamps, they are
+    taken to be wrong by up to twice the least that is needed, and a sample interval or the rounding.
+
+    Args:
+        stamps: [s], (n,), not falling.
+        run: number of the run between pauses that each is in, (n,), rising from zero.
+        quantum: to which they are rounded [s].
+    """
+    # Loaded here: most stamps are exact.
+    from scipy.optimize import brentq, minimize_scalar
+
+    time, row = stamps - stamps[0], np.arange(len(stamps), dtype=float)
+    starts = np.flatnonzero(np.diff(run, prepend=-1))
+    length = np.diff(np.append(starts, len(run)))
+    longest = int(np.argmax(length))
+    first, last = starts[longest], starts[longest] + length[longest] - 1
+    if last - first < 2:
+        return None
+    mean = (time[last] - time[first]) / (last - first)
+    reach = 2 * quantum / (last - first)
+
+    def bounds(interval: float) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest start of each run that its stamps allow."""
+        off = time - interval * row
+        return np.maximum.reduceat(off, starts), np.minimum.reduceat(off, starts) + quantum
+
+    def room(interval: float) -> np.ndarray:
+        low, high = bounds(interval)
+        return high - low
+
+    best: Any = minimize_scalar(
+        lambda interval: -np.min(room(interval)) / quantum,
+        bounds=(mean - reach, mean + reach),
+        method="bounded",
+        options={"xatol": 1e-6 * reach},
+    )
+    slack = max(0.0, 0.5 * best.fun * quantum)
+    # The least error leaves one clock only; that it is small, even none, says little of errors below a sample interval.
+    wider = 4 * slack + 2 * min(mean, quantum) if best.fun > -_EXACT else 0.0
+
+    def edge(far: float) -> float:
+        found: Any = brentq(lambda interval: np.min(room(interval)) + wider, best.x, far)
+        return found
+
+    low, high = edge(mean - 2 * reach - wider / (last - first)), edge(mean + 2 * reach + wider / (last - first))
+    grid = np.linspace(low, high, _GRID)
+    with np.errstate(divide="ignore"):
+        likely = np.array([np.sum(np.log(np.maximum(room(dt) + wider, 0.0) / quantum)) for dt in grid])
+    if not np.isfinite(likely.max()):
+        return None
+    density = np.exp(likely - likely.max())
+    interval = float(grid @ density / np.sum(density))
+    spread = float(np.sqrt((grid - interval) ** 2 @ density / np.sum(density)))
+    if interval <= 0:
+        return None
+    early, late = bounds(interval)
+    # As if the stamps were rounded to the nearest: whether they were cut off moves all alike.
+    middle = 0.5 * (early + late) - 0.5 * quantum
+    return SteadyClock(interval, spread / interval, stamps[0] + middle[run] + interval * row, slack)

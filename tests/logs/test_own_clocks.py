@@ -1,0 +1,150 @@
+"""A time column before each signal: each is read on its own clock."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rig
+from fitting.errors import DataError, InputError
+from fitting.estimation.experiment import experiment_from_log
+from fitting.logs.drive_file import DriveFile, read_drive_file
+from fitting.logs.log import Log, read_log
+
+COUNT = 2000
+TORQUE = rig.drive_torque(COUNT)
+FINE = rig.drive_motion(np.repeat(TORQUE, 5), step=rig.STEP / 5, substeps=2)
+TIME = np.arange(COUNT) * rig.STEP
+MOTOR, LOAD = FINE[::5, 0], FINE[2::5, 1]
+NAMES = ("Motor", "Load", "Torque")
+DRIVE = """
+[drive]
+reduction_ratio = 50
+motor_inertia = 5.26e-4
+load_inertia = 5.0e-2
+[signals]
+torque_hold = "zero-order"
+[columns]
+time = "Time"
+motor_angle = "Motor"
+load_angle = "Load"
+motor_torque = "Torque"
+"""
+Channel = tuple[np.ndarray, np.ndarray]
+
+
+def drive(folder: Path, text: str = DRIVE) -> DriveFile:
+    (folder / "drive.toml").write_text(text, encoding="utf-8")
+    return read_drive_file(folder / "drive.toml")
+
+
+def save(folder: Path, channels: Sequence[Channel], *, time_first: bool = True, time: str = "Time") -> Path:
+    pairs = [(time, name) if time_first else (name, time) for name in NAMES]
+    columns = [pair if time_first else pair[::-1] for pair in channels]
+    flat = [column for pair in columns for column in pair]
+    lines = [",".join(name for pair in pairs for name in pair)]
+    for i in range(max(map(len, flat))):
+        lines.append(",".join(repr(c[i].item()) if i < len(c) else "" for c in flat))
+    (folder / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder / "log.csv"
+
+
+def told(log: Log) -> str:
+    return " ".join(map(str, log.findings))
+
+
+@pytest.mark.parametrize("time_first", [True, False])
+def test_one_clock_written_before_each_signal(tmp_path: Path, time_first: bool):
+    path = save(tmp_path, [(TIME, MOTOR), (TIME, FINE[::5, 1]), (TIME, TORQUE)], time_first=time_first)
+    log = read_log(path, drive(tmp_path))
+    np.testing.assert_array_equal(log.time, TIME)
+    np.testing.assert_array_equal(log.motor_torque, TORQUE)
+    assert log.trusted is None and log.pieces is None and "3 columns are called 'Time'" in told(log)
+
+
+def test_clocks_that_round_apart_are_one(tmp_path: Path):
+    path = save(tmp_path, [(TIME, MOTOR), (TIME + 1e-9, FINE[::5, 1]), (TIME - 1e-9, TORQUE)])
+    log = read_log(path, drive(tmp_path))
+    np.testing.assert_allclose(log.time, TIME, atol=2e-9)
+    assert log.trusted is None
+
+
+def test_each_signal_keeps_its_clock(tmp_path: Path):
+    late = TIME[::2] + 0.4 * rig.STEP
+    path = save(tmp_path, [(TIME, MOTOR), (late, LOAD[::2]), (TIME, TORQUE)])
+    log = read_log(path, drive(tmp_path))
+    assert log.trusted is not None
+    np.testing.assert_allclose(log.time[log.trusted], late, atol=1e-12)
+    twist = FINE[2::10, 0] / rig.N - LOAD[::2]
+    np.testing.assert_allclose(log.dynamic_error[log.trusted], twist, atol=1e-3 * np.std(twist))
+    assert all(finding.severity == "note" for finding in log.findings)
+    acting = experiment_from_log(log, hold="zero-order", N=rig.N).torque
+    at = np.searchsorted(np.asarray(acting.knots), TIME[5:-5] + 0.7 * rig.STEP, side="right") - 1
+    np.testing.assert_array_equal(np.asarray(acting.coefficients)[at, 0], TORQUE[5:-5])
+
+
+def test_only_what_all_signals_share_is_kept(tmp_path: Path):
+    path = save(tmp_path, [(TIME[:1500], MOTOR[:1500]), (TIME[100:], FINE[::5, 1][100:]), (TIME, TORQUE)])
+    log = read_log(path, drive(tmp_path))
+    assert TIME[98] < log.time[0] <= TIME[100] and TIME[1499] <= log.time[-1] < TIME[1502]
+    path = save(tmp_path, [(TIME, MOTOR), (TIME + 10.0, LOAD), (TIME, TORQUE)])
+    with pytest.raises(DataError, match="before load_angle begins"):
+        read_log(path, drive(tmp_path))
+
+
+def test_rounded_stamps_of_each_clock_become_steady(tmp_path: Path):
+    rounded = np.round(TIME, 3)
+    path = save(tmp_path, [(rounded, MOTOR), (rounded, FINE[::5, 1]), (rounded, TORQUE)])
+    log = read_log(path, drive(tmp_path))
+    np.testing.assert_allclose(np.diff(log.time), rig.STEP, rtol=1e-3)
+    assert log.rate_std > 0 and "steady clock" in told(log) and log.trusted is None
+
+
+def test_frames_number_repeated_names_their_own_way():
+    import polars as pl
+
+    names = ("Time", "Motor", "Time.1", "Load", "Time.2", "Torque")
+    columns = (TIME, MOTOR, TIME[::2] + 0.4 * rig.STEP, LOAD[::2], TIME, TORQUE)
+    padded = [np.pad(column, (0, COUNT - len(column)), constant_values=np.nan) for column in columns]
+    frame = pl.DataFrame(dict(zip(names, padded, strict=True)))
+    folder = Path("frame")
+    log = read_log(folder, read_drive_file_of(DRIVE), table=frame)
+    assert log.trusted is not None and abs(log.trusted.sum() - COUNT // 2) <= 2
+
+
+def read_drive_file_of(text: str) -> DriveFile:
+    import tomllib
+
+    from fitting.logs.drive_file import drive_of
+
+    return drive_of(tomllib.loads(text), Path("drive"))
+
+
+def test_mistakes_are_told(tmp_path: Path):
+    path = save(tmp_path, [(TIME, MOTOR), (TIME, LOAD), (TIME, TORQUE)])
+    path.write_text(path.read_text(encoding="utf-8").replace("Load", "Motor", 1), encoding="utf-8")
+    with pytest.raises(InputError, match=r"'Motor' appears twice; give .* its number, or the name 'Motor \(2\)'"):
+        read_log(path, drive(tmp_path))
+    log = read_log(path, drive(tmp_path, DRIVE.replace('"Motor"', "2").replace('"Load"', '"Motor (2)"')))
+    np.testing.assert_array_equal(log.load_angle, LOAD)
+    still = save(tmp_path, [(TIME, MOTOR), (0 * TIME, LOAD), (TIME, TORQUE)])
+    with pytest.raises(InputError, match=r"'Time \(2\)' is no clock"):
+        read_log(still, drive(tmp_path))
+    restarted = np.concatenate([TIME[:1000], TIME[:1000]])
+    again = save(tmp_path, [(TIME, MOTOR), (restarted, LOAD), (TIME, TORQUE)])
+    with pytest.raises(InputError, match="clock of load_angle, starts anew"):
+        read_log(again, drive(tmp_path))
+
+
+def test_a_prediction_asks_for_so_many_samples_of_each(tmp_path: Path):
+    late = TIME[::2] + 0.4 * rig.STEP
+    motor, load = MOTOR.copy(), LOAD[::2].copy()
+    path = save(tmp_path, [(TIME, motor), (late, load), (TIME, TORQUE)])
+    log = read_log(path, drive(tmp_path), outputs_until=50)
+    assert log.outputs_until is not None and log.trusted is not None
+    assert 48 <= log.trusted.sum() <= 50 and not log.trusted[log.outputs_until :].any()
+    # What comes later is not looked at.
+    motor[103:], load[51:] = 0.0, 0.0
+    again = read_log(save(tmp_path, [(TIME, motor), (late, load), (TIME, TORQUE)]), drive(tmp_path), outputs_until=50)
+    np.testing.assert_array_equal(again.dynamic_error[again.trusted], log.dynamic_error[log.trusted])
