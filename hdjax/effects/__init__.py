@@ -1,36 +1,12 @@
 """Physical effects that a harmonic drive's log can hide, each inside the equations of motion."""
 
-from hdjax.effects.actuation import (
-    InputDelay,
-    InputLag,
-    TorqueBias,
-    TorqueGain,
-)
-from hdjax.effects.backlash import (
-    Backlash,
-    UndampedBacklash,
-)
-from hdjax.effects.catalogue import (
-    BY_NAME,
-    CATALOGUE,
-    FAMILIES,
-    applicable,
-)
-from hdjax.effects.cogging import (
-    Cogging,
-    SingleOrderCogging,
-)
-from hdjax.effects.creep import (
-    Creep,
-)
-from hdjax.effects.damping import (
-    CubicDamping,
-    DisplacementDamping,
-    QuadraticDamping,
-)
-from hdjax.effects.dry import (
-    DryFriction,
-)
+from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
+from hdjax.effects.backlash import Backlash, UndampedBacklash
+from hdjax.effects.catalogue import BY_NAME, CATALOGUE, FAMILIES, applicable
+from hdjax.effects.cogging import Cogging, SingleOrderCogging
+from hdjax.effects.creep import Creep
+from hdjax.effects.damping import CubicDamping, DisplacementDamping, QuadraticDamping
+from hdjax.effects.dry import DryFriction
 from hdjax.effects.effect import (
     ActuatorEffect,
     Conditions,
@@ -53,23 +29,9 @@ from hdjax.effects.friction import (
     StribeckLoadFriction,
     StribeckMotorFriction,
 )
-from hdjax.effects.hysteresis import (
-    BoucWen,
-    Dahl,
-    MaxwellSlip,
-    SharpBoucWen,
-)
-from hdjax.effects.kinematic import (
-    KinematicError,
-    KinematicHarmonic,
-    KinematicSidebands,
-)
-from hdjax.effects.load import (
-    ConstantLoad,
-    GravityLoad,
-    LoadDisturbance,
-    TwoLineDisturbance,
-)
+from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
+from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
 from hdjax.effects.position import (
     ConservativePositionDependentStiffness,
     PositionDependentMeshFriction,
@@ -77,32 +39,11 @@ from hdjax.effects.position import (
     PositionDependentStiffness,
     RipplingMotorFriction,
 )
-from hdjax.effects.presliding import (
-    DahlMotorFriction,
-    LuGreLoadFriction,
-    LuGreMotorFriction,
-)
-from hdjax.effects.resonance import (
-    ExtraResonance,
-    ResonanceBesideLoad,
-)
-from hdjax.effects.sensing import (
-    LoadEncoderDelay,
-    LoadEncoderEccentricity,
-    MotorEncoderDelay,
-    MotorEncoderEccentricity,
-)
-from hdjax.effects.stiffness import (
-    QuadraticStiffness,
-    QuinticStiffness,
-    SmoothKneeStiffness,
-    ThreeSlopeStiffness,
-)
-from hdjax.effects.thermal import (
-    ThermalDamping,
-    ThermalMotorFriction,
-    ThermalStiffness,
-)
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
+from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
+from hdjax.effects.sensing import LoadEncoderDelay, LoadEncoderEccentricity, MotorEncoderDelay, MotorEncoderEccentricity
+from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
+from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
 __all__ = [
     "ActuatorEffect",
