@@ -1,5 +1,6 @@
 """Identification of harmonic drives from measured logs.
 
+    print(fitting.inspect("run1.csv").summary())
     data = fitting.load(["run1.csv", "run2.csv"], drive="drive.toml")
     fit = fitting.fit(data)
     loop = fitting.close_loop(data)
@@ -14,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fitting.api.data import Data as Data
     from fitting.api.data import load as load
+    from fitting.api.inspection import InspectionResult as InspectionResult
+    from fitting.api.inspection import inspect as inspect
     from fitting.api.prediction import Comparison as Comparison
     from fitting.api.prediction import Prediction as Prediction
     from fitting.api.prediction import compare as compare
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "api.data": ("Data", "load"),
+    "api.inspection": ("InspectionResult", "inspect"),
     "api.prediction": ("Comparison", "Prediction", "compare", "predict"),
     "api.results": ("FitResult", "LoopResult"),
     "api.verbs": ("close_loop", "fit"),
@@ -44,6 +48,7 @@ __all__ = [
     "DataError",
     "FitResult",
     "InputError",
+    "InspectionResult",
     "LoopResult",
     "Prediction",
     "SearchOptions",
@@ -51,6 +56,7 @@ __all__ = [
     "close_loop",
     "compare",
     "fit",
+    "inspect",
     "load",
     "predict",
 ]

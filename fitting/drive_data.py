@@ -16,6 +16,7 @@ from fitting.logs.log import Log, read_log
 from fitting.logs.masks import masked
 from fitting.logs.zeroing import zeroed
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel
+from hdjax.drive import Prior
 
 WHY_NOT_QUASI_STATIC = (
     "a quasi-static log holds nothing of the resonance, so that there is no motion to simulate; `hdjax fit` finds its "
@@ -155,9 +156,9 @@ def base_model(drive_file: DriveFile, log: Log) -> Model:
     """The model without effects that suits a log; stiffness and damping are placeholders."""
     if log.kind == "reduced":
         return ReducedModel(ReducedDrive(mu=1.0, omega_0=1.0))
-    return TwoInertiaModel(
-        Drive(N=drive_file.reduction_ratio, J_m=drive_file.motor_inertia, J_l=drive_file.load_inertia, K=1.0)
-    )
+    known = {"J_m": drive_file.motor_inertia or 1.0, "J_l": drive_file.load_inertia or 1.0, "k_T": 1.0}
+    priors = tuple(Prior(path, known[path], tolerance) for path, tolerance in drive_file.tolerances.items())
+    return TwoInertiaModel(Drive(N=drive_file.reduction_ratio, K=1.0, priors=priors, **known))
 
 
 def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment, ...]:

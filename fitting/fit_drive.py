@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 
 from fitting.attribution.selection_round import Round
 from fitting.clock import Clock
-from fitting.estimation.base_fit import base_fit
+from fitting.estimation.base_fit import base_fit, is_held, told_by_load
 from fitting.estimation.experiment import Experiment, whole
+from fitting.estimation.free_parameters import with_priors
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import Finding
@@ -24,7 +25,7 @@ from fitting.validation.frequency_response import FrequencyResponse, frequency_r
 from fitting.validation.goodness_of_fit import Goodness, goodness
 from fitting.validation.residual_diagnostics import ResidualDiagnostics, diagnose
 from fitting.validation.residual_tests import ResidualTests, residual_tests
-from hdjax import Hold, Model
+from hdjax import Hold, Model, TwoInertiaModel
 
 
 class FitOnly(eqx.Module):
@@ -42,6 +43,9 @@ class FitOnly(eqx.Module):
         bands: how well the free runs are known, along test data where there are any.
         posterior: draws, where they were asked for.
         seconds: where the time went.
+        by_load: whether K, alpha and B_sp are those of the load's own equation, see
+            [`fitting.estimation.motor_driven`][], since the motion does not follow from the torque.
+        assumed: then, what the load's equation was given of the inertia of which nothing was known.
     """
 
     account: Account
@@ -55,6 +59,8 @@ class FitOnly(eqx.Module):
     bands: tuple[PredictionBand, ...]
     posterior: Posterior | None
     seconds: dict[str, float]
+    by_load: bool = eqx.field(static=True)
+    assumed: dict[str, float]
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()
     rounds: ClassVar[tuple[Round, ...]] = ()
@@ -113,10 +119,16 @@ def fit_only(
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    found = long_fit(base, must_explain=True)
+    told_by, assumed = told_by_load(base), {}
+    if told_by is not None and isinstance(base.model, TwoInertiaModel) and base.model.drive.priors:
+        # Nor do inertias and torque constant follow from the torque then.
+        unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path == "J_l"]
+        assumed = {path: float(base.model.get(path)) for path in unknown}
+        base = base_fit(with_priors(base.model, ()), base.stretches)
+    found = base if is_held(base) else long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs")
-    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True)
+    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True, told_by=told_by)
     seen = found.stretches if not tests else tests
     bands = prediction_bands(found, result.uncertainty, seen, noise=noise, runs=result.judged)
     clock.lap("free runs and standard errors")
@@ -143,4 +155,6 @@ def fit_only(
         bands=bands,
         posterior=draws,
         seconds=clock.laps,
+        by_load=told_by is not None,
+        assumed=assumed,
     )

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, Trajectory, TwoInertiaModel, sampled, simulate
+from hdjax.drive import Prior
 from hdjax.effects import BY_NAME, Effect
 from hdjax.effects.learned import LEARNED, Learned, LearnedFriction, LearnedPeriodic
 from hdjax.effects.learned_axes import (
@@ -71,6 +72,7 @@ def to_json(stored: StoredModel) -> str:
         "schema": SCHEMA,
         "kind": "two-inertia" if isinstance(model, TwoInertiaModel) else "reduced",
         "drive": _values(model.drive),
+        "priors": [_prior(p) for p in model.drive.priors] if isinstance(model.drive, Drive) else [],
         "effects": [{"name": e.name, "parameters": _values(e)} | _learned_content(e) for e in model.effects],
         "torque_hold": stored.hold,
         "substeps": stored.substeps,
@@ -101,6 +103,22 @@ def read_model(path: str | Path) -> StoredModel:
 
 def _values(module: eqx.Module) -> dict[str, float]:
     return {name: float(own_value(module, name)) for name, _ in own_parameters(module)}
+
+
+def _prior(prior: Prior) -> dict[str, Any]:
+    """What was known of a parameter beforehand, as the file has it; no tolerance where that was nothing."""
+    return {
+        "path": prior.path,
+        "value": prior.value,
+        "tolerance": None if math.isinf(prior.tolerance) else prior.tolerance,
+    }
+
+
+def _priors(content: Any) -> tuple[Prior, ...]:
+    return tuple(
+        Prior(str(p["path"]), float(p["value"]), math.inf if p["tolerance"] is None else float(p["tolerance"]))
+        for p in content
+    )
 
 
 def _learned_content(effect: Effect) -> dict[str, Any]:
@@ -172,7 +190,7 @@ def _stored(content: Any) -> StoredModel:
         raise ValueError(f"schema {content['schema']!r} where {SCHEMA!r} was expected")
     effects = tuple(_effect(e) for e in content["effects"])
     if content["kind"] == "two-inertia":
-        model: Model = TwoInertiaModel(Drive(**content["drive"]), effects)
+        model: Model = TwoInertiaModel(Drive(**content["drive"], priors=_priors(content.get("priors", ()))), effects)
     else:
         model = ReducedModel(ReducedDrive(**content["drive"]), effects)
     for path, (value, info) in model.parameters().items():

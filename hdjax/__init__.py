@@ -1,7 +1,7 @@
 """hdjax: the dynamic error of harmonic drives, simulated in JAX."""
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.dynamics import Model, ReducedModel, TwoInertiaModel
+from hdjax.dynamics import Model, MotorDrivenModel, ReducedModel, TwoInertiaModel
 from hdjax.forcing import Chirp, Harmonic, MultiHarmonic, random_phase_multisine
 from hdjax.fourier import FourierSeries, fourier_series, harmonic_series
 from hdjax.presets import PRESETS, hdc_40_050
@@ -18,6 +18,7 @@ __all__ = [
     "Harmonic",
     "Hold",
     "Model",
+    "MotorDrivenModel",
     "MultiHarmonic",
     "PRESETS",
     "PiecewisePolynomial",

@@ -1,5 +1,7 @@
 """The drive's own parameters: two inertias on a nonlinear, damped mesh, and what follows from them."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -7,6 +9,20 @@ from jaxtyping import Array, Float
 from hdjax.parameters import Scalar, parameter
 
 SEED = "seed document, Table 1"
+
+
+class Prior(NamedTuple):
+    """What is known beforehand of a parameter that is not known for sure.
+
+    Attributes:
+        path: its symbol.
+        value: the likeliest [SI].
+        tolerance: standard deviation of its logarithm; infinite where nothing is known.
+    """
+
+    path: str
+    value: float
+    tolerance: float
 
 
 class Drive(eqx.Module):
@@ -21,6 +37,10 @@ class Drive(eqx.Module):
     K: Scalar = parameter(unit="N m/rad", doc="torsional stiffness", source=SEED, bounds=(0.0, 1e9))
     alpha: Scalar = parameter(0.0, unit="rad^-2", doc="cubic stiffness coefficient", source=SEED)
     B_sp: Scalar = parameter(0.0, unit="N m s/rad", doc="mesh damping", source=SEED)
+    k_T: Scalar = parameter(
+        1.0, unit="1", doc="motor torque over the torque as logged", source="one where it is right", bounds=(0.0, 1e9)
+    )
+    priors: tuple[Prior, ...] = eqx.field(static=True, default=(), kw_only=True)
 
     @property
     def c(self) -> Scalar:
@@ -52,11 +72,11 @@ class Drive(eqx.Module):
 
         The seed prints `(T_m J_l - T_l J_m)/(N J_m J_l)`, which lacks a factor N on the load torque.
         """
-        return T_m / (self.N * self.J_m) - T_l / self.J_l
+        return self.k_T * T_m / (self.N * self.J_m) - T_l / self.J_l
 
     def reduced(self) -> "ReducedDrive":
         """The single equation of the dynamic error that this drive obeys, forced by the motor torque."""
-        return ReducedDrive(mu=self.mu, omega_0=self.omega_0, alpha=self.alpha, gain=1.0 / (self.N * self.J_m))
+        return ReducedDrive(mu=self.mu, omega_0=self.omega_0, alpha=self.alpha, gain=self.k_T / (self.N * self.J_m))
 
 
 class ReducedDrive(eqx.Module):

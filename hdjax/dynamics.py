@@ -161,7 +161,7 @@ class Model(eqx.Module):
 class TwoInertiaModel(Model):
     """Motor and load inertia with the mesh between them.
 
-        J_m theta_m'' = T_m + tau_m - (1/N + e') tau        J_l theta_l'' = tau + T_l + tau_l
+        J_m theta_m'' = k_T T_m + tau_m - (1/N + e') tau        J_l theta_l'' = tau + T_l + tau_l
 
     with the mesh torque at `x_s = theta_m/N + e(theta_m) - theta_l`. States: theta_m, theta_l, omega_m, omega_l.
     """
@@ -189,7 +189,7 @@ class TwoInertiaModel(Model):
         transmission = 1.0 / drive.N
         for effect in self._of(MeshGeometryEffect):
             transmission = transmission + effect.slope(state[0])
-        on_motor = torque - transmission * tau
+        on_motor = drive.k_T * torque - transmission * tau
         for effect in self._of(MeshTorqueEffect):
             if effect.reacts():
                 on_motor = on_motor + effect.reaction(motion, drive)
@@ -252,6 +252,36 @@ class ReducedModel(Model):
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0
+
+    def outputs(self, state: State) -> Float[Array, "1"]:
+        return state[:1]
+
+
+class MotorDrivenModel(Model):
+    """The load behind the mesh where the motor's motion is given, whatever moves the motor.
+
+        x'' = theta_m''/N - (tau + T_l)/J_l
+
+    The motor's acceleration over N [rad/s^2] takes the place of the torque. States: x, v.
+    """
+
+    drive: Drive
+    effects: tuple[Effect, ...] = ()
+    motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
+
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
+        return Motion(x=state[0], v=state[1], **vars(conditions))
+
+    def component_rates(
+        self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
+    ) -> list[Array]:
+        motion = self.motion(state, conditions)
+        own = self._own_states(state)
+        rates = [state[1], torque - (self._mesh_torque(motion, own) + load_torque) / self.drive.J_l]
+        return self._with_own_rates(motion, rates, own)
+
+    def mobility(self, moved: str, opposed: str) -> Array | float:
+        return 1.0 / self.drive.J_l
 
     def outputs(self, state: State) -> Float[Array, "1"]:
         return state[:1]

@@ -139,4 +139,4 @@ def _error_gains(drive: Drive | ReducedDrive) -> tuple[Array, Array]:
     """What a unit of torque on motor and load adds to the forcing of the dynamic error, but for the sign."""
     if isinstance(drive, ReducedDrive):
         return drive.gain, jnp.zeros_like(drive.gain)
-    return 1.0 / (drive.N * drive.J_m), 1.0 / drive.J_l
+    return drive.k_T / (drive.N * drive.J_m), 1.0 / drive.J_l

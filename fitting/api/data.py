@@ -1,6 +1,6 @@
 """The logs of one drive, from files or from tables in memory."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -117,32 +117,35 @@ def load(
         DataError: A log is too short, or has too many gaps.
     """
     known = _drive(drive)
-    sources = _several(logs)
-    tested = _several(test)
-    if not sources:
+    fitted = sources(logs)
+    if not fitted:
         raise InputError("there is no log; give a path or a table")
-    refuse_twice(*([Path(s) for s in own if not _is_table(s)] for own in (sources, tested)))
-    tables: dict[Path, Any] = {}
-    read = []
-    for number, source in enumerate((*sources, *tested), start=1):
-        path, table = (Path(f"log {number}"), source) if _is_table(source) else (Path(source), None)
-        if table is not None:
-            tables[path] = table
-        read.append(read_log(path, known, outputs_until=outputs_until, table=table))
+    given = [*fitted, *sources(test, first=len(fitted) + 1)]
+    refuse_twice(*([path for path, table in own if table is None] for own in (fitted, given[len(fitted) :])))
+    read = [read_log(path, known, outputs_until=outputs_until, table=table) for path, table in given]
     both = together(read)
-    return Data(known, both[: len(sources)], both[len(sources) :], tables, outputs_until)
+    tables = {path: table for path, table in given if table is not None}
+    return Data(known, both[: len(fitted)], both[len(fitted) :], tables, outputs_until)
+
+
+def sources(logs: Any, *, first: int = 1) -> list[tuple[Path, Any]]:
+    """The path of each log and None, or what messages call it and its table in memory.
+
+    Args:
+        logs: A path, a table in memory, or several of these.
+        first: The number of the first, by which tables are called.
+    """
+    several = [logs] if isinstance(logs, str | PathLike) or _is_table(logs) else list(logs)
+    return [
+        (Path(f"log {number}"), source) if _is_table(source) else (Path(source), None)
+        for number, source in enumerate(several, start=first)
+    ]
 
 
 def _drive(drive: str | PathLike[str] | Mapping[str, Any] | DriveFile) -> DriveFile:
     if isinstance(drive, DriveFile):
         return drive
     return drive_of(drive, Path("drive")) if isinstance(drive, Mapping) else read_drive_file(drive)
-
-
-def _several(sources: Any) -> Sequence[Any]:
-    if isinstance(sources, str | PathLike) or _is_table(sources):
-        return [sources]
-    return list(sources)
 
 
 def _is_table(source: Any) -> bool:

@@ -18,6 +18,7 @@ from typing_extensions import TypeVar
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import scales
 from fitting.estimation.free_parameters import strength_paths
+from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import Answered, Sight, batches, follow_on, sight
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, Scores, null_gains
@@ -86,7 +87,8 @@ def screen(
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS, -np.inf)
-    sights = sight(training, seed), sight(held_out, seed + 1)
+    lost_way = not follows(training)
+    sights = sight(training, seed, measured=lost_way), sight(held_out, seed + 1, measured=lost_way)
     known = len(free_now)
     for batch in batches(sights, proposals, follow_on(training, held_out)):
         scores = [_scores(*pair) for pair in zip(sights, batch.answers, strict=True)]

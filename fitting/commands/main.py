@@ -1,5 +1,5 @@
-"""The command line: `hdjax fit | close-loop | predict | simulate | sweep | design | demo | amplitudes | seed-tables |
-speeds`."""
+"""The command line: `hdjax inspect | init | fit | close-loop | predict | simulate | sweep | design | demo |
+amplitudes | seed-tables | speeds`."""
 
 import atexit
 import gc
@@ -9,6 +9,7 @@ import sys
 import cyclopts
 
 from fitting.commands.fit import close_loop, demo, fit
+from fitting.commands.inspect import init, inspect
 from fitting.commands.motion import predict, simulate
 from fitting.commands.response import amplitudes, seed_tables, speeds
 from fitting.commands.studies import design, sweep
@@ -27,7 +28,20 @@ app = cyclopts.App(
     help="The dynamic error of harmonic drives: simulate it, fit it to logs, and find what the model lacks.",
     version=_version,
 )
-for command in (amplitudes, seed_tables, speeds, sweep, design, fit, close_loop, predict, simulate, demo):
+for command in (
+    inspect,
+    init,
+    amplitudes,
+    seed_tables,
+    speeds,
+    sweep,
+    design,
+    fit,
+    close_loop,
+    predict,
+    simulate,
+    demo,
+):
     app.command(command)
 app.register_install_completion_command(
     "install-completion", help="Add the completion of commands and options to your shell."

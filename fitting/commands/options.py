@@ -14,6 +14,7 @@ from fitting.search_options import SearchOptions
 Logs = Annotated[
     list[Path], Parameter(help="Log files of one drive: CSV, TSV, MAT, HDF5, Parquet or MDF4.", negative="")
 ]
+AnyLogs = Annotated[list[Path], Parameter(help="Log files of any format, or folders of them.", negative="")]
 TestLogs = Annotated[
     tuple[Path, ...],
     Parameter(help="Logs of the same drive that are test data, in place of the last fifth of each log.", negative=""),

@@ -8,6 +8,7 @@ it has found.
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeGuard
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,13 +16,19 @@ import numpy as np
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.free_parameters import MESH, base_paths, with_priors
+from fitting.estimation.motor_driven import held_at, motor_driven_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
-from fitting.estimation.starting_values import apart, starting_models, starts_blind_to_loads
-from fitting.estimation.steady_load import SteadyLoad
+from fitting.estimation.starting_values import (
+    apart,
+    starting_models,
+    starts_blind_to_loads,
+    with_starting_inertias,
+)
+from fitting.estimation.steady_torque import SteadyLoad
 from fitting.estimation.whiteness import autocorrelation, left_over, ljung_box
-from hdjax import Drive, Model
+from hdjax import Drive, Model, TwoInertiaModel
 
 # Iterations that tell a start that leads somewhere from one that does not.
 _TRIAL_STEPS = 10
@@ -40,8 +47,8 @@ _FALSE_ALARM = 1e-3
 def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
     """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
 
-    Where a load that is not logged leaves the model no minimum near the drive's parameters, they are held (see
-    [`is_held`][]).
+    Where what acts on the motor (friction, say) or a load that is not logged leaves the model no minimum near the
+    drive's parameters, they are held (see [`is_held`][]).
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -52,8 +59,20 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: where the data supply no starting values.
     """
     training = without_glitches(training)
+    priors = ()
+    if isinstance(model, TwoInertiaModel):
+        # What the base model lacks would go into inertias that are free, before the load's equation is asked.
+        priors = model.drive.priors
+        model = with_priors(with_starting_inertias(model, training), ())
     best, start = _coarse_fit(starting_models(model, training), training, halo)
-    best = _beside_loads(best, training, halo)
+    if not is_held(best):
+        best = _beside_loads(best, training, halo)
+    if priors:
+        start = with_priors(start, priors)
+        free = with_priors(best.model, priors)
+        strategy = Strategy(hold_parameters=is_held(best))
+        states = Start(states=best.unknowns.states)
+        best = fit(free, best.stretches, base_paths(free), best.segmentation, start=states, strategy=strategy)
     if is_held(best):
         return eqx.tree_at(lambda f: f.problem.model, best, start)
     horizon = short_horizon(best.model, training)
@@ -83,14 +102,19 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
     if len(starts) > 1:
         starts = sorted(starts, key=lambda s: fitted(s, strategy=Strategy(20, hold_parameters=True)).objective)
     best, begun = fitted(starts[0]), starts[0]
-    if len(starts) == 1 or leaves_white_noise(best):
+    if leaves_white_noise(best):
         return best, begun
+    driven = motor_driven_fit(best.model, training) if isinstance(best.model, TwoInertiaModel) else None
+    if _contradicts(driven, best):
+        return _held_at(driven, best.model, training, halo), begun
     trials = [(fitted(s, strategy=Strategy(_TRIAL_STEPS)), s) for s in starts[1:]]
     for trial, start in sorted(trials, key=lambda pair: pair[0].objective):
         if trial.objective < best.objective + _HOPELESS:
             other = fitted(trial.model)
             if other.objective < best.objective:
                 best, begun = other, start
+    if _contradicts(driven, best):
+        best = _held_at(driven, best.model, training, halo)
     return best, begun
 
 
@@ -127,6 +151,26 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     return other if apart(other.model, bare) < _OFF else fitted(bare, strategy=Strategy(hold_parameters=True))
 
 
+def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
+    """Whether the load's own equation, which holds whatever acts on the motor, contradicts a fit of the drive.
+
+    A motor whose friction is a good part of its torque moves far less than the base model makes it. Nothing in that
+    model takes energy from the motor alone. So the fit brakes the motor by tying it to the load, with a damping B_sp so
+    large that the twist stands still and K no longer matters.
+    """
+    if driven is None:
+        return False
+    return held_at(best.model, driven).objective - driven.objective > -np.log(_MUCH)
+
+
+def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:
+    """The base model with its parameters held at what the load's own equation tells."""
+    told = model.replace({path: driven.model.get(path) for path in MESH})
+    horizon = short_horizon(told, training)
+    segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
+    return _fitted(told, training=training, segmentation=segmentation, strategy=Strategy(hold_parameters=True))
+
+
 def is_held(found: Fit) -> bool:
     """Whether its parameters were held."""
     return not np.any(np.asarray(found.problem.active))
@@ -150,6 +194,18 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     )
     states = initial_states(best.model, segmentation.of(as_followed(best)))
     return fit(best.model, training, paths, segmentation, start=Start(states=states))
+
+
+def told_by_load(found: Fit) -> Fit | None:
+    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others."""
+    if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
+        return None
+    driven = motor_driven_fit(with_priors(found.model, ()), found.stretches)
+    if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
+        return None
+    # The stiffness is known in proportion to the load's inertia, and no better.
+    known = tuple(p for p in found.model.drive.priors if p.path == "J_l" and np.isfinite(p.tolerance))
+    return motor_driven_fit(with_priors(found.model, known), found.stretches) if known else driven
 
 
 def need_double_precision() -> None:

@@ -125,7 +125,9 @@ def residual_and_products(unknowns: Unknowns, problem: Problem) -> tuple[Lineari
     """What [`fitting.estimation.levenberg_marquardt.ArrowLevenbergMarquardt`][] minimises: the residual with weighted
     gaps; and what it needs of it."""
     found = blocks_inside(problem, unknowns)
-    return seen_residual(found, problem.gap_weight), Products.of(found)
+    free = problem.free
+    products = Products.of(found).beside_prior(free.off_prior(unknowns.parameters), free.precision * problem.active)
+    return seen_residual(found, problem.gap_weight), products
 
 
 @eqx.filter_custom_jvp

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,12 +11,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from hdjax import Model, TwoInertiaModel
+from hdjax import Drive, Model
+from hdjax.drive import Prior
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
 # A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
 LARGEST_LOG = 100.0
+
+
+ModelT = TypeVar("ModelT", bound=Model)
+
+MESH = ("K", "alpha", "B_sp")
+"""What is fitted of the mesh."""
 
 
 class FreeParameters(eqx.Module):
@@ -27,11 +35,19 @@ class FreeParameters(eqx.Module):
         paths: dotted paths.
         logarithmic: which move by their logarithm.
         scale: unit of each of the others.
+        centre: what is known beforehand of each entry of the vector.
+        precision: inverse of its standard deviation; zero where nothing is known.
     """
 
     paths: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     scale: Float[Array, " parameters"]
+    centre: Float[Array, " parameters"]
+    precision: Float[Array, " parameters"]
+
+    def off_prior(self, vector: Float[Array | np.ndarray, " parameters"]) -> Float[Array | np.ndarray, " parameters"]:
+        """How many standard deviations each entry of a vector is off what is known beforehand."""
+        return self.precision * (vector - self.centre)
 
     def pack(self, model: Model) -> Float[Array, " parameters"]:
         """The vector that stands for the model's values."""
@@ -96,13 +112,22 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
     units = [
         max(abs(v), scale.get(p, 0.0)) or 1.0 if math.isfinite(v) else 1.0 for p, v in zip(paths, values, strict=True)
     ]
-    return FreeParameters(tuple(paths), logarithmic, jnp.asarray(np.array(units, dtype=float)))
+    priors = {p.path: p for p in model.drive.priors} if isinstance(model.drive, Drive) else {}
+    known_before = [priors.get(p, Prior(p, 1.0, math.inf)) for p in paths]
+    numbers = units, [math.log(p.value) for p in known_before], [1.0 / p.tolerance for p in known_before]
+    return FreeParameters(tuple(paths), logarithmic, *(jnp.asarray(np.array(n, dtype=float)) for n in numbers))
+
+
+def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:
+    """The model of a drive with other priors."""
+    assert isinstance(model.drive, Drive)
+    return replace(model, drive=replace(model.drive, priors=priors))
 
 
 def base_paths(model: Model) -> tuple[str, ...]:
     """What is fitted of a drive without effects."""
-    if isinstance(model, TwoInertiaModel):
-        return ("K", "alpha", "B_sp")
+    if isinstance(model.drive, Drive):
+        return (*MESH, *(prior.path for prior in model.drive.priors))
     return ("mu", "omega_0", "alpha", "gain")
 
 

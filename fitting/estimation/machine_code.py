@@ -177,6 +177,9 @@ class Task(eqx.Module):
         logarithmic: which parameters move by their logarithm.
         scale: unit of each of the others.
         active: 1 for a parameter that may move, 0 for one that is held, or that there is not.
+        centre: what is known beforehand of each parameter's entry, see
+            [`fitting.estimation.free_parameters.FreeParameters`][].
+        precision: likewise.
         hidden: how many states are effects' own.
     """
 
@@ -186,6 +189,8 @@ class Task(eqx.Module):
     logarithmic: np.ndarray
     scale: np.ndarray
     active: np.ndarray
+    centre: np.ndarray
+    precision: np.ndarray
     hidden: int = eqx.field(static=True)
 
     def look(self, unknowns: Unknowns) -> tuple[Products, Float[Array, "segments rows"]]:
@@ -202,7 +207,9 @@ class Task(eqx.Module):
             lanes = self.acting.on(lanes)
         found = _march(self.address, lanes, self.hidden, "jacobian", "products")
         assert found.products is not None
-        return Products(found.products, *_ends(lanes, found)), jnp.asarray(found.rows)
+        products = Products(found.products, *_ends(lanes, found))
+        off = self.precision * (vector - self.centre)
+        return products.beside_prior(off, self.precision * self.active), jnp.asarray(found.rows)
 
     def blank(self) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
         """Zeros like what a look finds."""
@@ -231,6 +238,8 @@ def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
         logarithmic=np.pad(np.array(free.logarithmic, dtype=bool), more),
         scale=np.pad(np.asarray(free.scale), more, constant_values=1.0),
         active=np.pad(np.asarray(problem.active), more),
+        centre=np.pad(np.asarray(free.centre), more),
+        precision=np.pad(np.asarray(free.precision), more),
         hidden=kernel.hidden,
     )
 

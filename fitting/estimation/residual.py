@@ -1,6 +1,7 @@
 """Measured minus simulated on every segment, and its derivatives: the one program that all fits run."""
 
-from typing import Literal
+from dataclasses import replace
+from typing import Any, Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -110,6 +111,21 @@ class Products(eqx.Module):
         columns = jnp.concatenate([found.by_parameter, found.by_state, found.residual[:, :, None]], axis=2)
         ends = found.gap, found.before_by_parameter, found.before_by_state
         return Products(jnp.einsum("sri,srj->sij", columns, columns), *ends)
+
+    def beside_prior(
+        self, off: Float[Array | np.ndarray, " parameters"], slope: Float[Array | np.ndarray, " parameters"]
+    ) -> "Products":
+        """With what is known of the parameters beforehand as rows of the first segment.
+
+        Args:
+            off: how many standard deviations each parameter's entry is off.
+            slope: derivative of that by the entry; zero for a parameter that is held.
+        """
+        library: Any = np if isinstance(self.products, np.ndarray) else jnp
+        more = self.products.shape[1] - off.size - 1
+        rows = library.concatenate([library.diag(slope), library.zeros((off.size, more)), off[:, None]], axis=1)
+        first = (library.arange(self.products.shape[0]) == 0).astype(float)[:, None, None]
+        return replace(self, products=self.products + first * (rows.T @ rows)[None])
 
     @property
     def square(self) -> Float[Array, ""]:

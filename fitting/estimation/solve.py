@@ -139,13 +139,17 @@ def _by_host(
     problem: Problem, start: Unknowns, unknowns: Unknowns, solver: ArrowLevenbergMarquardt, looked_at: Task | None
 ) -> _Point:
     """The iteration step by step, where what is looked at is no part of one program for all models."""
-    count = start.parameters.shape[0]
+    count, free = start.parameters.shape[0], problem.free
+    more = (0, unknowns.parameters.size - count)
+    slope = jnp.asarray(np.pad(np.asarray(free.precision * problem.active), more))
 
     def seen_from(wide: Unknowns) -> tuple[Products, Array]:
         if looked_at is not None:
             return looked_at.look(wide)
         own = placed_like(Unknowns(jnp.asarray(np.asarray(wide.parameters)[:count]), wide.states), start)
-        return _products(on_one_device(linearise(problem, own, unknowns.parameters.size)))
+        products, rows = _products(on_one_device(linearise(problem, own, unknowns.parameters.size)))
+        off = free.off_prior(np.asarray(own.parameters))
+        return products.beside_prior(jnp.asarray(np.pad(off, more)), slope), rows
 
     seen = seen_from(unknowns)
     point = _begun(unknowns, solver, *seen)

@@ -49,8 +49,86 @@ def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[M
     return _distinct(model, _estimates(model, stretches, blind=True))
 
 
-def _estimates(model: Model, stretches: Sequence[Stretch], *, blind: bool) -> list[dict[str, float]]:
-    forms = itertools.product(_WIDTHS, _equations(model))
+def starts_of_load_equation(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
+    """Those of the load's own equation, which holds whatever acts on the motor; there may be none. Arguments as in
+    [`starting_models`][]."""
+    found = (_estimates(model, stretches, blind=blind, equations=("load",)) for blind in (False, True))
+    return _distinct(model, list(itertools.chain(*found)))
+
+
+def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Model:
+    """The model with starting values of the inertias of which nothing is known.
+
+    Both inertias' momenta, in which the spring cancels, change as the torques from outside say,
+
+        N J_m theta_m'' + J_l theta_l'' = N k_T T_m + T_l,
+
+    less the friction of either side, of which the motor's may be large: it is estimated beside the inertias.
+
+    Raises:
+        DataError: where no positive inertias follow from the torque.
+    """
+    wanted = [p.path for p in model.drive.priors if np.isinf(p.tolerance) and p.path in ("J_m", "J_l")]
+    if not wanted:
+        return model
+    found = [_momentum(model, stretches, width, wanted) for width in _WIDTHS]
+    usable = [(missed, values) for missed, values in filter(None, found) if min(values) > 0]
+    if not usable:
+        names = ", ".join(s.name for s in stretches)
+        raise DataError(
+            f"{names}: {' and '.join(wanted)} do not follow from the torque; check the signs and units of "
+            "motor_torque, motor_angle and load_angle in the drive file, or state the inertias"
+        )
+    _, values = min(usable)
+    return model.replace(dict(zip(wanted, values, strict=True)))
+
+
+def _momentum(
+    model: TwoInertiaModel, stretches: Sequence[Stretch], width: int, wanted: Sequence[str]
+) -> tuple[float, tuple[float, ...]] | None:
+    """The share of the torque's mean square that is missed, and the wanted inertias; None for too few data."""
+    drive, parts = model.drive, []
+    for stretch in stretches:
+        if len(stretch) < 3 * width:
+            continue
+        experiment, part = stretch.experiment, slice(stretch.start, stretch.stop)
+        tests, slopes, curvatures = _test_functions(width, experiment.time_step)
+        output = experiment.measured[part, 0] - experiment.measured[stretch.start, 0]
+        load = output - experiment.measured[part, -1]
+        N, u = float(drive.N), np.asarray(experiment.torque.coefficients)[part, 0] * float(drive.k_T)
+        T_l = 0.0 if experiment.load_torque is None else np.asarray(experiment.load_torque.coefficients)[part, 0]
+        direction = np.sign(np.gradient(output))
+        hop, dt = max(1, width // 4), experiment.time_step
+
+        def against(signal: np.ndarray, functions: np.ndarray, hop: int = hop, dt: float = dt) -> np.ndarray:
+            windows = np.lib.stride_tricks.sliding_window_view(signal, width)[::hop]
+            return (windows @ functions.T).ravel() * dt
+
+        momenta = {"J_m": N**2 * against(output, curvatures), "J_l": against(load, curvatures)}
+        friction = -against(output, slopes), against(direction, tests)
+        right = against(N * u + T_l, tests) - sum(
+            (
+                float(drive_value) * momenta[p]
+                for p, drive_value in (("J_m", drive.J_m), ("J_l", drive.J_l))
+                if p not in wanted
+            ),
+            np.zeros(1),
+        )
+        parts.append((np.stack([*(momenta[p] for p in wanted), *friction], axis=1), right))
+    if not parts:
+        return None
+    matrix, right = (np.concatenate(column) for column in zip(*parts, strict=True))
+    norm = np.linalg.norm(matrix, axis=0)
+    norm[norm == 0] = 1.0
+    solution = np.linalg.lstsq(matrix / norm, right, rcond=1e-10)[0]
+    missed = float(np.sum((right - matrix / norm @ solution) ** 2) / np.sum(right**2))
+    return missed, tuple(map(float, (solution / norm)[: len(wanted)]))
+
+
+def _estimates(
+    model: Model, stretches: Sequence[Stretch], *, blind: bool, equations: tuple[str, ...] | None = None
+) -> list[dict[str, float]]:
+    forms = itertools.product(_WIDTHS, _equations(model) if equations is None else equations)
     estimates = (_weak_form(model, stretches, width, equation, blind=blind) for width, equation in forms)
     return [estimate for estimate in estimates if estimate is not None]
 
@@ -143,7 +221,7 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: b
         return np.stack([spring, cubic, damper], axis=1), right
     right = -against(x, curvatures)
     if isinstance(model.drive, Drive):
-        forcing = u / float(model.drive.N * model.drive.J_m) - T_l / float(model.drive.J_l)
+        forcing = u * float(model.drive.k_T / (model.drive.N * model.drive.J_m)) - T_l / float(model.drive.J_l)
         return np.stack([spring, cubic, damper], axis=1), right + against(forcing, tests)
     return np.stack([spring, cubic, damper, -against(u, tests)], axis=1), right
 

@@ -17,6 +17,7 @@ from fitting.estimation.linear_response import Followed, follow
 from fitting.estimation.problem import STEP_ANGLE, suggested_substeps
 from fitting.estimation.projection import Answers, without_untold
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.first_order.close_following import followed_closely
 from fitting.first_order.motion import Along, along
 from fitting.first_order.regressors import regressors
 from fitting.first_order.surrogates import surrogates
@@ -45,12 +46,13 @@ class Sight(eqx.Module):
     surrogates: Float[np.ndarray, "draws segments rows"]
 
 
-def sight(fit: Fit, seed: int) -> Sight:
+def sight(fit: Fit, seed: int, *, measured: bool = False) -> Sight:
     """Look along a fit's motion.
 
     Args:
         fit: of the model without what is looked for.
         seed: of the surrogates.
+        measured: whether effects look at the measured motion, see [`fitting.first_order.close_following`][].
     """
     problem, unknowns = _looked_at(fit)
     found = without_untold(linearise(problem, unknowns), problem.free)
@@ -61,8 +63,9 @@ def sight(fit: Fit, seed: int) -> Sight:
         before_by_parameter=jnp.asarray(np.asarray(found.before_by_parameter) / slopes),
     )
     followed, segments, residual = where_it_goes(fit, problem, unknowns)
+    seen = followed_closely(fit) if measured else followed
     return Sight(
-        seen=along(fit.model, followed, segments, fit.stretches),
+        seen=along(fit.model, seen, segments, fit.stretches),
         answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
         residual=residual,
         surrogates=surrogates(fit, seed)[:, : len(residual)],

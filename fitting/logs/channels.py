@@ -1,7 +1,7 @@
 """From a raw column to a signal in SI units: unit, sign, offset, blanks, wrapped counts."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -121,12 +121,21 @@ def _unwrapped(
 
 
 def _convert(
-    drive_file: DriveFile, signal: str, place: ColumnMap, values: np.ndarray, unit: str | None
+    drive_file: DriveFile,
+    signal: str,
+    place: ColumnMap,
+    values: np.ndarray,
+    unit: str | None,
+    si: str | None = None,
 ) -> tuple[np.ndarray, str]:
+    if place.torque_constant is not None:
+        torque, _ = _convert(drive_file, signal, replace(place, torque_constant=None), values, unit, si="A")
+        return place.torque_constant * torque, SI[signal]
     if unit is None:
         return values, SI.get(signal) or _UNSTATED[signal]
     try:
-        return (convert(values, unit, SI[signal]), SI[signal]) if signal in SI else to_base(values, unit)
+        wanted = si or SI.get(signal)
+        return to_base(values, unit) if wanted is None else (convert(values, unit, wanted), wanted)
     except UnitError as error:
         example = ', such as "deg", or "rev / 16777216" for counts' if "angle" in signal else ""
         raise InputError(

@@ -3,11 +3,11 @@
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fitting.errors import InputError
 from fitting.logs.raw_table import numbered
@@ -19,6 +19,7 @@ SIGNALS = (
     "motor_angle",
     "load_angle",
     "motor_torque",
+    "motor_current",
     "load_torque",
     "temperature",
     "dynamic_error",
@@ -28,8 +29,16 @@ SIGNALS = (
     "twist",
     "joint_torque",
 )
-_DRIVE_UNITS = {"reduction_ratio": "1", "motor_inertia": "kg m^2", "load_inertia": "kg m^2", "rated_torque": "N m"}
 _MOST_COLUMNS = 9999
+_DRIVE_UNITS = {
+    "reduction_ratio": "1",
+    "motor_inertia": "kg m^2",
+    "load_inertia": "kg m^2",
+    "rated_torque": "N m",
+    "largest_twist": "rad",
+}
+# What may be known to a tolerance, or not at all, and its symbol.
+_SYMBOLS = {"motor_inertia": "J_m", "load_inertia": "J_l", "torque_constant": "k_T"}
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
     "signals": ("torque_hold", "sample_rate"),
@@ -48,6 +57,7 @@ class ColumnMap:
         offset: What is subtracted before, in the column's own numbers.
         time: Name of the column with this channel's own stamps, in the unit of [columns] time, or None.
         fraction: Of stamps in two columns: where the parts of a second stand, or None.
+        torque_constant: Torque of a current [N m/A], or None for what is no current.
     """
 
     column: str
@@ -56,6 +66,7 @@ class ColumnMap:
     offset: float = 0.0
     time: str | None = None
     fraction: "ColumnMap | None" = None
+    torque_constant: float | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,9 @@ class DriveFile:
         sample_rate: Samples per second [Hz] of a log without time column, or None.
         columns: Signal name to its place in the log, only where the drive file states it.
         rated_torque: At the output [N m], or None; lost motion is defined by it.
+        largest_twist: That the joint may reach [rad], or None for what a strain-wave gear bears.
+        tolerances: Relative standard deviation of each of J_m, J_l and k_T (the torque constant over its value here)
+            that is not known for sure, by its symbol; infinite for what a fit is to find.
     """
 
     path: Path
@@ -83,24 +97,27 @@ class DriveFile:
     sample_rate: float | None
     columns: dict[str, ColumnMap]
     rated_torque: float | None = None
+    largest_twist: float | None = None
+    tolerances: dict[str, float] = field(default_factory=dict)
 
     def column_of(self, signal: str) -> ColumnMap:
         """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""
         return self.columns.get(signal, ColumnMap(signal, None, 1.0))
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
     """A suggestion in brackets, or nothing when no known name is close.
 
     Args:
         word: What was written.
         known: Names that would have been understood.
+        cutoff: How alike they must be, 0 to 1.
 
     Returns:
         " (did you mean 'time'?)" or "".
     """
     by_lower = {name.lower(): name for name in known}
-    close = get_close_matches(word.lower(), list(by_lower), n=1, cutoff=0.6)
+    close = get_close_matches(word.lower(), list(by_lower), n=1, cutoff=cutoff)
     return f" (did you mean '{by_lower[close[0]]}'?)" if close else ""
 
 
@@ -133,15 +150,86 @@ def drive_of(tables: Mapping[str, Any], path: Path) -> DriveFile:
             raise InputError(f"{path}: '{table}' must be a table, so write it as [{table}]")
         _refuse_unknown(path, f"key in [{table}]", tables.get(table, {}), known)
     drive, signals = tables.get("drive", {}), tables.get("signals", {})
-    numbers = {k: _positive(path, "drive", k, drive.get(k), u) for k, u in _DRIVE_UNITS.items()}
+    stated = {k: _stated(path, k, drive.get(k)) for k in _DRIVE_UNITS}
+    numbers = {k: _positive(path, "drive", k, stated[k].value, u) for k, u in _DRIVE_UNITS.items()}
+    columns = {s: _column_map(path, s, e) for s, e in tables.get("columns", {}).items()}
+    tolerances = {_SYMBOLS[k]: one.tolerance for k, one in stated.items() if one.tolerance is not None}
+    if "motor_current" in columns:
+        columns, constant = _torque_of_current(path, columns, tables["columns"]["motor_current"])
+        tolerances |= {"k_T": constant.tolerance} if constant.tolerance is not None else {}
     return DriveFile(
         path=path,
         name=_text(path, "[drive] name", drive.get("name", path.stem)),
         torque_hold=_hold(path, signals.get("torque_hold")),
         sample_rate=_positive(path, "signals", "sample_rate", signals.get("sample_rate"), "Hz"),
-        columns={s: _column_map(path, s, e) for s, e in tables.get("columns", {}).items()},
+        columns=columns,
+        tolerances=tolerances,
         **numbers,
     )
+
+
+class _Stated(NamedTuple):
+    """A number as the drive file states it, and its relative standard deviation, infinite for "fit"; None if known."""
+
+    value: object
+    tolerance: float | None = None
+
+
+def _stated(path: Path, key: str, entry: object, where: str = "[drive] ") -> _Stated:
+    """A number, or what may be known of it to a tolerance.
+
+    Args:
+        path: Of the drive file.
+        key: Of the number.
+        entry: A number; or, for an inertia or a torque constant, `{ value = ..., tolerance = "5 %" }` or "fit".
+        where: Of the key, for messages.
+    """
+    if key not in _SYMBOLS:
+        return _Stated(entry)
+    if entry == "fit":
+        return _Stated(None, math.inf)
+    if not isinstance(entry, dict):
+        return _Stated(entry)
+    place = f"{where}{key}"
+    _refuse_unknown(path, f"key in {place}", entry, ("value", "tolerance"))
+    if "value" not in entry:
+        example = '{ value = 5.26e-4, tolerance = "5 %" }'
+        raise InputError(f'{path}: {place} needs a value, as in {example}, or write "fit"')
+    share = _share(path, place, entry.get("tolerance", 0.0))
+    return _Stated(entry["value"], share or None)
+
+
+def _share(path: Path, place: str, entry: object) -> float:
+    """A relative tolerance: "5 %" or 0.05."""
+    text = entry.strip() if isinstance(entry, str) else ""
+    try:
+        value = 0.01 * float(text[:-1]) if text.endswith("%") else math.nan if text else entry
+    except ValueError:
+        value = math.nan
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
+        raise InputError(
+            f'{path}: tolerance in {place} must be a share of the value below one, such as "5 %" or 0.05, but is '
+            f"{_short(entry)}"
+        )
+    return float(value)
+
+
+def _torque_of_current(
+    path: Path, columns: Mapping[str, ColumnMap], entry: object
+) -> tuple[dict[str, ColumnMap], _Stated]:
+    """The columns with the motor's torque in the place of its current, and what is known of the torque constant."""
+    if "motor_torque" in columns:
+        raise InputError(f"{path}: [columns] has both motor_torque and motor_current; keep the one that was measured")
+    given = entry.get("torque_constant") if isinstance(entry, dict) else None
+    where = "[columns] motor_current "
+    if given is None:
+        raise InputError(f"{path}: {where}needs a torque_constant in N m / A, as in {{ torque_constant = 0.12 }}")
+    stated = _stated(path, "torque_constant", given, where)
+    # A constant that is free is counted from one.
+    value = 1.0 if math.isinf(stated.tolerance or 0.0) else stated.value
+    constant = _positive(path, "columns", "torque_constant", value, "N m/A")
+    others = {signal: place for signal, place in columns.items() if signal != "motor_current"}
+    return others | {"motor_torque": replace(columns["motor_current"], torque_constant=constant)}, stated
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -222,7 +310,8 @@ def _column_map(path: Path, signal: str, entry: object, key: str = "") -> Column
             f'{{ column = "name", unit = "deg", sign = 1 }}, but is {_short(entry)}'
         )
     known = ("column", "unit") if key else ("column", "unit", "sign", "offset", "time")
-    _refuse_unknown(path, f"key in {where}", entry, (*known, "fraction") if signal == "time" and not key else known)
+    further = {"time": ("fraction",), "motor_current": ("torque_constant",)}.get("" if key else signal, ())
+    _refuse_unknown(path, f"key in {where}", entry, (*known, *further))
     sign = entry.get("sign", 1)
     if isinstance(sign, bool) or not isinstance(sign, int | float) or sign not in (1, -1):
         raise InputError(f"{path}: sign in {where} must be 1 or -1, but is {_short(sign)}")

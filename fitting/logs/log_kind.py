@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Literal
 
 from fitting.errors import InputError
+from fitting.logs.column_names import likely_columns
 from fitting.logs.drive_file import SIGNALS, DriveFile, did_you_mean
-from fitting.logs.raw_table import RawColumn, RawTable
+from fitting.logs.raw_table import RawColumn, RawTable, split_unit
 
 DRIVE_SIGNALS = ("motor_angle", "load_angle", "motor_torque")
 REDUCED_SIGNALS = ("dynamic_error", "forcing")
@@ -17,7 +18,10 @@ VELOCITIES = ("motor_velocity", "load_velocity")
 
 Kind = Literal["drive", "reduced", "quasi-static"]
 
+_MOST_LIKELY = 3
+_MISSPELT = 0.78
 _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
+_SYMBOLS = {"motor_inertia": "J_m", "load_inertia": "J_l"}
 
 
 def refuse_repeated(path: Path, drive_file: DriveFile, table: RawTable) -> None:
@@ -53,7 +57,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
             return "quasi-static"
     if is_drive:
         for key in _DRIVE_KEYS:
-            if getattr(drive_file, key) is None:
+            if getattr(drive_file, key) is None and _SYMBOLS.get(key) not in drive_file.tolerances:
                 raise InputError(
                     f"{drive_file.path}: [drive] {key} is missing, which a log with angles and "
                     f"torque such as {path} needs; add it"
@@ -63,13 +67,19 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
         return "reduced"
     begun = any(s in raw for s in REDUCED_SIGNALS) and not any(s in raw for s in DRIVE_SIGNALS)
     missing = [s for s in (REDUCED_SIGNALS if begun else DRIVE_SIGNALS) if s not in raw]
-    hint = did_you_mean(missing[0], table.names)
+    taken = [drive_file.column_of(signal).column for signal in raw]
+    free = [name for name in table.names if split_unit(name)[0] not in taken]
+    likely = likely_columns(missing[0], free)[:_MOST_LIKELY]
+    could_be = f" ({' or '.join(repr(name[:60]) for name in likely)} could be it)" if likely else ""
+    example = likely[0][:60] if likely else "..."
+    # The name of another signal is like this one's as well.
+    hint = did_you_mean(missing[0], free, cutoff=_MISSPELT) or could_be
     velocity = missing[0].replace("angle", "velocity")
     if velocity in raw and velocity != missing[0]:
         hint = f" ({velocity} cannot stand in for it: integrated, it drifts by more than the twist)"
     raise InputError(
-        f"{path}: no column for {', '.join(missing)}{hint}; {listing(table)}, so say which one "
-        f'it is in the drive file, e.g. [columns] {missing[0]} = {{ column = "..." }}'
+        f"{path}: no column for {', '.join(missing)}{hint}; {listing(table)}, so say which one it is in the drive "
+        f'file, e.g. [columns] {missing[0]} = {{ column = "{example}" }}, or let `hdjax init` guess'
     )
 
 

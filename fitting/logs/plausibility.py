@@ -95,10 +95,11 @@ def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     mend = _mend(says, ratio)
     if span <= FREE_MOTION:
         severity, consequence = "warning", f"unless it was locked, {mend}"
-    elif deviation * span <= LARGE_TWIST:
+    elif deviation * span <= (drive_file.largest_twist or LARGE_TWIST):
         severity, consequence = "warning", f"unless slow torque twists the gear by {deviation * span:.2g} rad, {mend}"
     else:
-        severity, consequence = "refusal", mend
+        soft = "if its spring is so soft, state the largest_twist of the joint in [drive]"
+        severity, consequence = "refusal", f"{mend}; {soft}"
     yield Finding(severity, f"reduction_ratio says {ratio:g} but the angles say {_shown(says)}", where, consequence)
 
 

@@ -35,7 +35,8 @@ def zeroed(log: Log, drive_file: DriveFile) -> Log:
         middle, spread = float(np.median(x)), float(np.std(x))
         torque = log.motor_torque if log.forcing is None else log.forcing
         assert torque is not None
-        impossible = log.kind == "drive" and abs(middle) > max(LARGEST_TWIST, _OFFSET * spread)
+        most = drive_file.largest_twist or LARGEST_TWIST
+        impossible = log.kind == "drive" and abs(middle) > max(most, _OFFSET * spread)
         balanced = abs(float(np.mean(torque))) < _NO_MEAN * float(np.std(torque)) and log.load_torque is None
         unexplained = balanced and abs(middle) > _OFFSET * spread > 0 and log.outputs_until is None
         if not (impossible or unexplained):

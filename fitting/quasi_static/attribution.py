@@ -15,7 +15,7 @@ from fitting.quasi_static.form import Form, Terms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.screening import Lead, screen
 from fitting.quasi_static.stretches import folds, stretches, worse
-from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out
+from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out, strengths_of
 
 # A form that explains less than this share of what the best one does is no rival, and is not refitted.
 _RIVAL = 0.25
@@ -102,7 +102,13 @@ class Held:
 
 
 def look(
-    held: Held, before: TwistTrial, base: TwistTrial, choices: Sequence[tuple[Form, ...]], seed: int
+    held: Held,
+    before: TwistTrial,
+    base: TwistTrial,
+    choices: Sequence[tuple[Form, ...]],
+    seed: int,
+    *,
+    elastic: bool = True,
 ) -> TwistRound:
     """Look for the effect that explains most of what a model leaves over.
 
@@ -112,6 +118,8 @@ def look(
         base: The model without any effect.
         choices: Forms, or two together, to consider, the more usual ones first.
         seed: Of the surrogates.
+        elastic: Whether the twist must rise with the torque; at rest, where the torque hardly changes, its noise may
+            make it fall.
     """
     screened = screen(held.points, before.model, choices, held.fold, seed)
     verdicts = []
@@ -122,6 +130,9 @@ def look(
         p_value = screened.p_value(min(gain, lead.gain))
         name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
         verdicts.append(Verdict(name, family, trial, gain, p_value, True))
+    if elastic:
+        # No gear twists against its torque.
+        verdicts = [v for v in verdicts if v.trial.model.coefficients[0] > 0]
     verdicts.sort(key=lambda verdict: -verdict.gain)
     if not verdicts or not _is_supported(verdicts[0].gain, verdicts[0].p_value):
         return Round(before, screened, tuple(verdicts), False)
@@ -187,6 +198,12 @@ def _simplest_first(
     near = [v for v in small if v.gain >= NEARLY * max(v.gain for v in small)]
     winner = min(near, key=lambda v: choices.index(forms[v.name]))
     return [winner, *(replace(v, separable=v not in tied) for v in verdicts if v is not winner)]
+
+
+def is_told(points: Points, model: TwistModel, form: Form) -> bool:
+    """Whether the logs tell anything of a form: one of its figures at least, phases aside."""
+    figures = strengths_of(points, model, form)
+    return any(one.identifiable for name, one in figures.items() if not name.startswith("phase"))
 
 
 def _is_possible(model: TwistModel) -> bool:

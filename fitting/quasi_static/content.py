@@ -97,13 +97,18 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
 def summary(report: Mapping[str, Any]) -> str:
     """The result in plain words."""
     known, shape = report["before"]["parameters"], plain_shape(report["shape"])
-    names = [n for n in ("K", "K1", "K2", "K3") if n in known and known[n]["value"] is not None]
-    stiffness = formatting.words([f"{name} {_with_interval(known[name])}" for name in names])
+    names = [n for n in ("K", "K1", "K2", "K3") if n in known and known[n]["identifiable"]]
     validation = formatting.quantity(report["before"]["rmse"]["validation"], "rad")
     width = known["hysteresis_width"]
     loop = "The logs do not show a width of the loop"
     if width["value"] is not None and width["identifiable"]:
         loop = f"The loop is {_with_interval(width)} wide at zero torque"
+    if not names:
+        return (
+            "The logs do not determine a stiffness: what the twist does beside the torque outweighs what the torque "
+            f"does to it. On stretches that a straight line has not seen it errs by {validation} rms."
+        )
+    stiffness = formatting.words([f"{name} {_with_interval(known[name])}" for name in names])
     article = "" if shape.endswith("slopes") else "a "
     return (
         f"Torque and twist follow {article}{shape} with {stiffness}. {loop}. On stretches that "
@@ -144,7 +149,9 @@ def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
         )
         if fit.chosen == "linear":
             one = fit.known["cubic"]["alpha"]
-            why = _alpha_reason(fit, one) if fit.undetermined is None else one.reason or why
+            if chosen["K"].value is None:
+                one = dataclasses.replace(one, value=None, std=None, ci95=None, reason=chosen["K"].reason)
+            why = _alpha_reason(fit, one) if fit.undetermined is None and one.ci95 else one.reason or why
             alpha = {"alpha": dataclasses.replace(one, identifiable=False, reason=why)}
     still = "the torque does not turn back" if max(fit.blocks.reversals) == 0 else "the joint turned one way only"
     short = f"the torque's range of +-{fit.blocks.amplitude:.3g} N m does not cover "

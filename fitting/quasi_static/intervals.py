@@ -135,9 +135,12 @@ class Figure:
         value, slope = float(self.formula(parameters)), slopes(self.formula, parameters, steps)
         half = found.half_width(slope)
         told = partial(Known, value, found.std(slope), unit=self.unit, description=self.description)
-        if self.positive and half > _NOT_AT_ALL * abs(value):
-            return told(ci95=None, identifiable=False, reason="the logs do not determine it at all")
-        if self.positive and value > 0:
+        if self.positive and (value <= 0 or half > _NOT_AT_ALL * value):
+            reason = (
+                "the logs do not determine it at all" if value > 0 else "it came out below zero, as no drive has it"
+            )
+            return Known(None, None, None, self.unit, False, self.description, reason)
+        if self.positive:
             factor = math.exp(half / value)
             reason = "" if half < _VAGUE * value else f"the logs determine it only to within a factor of {factor:.2g}"
             return told(ci95=(value / factor, value * factor), identifiable=not reason, reason=reason)

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 from fitting.attribution.case_evidence import FinalEvidence
 from fitting.attribution.decisions import RULES, Outcome, conclude
-from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
+from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, is_told, look
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
 from fitting.quasi_static.motion_forms import motion_forms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.rests import RestLook, look_at_rests
 from fitting.quasi_static.torque_forms import torque_forms
-from fitting.quasi_static.twist_model import TwistModel
+from fitting.quasi_static.twist_model import TwistModel, stiffness_of
 
 # Forms of one family in a model: orders of an angle, sliders side by side.
 _MOST_OF_A_FAMILY = 4
@@ -109,6 +109,8 @@ def close_loop(
         current = rounds[-1].winner.trial
         progress(f"found {rounds[-1].winner.name}")
     current, dropped = _without_superfluous(held, current, base)
+    current, untold = _without_untold(held, current)
+    dropped += untold
     at_rest = None
     families = {form.family for form in current.model.forms}
     if "creep" not in families and len(families) < max_effects:
@@ -161,6 +163,19 @@ def _without_superfluous(held: Held, trial: TwistTrial, base: TwistTrial) -> tup
         if trial.gain_over(poorer) < RULES.least_gain or poorer.mean_square - trial.mean_square < least:
             trial = poorer
             dropped.append(form.name)
+    return trial, tuple(dropped)
+
+
+def _without_untold(held: Held, trial: TwistTrial) -> tuple[TwistTrial, tuple[str, ...]]:
+    """The model without forms of which the logs tell no figure, where they do not tell the stiffness beside them
+    either: such forms only take each other's place."""
+    dropped = []
+    while not stiffness_of(held.points, trial.model)["K"].identifiable:
+        untold = [form for form in trial.model.forms if not is_told(held.points, trial.model, form)]
+        if not untold:
+            break
+        trial = held.without(trial, untold[-1:])
+        dropped.append(untold[-1].name)
     return trial, tuple(dropped)
 
 

@@ -1,5 +1,6 @@
 """Quasi-static logs made ready for their fit: how the joint moved, which rows count, and what is refused."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -15,12 +16,16 @@ from fitting.logs.gaps import SHORTEST
 from fitting.logs.log import Log
 from fitting.logs.plausibility import FREE_MOTION
 from fitting.quasi_static.blocks import means
+from fitting.quasi_static.torque_sign import compliance
 
 Motion = Literal["held", "one way", "both ways", "unknown"]
 MOVES: tuple[Motion, ...] = ("one way", "both ways")
 
-# More than any gear bears: vendors' drives twist by less than 0.01 rad at their peak torque.
-LARGEST_TWIST = 0.1
+# Ten times what strain-wave gears twist by at their peak torque (vendors' catalogues); springs of elastic joints twist
+# farther.
+GEAR_TWIST = 0.1
+# No spring between motor and load is wound up by so much, unless the drive file says so.
+_TURN = 2.0 * math.pi
 # Assumed: the part of the typical speed above which friction is that of steady motion.
 _STEADY = 0.7
 # Correlation of means over a hundredth of the log; even a wide loop stays above it.
@@ -70,11 +75,15 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
         )
         speed = speed_of(known, drive_file.reduction_ratio)
         motion = _motion(known, speed)
-        _refuse_mix_ups(log, must_follow=not (at_rest and motion in MOVES))
-        kept, more = _steady(known, speed) if motion in MOVES and not at_rest else (known, ())
+        wide = _wide_twist(log, drive_file.largest_twist)
+        moves = motion in MOVES
+        steady, more = _steady(known, speed) if moves else (known, ())
+        rows = _is_steady(speed) if moves else slice(None)
+        doubt = _refuse_mix_ups(steady, speed[rows], moves=moves, must_follow=not (at_rest and moves))
+        kept, more = (known, ()) if at_rest else (steady, more)
         ready.append(kept)
         motions.append(motion)
-        findings[log.name] = (*seen, *more)
+        findings[log.name] = (*seen, *wide, *doubt, *more)
     return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
 
 
@@ -84,34 +93,76 @@ def torque_of(log: Log) -> np.ndarray:
     return log.joint_torque
 
 
-def _refuse_mix_ups(log: Log, *, must_follow: bool) -> None:
+def _wide_twist(log: Log, most: float | None) -> tuple[Finding, ...]:
+    """A warning where the twist is wider than a gear's, unless the drive file says how far the joint may twist.
+
+    Args:
+        log: The log.
+        most: What the drive file says [rad], or None.
+
+    Raises:
+        DataError: The twist is wider than the drive file says.
+    """
+    span = float(np.ptp(log.dynamic_error))
+    if span <= (most or GEAR_TWIST):
+        return ()
+    limit = most or _TURN
+    moved = log.motor_angle is not None and log.load_angle is not None
+    remedy = (
+        "check reduction_ratio, and the units and signs of the two angles in [columns]"
+        if moved
+        else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, '
+        "lock the motor or log both angles"
+    )
+    if span > limit:
+        known = "a full turn" if most is None else f"the largest_twist of {most:.3g} rad in [drive]"
+        raise DataError(f"{log.path}: the twist spans {span:.3g} rad, which is more than {known}; {remedy}")
+    return (
+        Finding(
+            "warning",
+            f"the twist spans {span:.3g} rad, ten times what strain-wave gears bear",
+            "twist",
+            f"unless its spring is so soft (state largest_twist in [drive], and this is not said again), {remedy}",
+        ),
+    )
+
+
+def _refuse_mix_ups(log: Log, speed: np.ndarray, *, moves: bool, must_follow: bool) -> tuple[Finding, ...]:
+    """Refuse a torque of the wrong sign, and a twist that does not follow the torque; a warning where the sign seems
+    wrong, but one stretch of the log decides.
+
+    Args:
+        log: Of the rows that count.
+        speed: Of the joint there [rad/s].
+        moves: Whether the joint moved.
+        must_follow: Whether the torque must be seen in the twist.
+    """
     torque, twist = torque_of(log), log.dynamic_error
-    span = float(np.ptp(twist))
-    if span > LARGEST_TWIST:
-        moved = log.motor_angle is not None
-        remedy = (
-            "correct reduction_ratio, or the units and signs of the two angles in [columns]"
-            if moved
-            else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, '
-            "lock the motor or log both angles"
-        )
+    slope, classical, robust = compliance(log, speed, moves=moves)
+    if slope < -robust:
         raise DataError(
-            f"{log.path}: the twist spans {span:.3g} rad, which is more than the {LARGEST_TWIST} rad that any gear "
-            f"bears; {remedy}"
+            f"{log.path}: the twist falls where the joint torque rises; give one of the two sign = -1 in [columns]"
         )
     size = max(1, len(log) // 100)
     with np.errstate(invalid="ignore"):
         # Means that never change have no correlation.
         likeness = float(np.nan_to_num(np.corrcoef(means(torque, size), means(twist, size))[0, 1]))
-    if abs(likeness) < _UNRELATED and must_follow:
+    if must_follow and abs(slope) < classical and abs(likeness) < _UNRELATED:
         raise DataError(
             f"{log.path}: the twist does not follow the joint torque (their correlation is {likeness:.2g}); check "
             "which columns they are, or record larger torque cycles"
         )
-    if likeness < -_UNRELATED:
-        raise DataError(
-            f"{log.path}: the twist falls where the joint torque rises; give one of the two sign = -1 in [columns]"
-        )
+    if slope >= -classical:
+        return ()
+    return (
+        Finding(
+            "warning",
+            f"the twist seems to fall where the joint torque rises (by {-slope:.2g} rad/(N m)), as no spring does",
+            "joint_torque",
+            "the logs hold too little to be sure: unless another effect does this, give the torque or the twist sign = "
+            "-1 in [columns]",
+        ),
+    )
 
 
 def speed_of(log: Log, ratio: float | None) -> np.ndarray:

@@ -104,7 +104,7 @@ def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None
 def _look(points: Points, form: Form, seed: int) -> TwistRound:
     held = Held.of(points)
     base = held.attempt()
-    return look(held, base, base, [(form,), (delay(),)], seed)
+    return look(held, base, base, [(form,), (delay(),)], seed, elastic=False)
 
 
 def _chance(this: TwistRound) -> float:

@@ -30,6 +30,8 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     """
     g, account = fitted.goodness, fitted.account
     return {
+        "parameters_from": "load equation" if fitted.by_load else "torque",
+        "assumed": dict(fitted.assumed),
         "goodness": {
             "fit_percent": dict(g.fit_percent),
             "rmse_over_noise": {part: rmse / noise for part, rmse in account.rmse.items()},
@@ -68,12 +70,25 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
     on = report["judged_on"]
     rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"][on]
     notes = []
+    by_load = report["parameters_from"] == "load equation"
+    if by_load:
+        notes.append(
+            "The motor does not move as the logged torque says: friction or something else of that size acts on it. K, "
+            "alpha and B_sp are therefore those of the load's own equation, driven by the motor's motion as measured. "
+            "The errors below are those of free runs under the torque. `hdjax close-loop` looks for what acts on the "
+            "motor."
+        )
+    for path, value in report["assumed"].items():
+        notes.append(
+            f"{path} was not known, and was taken to be {formatting.number(value)} kg m^2, as the torque beside a "
+            "simple friction tells it. K and B_sp go in proportion to it, and their intervals don't hold its error."
+        )
     if not report["goodness"]["converged"]:
         notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")
     missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
     if over_noise is None:
         notes.append(f"The free run diverges on {on} data: the model doesn't stand for this drive.")
-    elif missing:
+    elif missing and not by_load:
         notes.append(
             "The residual is not white noise: the model lacks something, or the sensors' noise has a memory. What is "
             "missing is absorbed in part by the parameters, so that the truth may lie outside the intervals. "

@@ -17,6 +17,8 @@ from hdjax.parameters import ParameterInfo
 _CORRELATED = 0.9
 _MOST_CORRELATIONS = 8
 _DAMPING = ("B_sp", "mu")
+# A standard error above this share of the prior's is the prior's.
+_NOTHING_NEW = 0.8
 
 NOT_TOLD_FROM_ZERO = "not told from zero"
 """Flag of an effect's parameter whose interval holds zero."""
@@ -79,6 +81,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     told += [d["sentence"] for d in found["directions"] if not silent.issuperset(d["members"])]
     notes = list(dict.fromkeys(n for n in told if n))
     notes += [h["sentence"] for h in found["held"]]
+    notes += [_of_prior(path, e) for path, e in final["parameters"].items() if (e.get("prior") or {}).get("tolerance")]
     for other in report["alternatives"]:
         if not other["separable"]:
             notes.append(
@@ -97,6 +100,16 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _of_prior(path: str, estimate: Mapping[str, Any]) -> str:
+    """What the logs add to what was known of a parameter."""
+    before, after = 100.0 * estimate["prior"]["tolerance"], estimate["percent"]
+    value = formatting.quantity(estimate["prior"]["value"], estimate["unit"])
+    told = f"{path} was known to be {value} to within {before:.2g} %"
+    if after is None or after > _NOTHING_NEW * before:
+        return f"{told}, and the logs add nothing to that: standard errors contain it."
+    return f"{told}; with the logs it is known to {after:.2g} %."
 
 
 def _own_phases(report: Mapping[str, Any]) -> list[str]:

@@ -13,7 +13,7 @@ from fitting.report.outcome import Outcome
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
 from fitting.validation.account import Account
 from fitting.validation.derived_quantities import Derived, derived, drive_figures, effect_figures
-from hdjax import Model, ReducedModel
+from hdjax import Drive, Model, ReducedModel
 from hdjax.effects import ActuatorEffect
 
 _TOLD_CORRELATION = 0.1
@@ -77,8 +77,20 @@ def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start:
         "percent": _percent(estimate.value, estimate.std),
         "start": None if start is None else float(start.get(path)),
         "at_bound": path in account.identifiability.bounds,
+        "prior": _prior_dict(path, account.model),
         "note": None if note is None else in_words_of_log(note, units),
     }
+
+
+def _prior_dict(path: str, model: Model) -> dict[str, float | None] | None:
+    """What the drive file says of a parameter that is fitted, its relative standard deviation None for "fit"; None
+    where it says nothing."""
+    known = model.drive.priors if isinstance(model.drive, Drive) else ()
+    found = next((prior for prior in known if prior.path == path), None)
+    if found is None:
+        return None
+    free = math.isinf(found.tolerance)
+    return {"value": None if free else found.value, "tolerance": None if free else found.tolerance}
 
 
 def _flag(path: str, estimate: Estimate, at_bound: bool) -> str | None:

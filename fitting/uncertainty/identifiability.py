@@ -16,7 +16,7 @@ from fitting.estimation.residual import Problem
 from fitting.formatting import words
 from fitting.uncertainty.sandwich import directions
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty
-from hdjax import Model, TwoInertiaModel
+from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.parameters import ParameterInfo
 
 # Two standard errors along a direction that are more than 40 % leave it open.
@@ -103,7 +103,7 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
         return Identifiability({}, (), (), {})
     estimates = found.estimates
     x_max = scales(fit.stretches).x_max
-    x_unit = "rad" if isinstance(fit.model, TwoInertiaModel) else "[x]"
+    x_unit = "rad" if isinstance(fit.model.drive, Drive) else "[x]"
     known, first = fit.model.parameters(), fit.problem.model
     bounds = {
         p: at_bound(p, float(known[p][0]), _in_units_of(fit.model, known[p][1]), start=float(first.get(p)))
@@ -234,7 +234,7 @@ def _power(path: str, exponent: float) -> str:
 def _in_units_of(model: Model, info: ParameterInfo) -> ParameterInfo:
     """What is known of a parameter of a model. The units of a reduced log are its own, so that of bounds in SI units no
     more is left than a sign."""
-    if isinstance(model, TwoInertiaModel) or info.unit == "1":
+    if isinstance(model.drive, Drive) or info.unit == "1":
         return info
     low, high = info.bounds
     return replace(info, bounds=(low if low == 0.0 else -np.inf, high if high == 0.0 else np.inf))

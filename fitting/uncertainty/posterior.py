@@ -187,8 +187,9 @@ def _density_and_gradient(change: Array, given: tuple[Problem, Unknowns]) -> tup
     def refine(_, carried):
         states, _, _ = carried
         found = blocks_inside(problem, Unknowns(parameters, states))
-        value = -0.5 * jnp.sum(found.residual**2)
-        gradient = -jnp.einsum("srp,sr->p", project(found, joined), found.residual)
+        off = problem.free.off_prior(parameters)
+        value = -0.5 * jnp.sum(found.residual**2) - 0.5 * jnp.sum(off**2)
+        gradient = -jnp.einsum("srp,sr->p", project(found, joined), found.residual) - problem.free.precision * off
         held = eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), found, replace_fn=jnp.zeros_like)
         step = normal_equations(Products.of(held), joined).step(jnp.zeros(()))
         return states + step.states, value, gradient

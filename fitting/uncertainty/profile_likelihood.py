@@ -215,7 +215,8 @@ def _cost(problem: Problem, unknowns: Unknowns) -> float:
 
 @eqx.filter_jit
 def _evaluate(problem: Problem, unknowns: Unknowns) -> Array:
-    return jnp.sum(residual_with_blocks(unknowns, problem).rows ** 2)
+    off = problem.free.off_prior(unknowns.parameters)
+    return jnp.sum(residual_with_blocks(unknowns, problem).rows ** 2) + jnp.sum(off**2)
 
 
 @eqx.filter_jit

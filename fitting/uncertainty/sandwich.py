@@ -67,7 +67,7 @@ class Linearised(eqx.Module):
     Attributes:
         records: by stretch.
         information: J^T J of the free vector after the initial states are eliminated.
-        prior: the part of it that comes from the hidden states' prior.
+        prior: the part of it that comes from the priors of hidden states and of parameters.
         chunk: samples in a chunk of time that holds the memory of what is estimated.
     """
 
@@ -114,12 +114,13 @@ def linearised(fit: Fit) -> Linearised:
         projected = np.where(np.isfinite(np.sum(projected**2, axis=(0, 1))), projected, 0.0)
     samples = problem.segments.measured.shape[1] * problem.segments.measured.shape[2]
     prior = projected[:, samples:]
+    known = np.diag(np.asarray(problem.free.precision) ** 2)
     period = 2 * np.pi / natural_frequency(fit.model, fit.stretches) / fit.stretches[0].experiment.time_step
     total = sum(len(s) for s in fit.stretches)
     return Linearised(
         records=_records(fit, residual, projected, states.by_first),
-        information=np.einsum("srp,srq->pq", projected, projected),
-        prior=np.einsum("srp,srq->pq", prior, prior),
+        information=np.einsum("srp,srq->pq", projected, projected) + known,
+        prior=np.einsum("srp,srq->pq", prior, prior) + known,
         chunk=max(1, round(max(_CHUNK_PERIODS * period, total / _CHUNKS))),
     )
 

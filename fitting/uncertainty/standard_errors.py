@@ -60,6 +60,23 @@ class Uncertainty(eqx.Module):
     covariance: Float[np.ndarray, "parameters parameters"]
     unit_covariance: Float[np.ndarray, "parameters parameters"]
 
+    def in_units_of(self, fit: Fit, told_by: Fit) -> "Uncertainty":
+        """The same for the parameters and the free vector of another fit.
+
+        Args:
+            fit: the other fit; its parameters are among those that are known here.
+            told_by: the fit whose uncertainty this is.
+        """
+        own = [told_by.free.paths.index(path) for path in fit.free.paths]
+        ratio = np.asarray(told_by.free.slopes(told_by.model))[own] / np.asarray(fit.free.slopes(fit.model))
+        kept, both = np.ix_(own, own), np.outer(ratio, ratio)
+        return Uncertainty(
+            {path: self.estimates[path] for path in fit.free.paths},
+            self.correlation[kept],
+            both * self.covariance[kept],
+            both * self.unit_covariance[kept],
+        )
+
     def of_effect(self, name: str) -> tuple[list[str], Float[np.ndarray, "own own"]]:
         """The dotted paths of an effect's parameters, and their covariance in SI units."""
         known = list(self.estimates)
@@ -117,8 +134,10 @@ def _described(found: Covariance, other: Float[np.ndarray, "parameters parameter
     if other is None:
         return found
     reach = stdtrit(found.degrees_of_freedom, 0.975) * np.sqrt(np.diag(found.robust))
-    longer = NORMAL_95 * np.sqrt(np.diag(other)) > reach
-    stretch = np.where(longer, np.sqrt(np.diag(other) / np.diag(found.robust)), 1.0)
+    # Of what only a prior tells, rounding may leave less than nothing.
+    variance = np.maximum(np.diag(other), 0.0)
+    longer = NORMAL_95 * np.sqrt(variance) > reach
+    stretch = np.where(longer, np.sqrt(variance / np.diag(found.robust)), 1.0)
     return replace(
         found,
         robust=found.robust * np.outer(stretch, stretch),

@@ -69,6 +69,7 @@ def account(
     halo: int,
     selection: tuple[FreeRun, ...] = (),
     profiles: bool = False,
+    told_by: Fit | None = None,
 ) -> Account:
     """Free runs and standard errors of a fit, and what it can't tell.
 
@@ -81,13 +82,17 @@ def account(
         selection: free runs along the stretches by which it was selected.
         profiles: whether doubtful intervals are taken from the likelihood's profile, which compiles a program of its
             own.
+        told_by: a fit of the same parameters that their standard errors are taken from, where it is another one.
     """
     # Apart, so that test data do not even share the scale of a window.
     seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
-    found = uncertainty(fit)
+    judged = fit if told_by is None else told_by
+    found = uncertainty(judged)
     if profiles:
-        found = with_profiles(fit, found)
-    told = identifiability(fit, found)
+        found = with_profiles(judged, found)
+    told = identifiability(judged, found)
+    if told_by is not None:
+        found = found.in_units_of(fit, told_by)
     return Account(fit.model, found, seen, selection, unseen, told, why_not(fit.problem))
 
 

@@ -143,6 +143,6 @@ def _motion(case: Case, wanted: _Lanes, substeps: Array, tolerance: Array) -> tu
 def _size(case: Case, length: Array) -> Array:
     """The twist that the forcing's largest value would hold [rad]."""
     drive = case.model.drive
-    gain = 1.0 / (drive.N * drive.J_m) if hasattr(drive, "J_m") else drive.gain  # pyright: ignore[reportAttributeAccessIssue]
+    gain = drive.k_T / (drive.N * drive.J_m) if hasattr(drive, "J_m") else drive.gain  # pyright: ignore[reportAttributeAccessIssue]
     pushes = jax.vmap(case.forcing)(jnp.linspace(0.0, 1.0, 65) * length)
     return jnp.maximum(gain * jnp.max(jnp.abs(pushes)) / drive.omega_0**2, 1e-30)

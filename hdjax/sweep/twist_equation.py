@@ -60,5 +60,5 @@ def twist_equation(model: Model) -> TwistEquation:
     drive = model.drive
     effects = tuple(e for e in model.effects if isinstance(e, MeshTorqueEffect))
     if isinstance(drive, Drive):
-        return TwistEquation(drive, effects, 1.0 / (drive.N * drive.J_m), drive.c)
+        return TwistEquation(drive, effects, drive.k_T / (drive.N * drive.J_m), drive.c)
     return TwistEquation(drive, effects, drive.gain, jnp.ones_like(drive.gain))

@@ -130,7 +130,7 @@ print(*(name for name in {heavy!r} if name in sys.modules), file=sys.stderr)
 
 @pytest.mark.parametrize(
     "arguments",
-    [("--version",), ("--help",), ("fit", "--help"), ("speeds", "--help"), ("sweep", "--help")],
+    [("--version",), ("--help",), ("fit", "--help"), ("inspect", "--help"), ("speeds", "--help"), ("sweep", "--help")],
     ids=" ".join,
 )
 def test_what_needs_no_computation_imports_nothing_for_it(arguments: Sequence[str]):

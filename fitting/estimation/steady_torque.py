@@ -1,4 +1,4 @@
-"""A torque on the load that is another in each segment of a log: what a fit takes out to see what moves faster."""
+"""A torque that is another in each segment of a log: what a fit takes out to see what moves faster."""
 
 from typing import ClassVar
 
@@ -6,15 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdjax.drive import Drive
-from hdjax.effects import Effect, LoadSideEffect, Motion, Scales
+from hdjax.effects import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
+from hdjax.effects.effect import ShaftEffect
 from hdjax.parameters import Scalar, parameter
 
 
-class SteadyLoad(LoadSideEffect):
-    """A constant torque on the load; a state, and thus fitted to each segment on its own."""
+class SteadyTorque(ShaftEffect):
+    """A constant torque on a shaft; a state, and thus fitted to each segment on its own."""
 
-    family: ClassVar[str] = "load_disturbance"
-    name: ClassVar[str] = "steady_load"
     states: ClassVar[tuple[str, ...]] = ("share",)
     drawn_against: ClassVar[str | None] = None
 
@@ -35,3 +34,17 @@ class SteadyLoad(LoadSideEffect):
 
     def state_scale(self) -> Float[Array, "1"]:
         return jnp.ones_like(self.reach)[None]
+
+
+class SteadyLoad(SteadyTorque, LoadSideEffect):
+    """On the load."""
+
+    family: ClassVar[str] = "load_disturbance"
+    name: ClassVar[str] = "steady_load"
+
+
+class SteadyMotorTorque(SteadyTorque, MotorSideEffect):
+    """On the motor, beside what was logged."""
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "steady_motor_torque"

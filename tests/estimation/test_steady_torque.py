@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rig
-from fitting.estimation.steady_load import SteadyLoad
+from fitting.estimation.steady_torque import SteadyLoad
 from hdjax import sampled
 from hdjax.effects.load import ConstantLoad
 from hdjax.simulate import march

@@ -1,0 +1,65 @@
+"""What `hdjax inspect` and `hdjax init` do."""
+
+import shlex
+from collections.abc import Iterable
+from pathlib import Path
+
+from fitting.api.inspection import inspected
+from fitting.errors import InputError
+from fitting.inspection.columns import Table, read_columns
+from fitting.inspection.inspection import alike
+from fitting.logs.read_table import LOG_SUFFIXES
+
+
+def show_logs(logs: Iterable[Path], joint: str | None) -> None:
+    """Print what logs seem to hold, those with the same columns together.
+
+    Args:
+        logs: files, and folders of them.
+        joint: label of a joint, or None.
+
+    Raises:
+        InputError: A file can't be read, or has no such joint.
+    """
+    groups = alike(_tables(logs))
+    print("\n\n".join(inspected(group, joint=joint).summary() for group in groups))
+
+
+def write_drive_file(logs: Iterable[Path], out: Path, joint: str | None) -> None:
+    """Write a drive file from logs of one drive, and say what must be filled in.
+
+    Args:
+        logs: files, and folders of them.
+        out: the drive file.
+        joint: label of a joint, or None.
+
+    Raises:
+        InputError: A file can't be read, or the logs have different columns.
+    """
+    tables = _tables(logs)
+    found = inspected(tables, joint=joint)
+    found.save(out, force=True)
+    print(f"Drive file: {out}")
+    if found.inspection.joint.label is not None:
+        print(f"It describes joint {found.inspection.joint.label}; --joint picks another.")
+    for place, why in found.unknown.items():
+        print(f"Fill in {place}: {why}")
+    if not found.unknown:
+        names = " ".join(shlex.quote(str(table.path)) for table in tables)
+        print(f"Check the guesses, then: hdjax close-loop {names} --drive {shlex.quote(str(out))} --out report")
+
+
+def _tables(logs: Iterable[Path]) -> list[Table]:
+    return [read_columns(path) for log in logs for path in (_inside(log) if log.is_dir() else [log])]
+
+
+def _inside(folder: Path) -> list[Path]:
+    """The logs of a folder, by their names."""
+    found = [p for p in sorted(folder.iterdir()) if p.is_file() and _is_log(p)]
+    if not found:
+        raise InputError(f"{folder}: the folder has no log; give one with {', '.join(LOG_SUFFIXES)} files")
+    return found
+
+
+def _is_log(path: Path) -> bool:
+    return path.with_suffix("" if path.suffix.lower() == ".gz" else path.suffix).suffix.lower() in LOG_SUFFIXES

@@ -1,0 +1,84 @@
+"""The measured motion, from simulations so short that they stay with the log.
+
+A model that lacks much of what acts (friction that takes most of the torque) leaves the log within a few samples. What
+an effect would do along that model's own motion then says nothing of what it does in the drive. Simulations that start
+anew every few samples, with a steady torque of their own on either side, stay with the log: their states are the
+measured motion, smoothed by the equations.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.linear_response import Followed, follow
+from fitting.estimation.problem import initial_states
+from fitting.estimation.steady_torque import SteadyLoad, SteadyMotorTorque
+from hdjax import TwoInertiaModel
+
+# Samples of the shortest simulations, which still tell each state from noise.
+_SHORTEST = 8
+
+
+def followed_closely(found: Fit) -> Followed:
+    """The motion along a fit's data from simulations whose length suits the log best, in the fit's own segments.
+
+    Shorter simulations have more initial states, which also follow noise; Akaike's criterion (1974) weighs the two.
+
+    Args:
+        found: a fit whose own motion does not stay with the log.
+    """
+    best = _held(found, _SHORTEST)
+    while 2 * best.horizon <= found.error.shape[1]:
+        longer = _held(found, 2 * best.horizon)
+        if _criterion(longer) > _criterion(best):
+            break
+        best = longer
+    return _in_segments_of(found, best)
+
+
+def _held(found: Fit, horizon: int) -> Fit:
+    """The same parameters over simulations that start anew every `horizon` samples, beside steady torques."""
+    segmentation = replace(found.segmentation, horizon=horizon, length=horizon, count=None)
+    model = found.model
+    if isinstance(model, TwoInertiaModel):
+        reach = max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in found.stretches)
+        model = model.with_effects(SteadyMotorTorque(reach=reach), SteadyLoad(reach=float(model.drive.N) * reach))
+    start = Start(found.covariance, initial_states(model, segmentation.of(found.stretches)))
+    strategy = Strategy(hold_parameters=True, retry_states=False)
+    return fit(model, found.stretches, found.free.paths, segmentation, start=start, strategy=strategy)
+
+
+def _criterion(found: Fit) -> float:
+    """Akaike's, of the outputs' Gaussian errors and the initial states."""
+    states = int(np.sum(~np.asarray(found.problem.segments.joined)[: found.pieces.sum()])) * len(
+        found.model.state_names
+    )
+    return float(np.sum(np.asarray(found.problem.segments.weight))) * found.objective + states
+
+
+def _in_segments_of(found: Fit, shorter: Fit) -> Followed:
+    """What the shorter simulations go through, cut as the fit's own segments are."""
+    followed = follow(shorter.at_solution, shorter.unknowns)
+    length, own = found.error.shape[1], len(found.model.state_names)
+
+    def cut(values: np.ndarray) -> np.ndarray:
+        """Sample by sample, each stretch filled up to whole segments with its last sample."""
+        flat = values.reshape(-1, *values.shape[2:])
+        samples = shorter.pieces * shorter.error.shape[1]
+        ends = np.cumsum(samples)
+        rows = [
+            np.minimum(np.arange(pieces * length), count - 1) + end - count
+            for pieces, count, end in zip(found.pieces, samples, ends, strict=True)
+        ]
+        return flat[np.concatenate(rows)].reshape(-1, length, *flat.shape[1:])
+
+    starts, ends = cut(followed.states[:, :-1]), cut(followed.states[:, 1:])
+    return Followed(
+        states=np.concatenate([starts, ends[:, -1:]], axis=1)[..., :own],
+        between=cut(followed.between)[..., :own],
+        transition=cut(followed.transition)[..., :own, :own],
+        from_start=cut(followed.from_start)[..., :own, :own],
+        from_end=cut(followed.from_end)[..., :own, :own],
+        readout=cut(followed.readout)[..., :own],
+    )

@@ -1,0 +1,179 @@
+"""All columns of a log, as numbers, with what their names say."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.errors import InputError
+from fitting.logs.column_names import NameSense, sense
+from fitting.logs.raw_table import RawColumn, RawTable, split_unit
+from fitting.logs.read_table import read_table
+
+_FEWEST_ROWS = 8
+_MOST_TEXT = 0.05  # share of rows; what has more is no channel
+_MOST_IN_A_MATRIX = 64
+# Written out, these say the same as the symbol.
+_FILL = 1e30
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """One column of numbers.
+
+    Attributes:
+        name: By which a drive file asks for it.
+        unit: As the file or the name states it, or None.
+        values: float64, (n,), NaN where unknown.
+        time: Own stamps [s], (n,), or None.
+        sense: What its name says.
+    """
+
+    name: str
+    unit: str | None
+    values: np.ndarray
+    time: np.ndarray | None
+    sense: NameSense
+
+    @property
+    def constant(self) -> bool:
+        """Whether it never changes."""
+        known = self.values[np.isfinite(self.values)]
+        return len(known) == 0 or bool(np.ptp(known) == 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The columns of one log.
+
+    Attributes:
+        path: Of the file, or what stands for a table in memory.
+        source: The table in memory, or None.
+        columns: That hold numbers, in the file's order, all of one length but for own clocks.
+        left_out: Why other columns are not among them, by name.
+        sample_rate: Hz, where it stands beside the data, or None.
+    """
+
+    path: Path
+    source: Any
+    columns: tuple[Column, ...]
+    left_out: dict[str, str]
+    sample_rate: float | None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Of all columns."""
+        return frozenset(column.name for column in self.columns)
+
+    @property
+    def rows(self) -> int:
+        """Of the longest column."""
+        return max(len(column.values) for column in self.columns)
+
+    def column(self, name: str) -> Column:
+        """The column of that name."""
+        return next(column for column in self.columns if column.name == name)
+
+
+def read_columns(path: Path, source: Any = None) -> Table:
+    """Read all columns of a log.
+
+    Args:
+        path: File of any format of [`fitting.logs.read_table`][], or what messages call a table.
+        source: A table in memory in place of the file, as in [`fitting.logs.frames.table_of`][].
+
+    Raises:
+        InputError: The file can't be read, or holds no column of numbers.
+    """
+    read = _reader(path, source)
+    names = tuple(dict.fromkeys(read(()).names))
+    raw, left_out, rate = _all(read, names)
+    kept = {name: column for name, column in raw.items() if len(column.values) >= _FEWEST_ROWS}
+    left_out |= {name: "a single number" for name in raw if name not in kept}
+    for name, column in list(kept.items()):
+        reason = _no_channel(column)
+        if reason:
+            left_out[name] = reason
+            del kept[name]
+    if not kept:
+        raise InputError(f"{path}: no column holds numbers; give the log file itself, or export it with its samples")
+    lengths = [len(column.values) for column in kept.values() if column.time is None]
+    # Of arrays of several lengths, those that belong together are the most.
+    usual = max(lengths, key=lambda n: (lengths.count(n), n), default=0)
+    for name, column in list(kept.items()):
+        if column.time is None and len(column.values) != usual:
+            left_out[name] = f"{len(column.values)} rows, where most columns have {usual}"
+            del kept[name]
+    plain = [split_unit(name)[0] for name in names]
+    columns = tuple(_column(name, column, plain) for name, column in kept.items())
+    return Table(path, source, columns, left_out, rate)
+
+
+Read = Callable[[Sequence[str]], RawTable]
+
+
+def _reader(path: Path, source: Any) -> Read:
+    if source is None:
+        return lambda wanted: read_table(path, wanted)
+    # Loaded here: tables in memory need polars, which takes long to load.
+    from fitting.logs.frames import table_of
+
+    return lambda wanted: table_of(path, source, wanted)
+
+
+def _all(read: Read, names: Sequence[str]) -> tuple[dict[str, RawColumn], dict[str, str], float | None]:
+    """The columns that can be read, why others can't, and a sample rate beside them."""
+    try:
+        table = read(names)
+        return {name: table.columns[name] for name in names if name in table.columns}, {}, table.sample_rate
+    except InputError as error:
+        if len(names) > 1:
+            # One column that is no vector of numbers hides all others.
+            half = len(names) // 2
+            first, second = _all(read, names[:half]), _all(read, names[half:])
+            return first[0] | second[0], first[1] | second[1], first[2] or second[2]
+        matrix = _matrix(read, names[0])
+        reason = str(error).partition(f"'{names[0]}' ")[2].partition(",")[0]
+        return (matrix, {}, None) if matrix else ({}, {names[0]: reason or "no numbers"}, None)
+
+
+def _matrix(read: Read, name: str) -> dict[str, RawColumn]:
+    """The columns of a matrix, as readers of arrays name them."""
+    found: dict[str, RawColumn] = {}
+    for k in range(1, _MOST_IN_A_MATRIX + 1):
+        column = f"{name}(:,{k})"
+        try:
+            found |= read((column,)).columns
+        except InputError:
+            break
+        if column not in found:
+            break
+    return found
+
+
+def _no_channel(column: RawColumn) -> str | None:
+    known = np.isfinite(column.values)
+    if len(column.text_rows) > max(1, _MOST_TEXT * len(column.values)):
+        return f"text such as {column.text!r}"
+    return None if known.any() else "blank"
+
+
+def _column(name: str, raw: RawColumn, plain: Sequence[str]) -> Column:
+    said = sense(name)
+    short = split_unit(name)[0]
+    values = np.where(np.abs(raw.values) < _FILL, raw.values, np.nan)
+    return Column(
+        name=short if plain.count(short) == 1 else name,
+        unit=_plain_unit(raw.unit or said.unit),
+        values=values,
+        time=raw.time,
+        sense=said if raw.unit is None else replace(said, unit=raw.unit),
+    )
+
+
+def _plain_unit(unit: str | None) -> str | None:
+    """A unit without the marks that exports put around it; None for one that says nothing."""
+    unit = (unit or "").strip().strip("[]()").strip()
+    return unit if unit not in ("", "-", "1", "none", "None") else None

@@ -1,0 +1,227 @@
+"""A drive file in words: what was guessed of a log, each guess with its reason, and lines for what can't be known."""
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from fitting.inspection.inspection import Inspection, SignalGuess
+
+_ANGLES = ("motor_angle", "load_angle")
+_ORDER = (
+    *_ANGLES,
+    "motor_velocity",
+    "load_velocity",
+    "motor_torque",
+    "motor_current",
+    "joint_torque",
+    "load_torque",
+    "twist",
+    "dynamic_error",
+    "forcing",
+    "temperature",
+)
+_INERTIAS = {
+    "motor_inertia": 'rotor, wave generator and brake about the motor\'s axis, e.g. "5.26 kg cm^2"',
+    "load_inertia": "all that the output moves, about its axis [kg m^2]",
+}
+_WHERE_TO_FILL = "FILL IN"
+
+
+def drive_tables(inspection: Inspection) -> dict[str, Any]:
+    """What is known of a drive as the tables of a drive file, without what must be filled in."""
+    joint = inspection.joint
+    drive: dict[str, Any] = {"name": _name(inspection)}
+    if joint.ratio is not None and joint.ratio.sure and _known_angles(inspection):
+        drive["reduction_ratio"] = _number(joint.ratio.value)
+    columns = {s: _place(joint.signals[s]) for s in _written(inspection)}
+    if inspection.time.column is not None:
+        columns = {"time": {"column": inspection.time.column, "unit": inspection.time.unit}} | columns
+    return {"drive": drive, "columns": columns}
+
+
+def unknowns(inspection: Inspection) -> dict[str, str]:
+    """What must be filled in before the logs can be fitted, by its place in the drive file, and why."""
+    joint = inspection.joint
+    missing: dict[str, str] = {}
+    both = set(_ANGLES) <= set(joint.signals)
+    if both and "reduction_ratio" not in drive_tables(inspection)["drive"]:
+        missing["[drive] reduction_ratio"] = _why_no_ratio(inspection)
+    if joint.kind in ("drive", "motor side"):
+        missing |= {f"[drive] {key}": what for key, what in _INERTIAS.items()}
+    if inspection.time.column is None and inspection.rates[0] is None:
+        missing["[signals] sample_rate"] = "in Hz; no column is a clock"
+    written = _written(inspection)
+    for signal in _in_order(joint.signals):
+        if signal not in written and not _spare(inspection, signal):
+            missing[f"[columns] {signal}"] = _why_not_written(joint.signals[signal])
+    for column, shares in joint.open.items():
+        missing[f"[columns] for '{column}'"] = f"it may be {_listed(shares)}"
+    if joint.kind is None and not joint.open:
+        missing["[columns]"] = "no column was recognised as an angle and a torque, or as a twist and a forcing"
+    return missing
+
+
+def drive_file_text(inspection: Inspection, made_by: str) -> str:
+    """The drive file.
+
+    Args:
+        inspection: What was found.
+        made_by: The command or verb, for the first line.
+    """
+    tables = drive_tables(inspection)
+    names = ", ".join(table.path.name for table in inspection.tables)
+    head = [
+        f"# Written by {made_by} from {names}.",
+        "# Each guess has its reason behind it: check it. Lines with FILL IN are not known from the logs:",
+        "# complete them and take away the # before them.",
+    ]
+    lines = [*head, "", "[drive]", f"name = {_toml(tables['drive']['name'])}"]
+    lines += [*_ratio_lines(inspection), *_inertia_lines(inspection), "", "[signals]", *_sampling_lines(inspection)]
+    lines += ["", "[columns]", *_time_lines(inspection)]
+    written = _written(inspection)
+    for signal in _in_order(inspection.joint.signals):
+        guess = inspection.joint.signals[signal]
+        if signal in written:
+            lines.append(_with_reason(f"{signal} = {_toml(_place(guess))}", guess))
+        elif _spare(inspection, signal):
+            lines.append(f"# {signal} = {_toml(_place(guess))}  # beside the motor torque it is not needed")
+        else:
+            lines.append(f"# {signal} = {_open_place(guess)}  # {_WHERE_TO_FILL}: {_why_not_written(guess)}")
+    lines += _open_lines(inspection)
+    return "\n".join(lines) + "\n"
+
+
+def _name(inspection: Inspection) -> str:
+    stem = inspection.tables[0].path.name.partition(".")[0] or "drive"
+    return f"{stem}, joint {inspection.joint.label}" if inspection.joint.label else stem
+
+
+def _in_order(signals: Iterable[str]) -> list[str]:
+    return sorted(signals, key=_ORDER.index)
+
+
+def _written(inspection: Inspection) -> list[str]:
+    """The signals whose lines need nothing more."""
+    signals = inspection.joint.signals
+    return [
+        s
+        for s in _in_order(signals)
+        if not _spare(inspection, s) and s != "motor_current" and (s not in _ANGLES or signals[s].unit is not None)
+    ]
+
+
+def _spare(inspection: Inspection, signal: str) -> bool:
+    return signal == "motor_current" and "motor_torque" in inspection.joint.signals
+
+
+def _known_angles(inspection: Inspection) -> bool:
+    """Whether the ratio of the angles is that of the drive: units that cancel need not be known."""
+    signals = inspection.joint.signals
+    return all(s in signals for s in _ANGLES)
+
+
+def _place(guess: SignalGuess) -> dict[str, Any]:
+    place: dict[str, Any] = {"column": guess.column}
+    if guess.unit is not None:
+        place["unit"] = guess.unit
+    return place | ({"sign": -1} if guess.sign < 0 else {})
+
+
+def _open_place(guess: SignalGuess) -> str:
+    """A place with the part that is not known left to be written."""
+    sign = ", sign = -1" if guess.sign < 0 else ""
+    if guess.signal == "motor_current":
+        unit = f", unit = {_toml(guess.unit)}" if guess.unit else ""
+        return f"{{ column = {_toml(guess.column)}{unit}{sign}, torque_constant = ... }}"
+    return f'{{ column = {_toml(guess.column)}, unit = "..."{sign} }}'
+
+
+def _why_not_written(guess: SignalGuess) -> str:
+    if guess.signal == "motor_current":
+        return "the torque constant [N m / A] is not known from a log"
+    return 'the unit can\'t be seen; for counts write "rev / 65536" with the counts of a revolution'
+
+
+def _with_reason(line: str, guess: SignalGuess) -> str:
+    return f"{line}  # guess, {_percent(guess.confidence)}: {_plain(guess.why)}"
+
+
+def _ratio_lines(inspection: Inspection) -> list[str]:
+    ratio = inspection.joint.ratio
+    both = _known_angles(inspection)
+    known = "reduction_ratio" in drive_tables(inspection)["drive"]
+    if ratio is not None and known:
+        said = f"reduction_ratio = {_toml(_number(ratio.value))}"
+        if ratio.value == 1:
+            why = "both angles turn alike, so that motor inertia and torque count as seen from the output"
+        else:
+            why = f"the angles leave {ratio.low:.4g} to {ratio.high:.4g}"
+        return [f"{said}  # guess: {why}"]
+    if inspection.joint.kind == "reduced" or (inspection.joint.kind == "quasi-static" and not both):
+        return []
+    likely = f" {_toml(_number(ratio.value))}" if ratio is not None else ""
+    return [f"# reduction_ratio ={likely or ' ...'}  # {_WHERE_TO_FILL}: {_why_no_ratio(inspection)}"]
+
+
+def _why_no_ratio(inspection: Inspection) -> str:
+    ratio = inspection.joint.ratio
+    if ratio is None:
+        return "motor turns per output turn; the log does not show it"
+    return f"motor turns per output turn; the angles leave {ratio.low:.4g} to {ratio.high:.4g}"
+
+
+def _inertia_lines(inspection: Inspection) -> list[str]:
+    if inspection.joint.kind in ("reduced", "quasi-static"):
+        return []
+    return [f"# {key} = ...  # {_WHERE_TO_FILL}: {what}" for key, what in _INERTIAS.items()]
+
+
+def _sampling_lines(inspection: Inspection) -> list[str]:
+    lines = []
+    if inspection.time.column is None and inspection.rates[0] is None:
+        lines.append(f"# sample_rate = ...  # {_WHERE_TO_FILL}: Hz; no column is a clock")
+    hold = '# torque_hold = "zero-order"  # what the torque does between samples, where you know it'
+    return [*lines, hold] if inspection.joint.kind != "quasi-static" else lines
+
+
+def _time_lines(inspection: Inspection) -> list[str]:
+    time = inspection.time
+    if time.column is None:
+        return [f"# time: {_plain('; '.join(time.reasons))}"]
+    place = {"column": time.column, "unit": time.unit}
+    return [f"time = {_toml(place)}  # guess, {_percent(time.confidence)}: {_plain('; '.join(time.reasons))}"]
+
+
+def _open_lines(inspection: Inspection) -> list[str]:
+    lines = []
+    for column, shares in inspection.joint.open.items():
+        lines.append(f"# {_WHERE_TO_FILL}: {_plain(repr(column))} may be {_listed(shares)}; take the # from one line")
+        lines += [f"# {signal} = {{ column = {_toml(column)} }}" for signal in shares]
+    return lines
+
+
+def _listed(shares: dict[str, float]) -> str:
+    return ", ".join(f"{signal} ({_percent(share)})" for signal, share in shares.items())
+
+
+def _percent(share: float) -> str:
+    return f"{100 * min(share, 0.99):.0f} %"
+
+
+def _number(value: float) -> int | float:
+    return int(value) if value == int(value) else float(f"{value:.6g}")
+
+
+def _plain(text: str) -> str:
+    """Text that may stand in a comment: names of columns may hold line ends."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML writes it; its strings are those of JSON."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, str):
+        # JSON leaves the delete character as it is, TOML does not.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)

@@ -1,0 +1,118 @@
+"""How a log moves its drive: ranges, the band of the torque, and where the response follows it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.signal
+
+from fitting.inspection.inspection import Inspection
+from fitting.logs.channels import SI
+
+COHERENT = 0.9
+"""Coherence from which a response is said to follow its input; assumed."""
+
+_POWER = (0.05, 0.95)  # of a torque, between these shares lies its band
+_SEGMENTS = 16
+_FEWEST = 256
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """How one log moves its drive.
+
+    Attributes:
+        ranges: Lowest and highest value of each signal, and its unit, by name.
+        driver: The torque or forcing that was looked at, or None.
+        response: What follows it, or None.
+        band: Hz, between which 90 % of the driver's power lies, or None.
+        coherent: Hz, the widest band in which the response follows the driver, or None.
+        twist: Range of what both angles do not share [rad], or None.
+    """
+
+    ranges: dict[str, tuple[float, float, str]]
+    driver: str | None
+    response: str | None
+    band: tuple[float, float] | None
+    coherent: tuple[float, float] | None
+    twist: float | None
+
+
+def excitation(inspection: Inspection, log: int = 0) -> Excitation:
+    """How a log moves its drive.
+
+    Args:
+        inspection: What was guessed.
+        log: Number of the log.
+    """
+    signals = inspection.joint.signals
+    ranges = {name: _range(inspection, name, log) for name in signals}
+    driver = next((s for s in ("motor_torque", "motor_current", "forcing", "joint_torque") if s in signals), None)
+    twist = _twist(inspection, log)
+    names = ("dynamic_error", "twist", "load_angle", "motor_angle", "motor_velocity")
+    response = "both angles" if twist is not None else next((s for s in names if s in signals), None)
+    rate = inspection.rates[log]
+    band = coherent = None
+    if driver is not None and rate is not None:
+        torque = _even(*inspection.samples(driver, log), rate)
+        answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
+        if len(torque) >= _FEWEST and np.ptp(torque) > 0:
+            band = _band(torque, rate)
+            coherent = None if answer is None or np.ptp(answer) == 0 else _coherent(torque, answer, rate, band)
+    spread = None if twist is None else float(np.ptp(twist))
+    return Excitation(ranges, driver, response, band, coherent, spread)
+
+
+def _range(inspection: Inspection, signal: str, log: int) -> tuple[float, float, str]:
+    _, values = inspection.samples(signal, log)
+    guess = inspection.joint.signals[signal]
+    unit = SI.get(signal, "A" if signal == "motor_current" else "")
+    if guess.unit is None and signal.endswith("_angle"):
+        unit = "as logged"
+    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)), unit
+
+
+def _twist(inspection: Inspection, log: int) -> np.ndarray | None:
+    """theta_m/N - theta_l [rad] less its mean, evenly sampled, where both angles and the ratio are known."""
+    joint, rate = inspection.joint, inspection.rates[log]
+    both = {"motor_angle", "load_angle"} <= set(joint.signals)
+    if not both or rate is None or joint.ratio is None or not joint.ratio.sure:
+        return None
+    if joint.signals["load_angle"].unit is None:
+        return None
+    motor, load = (_even(*inspection.samples(s, log), rate) for s in ("motor_angle", "load_angle"))
+    count = min(len(motor), len(load))
+    twist = motor[:count] / joint.ratio.value - load[:count]
+    return twist - twist.mean()
+
+
+def _even(time: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """A channel on an even grid."""
+    if len(time) < 2:
+        return values
+    count = min(int((time[-1] - time[0]) * rate) + 1, 4 * len(time))
+    return np.interp(time[0] + np.arange(count) / rate, time, values)
+
+
+def _band(values: np.ndarray, rate: float) -> tuple[float, float]:
+    frequencies, power = scipy.signal.periodogram(values, rate, detrend="constant")
+    share = np.cumsum(power) / np.sum(power)
+    low, high = (float(frequencies[int(np.searchsorted(share, level))]) for level in _POWER)
+    return low, high
+
+
+def _coherent(
+    driver: np.ndarray, response: np.ndarray, rate: float, band: tuple[float, float]
+) -> tuple[float, float] | None:
+    count = min(len(driver), len(response))
+    length = count // _SEGMENTS * 2
+    if length < 32:
+        return None
+    frequencies, share = scipy.signal.coherence(driver[:count], response[:count], rate, nperseg=length)
+    driven = (frequencies >= band[0]) & (frequencies <= band[1])
+    follows = np.concatenate(([False], (share >= COHERENT) & driven, [False]))
+    edges = np.flatnonzero(np.diff(follows.astype(int)))
+    starts, stops = edges[::2], edges[1::2]
+    if len(starts) == 0:
+        return None
+    widest = int(np.argmax(stops - starts))
+    return float(frequencies[starts[widest]]), float(frequencies[stops[widest] - 1])

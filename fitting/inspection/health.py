@@ -1,0 +1,69 @@
+"""What the health gate says of logs as they were guessed, before anything is filled in."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.errors import DataError, InputError
+from fitting.inspection.drive_text import drive_tables
+from fitting.inspection.inspection import Inspection
+from fitting.inspection.time_column import sampling_findings
+from fitting.logs.checks import examine
+from fitting.logs.drive_file import drive_of
+from fitting.logs.findings import Finding
+from fitting.logs.log import read_log
+from fitting.logs.masks import masked
+
+# What stands for what is not known yet; no finding hangs on it.
+_ANY_INERTIA = 1.0
+_ANY_RATE = 1.0
+_DRIVE_FILE = Path("the drive file")
+
+
+def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
+    """The findings for each log."""
+    tables = drive_tables(inspection)
+    readable = inspection.joint.kind is not None and _complete(inspection, tables)
+    return tuple(
+        _of_log(inspection, k, tables) if readable else _of_columns(inspection, k)
+        for k in range(len(inspection.tables))
+    )
+
+
+def _complete(inspection: Inspection, tables: Mapping[str, Any]) -> bool:
+    """Whether every signal has its unit, so that the log can be read as a fit would."""
+    return all(s in tables["columns"] for s in inspection.joint.signals if s != "motor_current")
+
+
+def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[Finding, ...]:
+    path, source, ratio = inspection.tables[k].path, inspection.tables[k].source, inspection.joint.ratio
+    known = dict(tables["drive"]) | ({} if ratio is None else {"reduction_ratio": float(ratio.value)})
+    filled = {"reduction_ratio": 1.0, "motor_inertia": _ANY_INERTIA, "load_inertia": _ANY_INERTIA} | known
+    signals = {} if inspection.rates[k] is not None else {"sample_rate": _ANY_RATE}
+    wanted = drive_of({**tables, "drive": filled, "signals": signals}, _DRIVE_FILE)
+    try:
+        log = read_log(path, wanted, table=source)
+        log = log if log.kind == "quasi-static" else masked(log)
+    except (InputError, DataError) as error:
+        return (Finding("refusal", str(error).removeprefix(f"{path}: "), path.name, "`hdjax fit` refuses this"),)
+    if ratio is None and log.motor_angle is not None and log.load_angle is not None:
+        return log.findings
+    # Without inertias, nothing is held against them.
+    return examine(log, drive_of({**tables, "drive": known, "signals": signals}, _DRIVE_FILE))
+
+
+def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:
+    """What can be said of columns of which no log is made."""
+    table, time = inspection.tables[k], inspection.time
+    found = [] if time.column is None else [*sampling_findings(table, table.column(time.column), time.unit)]
+    for guess in inspection.joint.signals.values():
+        values = table.column(guess.column).values
+        blank = int((~np.isfinite(values)).sum())
+        if blank:
+            what = f"blank in {blank} rows ({100 * blank / len(values):.2g} %)"
+            found.append(Finding("note", what, guess.column, "they will have no weight in a fit"))
+        if table.column(guess.column).constant:
+            found.append(Finding("warning", "it never changes", guess.column, "it tells nothing in this log"))
+    return tuple(found)

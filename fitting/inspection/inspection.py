@@ -1,0 +1,336 @@
+"""What logs hold that nobody has described."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from fitting.errors import InputError
+from fitting.inspection.columns import Column, Table
+from fitting.inspection.hypotheses import ANGLES, OTHERS, Evidence, hypotheses, readings, weighed
+from fitting.inspection.reasons import physical_reasons
+from fitting.inspection.relations import Relations
+from fitting.inspection.settling import SURE, RatioGuess, UnitGuess, ratio_of, signs_of, units_of
+from fitting.inspection.time_column import Clock, TimeGuess, clock_of, guess_time, own_stamps
+from fitting.inspection.unit_evidence import si_size
+from fitting.inspection.windows import Uniform, scales, uniform
+from fitting.logs.channels import SI
+from fitting.logs.unwrapping import unwrapped_angle
+
+_COPY = 5.0  # log odds of proportionality above which a column is said to follow another
+_RIVAL, _WORTH_A_WORD = 0.05, 0.3  # confidence below which a reading is not told, and a column is said to be none
+_TOLD_UNIT, _SURE_UNIT = 0.5, 0.95  # confidence below which a unit is not told at all, or said to be assumed
+_WITHOUT_SIGN = ("temperature", "load_torque")
+_SHARED = ("angle", "velocity", "torque", "current", "twist")
+
+
+@dataclass(frozen=True, eq=False)
+class SignalGuess:
+    """A signal and the column it stands in.
+
+    Attributes:
+        signal: Of a drive file.
+        column: Name of the column.
+        unit: Stated or guessed, or None where it can't be told.
+        unit_stated: Whether the file states it.
+        size: Of the unit in SI.
+        sign: +1 or -1.
+        confidence: 0 to 1.
+        reasons: In words.
+        unit_reason: For the unit, where it is guessed.
+        doubts: What can't be told of the unit.
+    """
+
+    signal: str
+    column: str
+    unit: str | None
+    unit_stated: bool
+    size: float
+    sign: int
+    confidence: float
+    reasons: tuple[str, ...]
+    unit_reason: str = ""
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def why(self) -> str:
+        """All that speaks for the guess and against it."""
+        unit = (f"{self.unit}: {self.unit_reason}",) if self.unit_reason and self.unit else ()
+        return "; ".join((*self.reasons, *unit, *self.doubts))
+
+
+@dataclass(frozen=True, eq=False)
+class JointInspection:
+    """The columns of one joint of a robot, or of the only drive.
+
+    Attributes:
+        label: Of the joint, or None.
+        signals: That were found, by name.
+        open: Columns that could be several signals, with the confidence of each.
+        copies: Columns that follow another one, with what they follow and how many times it.
+        ratio: The reduction ratio, or None where it can't be seen.
+        span: Range of the output's angle, or else of the motor's or the twist, in the column's own unit.
+    """
+
+    label: str | None
+    signals: dict[str, SignalGuess]
+    open: dict[str, dict[str, float]]
+    copies: dict[str, tuple[str, float]]
+    ratio: RatioGuess | None
+    span: float
+
+    @property
+    def travel(self) -> float:
+        """Range of the output's angle, or else of the motor's or the twist, in SI as far as the unit is known."""
+        found = [self.signals[s].size for s in ("load_angle", "motor_angle") if s in self.signals]
+        return self.span * (found or [1.0])[0]
+
+    @property
+    def kind(self) -> str | None:
+        """What kind of log the joint's columns are: "drive", "reduced", "quasi-static", "motor side"; None for none."""
+        found = set(self.signals)
+        driven = found & {"motor_torque", "motor_current"}
+        if {"motor_angle", "load_angle"} <= found and driven:
+            return "drive"
+        if {"dynamic_error", "forcing"} <= found:
+            return "reduced"
+        if "joint_torque" in found and (found & {"twist", "dynamic_error"} or {"motor_angle", "load_angle"} <= found):
+            return "quasi-static"
+        return "motor side" if driven and found & {"motor_angle", "motor_velocity", "load_angle"} else None
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Logs of one drive or robot, looked at without a drive file.
+
+    Attributes:
+        tables: The logs' columns.
+        clocks: The logs' stamps.
+        time: The column that is the clock.
+        joints: Of the robot; one without a label where there is a single drive.
+        joint: The one that moves the most, or the one asked for.
+    """
+
+    tables: tuple[Table, ...]
+    clocks: tuple[Clock, ...] = field(repr=False)
+    time: TimeGuess
+    joints: tuple[JointInspection, ...]
+    joint: JointInspection
+
+    @property
+    def sample_rate(self) -> float | None:
+        """Hz, where it stands beside the data."""
+        return self.tables[0].sample_rate
+
+    @cached_property
+    def rates(self) -> tuple[float | None, ...]:
+        """Samples per second of each log [Hz]; None where no seconds are known."""
+        return tuple(1.0 / float(np.median(np.diff(c.base.time))) if c.known else None for c in self.clocks)
+
+    def samples(self, signal: str, log: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps [s] and values of a signal of the chosen joint, in SI as guessed, (n,) each, where both are known."""
+        guess = self.joint.signals[signal]
+        values, own = _samples(self.tables[log], guess.column, self.clocks[log], self.time)
+        stamps = self.clocks[log].base.time if own is None else own
+        known = np.isfinite(values) & np.isfinite(stamps)
+        return stamps[known], guess.sign * guess.size * values[known]
+
+
+def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Inspection:
+    """Look at logs of one drive or robot.
+
+    Args:
+        tables: All columns of each.
+        joint: Label of the joint that matters; where None, the one that moves the most.
+
+    Raises:
+        InputError: The logs have different columns, or there is no such joint.
+    """
+    first = tables[0]
+    others = [table for table in tables[1:] if table.names != first.names]
+    if others:
+        differing = ", ".join(sorted(first.names ^ others[0].names)[:4])
+        raise InputError(
+            f"{others[0].path}: its columns are not those of {first.path} ({differing}); give logs of one drive that "
+            "were recorded alike, or one at a time"
+        )
+    time = guess_time(first)
+    clocks = tuple(clock_of(table, time) for table in tables)
+    labels = joint_labels(first.columns)
+    joints = tuple(_joint(tables, clocks, time, label, labels) for label in labels or (None,))
+    joints = tuple(_as_others(joint, joints, first) for joint in joints)
+    return Inspection(tuple(tables), clocks, time, joints, _chosen(joints, joint, first.path))
+
+
+def alike(tables: Sequence[Table]) -> list[tuple[Table, ...]]:
+    """Tables in groups that have the same columns."""
+    groups: dict[frozenset[str], list[Table]] = {}
+    for table in tables:
+        groups.setdefault(table.names, []).append(table)
+    return [tuple(group) for group in groups.values()]
+
+
+def joint_labels(columns: Sequence[Column]) -> tuple[str, ...]:
+    """The labels of the joints of a robot, which its columns repeat; nothing where there is one drive."""
+    stems: dict[str, set[str]] = {}
+    for column in columns:
+        if column.sense.joint is not None and column.sense.quantities[:1] and column.sense.quantities[0] in _SHARED:
+            stems.setdefault(column.sense.joint, set()).add(column.sense.stem)
+    bare = [c.sense for c in columns if c.sense.joint is None]
+    # Two encoders of one drive are numbered as well; there its torque is not.
+    one_torque = any(s.quantities[:1] in (("torque",), ("current",)) for s in bare)
+    labelled = any("torque" in c.sense.quantities or "current" in c.sense.quantities for c in columns if c.sense.joint)
+    if one_torque and not labelled:
+        return ()
+    several = [label for label, found in stems.items() if len(found) > 1]
+    return tuple(sorted(several, key=lambda label: (len(label), label))) if len(several) > 1 else ()
+
+
+def _chosen(joints: tuple[JointInspection, ...], wanted: str | None, path: Path) -> JointInspection:
+    if wanted is None:
+        return max(joints, key=lambda j: (len(j.signals) > 0, j.travel))
+    found = next((j for j in joints if j.label == wanted), None)
+    if found is None:
+        known = ", ".join(j.label for j in joints if j.label) or "no joints, since the log is of one drive"
+        raise InputError(f"{path}: there is no joint '{wanted}'; the log has {known}")
+    return found
+
+
+def _unwrapped(column: Column) -> np.ndarray:
+    """The values, without the jumps of an angle that wraps."""
+    said = column.sense.quantities
+    if said and "angle" not in said:
+        return column.values
+    values = column.values
+    for revolution in (2 * np.pi, 360.0):
+        values, _, rows = unwrapped_angle(values, revolution)
+        if len(rows):
+            break
+    return values
+
+
+def _joint(
+    tables: Sequence[Table], clocks: Sequence[Clock], time: TimeGuess, label: str | None, labels: tuple[str, ...]
+) -> JointInspection:
+    clocks_of = {time.column, *time.clocks.values()}
+    columns = [c for c in tables[0].columns if c.name not in clocks_of and _is_of(c, label, labels)]
+    logs = [
+        uniform(clock.base.time, [_samples(table, c.name, clock, time) for c in columns])
+        for table, clock in zip(tables, clocks, strict=True)
+    ]
+    moves = np.array([any(not table.column(c.name).constant for table in tables) for c in columns], dtype=bool)
+    evidence = Evidence(columns, Relations(scales(logs), moves))
+    return _settled(label, evidence, logs)
+
+
+def _as_others(joint: JointInspection, joints: Sequence[JointInspection], table: Table) -> JointInspection:
+    """A joint whose unknown units are those of the same channel of another joint."""
+
+    def known(guess: SignalGuess) -> SignalGuess:
+        others = [other.signals[guess.signal] for other in joints if guess.signal in other.signals]
+        stem = table.column(guess.column).sense.stem
+        like = next((o for o in others if o.unit is not None and table.column(o.column).sense.stem == stem), None)
+        if like is None or guess.unit is not None or not guess.signal.endswith("_angle"):
+            return guess
+        return replace(guess, unit=like.unit, size=like.size, unit_reason=f"as '{like.column}'", doubts=())
+
+    return replace(joint, signals={name: known(guess) for name, guess in joint.signals.items()})
+
+
+def _samples(table: Table, name: str, clock: Clock, time: TimeGuess) -> tuple[np.ndarray, np.ndarray | None]:
+    """The values of a column and its own stamps, or those of its rows that the clock has."""
+    column = table.column(name)
+    values, own = _unwrapped(column), own_stamps(table, column, time)
+    return (values, own) if own is not None else (values[clock.base.rows], None)
+
+
+def _is_of(column: Column, label: str | None, labels: tuple[str, ...]) -> bool:
+    """Whether a column is a joint's, or of none, and may be a signal."""
+    if column.sense.quantities[:1] in (("other",), ("time",), ("counter",)):
+        return False
+    return label is None or column.sense.joint == label or column.sense.joint not in labels
+
+
+def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> JointInspection:
+    if not evidence.columns:
+        return JointInspection(label, {}, {}, {}, None, 0.0)
+    found = hypotheses(evidence)
+    best, shares = found[0].columns, weighed(found, evidence)
+    sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}
+    # What is not sure enough to be told still bears on the units and signs of the rest.
+    units, signs = units_of(best, evidence, logs), signs_of(best, evidence)
+    ratio = ratio_of(sure, units, evidence, logs)
+    names = _names(sure)
+    signals = {
+        names[s]: _signal(names[s], s, sure, evidence, shares[k][s], (units.get(s), signs.get(s)))
+        for s, k in sure.items()
+    }
+    taken = set(sure.values())
+    maybe = {}
+    for k, column in enumerate(evidence.columns):
+        angles = {s: w for s, w in shares.get(k, {}).items() if s in ANGLES and w > _RIVAL}
+        others = {s: w for s, w in readings(evidence, found[0], k).items() if w > _RIVAL}
+        if k not in taken and max([*angles.values(), *others.values()], default=0.0) > _WORTH_A_WORD:
+            maybe[column.name] = angles | {s: w * (1.0 - sum(angles.values())) for s, w in others.items()}
+    copies = _copies(evidence, taken)
+    maybe = {name: own for name, own in maybe.items() if own and name not in copies}
+    angle = sure.get("load_angle", sure.get("motor_angle", sure.get("dynamic_error")))
+    span = max(float(np.ptp(log.values[:, angle])) for log in logs) if angle is not None else 0.0
+    return JointInspection(label, signals, maybe, copies, ratio, span)
+
+
+def _names(sure: dict[str, int]) -> dict[str, str]:
+    """What drive files call the signals: the twist of a quasi-static log is no dynamic error of a reduced one."""
+    slow = "joint_torque" in sure and "forcing" not in sure
+    return {s: "twist" if s == "dynamic_error" and slow else s for s in (*ANGLES, *OTHERS)}
+
+
+def _copies(evidence: Evidence, taken: set[int]) -> dict[str, tuple[str, float]]:
+    """Columns that are no signal, but move as one does."""
+    copies = {}
+    for k, column in enumerate(evidence.columns):
+        if k in taken:
+            continue
+        told = {i: evidence.relations.proportional(k, i) for i in taken}
+        i = max(told, key=lambda i: told[i].odds, default=None)
+        if i is not None and told[i].odds > _COPY:
+            copies[column.name] = (evidence.columns[i].name, told[i].slope)
+    return copies
+
+
+def _signal(
+    name: str,
+    signal: str,
+    columns: dict[str, int],
+    evidence: Evidence,
+    confidence: float,
+    settled: tuple[UnitGuess | None, tuple[int, str] | None],
+) -> SignalGuess:
+    (unit, sign), k = settled, columns[signal]
+    reference = next((s for s in ANGLES if s in columns), None)
+    column = evidence.columns[k]
+    reasons = [*evidence.names[signal][k].reasons, *physical_reasons(signal, columns, evidence)]
+    if sign is not None and sign[1]:
+        reasons.append(sign[1])
+    guess = SignalGuess(
+        signal=name,
+        column=column.name,
+        unit=column.unit,
+        unit_stated=column.unit is not None,
+        size=1.0 if column.unit is None else si_size(column.unit, SI.get(signal, "A")) or 1.0,
+        sign=sign[0] if sign else 1,
+        confidence=confidence,
+        reasons=tuple(reasons),
+    )
+    doubts = () if sign is not None or signal in _WITHOUT_SIGN or signal == reference else ("its sign does not show",)
+    if unit is None or unit.reason == "stated":
+        return replace(guess, doubts=doubts)
+    rivals = " or ".join(unit.rivals)
+    if unit.confidence < _TOLD_UNIT:
+        doubts = (f"its unit may be {unit.unit} or {rivals}", *doubts)
+        return replace(guess, unit=None, unit_stated=False, size=unit.size, doubts=doubts)
+    if unit.confidence < _SURE_UNIT:
+        doubts = (f"{unit.unit} is assumed, {rivals} would do", *doubts)
+    return replace(guess, unit=unit.unit, unit_stated=False, size=unit.size, unit_reason=unit.reason, doubts=doubts)

@@ -1,0 +1,82 @@
+"""What such a log can and can't tell, before it is fitted."""
+
+from collections.abc import Iterator
+
+from fitting.inspection.excitation import Excitation
+from fitting.inspection.inspection import Inspection
+
+# rad^-2, of the piecewise stiffness in vendors' catalogues (effects.md).
+_ALPHAS = (1e5, 4.5e5)
+_VISIBLE = 0.01  # change of stiffness below which alpha is hardly identifiable; assumed
+
+
+def promises(inspection: Inspection, moved: Excitation) -> tuple[str, ...]:
+    """Sentences on what a fit of the logs can and can't tell."""
+    by_kind = {
+        "drive": _of_drive,
+        "motor side": _of_motor_side,
+        "quasi-static": _of_quasi_static,
+        "reduced": _of_reduced,
+    }
+    kind = inspection.joint.kind
+    return tuple(by_kind[kind](inspection, moved) if kind is not None else _of_nothing(inspection))
+
+
+def _of_drive(inspection: Inspection, moved: Excitation) -> Iterator[str]:
+    current = "motor_torque" not in inspection.joint.signals
+    yield (
+        f"A drive log (both angles and a motor {'current' if current else 'torque'}): stiffness K, cubic coefficient "
+        "alpha, mesh damping B_sp, and effects beside them."
+    )
+    yield "It needs the inertias of motor and load: without them, a wrong stiffness and a wrong torque look alike."
+    if current:
+        yield "The torque constant scales the inertias and K alike; a log does not tell it."
+    yield from _of_alpha(moved)
+    if moved.band is not None:
+        yield (
+            "B_sp and the inertias show near the resonance: it must lie inside the band of the torque "
+            f"({moved.band[0]:.3g} to {moved.band[1]:.3g} Hz)."
+        )
+
+
+def _of_alpha(moved: Excitation) -> Iterator[str]:
+    if moved.twist is None:
+        return
+    share = (0.5 * moved.twist) ** 2
+    low, high = (alpha * share for alpha in _ALPHAS)
+    verdict = "may show" if high > _VISIBLE else "hardly shows"
+    low, high = (float(f"{100 * change:.2g}") for change in (low, high))
+    yield (
+        f"The twist spans {moved.twist:.2g} rad: alpha {verdict}, since that of catalogue gears changes the stiffness "
+        f"by {low:g} to {high:g} % there."
+    )
+
+
+def _of_motor_side(inspection: Inspection, moved: Excitation) -> Iterator[str]:
+    angle = next(s for s in ("motor_angle", "load_angle", "motor_velocity") if s in inspection.joint.signals)
+    yield f"One side alone ({angle} and torque): the whole inertia and friction show in any motion."
+    yield "K and B_sp show only where the torque reaches the resonance; alpha and effects of the mesh hardly."
+    yield "A second angle, or a joint torque, would tell them: look for one in the log."
+
+
+def _of_quasi_static(inspection: Inspection, moved: Excitation) -> Iterator[str]:
+    yield "A quasi-static log (a twist and the joint torque): stiffness by torque, hysteresis, lost motion, ripple."
+    yield "It tells neither damping nor inertias, and needs none."
+    velocity = {"motor_angle", "load_angle"} <= set(inspection.joint.signals)
+    if velocity:
+        yield "The motion must be slow: what accelerates the load is counted as torque through the gear."
+
+
+def _of_reduced(inspection: Inspection, moved: Excitation) -> Iterator[str]:
+    yield "A reduced log (a dynamic error and a forcing): mu, omega_0, alpha and a gain, in the log's own units."
+    yield "It tells neither K nor inertias, since the forcing has any scale."
+
+
+def _of_nothing(inspection: Inspection) -> Iterator[str]:
+    found = inspection.joint.signals
+    has = ", ".join(found) if found else "no signal"
+    yield f"No fit can be made of what was recognised ({has})."
+    yield (
+        "A drive log needs motor torque and an angle of each side, a quasi-static one a twist (or both angles) and the "
+        "joint torque, a reduced one a dynamic error and a forcing."
+    )

@@ -1,0 +1,198 @@
+"""Which column of a log is its clock, and in which unit."""
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fitting.errors import InputError
+from fitting.inspection.columns import Column, Table
+from fitting.logs.findings import Finding
+from fitting.logs.time_stamps import TimeBase, time_base
+from fitting.logs.units import UnitError, convert
+
+# Log odds, assumed.
+_NAMED, _MAYBE, _ANONYMOUS, _OTHERWISE, _COUNTER = 3.0, 0.5, -1.0, -6.0, -2.0
+_UNIT_FITS, _UNIT_CONTRADICTS = 2.0, -8.0
+_EPOCH = 8.0
+# Loggers of drives sample at some hundreds of hertz, give or take a factor of ten; assumed.
+_USUAL_RATE, _RATE_SPREAD = 500.0, np.log(10.0)
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_EPOCHS = (0.9e9, 2.5e9)  # s since 1970, of the years 1998 to 2049
+_MOST_BACK = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class TimeGuess:
+    """The clock of a log.
+
+    Attributes:
+        column: Its name; None where the channels have clocks of their own, a sample rate is stated, or there is none.
+        unit: Of its stamps.
+        confidence: Of the column, 0 to 1.
+        reasons: For both.
+        unit_stated: Whether the file states the unit.
+        clocks: Where a table repeats its time column: the clock of each column that has another one, by name.
+    """
+
+    column: str | None
+    unit: str
+    confidence: float
+    reasons: tuple[str, ...]
+    unit_stated: bool = True
+    clocks: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """The stamps of one log.
+
+    Attributes:
+        base: Stamps [s] and the rows that have one.
+        known: Whether seconds are known; where not, a row is taken for one.
+    """
+
+    base: TimeBase
+    known: bool
+
+
+def guess_time(table: Table) -> TimeGuess:
+    """The column of a table that is its clock."""
+    if any(column.time is not None for column in table.columns):
+        return TimeGuess(None, "s", 1.0, ("each channel has stamps of its own",))
+    # Of a time column that is repeated, the first stands for all.
+    scored = [(_log_odds(column), column) for column in table.columns if _first_name(column.name, table) is None]
+    weights = np.exp(np.clip([0.0, *(score for score, _ in scored)], -30.0, 30.0))
+    score, column = max(scored, key=lambda pair: pair[0], default=(-np.inf, None))
+    if column is None or score <= 0.0:
+        why = "a sample rate stands beside the data" if table.sample_rate else "no column rises like a clock"
+        return TimeGuess(None, "s", 1.0 if table.sample_rate else 0.0, (why,))
+    rising = _rising(column.values)[0]
+    reasons = [f"rises in {100 * rising:.4g} % of its rows"]
+    if "time" in column.sense.quantities:
+        reasons.insert(0, f"the name '{column.name}'")
+    unit, why = _unit(column)
+    stated = _stated(column) is not None
+    confidence = float(np.exp(min(score, 30.0)) / weights.sum())
+    return TimeGuess(column.name, unit, confidence, (*reasons, why), stated, _clocks(table, column.name))
+
+
+def _first_name(name: str, table: Table) -> str | None:
+    """The name that a column repeats, as readers and frames number columns of one name; None where it repeats none."""
+    match = re.fullmatch(r"(.+?)(?: \([0-9]+\)|\.[0-9]+|_duplicated_[0-9]+)", name)
+    return match[1] if match is not None and match[1] in table.names else None
+
+
+def _clocks(table: Table, first: str) -> dict[str, str]:
+    """The clock of each column behind a repeated time column."""
+    clocks, clock = {}, first
+    for column in table.columns:
+        if _first_name(column.name, table) == first:
+            clock = column.name
+        elif clock != first:
+            clocks[column.name] = clock
+    return clocks
+
+
+def own_stamps(table: Table, column: Column, guess: TimeGuess) -> np.ndarray | None:
+    """The stamps [s] of a column that has a clock of its own, NaN where blank; None where it has the table's."""
+    if column.name not in guess.clocks:
+        return column.time
+    return table.column(guess.clocks[column.name]).values * float(convert(np.array(1.0), guess.unit, "s"))
+
+
+def clock_of(table: Table, guess: TimeGuess) -> Clock:
+    """The stamps of a table by the column that was guessed."""
+    rows = np.arange(table.rows)
+    if guess.column is not None:
+        column = table.column(guess.column)
+        try:
+            return Clock(_base(table, column, guess.unit), True)
+        except InputError:
+            pass
+    step = 1.0 / table.sample_rate if table.sample_rate else 1.0
+    stamps = [column.time for column in table.columns if column.time is not None]
+    if stamps:
+        # The quickest clock has the finest grid.
+        finest = max(stamps, key=len)
+        return Clock(TimeBase(np.arange(len(finest)), finest, np.zeros(0, dtype=int), ()), True)
+    return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None)
+
+
+def _base(table: Table, column: Column, unit: str) -> TimeBase:
+    second = float(convert(np.array(1.0), unit, "s"))
+    others = [other.values for other in table.columns if other is not column]
+    samples = np.stack(others or [np.arange(len(column.values))], axis=1)
+    return time_base(
+        column.values * second, samples, path=table.path, name=column.name, second=1.0 / second, first_row=0
+    )
+
+
+def sampling_findings(table: Table, column: Column, unit: str) -> tuple[Finding, ...]:
+    """What was mended of the stamps, or why they are none."""
+    try:
+        return _base(table, column, unit).findings
+    except InputError as error:
+        return (Finding("refusal", str(error).partition(": ")[2], column.name, "there is no time base"),)
+
+
+def _stated(column: Column) -> str | None:
+    """The stated unit where it is one of time."""
+    try:
+        convert(np.array(1.0), column.unit or "", "s")
+    except UnitError:
+        return None
+    return column.unit
+
+
+def _rising(values: np.ndarray) -> tuple[float, float, float]:
+    """Share of rows that rise, share that falls, and how even the rises are (their spread over their median)."""
+    step = np.diff(values[np.isfinite(values)])
+    if len(step) == 0 or not (step > 0).any():
+        return 0.0, 1.0, np.inf
+    up = step[step > 0]
+    low, high = np.quantile(up, (0.1, 0.9))
+    return float(np.mean(step > 0)), float(np.mean(step < 0)), float((high - low) / np.median(up))
+
+
+def _log_odds(column: Column) -> float:
+    """That the column is the clock, against that it is none."""
+    known = np.isfinite(column.values)
+    if known.mean() < 1.0 - 0.2 or column.constant:
+        return -np.inf
+    rising, falling, uneven = _rising(column.values)
+    if falling > _MOST_BACK:
+        return -np.inf
+    known_from = float(np.nanmin(column.values))
+    said = column.sense.quantities
+    if said[:1] == ("counter",):
+        name = _COUNTER
+    else:
+        name = _NAMED if said == ("time",) else _MAYBE if "time" in said else _OTHERWISE if said else _ANONYMOUS
+    unit = 0.0
+    if column.unit is not None:
+        unit = _UNIT_FITS if _stated(column) else _UNIT_CONTRADICTS
+    elif any(_EPOCHS[0] < known_from * second < _EPOCHS[1] for second in _SECONDS.values()):
+        unit = _UNIT_FITS
+    return name + unit + 4.0 * rising + (1.0 if falling == 0 else -2.0) + (1.0 if uneven < 1.0 else -1.0)
+
+
+def _unit(column: Column) -> tuple[str, str]:
+    """Unit of a clock and why."""
+    stated = _stated(column)
+    if stated is not None:
+        return stated, f"the unit '{stated}'"
+    known = column.values[np.isfinite(column.values)]
+    step = np.abs(np.diff(known))
+    # Stamps that repeat are coarse: the mean step says more than the typical one.
+    typical = float(np.ptp(known)) / max(1, len(known) - 1) if (step == 0).mean() > 0.1 else float(np.median(step))
+    scores = {}
+    for unit, second in _SECONDS.items():
+        rate = 1.0 / (typical * second) if typical > 0 else np.inf
+        scores[unit] = -0.5 * (np.log(rate / _USUAL_RATE) / _RATE_SPREAD) ** 2
+        if _EPOCHS[0] < known[0] * second < _EPOCHS[1]:
+            scores[unit] += _EPOCH
+    best = max(scores, key=lambda unit: scores[unit])
+    rate = 1.0 / (typical * _SECONDS[best])
+    since = " since 1970" if _EPOCHS[0] < known[0] * _SECONDS[best] < _EPOCHS[1] else ""
+    return best, f"as {best}{since} the rate is {rate:.4g} Hz"

@@ -1,0 +1,41 @@
+"""Simulations that stay with the log show the motion as it was, where those of the model lead elsewhere."""
+
+import numpy as np
+
+import joints
+from fitting.estimation.estimate import Strategy, fit
+from fitting.estimation.experiment import experiment_from_log, whole
+from fitting.estimation.free_parameters import base_paths
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.whole_log_fit import follows
+from fitting.first_order.close_following import followed_closely
+from fitting.first_order.linearised_fit import motion_states
+from hdjax import Drive, TwoInertiaModel
+
+JOINT = joints.with_friction(joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05), 0.5, 0.5)
+COUNT = 1500
+
+
+def test_motor_speed_under_friction_that_the_model_lacks():
+    torque = joints.torque_of(JOINT, count=COUNT)
+    truth = joints.motion_of(JOINT, torque)[:, 2]
+    experiment = experiment_from_log(joints.log_of(JOINT, count=COUNT), hold="zero-order", N=JOINT.N)
+    model = TwoInertiaModel(Drive(N=JOINT.N, J_m=JOINT.J_m, J_l=JOINT.J_l, K=JOINT.K, B_sp=JOINT.B_sp))
+    # 1024 samples in segments of 256, the last of which the data do not fill.
+    found = fit(
+        model,
+        whole([experiment]),
+        base_paths(model),
+        Segmentation(1024, 256),
+        strategy=Strategy(hold_parameters=True),
+    )
+    assert not follows(found)
+    lost, close = motion_states(found), followed_closely(found)
+    assert close.states.shape == lost.shape
+
+    def off(states: np.ndarray) -> float:
+        speed = states[:, :-1, 2].ravel()[:COUNT]
+        return float(np.std(speed - truth) / np.std(truth))
+
+    assert off(lost) > 0.3
+    assert off(close.states) < 0.1

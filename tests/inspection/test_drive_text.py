@@ -1,0 +1,90 @@
+"""Drive files from guesses: they are read as they are, and fitted once the lines to fill in are filled in."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from joint_logs import SHAPES, Motion, simulated
+
+import fitting
+from fitting.logs.drive_file import read_drive_file
+
+FILLED = {"motor_inertia": "3e-4", "load_inertia": "1.2", "reduction_ratio": "100", "sample_rate": "1000"}
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    return simulated(count=3000)
+
+
+def fill_in(text: str) -> str:
+    """The same with the numbers that are known of the drive."""
+    for key, number in FILLED.items():
+        text = re.sub(rf"^# {key} = \S+  # FILL IN.*$", f"{key} = {number}", text, flags=re.MULTILINE)
+    return text
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_drive_file_says_what_was_found(name: str, motion: Motion, tmp_path: Path):
+    found = fitting.inspect(SHAPES[name].columns(motion), joint=SHAPES[name].joint)
+    path = found.save(tmp_path / "drive.toml")
+    drive = read_drive_file(path)
+    told = {s: g for s, g in found.inspection.joint.signals.items() if s in drive.columns}
+    for signal, guess in told.items():
+        place = drive.columns[signal]
+        assert (place.column, place.unit, place.sign) == (guess.column, guess.unit, float(guess.sign))
+    # A current needs its constant; all else that was found is written.
+    assert set(found.inspection.joint.signals) - set(told) <= {"motor_current"}
+    # Each thing to fill in has a line.
+    assert all(key.split()[-1].strip("'") in path.read_text(encoding="utf-8") for key in found.unknown)
+
+
+READ_AT_ONCE = {"twist and joint torque": "quasi-static", "input and output": "reduced"}
+READ_WHEN_FILLED = ("own names", "symbols of papers", "German PLC", "degrees that nobody states", "an angle that wraps")
+
+
+@pytest.mark.parametrize("name", [*READ_AT_ONCE, *READ_WHEN_FILLED])
+def test_a_drive_file_reads_its_log(name: str, motion: Motion, tmp_path: Path):
+    columns = SHAPES[name].columns(motion)
+    found = fitting.inspect(columns)
+    text = found.drive_file()
+    if name in READ_AT_ONCE:
+        assert found.unknown == {}
+    else:
+        assert set(found.unknown) == {"[drive] motor_inertia", "[drive] load_inertia"}
+        text = fill_in(text)
+    (tmp_path / "drive.toml").write_text(text, encoding="utf-8")
+    data = fitting.load(columns, tmp_path / "drive.toml")
+    assert data.kind == READ_AT_ONCE.get(name, "drive")
+    if data.kind == "drive":
+        log = data.logs[0]
+        assert log.motor_angle is not None and log.motor_torque is not None
+        # Units and signs are right: the rig is made ready without a refusal, and twists as the drive did.
+        data.rig(other_holds=False)
+        twist = motion.motor_angle / 100 - motion.load_angle
+        error = log.dynamic_error - log.dynamic_error.mean() - (twist - twist.mean())
+        assert np.std(error) < 1e-3 * np.std(twist)
+
+
+@pytest.mark.slow
+def test_a_drive_file_from_a_guess_gives_the_drive(tmp_path: Path):
+    columns = SHAPES["German PLC"].columns(simulated(count=1200))
+    (tmp_path / "drive.toml").write_text(fill_in(fitting.inspect(columns).drive_file()), encoding="utf-8")
+    fit = fitting.fit(fitting.load(columns, tmp_path / "drive.toml"))
+    values = dict(zip(fit.parameters["parameter"], fit.parameters["value"], strict=True))
+    assert abs(values["K"] / 2e4 - 1) < 0.02
+
+
+@settings(max_examples=15)
+@given(st.lists(st.text(min_size=1, max_size=12), min_size=3, max_size=3, unique=True))
+def test_any_name_of_a_column_stands_in_a_drive_file(names: list[str]):
+    motion = simulated(count=800)
+    channels = {"motor_angle": motion.motor_angle, "load_angle": motion.load_angle, "motor_torque": motion.motor_torque}
+    renamed = {f"{n}_{signal}": v for n, (signal, v) in zip(names, channels.items(), strict=True)}
+    found = fitting.inspect({"time": motion.time} | renamed)
+    tables = tomllib.loads(found.drive_file())
+    assert tables["columns"].items() >= found.drive["columns"].items()

@@ -1,0 +1,198 @@
+"""What is said of a log beside its columns: clocks, joints, health, excitation, what a fit could tell."""
+
+import json
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import polars as pl
+import pytest
+from joint_logs import SHAPES, Motion, simulated
+
+import fitting
+from fitting import InputError
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    return simulated(count=3000)
+
+
+@pytest.fixture(scope="module")
+def drive_log(motion: Motion) -> dict[str, np.ndarray]:
+    return SHAPES["own names"].columns(motion)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "start", "unit"),
+    [
+        ("t", 1.0, 0.0, "s"),
+        ("t", 1e3, 0.0, "ms"),
+        ("clock", 1e6, 0.0, "us"),
+        ("stamp", 1e9, 1.6e18, "ns"),
+        ("stamp", 1.0, 1.6e9, "s"),
+        ("time_us", 1e6, 0.0, "us"),
+        ("Time [ms]", 1e3, 0.0, "ms"),
+    ],
+)
+def test_the_unit_of_a_clock(name: str, factor: float, start: float, unit: str, drive_log: dict[str, np.ndarray]):
+    columns = {name: start + factor * drive_log["time"]} | {k: v for k, v in drive_log.items() if k != "time"}
+    found = fitting.inspect(columns).inspection
+    assert (found.time.column, found.time.unit) == (name.partition(" [")[0], unit)
+    assert found.rates[0] == pytest.approx(1000.0, rel=1e-3)
+
+
+def test_a_counter_and_a_coarse_clock_are_not_the_clock(drive_log: dict[str, np.ndarray]):
+    count = len(drive_log["time"])
+    columns = {"seq": np.arange(count), "secs": np.floor(drive_log["time"]), "stamp": drive_log["time"]}
+    found = fitting.inspect(columns | {k: v for k, v in drive_log.items() if k != "time"}).inspection
+    assert found.time.column == "stamp"
+
+
+def test_a_log_without_a_clock_asks_for_its_rate(drive_log: dict[str, np.ndarray]):
+    found = fitting.inspect({k: v for k, v in drive_log.items() if k != "time"})
+    assert found.inspection.time.column is None
+    assert "[signals] sample_rate" in found.unknown
+    assert set(found.inspection.joint.signals) == {"motor_angle", "load_angle", "motor_torque"}
+
+
+def test_a_repeated_time_column_is_the_clock_of_what_follows(motion: Motion):
+    late = motion.time + 3e-4
+    columns = {
+        "Time": motion.time,
+        "Motor angle": motion.motor_angle,
+        "Torque": motion.motor_torque,
+        "Time (2)": late,
+        "Load angle": np.interp(late, motion.time, motion.load_angle),
+    }
+    found = fitting.inspect(columns).inspection
+    assert found.time.column == "Time" and found.time.clocks == {"Load angle": "Time (2)"}
+    assert found.joint.ratio is not None and found.joint.ratio.value == 100
+    np.testing.assert_array_equal(found.samples("load_angle")[0], late)
+
+
+def test_gaps_jitter_and_health_are_told(drive_log: dict[str, np.ndarray]):
+    kept = np.delete(np.arange(3000), np.arange(1000, 1200))
+    columns = {name: values[kept].copy() for name, values in drive_log.items()}
+    columns["motor_angle"][5] = np.nan
+    found = fitting.inspect(columns)
+    text = found.summary()
+    assert "1 gaps, the longest 0.201 s" in text
+    assert any("blank" in finding.what for finding in found.findings[0])
+    assert any("gaps" in finding.what for finding in found.findings[0])
+
+
+def test_excitation_and_promises_of_each_kind(motion: Motion):
+    told = {name: fitting.inspect(SHAPES[name].columns(motion)) for name in SHAPES if SHAPES[name].joint is None}
+    drive = told["own names"].excitations[0]
+    assert drive.band is not None and 0 < drive.band[0] < drive.band[1] < 60
+    assert drive.coherent is not None and drive.twist == pytest.approx(
+        np.ptp(motion.motor_angle / 100 - motion.load_angle), rel=0.05
+    )
+    kinds = {"own names": "drive", "motor side alone": "motor side", "twist and joint torque": "quasi-static"}
+    kinds |= {"input and output": "reduced", "nothing that is a drive": None}
+    for name, kind in kinds.items():
+        assert told[name].inspection.joint.kind == kind
+    words = {"own names": "inertias", "motor side alone": "One side alone", "twist and joint torque": "hysteresis"}
+    words |= {"input and output": "omega_0", "nothing that is a drive": "No fit can be made"}
+    for name, word in words.items():
+        assert word in " ".join(told[name].told)
+
+
+def test_several_logs_speak_together(drive_log: dict[str, np.ndarray], motion: Motion):
+    # At rest in one log, the drive moves in the other.
+    still = drive_log | {name: np.zeros(3000) for name in ("motor_angle", "load_angle", "motor_torque")}
+    found = fitting.inspect([still, drive_log])
+    assert found.inspection.joint.kind == "drive" and len(found.findings) == len(found.excitations) == 2
+    with pytest.raises(InputError, match="log 2: its columns are not those of log 1"):
+        fitting.inspect([drive_log, SHAPES["German PLC"].columns(motion)])
+
+
+def test_a_joint_is_chosen_by_its_motion_or_by_its_label(motion: Motion):
+    columns = SHAPES["counts on both sides"].columns(motion)
+    assert fitting.inspect(columns).inspection.joint.label == "2"
+    other = fitting.inspect(columns, joint=1)
+    assert other.inspection.joint.label == "1"
+    # What counts a revolution has, only the joint that moves tells.
+    units = {s: g.unit for s, g in other.inspection.joint.signals.items()}
+    assert units["motor_angle"] == units["load_angle"] == "rev / 16777216"
+    with pytest.raises(InputError, match="there is no joint '9'; the log has 1, 2, 3"):
+        fitting.inspect(columns, joint=9)
+
+
+def test_two_numbered_encoders_of_one_drive_are_no_joints(motion: Motion):
+    columns = {
+        "t": motion.time,
+        "encoder1": motion.motor_angle,
+        "encoder2": motion.load_angle,
+        "speed1": motion.motor_velocity,
+        "speed2": motion.load_velocity,
+        "torque": motion.motor_torque,
+    }
+    found = fitting.inspect(columns).inspection
+    assert found.joint.label is None
+    assert {g.column: s for s, g in found.joint.signals.items()}["encoder1"] == "motor_angle"
+
+
+def test_what_is_no_channel_is_said(tmp_path: Path, drive_log: dict[str, np.ndarray]):
+    frame = pl.DataFrame(drive_log).with_columns(note=pl.lit("ok"), spare=pl.lit(None, dtype=pl.Float64))
+    frame.write_csv(tmp_path / "log.csv")
+    found = fitting.inspect(tmp_path / "log.csv")
+    assert set(found.inspection.tables[0].left_out) == {"note", "spare"}
+    assert "No channels: note (text such as 'ok'), spare (blank)" in found.summary()
+    frame.select("note").write_csv(tmp_path / "text.csv")
+    with pytest.raises(InputError):
+        fitting.inspect(tmp_path / "text.csv")
+    with pytest.raises(InputError, match="there is no log"):
+        fitting.inspect([])
+
+
+def test_matrices_and_structs_are_columns(tmp_path: Path, motion: Motion):
+    scipy_io = pytest.importorskip("scipy.io")
+    data = np.stack([motion.time, motion.motor_angle, motion.load_angle, motion.motor_torque], axis=1)
+    scipy_io.savemat(tmp_path / "log.mat", {"data": data, "Ts": 1e-3, "title": "run 1"})
+    found = fitting.inspect(tmp_path / "log.mat").inspection
+    assert found.time.column == "data(:,1)"
+    told = {g.column: s for s, g in found.joint.signals.items()}
+    assert (told["data(:,2)"], told["data(:,3)"]) == ("motor_angle", "load_angle")
+
+
+def test_a_result_shows_itself(drive_log: dict[str, np.ndarray], tmp_path: Path):
+    found = fitting.inspect(drive_log)
+    assert found.columns["signal"].to_list() == ["time", "motor_angle", "load_angle", "motor_torque"]
+    assert "motor_angle" in found._repr_html_() and str(found) == found.summary()
+    told = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert told["kind"] == "drive" and told["signals"]["load_angle"]["unit"] == "rad"
+    assert len(found.plot()) == 3
+    path = found.save(tmp_path / "drive.toml")
+    with pytest.raises(InputError, match="there is a file already"):
+        found.save(path)
+    assert found.save(path, force=True) == path
+    with pytest.raises(ValueError, match="nothing to draw"):
+        fitting.inspect({"t": np.arange(500) / 100, "a": np.random.default_rng(0).normal(size=500)}).plot()
+
+
+def test_measured_logs(shared: Path):
+    logs = {
+        "data/silverbox/silverbox_estimation.mat": ("reduced", {"V1": "forcing", "V2": "dynamic_error"}, None),
+        "data/bouc_wen/estimation.h5": ("reduced", {"multisine/u": "forcing", "multisine/y": "dynamic_error"}, None),
+        "data/lara8/ML1_validate.csv": (
+            "quasi-static",
+            {"encoder_motorinc_3": "motor_angle", "encoder_loadinc_3": "load_angle"},
+            101,
+        ),
+        "data/lara8/ML2_jogging_joint_mass.csv": (
+            "quasi-static",
+            {"encoder_motorinc_2": "motor_angle", "joint_torque_current_2": "joint_torque"},
+            121,
+        ),
+    }
+    for path, (kind, signals, ratio) in logs.items():
+        joint = fitting.inspect(shared / path).inspection.joint
+        assert joint.kind == kind, path
+        assert {g.column: s for s, g in joint.signals.items()}.items() >= signals.items()
+        assert ratio is None or (joint.ratio is not None and joint.ratio.sure and joint.ratio.value == ratio)
+        if "encoder" in str(signals):
+            assert joint.signals["motor_angle"].unit == joint.signals["load_angle"].unit == "rev / 16777216"

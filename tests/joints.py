@@ -1,0 +1,117 @@
+"""Joints as they are built: two inertias on a mesh, with friction on the motor, drawn at random.
+
+The equations once more in plain numpy (DESIGN 2.1), all joints of a draw side by side. Nothing here comes from hdjax'
+simulator.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import rig
+from fitting.logs.log import Log
+
+COUNT, STEP = 5000, 2e-3
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint; the torque is held between samples.
+
+    Attributes:
+        N: reduction ratio.
+        J_m: motor inertia [kg m^2].
+        J_l: load inertia [kg m^2].
+        K: stiffness [N m/rad].
+        B_sp: mesh damping [N m s/rad].
+        alpha: cubic coefficient [rad^-2].
+        coulomb: friction on the motor [N m].
+        viscous: likewise [N m s/rad].
+        rms: of the motor torque [N m].
+    """
+
+    N: float
+    J_m: float
+    J_l: float
+    K: float
+    B_sp: float
+    alpha: float = 0.0
+    coulomb: float = 0.0
+    viscous: float = 0.0
+    rms: float = 1.0
+
+    @property
+    def omega_0(self) -> float:
+        """Natural frequency of the twist [rad/s]."""
+        return float(np.sqrt(self.K * (1.0 / self.J_l + 1.0 / (self.N**2 * self.J_m))))
+
+
+def torque_of(joint: Joint, *, count: int = COUNT, step: float = STEP, seed: int = 0) -> np.ndarray:
+    """A multisine from a tenth of the natural frequency to one and a half of it."""
+    natural = joint.omega_0 / (2 * np.pi)
+    low, high = max(2.0 / (count * step), 0.05 * natural), min(1.5 * natural, 0.2 / step)
+    return rig.multisine(count, step, rms=joint.rms, low=low, high=high, seed=seed)
+
+
+def motion_of(joint: Joint, torque: np.ndarray, *, step: float = STEP, substeps: int = 8) -> np.ndarray:
+    """States (theta_m, theta_l, omega_m, omega_l) at the samples, from rest."""
+    rest, width = 1e-3 * joint.rms / (joint.J_m * joint.omega_0), joint.N
+
+    def rates(y, T):
+        theta_m, theta_l, omega_m, omega_l = y
+        x, v = theta_m / width - theta_l, omega_m / width - omega_l
+        tau = joint.K * (x + joint.alpha * x**3) + joint.B_sp * v
+        friction = joint.coulomb * np.tanh(omega_m / rest) + joint.viscous * omega_m
+        return omega_m, omega_l, (T - friction - tau / width) / joint.J_m, tau / joint.J_l
+
+    return rig.rk4(rates, (0.0,) * 4, torque, step, substeps)
+
+
+def with_friction(joint: Joint, coulomb: float, viscous: float, *, seed: int = 0) -> Joint:
+    """The joint with friction of so large a share of the rms torque, each kind, as it moves then."""
+    torque = torque_of(joint, seed=seed)
+    joint = replace(joint, coulomb=coulomb * joint.rms)
+    for _ in range(4):
+        speed = np.std(motion_of(joint, torque, substeps=4)[:, 2])
+        joint = replace(joint, viscous=viscous * joint.rms / speed)
+    return joint
+
+
+def drawn(seed: int) -> Joint:
+    """A joint with a natural frequency from 3 to 15 Hz, and friction of up to 60 % of the rms torque of either kind."""
+    random = np.random.default_rng(seed)
+    N = float(random.choice([1.0, 50.0, 100.0]))
+    J_l = float(10 ** random.uniform(-1.5, 1.0))
+    J_m = J_l * float(10 ** random.uniform(-0.7, 0.7)) / N**2
+    frequency = float(random.uniform(3.0, 15.0))
+    reduced = 1.0 / (1.0 / J_l + 1.0 / (N**2 * J_m))
+    K = reduced * (2 * np.pi * frequency) ** 2
+    damping = float(10 ** random.uniform(-2.0, -1.0))
+    joint = Joint(N, J_m, J_l, K, 2 * damping * np.sqrt(K * reduced), rms=K * N**-1.0 * 5e-3)
+    coulomb, viscous = random.uniform(0.0, 0.6, size=2)
+    return with_friction(joint, float(coulomb), float(viscous), seed=seed)
+
+
+def log_of(joint: Joint, *, seed: int = 0, count: int = COUNT, name: str = "joint") -> Log:
+    """Its log; the encoders' noise is a thousandth of the twist's rms, at the output."""
+    random = np.random.default_rng(10_000 + seed)
+    torque = torque_of(joint, count=count, seed=seed)
+    motion = motion_of(joint, torque)
+    noise = 1e-3 * np.std(motion[:, 0] / joint.N - motion[:, 1])
+    motor = motion[:, 0] + joint.N * noise * random.normal(size=count)
+    load = motion[:, 1] + noise * random.normal(size=count)
+    return Log(
+        name=name,
+        path=Path(f"{name}.csv"),
+        kind="drive",
+        time=np.arange(count) * STEP,
+        motor_angle=motor,
+        load_angle=load,
+        motor_torque=torque,
+        load_torque=None,
+        temperature=None,
+        dynamic_error=motor / joint.N - load,
+        forcing=None,
+        units={"dynamic_error": "rad"},
+    )

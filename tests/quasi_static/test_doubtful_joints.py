@@ -1,0 +1,118 @@
+"""Joints whose spring twists far, and logs that hardly tell the stiffness or the torque's sign."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from slow_joints import RATIO, slow_joint
+from torque_cycles import cycles, line
+
+from fitting.errors import DataError
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.log import Log
+from fitting.quasi_static.content import report_dict
+from fitting.quasi_static.fit import fit_quasi_static
+from fitting.quasi_static.loop import close_loop
+from fitting.quasi_static.loop_content import loop_report
+from fitting.quasi_static.points import points_of
+from fitting.quasi_static.preparation import prepare
+
+SOFT = 120.0
+
+
+def drive_file(**known) -> DriveFile:
+    return DriveFile(Path("drive.toml"), "joint", RATIO, None, None, None, None, {}, **known)
+
+
+def soft_spring(twist: float) -> Log:
+    log = cycles(lambda x: SOFT * x, lambda x: np.zeros_like(x), largest=twist, twist_noise=1e-4, torque_noise=0.02)
+    return replace(log, dynamic_error=log.dynamic_error - 0.4)
+
+
+def wide_told(log: Log, **known) -> bool:
+    data = prepare([log], drive_file(**known))
+    return any("strain-wave gears" in finding.what for finding in data.findings["log"])
+
+
+def test_a_spring_that_twists_far_is_fitted_with_a_warning():
+    log = soft_spring(0.15)
+    assert wide_told(log)
+    found = fit_quasi_static(prepare([log], drive_file()).logs)
+    stiffness = found.known[found.chosen]["K"]
+    assert stiffness.ci95 is not None and stiffness.ci95[0] < SOFT < stiffness.ci95[1]
+
+
+def test_the_drive_file_may_say_how_far_it_twists():
+    log = soft_spring(0.15)
+    assert not wide_told(log, largest_twist=0.5)
+    assert not wide_told(cycles(line))
+    with pytest.raises(DataError, match=r"largest_twist of 0\.2 rad"):
+        prepare([log], drive_file(largest_twist=0.2))
+    with pytest.raises(DataError, match="full turn"):
+        prepare([soft_spring(4.0)], drive_file())
+    assert not wide_told(soft_spring(4.0), largest_twist=10.0)
+
+
+def drifting_joint(sign: float) -> Log:
+    """One way, at a torque that swings once at the beginning, while the encoders drift apart with the angle."""
+    log, _ = slow_joint(
+        [lambda motion: -6e-6 * motion.motor + 5e-5 * np.cos(motion.motor) + 2e-5 * np.cos(0.05 * motion.motor)],
+        moves="one way",
+        cycles=2.0,
+        largest=1.0,
+        twist_noise=2e-6,
+        torque_noise=0.05,
+    )
+    assert log.joint_torque is not None
+    return replace(log, joint_torque=sign * log.joint_torque)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_sign_is_refused_though_the_angle_moves_the_twist_more(seed):
+    """The torque alone would leave the sign to the kinematic error."""
+    log, _ = slow_joint(
+        [lambda motion: 2e-5 * motion.motor + 1e-3 * np.cos(motion.motor)], moves="one way", cycles=6.0, seed=seed
+    )
+    assert log.joint_torque is not None
+    prepare([log], drive_file())
+    with pytest.raises(DataError, match="sign = -1"):
+        prepare([replace(log, joint_torque=-log.joint_torque)], drive_file())
+
+
+def findings_of(log: Log) -> str:
+    return " ".join(finding.what for finding in prepare([log], drive_file(), at_rest=True).findings["log"])
+
+
+def test_where_the_logs_tell_little_a_wrong_sign_is_doubted_and_the_right_one_not():
+    assert "seems to fall" not in findings_of(drifting_joint(1.0))
+    try:
+        assert "seems to fall" in findings_of(drifting_joint(-1.0))
+    except DataError as refused:
+        assert "sign = -1" in str(refused)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_what_is_not_determined_makes_no_headline_and_nothing_unphysical_is_found(sign):
+    log, motion = slow_joint(
+        [lambda m: -4e-5 * m.motor + 3e-4 * np.cos(0.02 * m.motor)],
+        moves="one way",
+        kind="triangle",
+        cycles=5.0,
+        largest=0.1,
+        torque_noise=0.3,
+    )
+    assert log.joint_torque is not None
+    log = replace(log, joint_torque=20.0 + sign * log.joint_torque)
+    steady = prepare([log], drive_file(), at_rest=True)
+    fit = fit_quasi_static(steady.logs, hysteresis=False)
+    report = report_dict(steady, fit)
+    assert not report["before"]["parameters"]["K"]["identifiable"]
+    assert "do not determine a stiffness" in report["summary"] and "N m/rad" not in report["summary"]
+    loop = close_loop(points_of(steady.logs, [motion], RATIO))
+    told = loop_report(steady, loop)
+    for account in (told["before"], told["after"]):
+        stiffness = account["parameters"].get("K", {"value": None})["value"]
+        assert stiffness is None or stiffness > 0
+    for effect in told["after"]["effects"]:
+        assert any(one["identifiable"] for one in effect["parameters"].values())
