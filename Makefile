@@ -5,13 +5,14 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow bench lock clean
+.PHONY: help demo test slow bench docs lock clean
 
 help:
 	@echo "make demo   install, then close the loop on a simulated drive and write a report"
 	@echo "make test   the whole gate: ruff, pyright, import contracts, pytest"
 	@echo "make slow   the tests that take minutes"
 	@echo "make bench  the benchmarks, side by side with their peers"
+	@echo "make docs   renew the pages made from the code, and build the site into build/site"
 	@echo "make lock   resolve requirements.lock afresh"
 	@echo "make clean  remove what runs leave behind (.venv stays)"
 
@@ -40,6 +41,11 @@ slow: $(INSTALLED)
 bench: $(INSTALLED)
 	@set -e; for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done
 
+docs: $(INSTALLED)
+	$(BIN)/python docs/generate.py
+	$(BIN)/zensical build --clean --strict
+	@echo "build/site/index.html opens in a browser; for its search: $(BIN)/python -m http.server -d build/site"
+
 # Resolved in an environment of its own, so that nothing installed by hand slips in.
 lock:
 	@set -e; room=$$(mktemp -d); trap 'rm -rf "$$room"' EXIT; \
@@ -51,5 +57,5 @@ lock:
 	cp "$$room/requirements.lock" requirements.lock
 
 clean:
-	rm -rf hdjax-demo build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf hdjax-demo build dist *.egg-info .cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -13,4 +13,4 @@ def required(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise ImportError(f"{name} is not installed: this needs the extra `sweep`; install hdjax[sweep]") from error
+        raise ImportError(f"{name} is not installed: install the extra, `pip install 'hdjax[sweep]'`") from error

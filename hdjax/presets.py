@@ -16,3 +16,4 @@ def hdc_40_050() -> Drive:
 
 
 PRESETS = {"HDC-40-050": hdc_40_050}
+"""Functions that make drives with published parameters, by the name that the command line uses."""

@@ -15,7 +15,9 @@ DEGREE = 5
 """Degree of the polynomial of an interval; 5 lets value, slope and curvature match at both of its ends."""
 
 Hold = Literal["zero-order", "linear", "cubic", "band-limited"]
+"""Inter-sample behaviour of a sampled input: constant, straight, a cubic spline, or a windowed sinc."""
 HOLDS: tuple[Hold, ...] = get_args(Hold)
+"""All of them."""
 
 
 class PiecewisePolynomial(eqx.Module):

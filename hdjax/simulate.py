@@ -1,4 +1,8 @@
-"""The only place that integrates the equations of motion."""
+"""Simulation of the equations of motion: by diffrax, and by a march in fixed steps for fits.
+
+Other integrators serve one purpose each: machine code for fits and sweeps (`hdjax.engine`), steady motions
+(`hdjax.response`), many lanes (`hdjax.sweep`) and random torque (`hdjax.stochastic`).
+"""
 
 import functools
 from collections.abc import Callable

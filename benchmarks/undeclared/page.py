@@ -19,10 +19,10 @@ KEPT = Path(__file__).parent / "registered"
 
 OPENING = """# Evaluation
 
-What the loop says of drives with an effect hidden in them, of kinds that it knows and that it does not, and of drives
-with nothing hidden. A rig of its own draws them, which shares no code with the package (`benchmarks/undeclared`). The
-page is made by `benchmarks/undeclared/page.py`. No rule was changed between a run's seed and its end, and every run
-that was registered is here.
+The loop is closed on simulated logs of drives with a hidden effect, in the catalogue or not, and of drives without one.
+The simulator (`benchmarks/undeclared`) shares no code with the package; `benchmarks/README.md` has the protocol. A run
+is registered before it begins: no rule was changed between the draw of its seed and its end. Every registered run is on
+this page, which `benchmarks/undeclared/page.py` generates.
 """
 
 

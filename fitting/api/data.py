@@ -61,11 +61,11 @@ class Data:
         return replace(self, logs=rest, test=(*self.test, *chosen))
 
     def rig(self, *, other_holds: bool = True) -> Rig:
-        """The logs made ready to be fitted; arguments as in [`fitting.drive_data.rig_of`][]."""
+        """The logs made ready to be fitted; arguments as in `fitting.drive_data.rig_of`."""
         return rig_of(self.logs, self.drive, test=self.test, other_holds=other_holds)
 
     def ready(self, log: Log, *, outputs_until: int | None = None) -> Log:
-        """A log masked and zeroed, by outputs that are known so far; see [`fitting.logs.log.read_log`][]."""
+        """A log masked and zeroed, by outputs that are known so far; see `fitting.logs.log.read_log`."""
         table = self.tables.get(log.path)
         if outputs_until != self.outputs_until:
             log = replace(read_log(log.path, self.drive, outputs_until=outputs_until, table=table), name=log.name)

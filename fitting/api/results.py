@@ -1,7 +1,7 @@
 """Results of the verbs: tables, a summary, pictures, a report on disk."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -46,7 +46,7 @@ class Told(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """What a verb found.
 
@@ -55,8 +55,8 @@ class Result:
         rig: The logs as they were fitted; None for quasi-static ones.
     """
 
-    told: Told = field(repr=False)
-    rig: Rig | None = field(repr=False, default=None)
+    told: Told
+    rig: Rig | None = None
 
     @property
     def report(self) -> dict[str, Any]:
@@ -147,17 +147,20 @@ class Result:
     def __str__(self) -> str:
         return self.told.text
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.report['name']}: {self.report['summary']})"
+
     def _repr_html_(self) -> str:
         sentence = self.report["summary"].replace("&", "&amp;").replace("<", "&lt;")
         return f"<p><b>{self.report['name']}</b>: {sentence}</p>{self.parameters._repr_html_()}"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FitResult(Result):
     """A fit of the base model."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LoopResult(Result):
     """A closed loop: what was missing, and the model with it."""
 

@@ -29,7 +29,7 @@ def _rule(default: float, unit: str, meaning: str, source: str) -> Any:
     return field(default=default, metadata={"unit": unit, "meaning": meaning, "source": source})
 
 
-_UNDECLARED = "study of undeclared effects, `docs/undeclared.md`"
+_UNDECLARED = "study of undeclared effects, `docs/evaluation_history.md`"
 
 
 @dataclass(frozen=True)

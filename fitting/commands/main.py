@@ -43,6 +43,9 @@ for command in (
     demo,
 ):
     app.command(command)
+app.register_install_completion_command(
+    "install-completion", help="Add the completion of commands and options to your shell."
+)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -45,7 +45,8 @@ def own_states(seen: Along, stacked: Effect, proposals: int, before: Memory | No
     )
     first = jax.tree.map(lambda a: a[:, 0], motion)
     each = jax.tree.map(lambda a: a[:, None], stacked)
-    given = np.swapaxes(at_instants(_settled, (each, 2), (first, 1)), 0, 1)
+    # A copy: what JAX computed is read-only.
+    given = np.array(np.swapaxes(at_instants(_settled, (each, 2), (first, 1)), 0, 1))
     if before is not None:
         given[seen.firsts] = np.swapaxes(before.at_ends, 1, 2)
     found = np.empty((segments, samples + 1, *given.shape[1:]))

@@ -35,7 +35,7 @@ class Known:
         std: Standard error, robust against coloured residuals, or None.
         ci95: 95 % interval, or None.
         unit: SI unit.
-        identifiable: Whether the logs tell it from zero or, if it must be positive, know it to a factor of about two.
+        identifiable: Whether its interval excludes zero or, if it must be positive, stays within a factor of e.
         description: What it is.
         reason: Why it is not identifiable; empty where it is.
     """

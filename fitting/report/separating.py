@@ -159,6 +159,20 @@ def separating_experiment(one: str, other: str) -> str:
     return f"{sentence[0].upper()}{sentence[1:]}."
 
 
+def look_alikes(family: str) -> dict[str, str]:
+    """The families that leave a similar residual, each with the experiment that tells them apart.
+
+    Args:
+        family: of effects; it is its own look-alike where its forms are hard to tell apart.
+    """
+    pairs = {other: experiment for pair, experiment in _SEPARATING.items() for other in _other(pair, family)}
+    return dict(sorted(pairs.items()))
+
+
+def _other(pair: tuple[str, str], family: str) -> tuple[str, ...]:
+    return (pair[1],) if pair[0] == family else (pair[0],) if pair[1] == family else ()
+
+
 def plain_family(family: str) -> str:
     """A family's name in prose."""
     return _PLAIN_FAMILY.get(family, family.replace("_", " "))

@@ -28,8 +28,8 @@ class Estimate(eqx.Module):
         std_classical: standard error from J^T J alone, which takes the residual for white noise.
         ci95: 95 % interval; wider than 1.96 standard errors where those rest on few data.
         unit: SI unit.
-        identifiable: whether the data tell the parameter from zero; of a positive parameter, whether they know it
-            to better than a factor of about two.
+        identifiable: whether the data tell the parameter from zero; of a positive parameter, whether its interval
+            stays within a factor of e to either side.
         degrees_of_freedom: of Student's t behind the interval.
         interval: whether `ci95` is from the curvature at the optimum or from the likelihood's profile.
     """

@@ -1,19 +1,49 @@
 """Design studies by gradient: objectives and constraints of a drive, its best design, and the proof by brute force."""
 
-from hdjax.design.case import Case as Case
-from hdjax.design.case import Excitation as Excitation
-from hdjax.design.confirm import Confirmation as Confirmation
-from hdjax.design.confirm import confirm as confirm
-from hdjax.design.measure import Measure as Measure
-from hdjax.design.measures import MEASURES as MEASURES
-from hdjax.design.optimise import Optimised as Optimised
-from hdjax.design.optimise import Optimum as Optimum
-from hdjax.design.optimise import Outcome as Outcome
-from hdjax.design.optimise import optimise as optimise
-from hdjax.design.robustness import Draws as Draws
-from hdjax.design.study import Limit as Limit
-from hdjax.design.study import Maker as Maker
-from hdjax.design.study import Replaced as Replaced
-from hdjax.design.study import Study as Study
-from hdjax.design.study import Term as Term
-from hdjax.design.variables import Variable as Variable
+from hdjax.design.case import Case, Excitation
+from hdjax.design.catalogue_gear import CatalogueGear
+from hdjax.design.closed_measures import Bistability, MotorSpeed, MotorTorque, ResonanceDistance, StaticTwist
+from hdjax.design.confirm import Confirmation, confirm
+from hdjax.design.identification import IdentificationTime, LargestTwist
+from hdjax.design.measure import Measure
+from hdjax.design.measures import MEASURES
+from hdjax.design.optimise import Optimised, Optimum, Outcome, optimise
+from hdjax.design.response_measures import FoldDistance, Loss, MeshTorque, PeakError
+from hdjax.design.robustness import Draws
+from hdjax.design.settling import SettlingTime
+from hdjax.design.study import Limit, Maker, Replaced, Study, Term, appraise
+from hdjax.design.variables import Variable
+
+__all__ = [
+    "Bistability",
+    "Case",
+    "CatalogueGear",
+    "Confirmation",
+    "Draws",
+    "Excitation",
+    "FoldDistance",
+    "IdentificationTime",
+    "LargestTwist",
+    "Limit",
+    "Loss",
+    "MEASURES",
+    "Maker",
+    "Measure",
+    "MeshTorque",
+    "MotorSpeed",
+    "MotorTorque",
+    "Optimised",
+    "Optimum",
+    "Outcome",
+    "PeakError",
+    "Replaced",
+    "ResonanceDistance",
+    "SettlingTime",
+    "StaticTwist",
+    "Study",
+    "Term",
+    "Variable",
+    "appraise",
+    "confirm",
+    "optimise",
+]

@@ -60,7 +60,7 @@ def confirm(
 
     Args:
         study: whose optimum it is.
-        optimum: from [`hdjax.design.optimise`][].
+        optimum: from `hdjax.design.optimise`.
         width: half the width of the swept box, as a share of each range; bounds cut it.
         points: along each variable; of an odd number the middle is the optimum.
         seed: of the sample.

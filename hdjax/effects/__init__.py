@@ -1,45 +1,116 @@
 """Physical effects that a harmonic drive's log can hide, each inside the equations of motion."""
 
-from hdjax.effects.catalogue import BY_NAME as BY_NAME
-from hdjax.effects.catalogue import CATALOGUE as CATALOGUE
-from hdjax.effects.catalogue import FAMILIES as FAMILIES
-from hdjax.effects.catalogue import applicable as applicable
-from hdjax.effects.dry import (
-    DryFriction as DryFriction,
-)
+from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
+from hdjax.effects.backlash import Backlash, UndampedBacklash
+from hdjax.effects.catalogue import BY_NAME, CATALOGUE, FAMILIES, applicable
+from hdjax.effects.cogging import Cogging, SingleOrderCogging
+from hdjax.effects.creep import Creep
+from hdjax.effects.damping import CubicDamping, DisplacementDamping, QuadraticDamping
+from hdjax.effects.dry import DryFriction
 from hdjax.effects.effect import (
-    ActuatorEffect as ActuatorEffect,
+    ActuatorEffect,
+    Conditions,
+    Effect,
+    LoadSideEffect,
+    MeshGeometryEffect,
+    MeshTorqueEffect,
+    Motion,
+    MotorSideEffect,
+    Rubbing,
+    Scales,
+    SensorEffect,
+    ShaftEffect,
 )
-from hdjax.effects.effect import (
-    Conditions as Conditions,
+from hdjax.effects.friction import (
+    CoulombFriction,
+    LoadDependentFriction,
+    LoadFriction,
+    MotorFriction,
+    StribeckLoadFriction,
+    StribeckMotorFriction,
 )
-from hdjax.effects.effect import (
-    Effect as Effect,
+from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
+from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
+from hdjax.effects.load import ConstantLoad, GravityLoad, LoadDisturbance, TwoLineDisturbance
+from hdjax.effects.position import (
+    ConservativePositionDependentStiffness,
+    PositionDependentMeshFriction,
+    PositionDependentMotorFriction,
+    PositionDependentStiffness,
+    RipplingMotorFriction,
 )
-from hdjax.effects.effect import (
-    LoadSideEffect as LoadSideEffect,
-)
-from hdjax.effects.effect import (
-    MeshGeometryEffect as MeshGeometryEffect,
-)
-from hdjax.effects.effect import (
-    MeshTorqueEffect as MeshTorqueEffect,
-)
-from hdjax.effects.effect import (
-    Motion as Motion,
-)
-from hdjax.effects.effect import (
-    MotorSideEffect as MotorSideEffect,
-)
-from hdjax.effects.effect import (
-    Rubbing as Rubbing,
-)
-from hdjax.effects.effect import (
-    Scales as Scales,
-)
-from hdjax.effects.effect import (
-    SensorEffect as SensorEffect,
-)
-from hdjax.effects.effect import (
-    ShaftEffect as ShaftEffect,
-)
+from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
+from hdjax.effects.resonance import ExtraResonance, ResonanceBesideLoad
+from hdjax.effects.sensing import LoadEncoderDelay, LoadEncoderEccentricity, MotorEncoderDelay, MotorEncoderEccentricity
+from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, SmoothKneeStiffness, ThreeSlopeStiffness
+from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
+
+__all__ = [
+    "ActuatorEffect",
+    "BY_NAME",
+    "Backlash",
+    "BoucWen",
+    "CATALOGUE",
+    "Cogging",
+    "Conditions",
+    "ConservativePositionDependentStiffness",
+    "ConstantLoad",
+    "CoulombFriction",
+    "Creep",
+    "CubicDamping",
+    "Dahl",
+    "DahlMotorFriction",
+    "DisplacementDamping",
+    "DryFriction",
+    "Effect",
+    "ExtraResonance",
+    "FAMILIES",
+    "GravityLoad",
+    "InputDelay",
+    "InputLag",
+    "KinematicError",
+    "KinematicHarmonic",
+    "KinematicSidebands",
+    "LoadDependentFriction",
+    "LoadDisturbance",
+    "LoadEncoderDelay",
+    "LoadEncoderEccentricity",
+    "LoadFriction",
+    "LoadSideEffect",
+    "LuGreLoadFriction",
+    "LuGreMotorFriction",
+    "MaxwellSlip",
+    "MeshGeometryEffect",
+    "MeshTorqueEffect",
+    "Motion",
+    "MotorEncoderDelay",
+    "MotorEncoderEccentricity",
+    "MotorFriction",
+    "MotorSideEffect",
+    "PositionDependentMeshFriction",
+    "PositionDependentMotorFriction",
+    "PositionDependentStiffness",
+    "QuadraticDamping",
+    "QuadraticStiffness",
+    "QuinticStiffness",
+    "ResonanceBesideLoad",
+    "RipplingMotorFriction",
+    "Rubbing",
+    "Scales",
+    "SensorEffect",
+    "ShaftEffect",
+    "SharpBoucWen",
+    "SingleOrderCogging",
+    "SmoothKneeStiffness",
+    "StribeckLoadFriction",
+    "StribeckMotorFriction",
+    "ThermalDamping",
+    "ThermalMotorFriction",
+    "ThermalStiffness",
+    "ThreeSlopeStiffness",
+    "TorqueBias",
+    "TorqueGain",
+    "TwoLineDisturbance",
+    "UndampedBacklash",
+    "applicable",
+]

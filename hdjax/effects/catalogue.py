@@ -90,8 +90,12 @@ CATALOGUE: tuple[type[Effect], ...] = (
     LoadEncoderEccentricity,
 )
 
+"""Every form. Of two that gain the same, the earlier one comes first."""
+
 BY_NAME: dict[str, type[Effect]] = {form.name: form for form in CATALOGUE}
+"""The forms by their names."""
 FAMILIES: tuple[str, ...] = tuple(dict.fromkeys(form.family for form in CATALOGUE))
+"""The families, each once."""
 
 
 def applicable(

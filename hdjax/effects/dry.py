@@ -23,7 +23,7 @@ class DryFriction(Effect):
 
     Near rest this is a damper that brings the rate down within `corner / (level mobility)`, and an explicit solver with
     longer steps would rattle to and fro. In such steps the friction is the level times the sign's mean over the step,
-    which is known at its start (see [`hdjax.rubbing`][]): with it a drive stops within a step, sticks, or turns back,
+    which is known at its start (see `hdjax.rubbing`): with it a drive stops within a step, sticks, or turns back,
     and all else keeps the solver's order. Shorter steps follow the law at each of their stages.
 
     Attributes:

@@ -163,8 +163,9 @@ class LoadFriction(DryLoadFriction):
 
 
 class StribeckLoadFriction(DryLoadFriction):
-    """Load friction whose Coulomb part is larger near standstill, as [`StribeckMotorFriction`][] is on the motor:
-    bearings and seals that stick before they slide.
+    """Load friction whose Coulomb part is larger near standstill: bearings and seals that stick before they slide.
+
+    `(T_c + T_excess exp(-(omega_l/omega_s)^2)) sgn(omega_l) + b omega_l`, with static torque T_s = T_c + T_excess.
     """
 
     family: ClassVar[str] = "load_friction"

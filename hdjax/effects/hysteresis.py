@@ -71,7 +71,7 @@ class BoucWen(MeshTorqueEffect):
 
 
 class SharpBoucWen(BoucWen):
-    """[`BoucWen`][] whose yield is as sharp as the data say: n is fitted."""
+    """[`BoucWen`][] with the exponent n free: it says how sharply the spring yields."""
 
     name: ClassVar[str] = "sharp_bouc_wen"
 
@@ -133,8 +133,8 @@ _SHARE = "yield twist over that of the spring that slips last"
 class MaxwellSlip(MeshTorqueEffect):
     """Torque `k_1 z_1 + k_2 z_2 + k_3 z_3`: springs that slip, each at its own twist.
 
-    Each z follows the twist until it is its yield twist away, and then slips (see [`slip_rate`][]). The last one slips
-    at `yield_twist`, the others at shares of it.
+    Each z follows the twist until it is its yield twist away, and then slips. The last one slips at
+    `yield_twist`, the others at shares of it.
     """
 
     family: ClassVar[str] = "hysteresis"

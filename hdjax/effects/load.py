@@ -42,7 +42,7 @@ class GravityLoad(LoadSideEffect):
 
 
 class ConstantLoad(LoadSideEffect):
-    """A constant torque on the load."""
+    """A torque `constant` on the load."""
 
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "constant_load"

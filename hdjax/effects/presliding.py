@@ -128,7 +128,10 @@ class _LuGre(Effect):
 
 
 class LuGreMotorFriction(_LuGre, MotorSideEffect):
-    """LuGre friction against the motor."""
+    """LuGre friction `sigma_0 z + sigma_1 z' + b omega_m` against the motor, `z' = omega_m - sigma_0 |omega_m| z / g`.
+
+    `g = T_c (1 + excess exp(-(omega_m / omega_s)^2))`, `sigma_0 = T_c / bend`, `sigma_1 = sigma_0 tau`.
+    """
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "lugre_motor_friction"
@@ -143,7 +146,10 @@ class LuGreMotorFriction(_LuGre, MotorSideEffect):
 
 
 class LuGreLoadFriction(_LuGre, LoadSideEffect):
-    """LuGre friction against the load."""
+    """LuGre friction `sigma_0 z + sigma_1 z' + b omega_l` against the load, `z' = omega_l - sigma_0 |omega_l| z / g`.
+
+    `g = T_c (1 + excess exp(-(omega_l / omega_s)^2))`, `sigma_0 = T_c / bend`, `sigma_1 = sigma_0 tau`.
+    """
 
     family: ClassVar[str] = "load_friction"
     name: ClassVar[str] = "lugre_load_friction"

@@ -81,8 +81,10 @@ class _Resonance(LoadSideEffect):
 
 
 class ExtraResonance(_Resonance):
-    """A part J_3 of the load's inertia is on a spring and a damper, a flexible link: `J_l - J_3` is left on the load,
-    as the drive's J_l is the whole.
+    """A part J_3 of the load's inertia is on a spring and a damper, a flexible link; `J_l - J_3` is left on the load.
+
+    `J_3 theta_3'' = -K_3 (theta_3 - theta_l) - B_3 (theta_3' - theta_l')`, and the opposite torque on the load, with
+    `J_3 = mass_ratio J_l`, `K_3 = J_3 omega_3^2`, `B_3 = 2 zeta omega_3 J_3`. The drive's J_l is the whole.
     """
 
     name: ClassVar[str] = "extra_resonance"
@@ -92,8 +94,9 @@ class ExtraResonance(_Resonance):
 
 
 class ResonanceBesideLoad(_Resonance):
-    """A third inertia J_3 that the drive's J_l does not count is on a spring and a damper beside the load: a payload or
-    a fixture that the drive file does not know of.
+    """A third inertia J_3 that the drive's J_l does not count, on a spring and a damper: a payload or a fixture.
+
+    The same equations as of [`ExtraResonance`][], with the whole of J_l left on the load.
     """
 
     name: ClassVar[str] = "resonance_beside_load"

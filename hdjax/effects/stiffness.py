@@ -43,9 +43,10 @@ class QuinticStiffness(MeshTorqueEffect):
 
 
 class ThreeSlopeStiffness(MeshTorqueEffect):
-    """The vendors' three straight slopes K1, K2, K3 with knees at the twists x1 and x2.
+    """The vendors' three straight slopes K1, K2, K3 with knees at the twists `x1` and `x1 + gap`.
 
-    K1 is the drive's K; the cubic remains free beside it, and is near zero where three slopes are the truth.
+    Adds `K (stiffening_2 d(x, x1) + stiffening_3 d(x, x1 + gap))`, where `d(x, k) = x - clip(x, -k, k)`. K1 is the
+    drive's K; the cubic remains free beside it, and is near zero where three slopes are the truth.
     """
 
     family: ClassVar[str] = "stiffness_shape"

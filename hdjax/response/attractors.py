@@ -34,7 +34,7 @@ class Basins(eqx.Module):
     Attributes:
         x: twists of the starts [rad].
         v: rates of the starts [rad/s].
-        labels: place in `attractors` reached from `x[i], v[j]`, or [`ESCAPED`][] or [`UNSETTLED`][].
+        labels: place in `attractors` reached from `x[i], v[j]`, or `ESCAPED` or `UNSETTLED`.
         attractors: the periodic motions found, by rising amplitude.
     """
 
@@ -69,7 +69,7 @@ def attractors(
     """The coexisting attractors that a grid of starts settles to, and their basins.
 
     Starts that reach the same sub-harmonic in another phase belong to one attractor. Chaotic attractors are not told
-    apart: their starts are labelled [`UNSETTLED`][].
+    apart: their starts are labelled `UNSETTLED`.
 
     Args:
         model: a reduced model; own states of its effects start at rest.

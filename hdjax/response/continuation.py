@@ -12,7 +12,6 @@ import optimistix as optx
 from jax import lax
 from jax.core import Tracer
 from jax.scipy.linalg import lu_factor, lu_solve
-from jaxcont.core.scan_continuation import ScanResult, pseudo_arclength_scan
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hdjax.dynamics import Model
@@ -384,8 +383,11 @@ def _follow_fold(branch, fold, parameter, start, end, steps) -> FoldTrack:
     return FoldTrack(track.params * second, track.states[:, branch.unknowns.shape[1]] * branch.scale, valid)
 
 
-def _continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int) -> ScanResult:
+def _continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int):
     """JaxCont's pseudo-arclength continuation, with steps that suit unknowns and a parameter of order one."""
+    # Loaded here: JaxCont loads matplotlib, which takes as long as JAX.
+    from jaxcont.core.scan_continuation import pseudo_arclength_scan
+
     largest = _longest_step(p_0, p_1, steps)
     # JaxCont mixes integer and floating types.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):

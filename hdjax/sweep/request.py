@@ -37,7 +37,7 @@ class Request:
             behind `forcing.` (`forcing.omega`).
         response: `"steady"` for the periodic motions under a harmonic forcing, all that relate to the one-harmonic
             ones; `"transient"` for the motion from rest.
-        outputs: some of [`OUTPUTS`][] of that response.
+        outputs: some of `OUTPUTS` of that response.
         duration: of a transient [s].
         periods: of the forcing that a transient lasts, in place of a duration.
         windows: equal parts of a transient. A trace has as many samples; a settling time is known to one part, which

@@ -111,6 +111,7 @@ def test_a_fit_is_a_table_a_text_and_a_picture(fitted: fitting.FitResult, tmp_pa
     assert stiffness["low"] < rig.K < stiffness["high"] and stiffness["unit"] == "N m/rad"
     assert "K" in fitted.summary() and str(fitted) == fitted.summary()
     assert "<table" in fitted._repr_html_()
+    assert repr(fitted).startswith("FitResult(") and fitted.report["summary"] in repr(fitted)
     for name in fitted.plots:
         fitted.plot(name)
         matplotlib.pyplot.close("all")

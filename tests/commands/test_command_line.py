@@ -441,3 +441,12 @@ def test_predict_asks_for_the_temperature_that_a_model_depends_on(tmp_path: Path
     assert not out.exists()
     log = write_table(tmp_path / "log.csv", table() | {"temperature": np.linspace(295.0, 310.0, COUNT)})
     assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 0
+
+
+def test_shell_completion_is_installed(tmp_path, monkeypatch):
+    # The start-up file of the shell is written to as well.
+    monkeypatch.setenv("HOME", str(tmp_path))
+    script = tmp_path / "hdjax.bash"
+    assert run("install-completion", "--shell", "bash", "--output", script) == 0
+    assert {"close-loop", "--drive"} <= set(script.read_text(encoding="utf-8").replace("'", " ").split())
+    assert str(script) in (tmp_path / ".bashrc").read_text(encoding="utf-8")

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+import hdjax.effects
 from fitting.estimation.engines import linearise, with_engine
 from fitting.estimation.experiment import Experiment, Stretch, cut
 from fitting.estimation.free_parameters import FreeParameters
@@ -546,3 +547,7 @@ def test_a_delay_is_a_late_torque(fine):
     found = outputs(BASE.with_effects(InputDelay(delay=fine * STEP / 50)), held, START, substeps=4)[:, 1]
     undelayed = outputs(BASE, held, START, substeps=4)[:, 1]
     assert rms(found - exact) < 1e-3 * rms(undelayed - exact)
+
+
+def test_package_exports_every_form():
+    assert {form.__name__ for form in CATALOGUE} <= set(hdjax.effects.__all__)

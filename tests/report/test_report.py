@@ -737,3 +737,20 @@ def test_intervals_say_what_is_left(decision: str, times_noise: float, withheld:
     assert (K["ci95"] == [None, None]) == withheld
     assert (K["flag"] is not None) == (K["note"] is not None) == flagged
     assert not flagged or "K may be off" in K["note"]
+
+
+@pytest.mark.parametrize("kind", ["loop", "fitted"])
+def test_page_of_the_json_describes_every_key(kind, request):
+    """Names of schema 1 and keys that are data (paths, effects, outputs) are told by the page's own words."""
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "report_json.md").read_text(encoding="utf-8")
+    described = set(re.findall(r"`([a-z_0-9]+)`", page))
+    report = report_dict(request.getfixturevalue(kind), health=HEALTH)
+    keys = set(report) - {"evidence"}
+    for part in ("before", "after", "goodness", "frequency_response", "noise", "setting", "engine", "identifiability"):
+        keys |= set(report[part] or {})
+    for entries in ("rules", "alternatives", "steps", "residual_tests", "logs", "health"):
+        keys |= {key for entry in report[entries] for key in entry}
+    keys |= {key for estimate in report["before"]["parameters"].values() for key in estimate}
+    keys |= {key for effect in report["after"]["effects"] for key in effect}
+    earlier = {"validation_gain", "validation_rmse", "validation_rmse_of_found", "held_out_rmse", "held_out"}
+    assert keys - described - earlier == set()

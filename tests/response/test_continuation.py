@@ -1,5 +1,8 @@
 """Branches and folds: each motion against scipy's integration, folds against multipliers and one-term theory."""
 
+import subprocess
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -281,3 +284,9 @@ def test_folds_meet_in_the_cusp_of_one_term(lanes):
         assert factor[rising[-1]] > 1.0
         back = np.interp(1.0, factor[rising], omega[rising])
         assert back - 1.0 == pytest.approx(float(found.value[1 - fold]) - 1.0, rel=0.01)
+
+
+def test_response_is_loaded_without_the_libraries_of_pictures():
+    """JaxCont and matplotlib take as long to load as JAX: they are loaded at their first use."""
+    code = "import sys, hdjax.response; sys.exit(bool({'jaxcont', 'matplotlib'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
