@@ -38,7 +38,7 @@ _FAR_FETCHED = -3.0  # a forcing beside a drive's angles, a torque without any
 _AS_ONE_MASS = {"motor_torque": -0.3, "joint_torque": -1.0}
 _RATIO_FITS, _RATIO_BESIDE, _RATIO_ONE, _RATIO_WRONG = 0.0, -2.0, -2.5, -6.0
 _NO_WHOLE_RATIO = -1.5
-_MIXED = -4.0
+_MIXED, _OTHER_COUNTS = -4.0, -1.5
 _RATE_FITS, _RATE_CONTRADICTS = 0.0, -4.0
 _TWIST_UNITS = (1.0, float(np.pi / 180.0), 1e-3)  # rad, deg, mrad
 _USUAL_RATIOS, _POSSIBLE_RATIOS = (25.0, 330.0), (4.0, 1100.0)
@@ -190,8 +190,10 @@ class Evidence:
 
 
 def _beside(one: UnitChoice, other: UnitChoice) -> float:
-    """Log odds of two units in one log: where neither is stated, they are most often the same."""
-    return _MIXED if one.unit != other.unit and "stated" not in (one.reason, other.reason) else 0.0
+    """Log odds of two units in one log: where neither is stated, they are most often the same; encoders differ."""
+    if one.unit == other.unit or "stated" in (one.reason, other.reason):
+        return 0.0
+    return _OTHER_COUNTS if one.unit.startswith("rev /") and other.unit.startswith("rev /") else _MIXED
 
 
 def ratio_odds(ratio: float) -> float:

@@ -260,8 +260,8 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     best, shares = found[0].columns, weighed(found, evidence)
     sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}
     # What is not sure enough to be told still bears on the units and signs of the rest.
-    units, signs = units_of(best, evidence, logs), signs_of(best, evidence)
-    ratio = ratio_of(sure, units, evidence, logs)
+    (units, alike), signs = units_of(best, evidence, logs), signs_of(best, evidence)
+    ratio = ratio_of(sure, (units, alike), evidence, logs)
     names = _names(sure)
     signals = {
         names[s]: _signal(names[s], s, sure, evidence, shares[k][s], (units.get(s), signs.get(s)))
