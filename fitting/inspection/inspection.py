@@ -119,11 +119,6 @@ class Inspection:
     joints: tuple[JointInspection, ...]
     joint: JointInspection
 
-    @property
-    def sample_rate(self) -> float | None:
-        """Hz, where it stands beside the data."""
-        return self.tables[0].sample_rate
-
     @cached_property
     def rates(self) -> tuple[float | None, ...]:
         """Samples per second of each log [Hz]; None where no seconds are known."""
@@ -156,6 +151,13 @@ def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Insp
             f"{others[0].path}: its columns are not those of {first.path} ({differing}); give logs of one drive that "
             "were recorded alike, or one at a time"
         )
+    # Numbers of any size may stand in a file; what overflows tells nothing.
+    with np.errstate(all="ignore"):
+        return _inspected(tables, joint)
+
+
+def _inspected(tables: Sequence[Table], joint: str | None) -> Inspection:
+    first = tables[0]
     time = guess_time(first)
     clocks = tuple(clock_of(table, time) for table in tables)
     labels = joint_labels(first.columns)
@@ -216,6 +218,8 @@ def _joint(
 ) -> JointInspection:
     clocks_of = {time.column, *time.clocks.values()}
     columns = [c for c in tables[0].columns if c.name not in clocks_of and _is_of(c, label, labels)]
+    if not columns:
+        return JointInspection(label, {}, {}, {}, None, 0.0)
     logs = [
         uniform(clock.base.time, [_samples(table, c.name, clock, time) for c in columns])
         for table, clock in zip(tables, clocks, strict=True)
@@ -254,8 +258,6 @@ def _is_of(column: Column, label: str | None, labels: tuple[str, ...]) -> bool:
 
 
 def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> JointInspection:
-    if not evidence.columns:
-        return JointInspection(label, {}, {}, {}, None, 0.0)
     found = hypotheses(evidence)
     best, shares = found[0].columns, weighed(found, evidence)
     sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}

@@ -191,7 +191,8 @@ def _left(regressors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _share(left: np.ndarray, bare: np.ndarray) -> np.ndarray:
-    return np.minimum(np.where(bare > 0, left / np.where(bare > 0, bare, 1.0), 1.0), 1.0)
+    share = np.where(bare > 0, left / np.where(bare > 0, bare, 1.0), 1.0)
+    return np.minimum(np.nan_to_num(share, nan=1.0), 1.0)
 
 
 def _odds(share: np.ndarray, null: np.ndarray) -> np.ndarray:
@@ -248,4 +249,4 @@ def _correlated(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share = np.where(known, 1.0 - cross**2 / np.where(known, products, 1.0), 1.0)
     slope = np.where(other[None, :] > 0, cross / np.where(other > 0, other, 1.0)[None, :], 0.0)
     # A slope between two noisy channels of one motion lies between this and its counterpart.
-    return np.clip(share, 0.0, 1.0), slope
+    return np.clip(np.nan_to_num(share, nan=1.0), 0.0, 1.0), slope
