@@ -25,6 +25,7 @@ _INERTIAS = {
     "load_inertia": "all that the output moves, about its axis [kg m^2]",
 }
 _WHERE_TO_FILL = "FILL IN"
+_WHY_NO_ANGLE = "no column was recognised as this angle, which tells the twist"
 
 
 def drive_tables(inspection: Inspection) -> dict[str, Any]:
@@ -50,6 +51,7 @@ def unknowns(inspection: Inspection) -> dict[str, str]:
         missing |= {f"[drive] {key}": what for key, what in _INERTIAS.items()}
     if inspection.time.column is None and inspection.rates[0] is None:
         missing["[signals] sample_rate"] = "in Hz; no column is a clock"
+    missing |= {f"[columns] {signal}": _WHY_NO_ANGLE for signal in _unseen_angles(inspection)}
     written = _written(inspection)
     for signal in _in_order(joint.signals):
         if signal not in written and not _spare(inspection, signal):
@@ -87,6 +89,7 @@ def drive_file_text(inspection: Inspection, made_by: str) -> str:
             lines.append(f"# {signal} = {_toml(_place(guess))}  # beside the motor torque it is not needed")
         else:
             lines.append(f"# {signal} = {_open_place(guess)}  # {_WHERE_TO_FILL}: {_why_not_written(guess)}")
+    lines += [f"# {signal} = ...  # {_WHERE_TO_FILL}: {_WHY_NO_ANGLE}" for signal in _unseen_angles(inspection)]
     lines += _open_lines(inspection)
     return "\n".join(lines) + "\n"
 
@@ -112,6 +115,15 @@ def _written(inspection: Inspection) -> list[str]:
 
 def _spare(inspection: Inspection, signal: str) -> bool:
     return signal == "motor_current" and "motor_torque" in inspection.joint.signals
+
+
+def _unseen_angles(inspection: Inspection) -> list[str]:
+    """The angles that a log of one side lacks, and that no doubtful column may be."""
+    joint = inspection.joint
+    if joint.kind != "motor side":
+        return []
+    maybe = {signal for shares in joint.open.values() for signal in shares}
+    return [signal for signal in _ANGLES if signal not in joint.signals and signal not in maybe]
 
 
 def _known_angles(inspection: Inspection) -> bool:
