@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from fitting.inspection.inspection import Inspection, SignalGuess
+from fitting.inspection.unit_evidence import is_counts
 
 _ANGLES = ("motor_angle", "load_angle")
 _ORDER = (
@@ -208,7 +209,9 @@ def _open_lines(inspection: Inspection) -> list[str]:
     lines = []
     for column, shares in inspection.joint.open.items():
         lines.append(f"# {_WHERE_TO_FILL}: {_plain(repr(column))} may be {_listed(shares)}; take the # from one line")
-        lines += [f"# {signal} = {{ column = {_toml(column)} }}" for signal in shares]
+        unit = inspection.tables[0].column(column).unit
+        place = {"column": column} | ({} if unit is None or is_counts(unit) else {"unit": unit})
+        lines += [f"# {signal} = {_toml(place)}" for signal in shares]
     return lines
 
 

@@ -246,14 +246,19 @@ def _assigned(odds: np.ndarray, free: Sequence[int], without: str) -> tuple[floa
     return float(odds[rows, columns].sum()), chosen
 
 
+def _weights(found: Sequence[Hypothesis]) -> np.ndarray:
+    """Of each hypothesis, together 1."""
+    odds = np.array([h.odds for h in found])
+    weights = np.exp(odds - odds.max())
+    return weights / weights.sum()
+
+
 def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[str, float]]:
     """For each column the signals that it may be, with the weight of the hypotheses that say so, 0 to 1.
 
     A hypothesis that takes a copy of the column speaks for it as well.
     """
-    odds = np.array([h.odds for h in found])
-    weights = np.exp(odds - odds.max())
-    weights /= weights.sum()
+    weights = _weights(found)
     shares: dict[int, dict[str, float]] = {}
     for hypothesis, weight in zip(found, weights, strict=True):
         for signal, k in hypothesis.columns.items():
@@ -271,13 +276,19 @@ def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[s
     return shares
 
 
-def readings(evidence: Evidence, best: Hypothesis, column: int) -> dict[str, float]:
-    """What a column may be, given the angles, with the confidence of each, the likeliest first."""
+def readings(found: Sequence[Hypothesis], evidence: Evidence, column: int) -> dict[str, float]:
+    """What a column that is no angle may be, with the confidence of each, the likeliest first: every reading under the
+    best hypothesis, and that of each other one."""
+    best, weights = found[0], _weights(found)
     frame = tuple(best.columns.get(signal) for signal in ANGLES)
     idle = [s for s in OTHERS if s not in best.columns or best.columns[s] == column]
     odds = {s: evidence.other(s, column, *frame) for s in idle if evidence.names[s][column].odds > _WORST_NAME}
     total = 1.0 + sum(np.exp(list(odds.values())))
-    shares = {s: float(np.exp(o) / total) for s, o in odds.items()}
+    shares = {s: float(weights[0] * np.exp(o) / total) for s, o in odds.items()}
+    for hypothesis, weight in zip(found[1:], weights[1:], strict=True):
+        for signal, k in hypothesis.columns.items():
+            if k == column and signal in OTHERS:
+                shares[signal] = shares.get(signal, 0.0) + float(weight)
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 

@@ -261,6 +261,9 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     found = hypotheses(evidence)
     best, shares = found[0].columns, weighed(found, evidence)
     sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}
+    if {"motor_torque", "motor_current"} <= set(sure) and evidence.columns[sure["motor_torque"]].sense.commanded:
+        # The measured current tells the torque better than a command does.
+        del sure["motor_torque"]
     # What is not sure enough to be told still bears on the units and signs of the rest.
     (units, alike), signs = units_of(best, evidence, logs), signs_of(best, evidence)
     ratio = ratio_of(sure, (units, alike), evidence, logs)
@@ -273,9 +276,9 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     maybe = {}
     for k, column in enumerate(evidence.columns):
         angles = {s: w for s, w in shares.get(k, {}).items() if s in ANGLES and w > _RIVAL}
-        others = {s: w for s, w in readings(evidence, found[0], k).items() if w > _RIVAL}
+        others = {s: w for s, w in readings(found, evidence, k).items() if w > _RIVAL}
         if k not in taken and max([*angles.values(), *others.values()], default=0.0) > _WORTH_A_WORD:
-            maybe[column.name] = angles | {s: w * (1.0 - sum(angles.values())) for s, w in others.items()}
+            maybe[column.name] = dict(sorted((angles | others).items(), key=lambda item: -item[1]))
     copies = _copies(evidence, taken)
     maybe = {name: own for name, own in maybe.items() if own and name not in copies}
     angle = sure.get("load_angle", sure.get("motor_angle", sure.get("dynamic_error")))
