@@ -5,7 +5,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from fitting.inspection.inspection import Inspection, SignalGuess
-from fitting.inspection.unit_evidence import is_counts
+from fitting.inspection.unit_evidence import is_counts, si_size
+from fitting.logs.channels import SI
 
 _ANGLES = ("motor_angle", "load_angle")
 _ORDER = (
@@ -108,10 +109,15 @@ def _written(inspection: Inspection) -> list[str]:
     """The signals whose lines need nothing more."""
     signals = inspection.joint.signals
     return [
-        s
-        for s in _in_order(signals)
-        if not _spare(inspection, s) and s != "motor_current" and (s not in _ANGLES or signals[s].unit is not None)
+        s for s in _in_order(signals) if not _spare(inspection, s) and s != "motor_current" and _is_read(signals[s])
     ]
+
+
+def _is_read(guess: SignalGuess) -> bool:
+    """Whether a reader knows what the numbers count."""
+    if guess.unit is None:
+        return guess.signal not in _ANGLES
+    return guess.signal not in SI or si_size(guess.unit, SI[guess.signal]) is not None
 
 
 def _spare(inspection: Inspection, signal: str) -> bool:
@@ -152,6 +158,8 @@ def _open_place(guess: SignalGuess) -> str:
 def _why_not_written(guess: SignalGuess) -> str:
     if guess.signal == "motor_current":
         return "the torque constant [N m / A] is not known from a log"
+    if guess.unit is not None:
+        return f"write the size of one '{guess.unit}', such as \"0.27 N m\""
     return 'the unit can\'t be seen; for counts write "rev / 65536" with the counts of a revolution'
 
 
