@@ -6,6 +6,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from fitting.api.data import sources
@@ -79,7 +80,6 @@ class InspectionResult:
             axes: Of matplotlib, one for each signal; made where not given.
         """
         import matplotlib.pyplot as plt
-        import numpy as np
 
         signals = list(self.inspection.joint.signals)
         if not signals:
@@ -148,5 +148,6 @@ def inspect(logs: Any, *, joint: str | int | None = None) -> InspectionResult:
 def inspected(tables: Sequence[Table], *, joint: str | None = None) -> InspectionResult:
     """[`inspect`][] for logs whose columns have been read."""
     found = inspect_tables(tables, joint=joint)
-    moved = tuple(excitation(found, k) for k in range(len(tables)))
+    with np.errstate(all="ignore"):
+        moved = tuple(excitation(found, k) for k in range(len(tables)))
     return InspectionResult(found, health(found), moved, promises(found, moved[0]))

@@ -15,8 +15,7 @@ from fitting.logs.read_table import read_table
 _FEWEST_ROWS = 8
 _MOST_TEXT = 0.05  # share of rows; what has more is no channel
 _MOST_IN_A_MATRIX = 64
-# Written out, these say the same as the symbol.
-_FILL = 1e30
+_FILL = 1e30  # beyond it lie fill values
 
 
 @dataclass(frozen=True, eq=False)

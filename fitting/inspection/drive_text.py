@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from fitting.inspection.inspection import Inspection, SignalGuess
+from fitting.inspection.unit_evidence import is_counts, si_size
+from fitting.logs.channels import SI
 
 _ANGLES = ("motor_angle", "load_angle")
 _ORDER = (
@@ -25,6 +27,7 @@ _INERTIAS = {
     "load_inertia": "all that the output moves, about its axis [kg m^2]",
 }
 _WHERE_TO_FILL = "FILL IN"
+_WHY_NO_ANGLE = "no column was recognised as this angle, which tells the twist"
 
 
 def drive_tables(inspection: Inspection) -> dict[str, Any]:
@@ -50,6 +53,7 @@ def unknowns(inspection: Inspection) -> dict[str, str]:
         missing |= {f"[drive] {key}": what for key, what in _INERTIAS.items()}
     if inspection.time.column is None and inspection.rates[0] is None:
         missing["[signals] sample_rate"] = "in Hz; no column is a clock"
+    missing |= {f"[columns] {signal}": _WHY_NO_ANGLE for signal in _unseen_angles(inspection)}
     written = _written(inspection)
     for signal in _in_order(joint.signals):
         if signal not in written and not _spare(inspection, signal):
@@ -87,6 +91,7 @@ def drive_file_text(inspection: Inspection, made_by: str) -> str:
             lines.append(f"# {signal} = {_toml(_place(guess))}  # beside the motor torque it is not needed")
         else:
             lines.append(f"# {signal} = {_open_place(guess)}  # {_WHERE_TO_FILL}: {_why_not_written(guess)}")
+    lines += [f"# {signal} = ...  # {_WHERE_TO_FILL}: {_WHY_NO_ANGLE}" for signal in _unseen_angles(inspection)]
     lines += _open_lines(inspection)
     return "\n".join(lines) + "\n"
 
@@ -104,14 +109,28 @@ def _written(inspection: Inspection) -> list[str]:
     """The signals whose lines need nothing more."""
     signals = inspection.joint.signals
     return [
-        s
-        for s in _in_order(signals)
-        if not _spare(inspection, s) and s != "motor_current" and (s not in _ANGLES or signals[s].unit is not None)
+        s for s in _in_order(signals) if not _spare(inspection, s) and s != "motor_current" and _is_read(signals[s])
     ]
+
+
+def _is_read(guess: SignalGuess) -> bool:
+    """Whether a reader knows what the numbers count."""
+    if guess.unit is None:
+        return guess.signal not in _ANGLES
+    return guess.signal not in SI or si_size(guess.unit, SI[guess.signal]) is not None
 
 
 def _spare(inspection: Inspection, signal: str) -> bool:
     return signal == "motor_current" and "motor_torque" in inspection.joint.signals
+
+
+def _unseen_angles(inspection: Inspection) -> list[str]:
+    """The angles that a log of one side lacks, and that no doubtful column may be."""
+    joint = inspection.joint
+    if joint.kind != "motor side":
+        return []
+    maybe = {signal for shares in joint.open.values() for signal in shares}
+    return [signal for signal in _ANGLES if signal not in joint.signals and signal not in maybe]
 
 
 def _known_angles(inspection: Inspection) -> bool:
@@ -139,6 +158,8 @@ def _open_place(guess: SignalGuess) -> str:
 def _why_not_written(guess: SignalGuess) -> str:
     if guess.signal == "motor_current":
         return "the torque constant [N m / A] is not known from a log"
+    if guess.unit is not None:
+        return f"write the size of one '{guess.unit}', such as \"0.27 N m\""
     return 'the unit can\'t be seen; for counts write "rev / 65536" with the counts of a revolution'
 
 
@@ -196,7 +217,9 @@ def _open_lines(inspection: Inspection) -> list[str]:
     lines = []
     for column, shares in inspection.joint.open.items():
         lines.append(f"# {_WHERE_TO_FILL}: {_plain(repr(column))} may be {_listed(shares)}; take the # from one line")
-        lines += [f"# {signal} = {{ column = {_toml(column)} }}" for signal in shares]
+        unit = inspection.tables[0].column(column).unit
+        place = {"column": column} | ({} if unit is None or is_counts(unit) else {"unit": unit})
+        lines += [f"# {signal} = {_toml(place)}" for signal in shares]
     return lines
 
 

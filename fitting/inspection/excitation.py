@@ -45,7 +45,7 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
         log: Number of the log.
     """
     signals = inspection.joint.signals
-    ranges = {name: _range(inspection, name, log) for name in signals}
+    ranges = {name: _range(inspection, name, log) for name in signals if len(inspection.samples(name, log)[1])}
     driver = next((s for s in ("motor_torque", "motor_current", "forcing", "joint_torque") if s in signals), None)
     twist = _twist(inspection, log)
     names = ("dynamic_error", "twist", "load_angle", "motor_angle", "motor_velocity")
@@ -57,7 +57,8 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
         answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
         if len(torque) >= _FEWEST and np.ptp(torque) > 0:
             band = _band(torque, rate)
-            coherent = None if answer is None or np.ptp(answer) == 0 else _coherent(torque, answer, rate, band)
+            answers = answer is not None and len(answer) >= _FEWEST and np.ptp(answer) > 0
+            coherent = _coherent(torque, answer, rate, band) if answer is not None and answers else None
     spread = None if twist is None else float(np.ptp(twist))
     return Excitation(ranges, driver, response, band, coherent, spread)
 
@@ -68,7 +69,7 @@ def _range(inspection: Inspection, signal: str, log: int) -> tuple[float, float,
     unit = SI.get(signal, "A" if signal == "motor_current" else "")
     if guess.unit is None and signal.endswith("_angle"):
         unit = "as logged"
-    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf)), unit
+    return float(values.min()), float(values.max()), unit
 
 
 def _twist(inspection: Inspection, log: int) -> np.ndarray | None:

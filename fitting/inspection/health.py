@@ -11,7 +11,7 @@ from fitting.inspection.drive_text import drive_tables
 from fitting.inspection.inspection import Inspection
 from fitting.inspection.time_column import sampling_findings
 from fitting.logs.checks import examine
-from fitting.logs.drive_file import drive_of
+from fitting.logs.drive_file import SIGNALS, drive_of
 from fitting.logs.findings import Finding
 from fitting.logs.log import read_log
 from fitting.logs.masks import masked
@@ -19,12 +19,17 @@ from fitting.logs.masks import masked
 # What stands for what is not known yet; no finding hangs on it.
 _ANY_INERTIA = 1.0
 _ANY_RATE = 1.0
+_ANY_CONSTANT = 1.0
 _DRIVE_FILE = Path("the drive file")
 
 
 def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
     """The findings for each log."""
     tables = drive_tables(inspection)
+    current = inspection.joint.signals.get("motor_current")
+    if current is not None and "motor_torque" not in inspection.joint.signals and "motor_current" in SIGNALS:
+        place = {"column": current.column, "unit": current.unit or "A", "torque_constant": _ANY_CONSTANT}
+        tables["columns"]["motor_current"] = place
     readable = inspection.joint.kind is not None and _complete(inspection, tables)
     return tuple(
         _of_log(inspection, k, tables) if readable else _of_columns(inspection, k)
@@ -34,7 +39,8 @@ def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
 
 def _complete(inspection: Inspection, tables: Mapping[str, Any]) -> bool:
     """Whether every signal has its unit, so that the log can be read as a fit would."""
-    return all(s in tables["columns"] for s in inspection.joint.signals if s != "motor_current")
+    signals = set(inspection.joint.signals)
+    return all(s in tables["columns"] for s in signals - ({"motor_current"} if "motor_torque" in signals else set()))
 
 
 def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[Finding, ...]:

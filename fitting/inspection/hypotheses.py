@@ -38,7 +38,7 @@ _FAR_FETCHED = -3.0  # a forcing beside a drive's angles, a torque without any
 _AS_ONE_MASS = {"motor_torque": -0.3, "joint_torque": -1.0}
 _RATIO_FITS, _RATIO_BESIDE, _RATIO_ONE, _RATIO_WRONG = 0.0, -2.0, -2.5, -6.0
 _NO_WHOLE_RATIO = -1.5
-_MIXED = -4.0
+_MIXED, _OTHER_COUNTS = -4.0, -1.5
 _RATE_FITS, _RATE_CONTRADICTS = 0.0, -4.0
 _TWIST_UNITS = (1.0, float(np.pi / 180.0), 1e-3)  # rad, deg, mrad
 _USUAL_RATIOS, _POSSIBLE_RATIOS = (25.0, 330.0), (4.0, 1100.0)
@@ -190,8 +190,10 @@ class Evidence:
 
 
 def _beside(one: UnitChoice, other: UnitChoice) -> float:
-    """Log odds of two units in one log: where neither is stated, they are most often the same."""
-    return _MIXED if one.unit != other.unit and "stated" not in (one.reason, other.reason) else 0.0
+    """Log odds of two units in one log: where neither is stated, they are most often the same; encoders differ."""
+    if one.unit == other.unit or "stated" in (one.reason, other.reason):
+        return 0.0
+    return _OTHER_COUNTS if one.unit.startswith("rev /") and other.unit.startswith("rev /") else _MIXED
 
 
 def ratio_odds(ratio: float) -> float:
@@ -244,14 +246,19 @@ def _assigned(odds: np.ndarray, free: Sequence[int], without: str) -> tuple[floa
     return float(odds[rows, columns].sum()), chosen
 
 
+def _weights(found: Sequence[Hypothesis]) -> np.ndarray:
+    """Of each hypothesis, together 1."""
+    odds = np.array([h.odds for h in found])
+    weights = np.exp(odds - odds.max())
+    return weights / weights.sum()
+
+
 def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[str, float]]:
     """For each column the signals that it may be, with the weight of the hypotheses that say so, 0 to 1.
 
     A hypothesis that takes a copy of the column speaks for it as well.
     """
-    odds = np.array([h.odds for h in found])
-    weights = np.exp(odds - odds.max())
-    weights /= weights.sum()
+    weights = _weights(found)
     shares: dict[int, dict[str, float]] = {}
     for hypothesis, weight in zip(found, weights, strict=True):
         for signal, k in hypothesis.columns.items():
@@ -269,13 +276,19 @@ def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[s
     return shares
 
 
-def readings(evidence: Evidence, best: Hypothesis, column: int) -> dict[str, float]:
-    """What a column may be, given the angles, with the confidence of each, the likeliest first."""
+def readings(found: Sequence[Hypothesis], evidence: Evidence, column: int) -> dict[str, float]:
+    """What a column that is no angle may be, with the confidence of each, the likeliest first: every reading under the
+    best hypothesis, and that of each other one."""
+    best, weights = found[0], _weights(found)
     frame = tuple(best.columns.get(signal) for signal in ANGLES)
     idle = [s for s in OTHERS if s not in best.columns or best.columns[s] == column]
     odds = {s: evidence.other(s, column, *frame) for s in idle if evidence.names[s][column].odds > _WORST_NAME}
     total = 1.0 + sum(np.exp(list(odds.values())))
-    shares = {s: float(np.exp(o) / total) for s, o in odds.items()}
+    shares = {s: float(weights[0] * np.exp(o) / total) for s, o in odds.items()}
+    for hypothesis, weight in zip(found[1:], weights[1:], strict=True):
+        for signal, k in hypothesis.columns.items():
+            if k == column and signal in OTHERS:
+                shares[signal] = shares.get(signal, 0.0) + float(weight)
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 

@@ -119,11 +119,6 @@ class Inspection:
     joints: tuple[JointInspection, ...]
     joint: JointInspection
 
-    @property
-    def sample_rate(self) -> float | None:
-        """Hz, where it stands beside the data."""
-        return self.tables[0].sample_rate
-
     @cached_property
     def rates(self) -> tuple[float | None, ...]:
         """Samples per second of each log [Hz]; None where no seconds are known."""
@@ -156,6 +151,13 @@ def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Insp
             f"{others[0].path}: its columns are not those of {first.path} ({differing}); give logs of one drive that "
             "were recorded alike, or one at a time"
         )
+    # Numbers of any size may stand in a file; what overflows tells nothing.
+    with np.errstate(all="ignore"):
+        return _inspected(tables, joint)
+
+
+def _inspected(tables: Sequence[Table], joint: str | None) -> Inspection:
+    first = tables[0]
     time = guess_time(first)
     clocks = tuple(clock_of(table, time) for table in tables)
     labels = joint_labels(first.columns)
@@ -216,6 +218,8 @@ def _joint(
 ) -> JointInspection:
     clocks_of = {time.column, *time.clocks.values()}
     columns = [c for c in tables[0].columns if c.name not in clocks_of and _is_of(c, label, labels)]
+    if not columns:
+        return JointInspection(label, {}, {}, {}, None, 0.0)
     logs = [
         uniform(clock.base.time, [_samples(table, c.name, clock, time) for c in columns])
         for table, clock in zip(tables, clocks, strict=True)
@@ -254,14 +258,15 @@ def _is_of(column: Column, label: str | None, labels: tuple[str, ...]) -> bool:
 
 
 def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> JointInspection:
-    if not evidence.columns:
-        return JointInspection(label, {}, {}, {}, None, 0.0)
     found = hypotheses(evidence)
     best, shares = found[0].columns, weighed(found, evidence)
     sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}
+    if {"motor_torque", "motor_current"} <= set(sure) and evidence.columns[sure["motor_torque"]].sense.commanded:
+        # The measured current tells the torque better than a command does.
+        del sure["motor_torque"]
     # What is not sure enough to be told still bears on the units and signs of the rest.
-    units, signs = units_of(best, evidence, logs), signs_of(best, evidence)
-    ratio = ratio_of(sure, units, evidence, logs)
+    (units, alike), signs = units_of(best, evidence, logs), signs_of(best, evidence)
+    ratio = ratio_of(sure, (units, alike), evidence, logs)
     names = _names(sure)
     signals = {
         names[s]: _signal(names[s], s, sure, evidence, shares[k][s], (units.get(s), signs.get(s)))
@@ -271,9 +276,9 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     maybe = {}
     for k, column in enumerate(evidence.columns):
         angles = {s: w for s, w in shares.get(k, {}).items() if s in ANGLES and w > _RIVAL}
-        others = {s: w for s, w in readings(evidence, found[0], k).items() if w > _RIVAL}
+        others = {s: w for s, w in readings(found, evidence, k).items() if w > _RIVAL}
         if k not in taken and max([*angles.values(), *others.values()], default=0.0) > _WORTH_A_WORD:
-            maybe[column.name] = angles | {s: w * (1.0 - sum(angles.values())) for s, w in others.items()}
+            maybe[column.name] = dict(sorted((angles | others).items(), key=lambda item: -item[1]))
     copies = _copies(evidence, taken)
     maybe = {name: own for name, own in maybe.items() if own and name not in copies}
     angle = sure.get("load_angle", sure.get("motor_angle", sure.get("dynamic_error")))

@@ -19,6 +19,7 @@ FLOOR = 1e-4
 _SPAN = float(np.log(1.0 / FLOOR))
 # Channels that even a shifted one explains (ramps, single sines) tell nothing.
 _UNTESTABLE = 0.05
+_FITS = 0.01  # unexplained share below which a relation fits
 _SHIFTS = (0.382, 0.236)  # of a log; by the golden section, no multiples of one period
 _FEWEST_ROWS_A_REGRESSOR = 3
 
@@ -96,6 +97,8 @@ class Relations:
             (motor, load),
             lambda s: s.value[:, [load, motor]],
             lambda s: np.column_stack([s.rate[:, [motor, load]], s.direction[:, [motor, load]]]),
+            # A velocity that was filtered lags, and its lag goes with the acceleration.
+            apart=True,
         )
 
     def holds(self, twist: int) -> tuple[Told, ...]:
@@ -153,14 +156,13 @@ class Relations:
             full, coefficients = _left(np.column_stack([aside, asked]), y)
             if asked.shape[1] == 1:
                 bare, _ = _left(aside, y)
-                total = np.mean(y**2, axis=0)
                 shifted = [_left(np.column_stack([aside, moved]), y)[0] for moved in _shifted(asked)]
                 null = _share(np.max(shifted, axis=0), bare)
-                if apart:
-                    null = np.minimum(null, _share(bare, total))
             else:
                 alone = [_left(np.column_stack([aside, one]), y)[0] for one in asked.T]
                 bare, null = np.min(alone, axis=0), np.ones(channels)
+            if apart:
+                null = np.minimum(null, _share(bare, np.mean(y**2, axis=0)))
             share = _share(full, bare)
             odds.append(_odds(share, null))
             shares.append(share)
@@ -189,7 +191,8 @@ def _left(regressors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _share(left: np.ndarray, bare: np.ndarray) -> np.ndarray:
-    return np.minimum(np.where(bare > 0, left / np.where(bare > 0, bare, 1.0), 1.0), 1.0)
+    share = np.where(bare > 0, left / np.where(bare > 0, bare, 1.0), 1.0)
+    return np.minimum(np.nan_to_num(share, nan=1.0), 1.0)
 
 
 def _odds(share: np.ndarray, null: np.ndarray) -> np.ndarray:
@@ -212,10 +215,11 @@ def _best_scale(odds: np.ndarray, slopes: np.ndarray, shares: np.ndarray) -> tup
 
 def _over_scales(odds: np.ndarray, slopes: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, ...]:
     """The mean odds of the better half of the scales (noise spoils the short ones, drift the long ones), and the slope
-    and share where the relation fits best."""
+    and share of the slowest motion in which the relation fits: filters change that of quick motion."""
     half = (len(odds) + 1) // 2
-    best = np.argmin(shares, axis=0)
-    pick = (best, *np.indices(best.shape))
+    fits = shares <= np.maximum(2.0 * shares.min(axis=0), _FITS)
+    slowest = np.argmax(fits, axis=0)
+    pick = (slowest, *np.indices(slowest.shape))
     return np.sort(odds, axis=0)[-half:].mean(axis=0), slopes[pick], shares[pick]
 
 
@@ -245,4 +249,4 @@ def _correlated(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share = np.where(known, 1.0 - cross**2 / np.where(known, products, 1.0), 1.0)
     slope = np.where(other[None, :] > 0, cross / np.where(other > 0, other, 1.0)[None, :], 0.0)
     # A slope between two noisy channels of one motion lies between this and its counterpart.
-    return np.clip(share, 0.0, 1.0), slope
+    return np.clip(np.nan_to_num(share, nan=1.0), 0.0, 1.0), slope

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from fitting.inspection.hypotheses import Evidence, ratio_odds
+from fitting.inspection.hypotheses import Evidence
 from fitting.inspection.relations import NOTHING, Told
 from fitting.inspection.unit_evidence import UnitChoice
 from fitting.inspection.windows import Uniform
@@ -61,8 +61,14 @@ class RatioGuess:
     sure: bool
 
 
-def units_of(columns: Mapping[str, int], evidence: Evidence, logs: Sequence[Uniform]) -> dict[str, UnitGuess]:
-    """The units of the angles and velocities, chosen together: what is stated, the ratio, the rates and the twist."""
+def units_of(
+    columns: Mapping[str, int], evidence: Evidence, logs: Sequence[Uniform]
+) -> tuple[dict[str, UnitGuess], float]:
+    """The units of the angles and velocities, chosen together: what is stated, the ratio, the rates and the twist.
+
+    Returns:
+        The units by signal, and how sure the factor between the units of both angles is, 0 to 1.
+    """
     motor, load = columns.get("motor_angle"), columns.get("load_angle")
     twist = _twist(logs, motor, load)
     combined = []
@@ -91,8 +97,16 @@ def units_of(columns: Mapping[str, int], evidence: Evidence, logs: Sequence[Unif
     angles = [s for s in ("motor_angle", "load_angle") if s in columns]
     rates = [s for s in ("motor_velocity", "load_velocity") if s in columns]
     guesses = {s: _marginal(s, best, combined, weights) for s in (*angles, *rates) if best.get(s) is not None}
+    factors = np.array([_factor(units) for _, units in combined])
+    alike = float(weights[np.isclose(factors, _factor(best), rtol=1e-6)].sum())
     # A velocity that nothing is held against.
-    return guesses | {s: _alone(evidence.velocity_choices[columns[s]]) for s in rates if s not in guesses}
+    return guesses | {s: _alone(evidence.velocity_choices[columns[s]]) for s in rates if s not in guesses}, alike
+
+
+def _factor(units: Mapping[str, UnitChoice | None]) -> float:
+    """Unit of the motor's angle over that of the load's."""
+    motor, load = units["motor_angle"], units["load_angle"]
+    return 1.0 if motor is None or load is None else motor.size / load.size
 
 
 def _choices(evidence: Evidence, column: int | None) -> Sequence[UnitChoice | None]:
@@ -147,9 +161,19 @@ def _left_over(motor: np.ndarray, load: np.ndarray) -> tuple[float, float, float
 
 
 def ratio_of(
-    columns: Mapping[str, int], units: Mapping[str, UnitGuess], evidence: Evidence, logs: Sequence[Uniform]
+    columns: Mapping[str, int],
+    units: tuple[Mapping[str, UnitGuess], float],
+    evidence: Evidence,
+    logs: Sequence[Uniform],
 ) -> RatioGuess | None:
-    """The reduction ratio; None where there are not both angles or their common motion does not show it."""
+    """The reduction ratio; None where there are not both angles or their common motion does not show it.
+
+    Args:
+        columns: number of the column of each signal.
+        units: as [`units_of`][] gives them.
+        evidence: on the columns.
+        logs: channels by the same numbers.
+    """
     if "motor_angle" not in columns or "load_angle" not in columns:
         return None
     motor, load = columns["motor_angle"], columns["load_angle"]
@@ -160,19 +184,15 @@ def ratio_of(
     share, slope = min(shares, default=(np.inf, 0.0))
     if share > _SEEN_RATIO:
         return None
-    value = slope * units["motor_angle"].size / units["load_angle"].size
+    known, alike = units
+    value = slope * known["motor_angle"].size / known["load_angle"].size
     margin = value * max(_HIDDEN * share, _ROUNDED)
     low, high = value - margin, value + margin
     if margin < 0.5:
         # Strain-wave gears have whole ratios.
-        return RatioGuess(float(round(value)), low, high, sure=low <= round(value) <= high)
+        return RatioGuess(float(round(value)), low, high, sure=low <= round(value) <= high and alike >= SURE)
     usual = [n for n in _CATALOGUE if low <= n <= high]
     return RatioGuess(min(usual, key=lambda n: abs(n - value)) if len(usual) == 1 else value, low, high, sure=False)
-
-
-def odd_ratio(ratio: RatioGuess) -> bool:
-    """Whether no gear is built like this, so that a unit or a column is wrong."""
-    return ratio_odds(ratio.value) < -1.0
 
 
 def signs_of(columns: Mapping[str, int], evidence: Evidence) -> dict[str, tuple[int, str]]:

@@ -131,4 +131,5 @@ def _averages(log: Uniform, direction: np.ndarray, length: int) -> tuple[np.ndar
         np.einsum("l,wlc->wc", bump[0], direction[rows]),
         np.einsum("l,wlc->wc", bump[0], cube[rows]),
     )
+    parts = [np.nan_to_num(part, nan=0.0, posinf=0.0, neginf=0.0) for part in parts]
     return tuple(part - part.mean(axis=0) if len(part) else part for part in parts)

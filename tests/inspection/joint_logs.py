@@ -1,7 +1,7 @@
 """Logs of simulated drives in the shapes in which robots, drives and loggers export them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import cont2discrete
@@ -83,6 +83,7 @@ class Shape:
         open: columns of which no signal may be claimed, though they are some.
         ratio: that must be found, or None.
         joint: label of the joint that is looked at.
+        time: column that is the clock, where it is no matter of course.
     """
 
     columns: Callable[[Motion], Columns]
@@ -91,7 +92,6 @@ class Shape:
     ratio: float | None = 100.0
     joint: str | None = None
     time: str | None = None
-    drive: dict[str, float] = field(default_factory=dict)
 
 
 def _deg(values: np.ndarray) -> np.ndarray:

@@ -88,3 +88,12 @@ def test_any_name_of_a_column_stands_in_a_drive_file(names: list[str]):
     found = fitting.inspect({"time": motion.time} | renamed)
     tables = tomllib.loads(found.drive_file())
     assert tables["columns"].items() >= found.drive["columns"].items()
+
+
+def test_a_unit_that_measures_nothing_is_to_be_filled_in(motion: Motion):
+    columns = {"t": motion.time, "motor angle [deg]": np.rad2deg(motion.motor_angle)}
+    columns |= {"output angle [deg]": np.rad2deg(motion.load_angle), "motor torque [%]": 100 * motion.motor_torque}
+    found = fitting.inspect(columns)
+    assert "motor_torque" not in found.drive["columns"]
+    assert "the size of one '%'" in found.unknown["[columns] motor_torque"]
+    assert '# motor_torque = { column = "motor torque", unit = "..." }  # FILL IN' in found.drive_file()

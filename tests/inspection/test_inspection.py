@@ -1,16 +1,18 @@
 """What is said of a log beside its columns: clocks, joints, health, excitation, what a fit could tell."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import matplotlib
+import mutations
 import numpy as np
 import polars as pl
 import pytest
 from joint_logs import SHAPES, Motion, simulated
 
 import fitting
-from fitting import InputError
+from fitting import DataError, InputError
 
 matplotlib.use("Agg")
 
@@ -205,3 +207,21 @@ def test_measured_logs(shared: Path):
         assert ratio is None or (joint.ratio is not None and joint.ratio.sure and joint.ratio.value == ratio)
         if "encoder" in str(signals):
             assert joint.signals["motor_angle"].unit == joint.signals["load_angle"].unit == "rev / 16777216"
+
+
+@pytest.mark.parametrize("block", range(2))
+def test_spoilt_logs_give_a_result_or_a_sentence(block: int, tmp_path: Path):
+    read = 0
+    for seed in range(30 * block, 30 * block + 30):
+        path, _ = mutations.spoilt_case(seed, tmp_path / str(seed))
+        try:
+            found = fitting.inspect(path)
+        except (InputError, DataError) as error:
+            assert str(path) in str(error) and len(str(error).splitlines()) == 1
+            continue
+        read += 1
+        tomllib.loads(found.drive_file())
+        json.dumps(found.to_dict(), allow_nan=False)
+        assert not {"nan", "inf"} & set(found.summary().replace(",", " ").split())
+    # Most can be looked at, though few of them can be fitted.
+    assert read > 15

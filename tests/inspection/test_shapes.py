@@ -22,6 +22,8 @@ def test_columns_of_a_shape(name: str, motion):
         assert (told, guess.sign) == (signal, sign), column
         assert guess.unit == unit, column
     assert not set(shape.open) & set(guesses)
+    for column, shares in found.joint.open.items():
+        assert 0.0 < sum(shares.values()) < 1.001, (column, shares)
     ratio = found.joint.ratio
     if shape.ratio is None:
         assert ratio is None
