@@ -110,11 +110,11 @@ def fit_only(
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
-    factors = refined_intervals(fits[hold])
+    base, factors = fits[hold], refined_intervals(fits[hold])
     if factors:
-        experiments, test = with_intervals(experiments, factors), with_intervals(test or {}, factors)
-        fits[hold] = base_fit(model, whole(experiments[hold]))
-    base, tests = fits[hold], whole((test or {}).get(hold, ()))
+        experiments = with_intervals(experiments, factors)
+        base = base_fit(model, whole(experiments[hold]))
+    tests = whole(with_intervals(test or {}, factors).get(hold, ()))
     clock.lap("base fit")
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")

@@ -162,14 +162,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
         raise DataError(f"{path}: only {len(base.time)} rows have a stamp of their own; a fit needs {SHORTEST}")
     findings = [*joined, *told, *(f for c in channels.values() for f in c.findings), *base.findings]
     signals = {name: found.values[base.rows] for name, found in channels.items()}
-    ratio = drive_file.reduction_ratio or 1.0
-    if "motor_angle" in signals and "load_angle" in signals:
-        seen = slice(outputs_until)
-        motor, load = signals["motor_angle"], signals["load_angle"]
-        *angles, moved = angles_together(base.time[seen], motor[seen], load[seen], ratio, path)
-        for name, values in zip(("motor_angle", "load_angle"), angles, strict=True):
-            signals[name] = np.concatenate([values, signals[name][len(values) :]])
-        findings += moved
+    findings += _put_together(path, drive_file, base.time, signals, outputs_until)
     own_clocks = "time" in raw and raw["time"].time is not None
     trusted, untold = trusted_rows(path, drive_file, signals, outputs_until, asked, own_clocks=own_clocks)
     known, spans, gaps = input_rows(path, drive_file, base, signals, required[-1], outputs_until)
@@ -200,6 +193,20 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     for array in (log.time, log.dynamic_error, *signals.values()):
         array.setflags(write=False)
     return log
+
+
+def _put_together(
+    path: Path, drive_file: DriveFile, time: np.ndarray, signals: dict[str, np.ndarray], outputs_until: int | None
+) -> tuple[Finding, ...]:
+    """Put the two angles, where there are two, at the same stamps, as far as they may be looked at."""
+    if "motor_angle" not in signals or "load_angle" not in signals:
+        return ()
+    seen, ratio = slice(outputs_until), drive_file.reduction_ratio or 1.0
+    motor, load = signals["motor_angle"], signals["load_angle"]
+    *angles, moved = angles_together(time[seen], motor[seen], load[seen], ratio, path)
+    for name, values in zip(("motor_angle", "load_angle"), angles, strict=True):
+        signals[name] = np.concatenate([values, signals[name][len(values) :]])
+    return moved
 
 
 def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], start: int) -> int | None:

@@ -79,16 +79,22 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
 
     low, high = edge(mean - 2 * reach - wider / (last - first)), edge(mean + 2 * reach + wider / (last - first))
     grid = np.linspace(low, high, _GRID)
-    with np.errstate(divide="ignore"):
-        likely = np.array([np.sum(np.log(np.maximum(room(dt) + wider, 0.0) / quantum)) for dt in grid])
-    if not np.isfinite(likely.max()):
-        return None
-    density = np.exp(likely - likely.max())
-    interval = float(grid @ density / np.sum(density))
-    spread = float(np.sqrt((grid - interval) ** 2 @ density / np.sum(density)))
-    if interval <= 0:
+    interval, spread = _mean_and_spread(grid, np.array([(room(dt) + wider) / quantum for dt in grid]))
+    if not interval > 0:
         return None
     early, late = bounds(interval)
     # As if the stamps were rounded to the nearest: whether they were cut off moves all alike.
     middle = 0.5 * (early + late) - 0.5 * quantum
     return SteadyClock(interval, spread / interval, stamps[0] + middle[run] + interval * row, slack)
+
+
+def _mean_and_spread(grid: np.ndarray, heights: np.ndarray) -> tuple[float, float]:
+    """Mean and standard deviation of a density that is the product of its factors, nil where one is not positive."""
+    with np.errstate(divide="ignore"):
+        likely = np.sum(np.log(np.maximum(heights, 0.0)), axis=1)
+    if not np.isfinite(likely.max()):
+        return np.nan, np.nan
+    density = np.exp(likely - likely.max())
+    density /= np.sum(density)
+    mean = float(grid @ density)
+    return mean, float(np.sqrt((grid - mean) ** 2 @ density))
