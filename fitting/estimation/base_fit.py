@@ -29,6 +29,7 @@ from fitting.estimation.starting_values import (
 from fitting.estimation.steady_torque import SteadyLoad
 from fitting.estimation.whiteness import autocorrelation, left_over, ljung_box
 from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.drive import Prior
 
 # Iterations that tell a start that leads somewhere from one that does not.
 _TRIAL_STEPS = 10
@@ -69,10 +70,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         best = _beside_loads(best, training, halo)
     if priors:
         start = with_priors(start, priors)
-        free = with_priors(best.model, priors)
-        strategy = Strategy(hold_parameters=is_held(best))
-        states = Start(states=best.unknowns.states)
-        best = fit(free, best.stretches, base_paths(free), best.segmentation, start=states, strategy=strategy)
+        best = _with_inertias_free(best, priors)
     if is_held(best):
         return eqx.tree_at(lambda f: f.problem.model, best, start)
     horizon = short_horizon(best.model, training)
@@ -149,6 +147,17 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     if not loaded.objective < other.objective + np.log(_MUCH):
         return best
     return other if apart(other.model, bare) < _OFF else fitted(bare, strategy=Strategy(hold_parameters=True))
+
+
+def _with_inertias_free(found: Fit, priors: tuple[Prior, ...]) -> Fit:
+    """The fit with all that its drive's priors are of free as well; one whose parameters are held stays so, unless that
+    leaves nothing but noise: then an inertia was wrong, and nothing acts on the motor."""
+    model = with_priors(found.model, priors)
+    fitted = functools.partial(
+        fit, model, found.stretches, base_paths(model), found.segmentation, start=Start(states=found.unknowns.states)
+    )
+    free = fitted()
+    return fitted(strategy=Strategy(hold_parameters=True)) if is_held(found) and not leaves_white_noise(free) else free
 
 
 def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
