@@ -22,6 +22,8 @@ _LEAST_PROGRESS = 1e-3
 _POWERS = (2, 3)
 # These take at most 1.4 times off the rms of noise of any colour up to a random walk; where more goes, it was motion.
 _MOTION = 1.5
+# Share of the twist's swing to which a simulation is exact, or better (see `STEP_ANGLE`); encoders are noisier by far.
+_EXACT = 1e-6
 # Where pieces are so short that fewer of their numbers are left to tell the noise, powers of time are not taken off.
 _LEAST_LEFT = 0.25
 
@@ -125,7 +127,8 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         seen = linearise(part, unknowns)
         anew = anew.and_more(covariance * head.sum(), float(head.sum()), _states_freedom(part, seen))
         smoothed = smoothed.and_more(*_smoothed(part, seen, piece))
-    return jnp.asarray(_of_both(anew, smoothed))
+    # Logs that were simulated without noise show the solver's error.
+    return jnp.asarray(_of_both(anew, smoothed) + (_EXACT * swing) ** 2 * np.eye(len(found.covariance)))
 
 
 def _of_both(anew: _Pieces, smoothed: _Pieces) -> Float[np.ndarray, "outputs outputs"]:

@@ -156,7 +156,7 @@ def test_only_a_positive_parameter_that_is_not_told_to_a_factor_e_is_left_out():
     by_parameter = jnp.asarray(np.ones((2, 8, 3)) * size / 4.0)
     before = jnp.ones((2, 4, 3))
     other = jnp.zeros((2, 8)), by_parameter, jnp.zeros((2, 8, 4)), jnp.zeros((2, 4)), before, jnp.zeros((2, 4, 4))
-    free = FreeParameters(("K", "B_sp", "alpha"), (True, True, False), jnp.ones(3))
+    free = FreeParameters(("K", "B_sp", "alpha"), (True, True, False), jnp.ones(3), jnp.zeros(3), jnp.zeros(3))
     found = without_untold(Blocks(*other), free)
     np.testing.assert_array_equal(np.linalg.norm(found.by_parameter, axis=(0, 1)), [30.0, 0.0, 0.5])
     np.testing.assert_array_equal(found.before_by_parameter[..., 1], 0.0)

@@ -60,7 +60,8 @@ def marched(model, torque, start, substeps=1, settled=None):
     knots = np.asarray(torque.knots)
     log = Experiment("rig", knots[:-1], torque, None, np.zeros((count, 2)), None, temperature=warmth)
     paths = tuple(f"{e.name}.{name}" for e in model.effects[-1:] for name, _ in own_parameters(e))
-    free = FreeParameters(paths, (False,) * len(paths), jnp.ones(len(paths)))
+    nothing = jnp.zeros(len(paths))
+    free = FreeParameters(paths, (False,) * len(paths), jnp.ones(len(paths)), nothing, nothing)
     states = (model if settled is None else settled).settled(start)[None]
     weights = jnp.eye(2), jnp.ones(len(paths)), jnp.ones(states.shape[1])
     problem = Problem(model, free, cut([Stretch(log, 0, count)], count), *weights, substeps=substeps)

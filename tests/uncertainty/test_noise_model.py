@@ -114,6 +114,18 @@ def test_noise_that_the_torque_makes_in_short_pieces_is_not_the_sensors():
     assert np.sqrt(np.diag(seen.sensors.covariance)) == pytest.approx(np.sqrt(np.diag(OUTPUTS)), rel=0.2)
 
 
+def test_a_log_without_noise_is_explained():
+    """Its model is off by the solver's error alone."""
+    acting = rig.drive_torque(COUNT)
+    log = rig.drive_log(rig.drive_motion(acting), acting, noise=0.0)
+    found = fitted(experiment_from_log(log, hold="zero-order", N=rig.N))
+    known = np.asarray(measurement_noise(found).covariance)
+    assert np.all(np.diag(np.asarray(found.covariance)) < RULES.excess**2 * np.diag(known))
+    assert known[-1, -1] ** 0.5 < 1e-3 * rig.LOAD_NOISE
+    seen = noise_model(found, known, predictable=RULES.innovations)
+    assert np.isfinite([seen.std, seen.size, seen.predictable, seen.likelihood]).all()
+
+
 def test_the_likelihood_is_that_of_the_gaussian_law():
     """By the covariance of all samples at once."""
     random = np.random.default_rng(0)
