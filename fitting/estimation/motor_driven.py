@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
@@ -70,6 +69,9 @@ def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
 
 def _driven(stretch: Stretch) -> Stretch:
     """A stretch with the motor's acceleration over N in the place of the torque."""
+    # Loaded here: the base model explains most logs.
+    from scipy.interpolate import CubicSpline
+
     whole = stretch.experiment
     known = np.ones(len(whole), dtype=bool) if whole.weight is None else whole.weight > 0
     acceleration = CubicSpline(whole.time[known], whole.measured[known, 0])(whole.time, 2)

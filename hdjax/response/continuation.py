@@ -385,8 +385,9 @@ def _follow_fold(branch, fold, parameter, start, end, steps) -> FoldTrack:
 
 def _continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int):
     """JaxCont's pseudo-arclength continuation, with steps that suit unknowns and a parameter of order one."""
-    # Loaded here: JaxCont loads matplotlib, which takes as long as JAX.
-    from jaxcont.core.scan_continuation import pseudo_arclength_scan
+    # Loaded here: JaxCont loads matplotlib, which takes as long as JAX. Its constants must not belong to this program.
+    with jax.ensure_compile_time_eval():
+        from jaxcont.core.scan_continuation import pseudo_arclength_scan
 
     largest = _longest_step(p_0, p_1, steps)
     # JaxCont mixes integer and floating types.
