@@ -253,6 +253,7 @@ def _steps(fit: Fit) -> _Steps:
     followed = follow(problem, fit.unknowns)
     weight = np.asarray(problem.segments.weight)
     logs = [np.flatnonzero(weight.any(axis=1) & own) for own in segments_of_logs(fit)]
+    logs = [own for own in logs if own.size]
     logs = [logs[i] for i in _spread(len(logs), _LOGS)]
     logs = [own[_spread(own.size, _SEGMENTS)] for own in logs]
     used = np.concatenate(logs)
