@@ -24,11 +24,12 @@ import numpy as np
 from bench_fit import RATE, TRUTH, C, Record, _growth, experiment, record, verdict
 
 from fitting.estimation.engines import linearise, with_engine
-from fitting.estimation.experiment import Stretch, scales
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths, fitted_paths
 from fitting.estimation.machine_code import task
 from fitting.estimation.problem import Segmentation, pose, short_horizon
 from fitting.estimation.residual import Problem, Unknowns, blocks
+from fitting.estimation.scales import scales
 from fitting.estimation.solve import _WIDTH as WIDTH
 from hdjax import Model, sampled
 from hdjax.effects import CATALOGUE, Effect, Scales

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 
@@ -65,7 +66,7 @@ def read_rig(
         DataError: for logs that can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
-    fitted, tested = read_logs(log_paths, drive_file, test=test)
+    fitted, tested = read_logs([(p, None) for p in log_paths], drive_file, test=[(p, None) for p in test])
     return rig_of(fitted, drive_file, test=tested, other_holds=other_holds)
 
 
@@ -103,28 +104,30 @@ def rig_of(
     )
 
 
+Source = tuple[Path, Any]
+"""A log: its path and None, or what messages call it and its table in memory."""
+
+
 def read_logs(
-    paths: Sequence[Path], drive_file: DriveFile, *, test: Sequence[Path] = ()
+    logs: Sequence[Source], drive_file: DriveFile, *, test: Sequence[Source] = (), outputs_until: int | None = None
 ) -> tuple[tuple[Log, ...], tuple[Log, ...]]:
-    """Logs as they are in their files, and those that are test data; all of one kind, each with a name of its own.
+    """Logs as they were recorded, and those that are test data; all of one kind, each with a name of its own.
+
+    Args:
+        logs: to be fitted.
+        drive_file: of the drive.
+        test: logs that are test data.
+        outputs_until: see [`fitting.logs.log.read_log`][].
 
     Raises:
         InputError: They are of several kinds, or a log is to be fitted and to be test data.
     """
-    refuse_twice(paths, test)
-    logs = together([read_log(path, drive_file) for path in (*paths, *test)])
-    return logs[: len(paths)], logs[len(paths) :]
-
-
-def refuse_twice(paths: Sequence[Path], test: Sequence[Path]) -> None:
-    """Refuse a log that is to be fitted and to be test data.
-
-    Raises:
-        InputError: There is one.
-    """
-    both = {path.resolve() for path in paths} & {path.resolve() for path in test}
-    if both:
-        raise InputError(f"{min(both)}: the log is both fitted and test data; name it once")
+    fitted, tested = ({path.resolve() for path, table in own if table is None} for own in (logs, test))
+    if fitted & tested:
+        raise InputError(f"{min(fitted & tested)}: the log is both fitted and test data; name it once")
+    both = (*logs, *test)
+    read = together([read_log(path, drive_file, outputs_until=outputs_until, table=table) for path, table in both])
+    return read[: len(logs)], read[len(logs) :]
 
 
 def together(logs: Sequence[Log]) -> tuple[Log, ...]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from fitting.attribution.selection_round import Round
 from fitting.clock import Clock
 from fitting.estimation.base_fit import base_fit, is_held, told_by_load
+from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
@@ -84,7 +85,7 @@ class FitOnly(eqx.Module):
 
 def fit_only(
     model: Model,
-    experiments: dict[Hold, tuple[Experiment, ...]],
+    experiments: Mapping[Hold, tuple[Experiment, ...]],
     *,
     test: Mapping[Hold, tuple[Experiment, ...]] | None = None,
     hold: Hold | None = None,
@@ -107,24 +108,14 @@ def fit_only(
     """
     clock = Clock()
     progress("fitting the base model")
-    holds: list[Hold] = list(experiments) if hold is None else [hold]
-    fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
-    hold = min(holds, key=lambda h: fits[h].objective)
-    base, factors = fits[hold], refined_intervals(fits[hold])
-    if factors:
-        experiments = with_intervals(experiments, factors)
-        base = base_fit(model, whole(experiments[hold]))
-    tests = whole(with_intervals(test or {}, factors).get(hold, ()))
+    hold, base, experiments, test = _base(model, experiments, test or {}, hold)
+    tests = whole(test.get(hold, ()))
     clock.lap("base fit")
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    told_by, assumed = told_by_load(base), {}
-    if told_by is not None and isinstance(base.model, TwoInertiaModel) and base.model.drive.priors:
-        # Nor do inertias and torque constant follow from the torque then.
-        unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path == "J_l"]
-        assumed = {path: float(base.model.get(path)) for path in unknown}
-        base = base_fit(with_priors(base.model, ()), base.stretches)
+    told_by = told_by_load(base)
+    base, assumed = (base, {}) if told_by is None else _without_priors(base)
     found = base if is_held(base) else long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs")
@@ -158,3 +149,31 @@ def fit_only(
         by_load=told_by is not None,
         assumed=assumed,
     )
+
+
+def _base(
+    model: Model,
+    experiments: Mapping[Hold, tuple[Experiment, ...]],
+    test: Mapping[Hold, tuple[Experiment, ...]],
+    hold: Hold | None,
+) -> tuple[Hold, Fit, Mapping[Hold, tuple[Experiment, ...]], Mapping[Hold, tuple[Experiment, ...]]]:
+    """The base fit under the stated hold, or under the one that suits it best; and the data with the sample intervals
+    that it makes of those which rounded stamps leave open."""
+    holds: list[Hold] = list(experiments) if hold is None else [hold]
+    fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
+    hold = min(holds, key=lambda h: fits[h].objective)
+    factors = refined_intervals(fits[hold])
+    if not factors:
+        return hold, fits[hold], experiments, test
+    experiments, test = with_intervals(experiments, factors), with_intervals(test, factors)
+    return hold, base_fit(model, whole(experiments[hold])), experiments, test
+
+
+def _without_priors(base: Fit) -> tuple[Fit, dict[str, float]]:
+    """A base fit whose motion does not follow from the torque, with inertias and torque constant held, which then don't
+    either; and what the load's equation was given of an inertia of which nothing was known."""
+    if not isinstance(base.model, TwoInertiaModel) or not base.model.drive.priors:
+        return base, {}
+    unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path == "J_l"]
+    assumed = {path: float(base.model.get(path)) for path in unknown}
+    return base_fit(with_priors(base.model, ()), base.stretches), assumed

@@ -227,20 +227,28 @@ class TwoInertiaModel(Model):
         return jnp.stack([theta_m / self.drive.N, theta_m / self.drive.N - theta_l])
 
 
-class ReducedModel(Model):
+class TwistModel(Model):
+    """The dynamic error alone. States: x, v."""
+
+    motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
+
+    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
+        return Motion(x=state[0], v=state[1], **vars(conditions))
+
+    def outputs(self, state: State) -> Float[Array, "1"]:
+        return state[:1]
+
+
+class ReducedModel(TwistModel):
     """The dynamic error alone, `x'' = gain u - torque(x, v, ...)`. States: x, v."""
 
     drive: ReducedDrive
     effects: tuple[Effect, ...] = ()
-    motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
 
     def __check_init__(self):
         for effect in self.effects:
             if effect.needs_motor:
                 raise ValueError(f"`{effect.name}` needs the motor's motion; use a TwoInertiaModel")
-
-    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
-        return Motion(x=state[0], v=state[1], **vars(conditions))
 
     def component_rates(
         self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
@@ -253,11 +261,8 @@ class ReducedModel(Model):
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0
 
-    def outputs(self, state: State) -> Float[Array, "1"]:
-        return state[:1]
 
-
-class MotorDrivenModel(Model):
+class MotorDrivenModel(TwistModel):
     """The load behind the mesh where the motor's motion is given, whatever moves the motor.
 
         x'' = theta_m''/N - (tau + T_l)/J_l
@@ -267,10 +272,6 @@ class MotorDrivenModel(Model):
 
     drive: Drive
     effects: tuple[Effect, ...] = ()
-    motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
-
-    def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
-        return Motion(x=state[0], v=state[1], **vars(conditions))
 
     def component_rates(
         self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
@@ -282,6 +283,3 @@ class MotorDrivenModel(Model):
 
     def mobility(self, moved: str, opposed: str) -> Array | float:
         return 1.0 / self.drive.J_l
-
-    def outputs(self, state: State) -> Float[Array, "1"]:
-        return state[:1]

@@ -5,7 +5,6 @@ simulator.
 """
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -101,17 +100,4 @@ def log_of(joint: Joint, *, seed: int = 0, count: int = COUNT, name: str = "join
     noise = 1e-3 * np.std(motion[:, 0] / joint.N - motion[:, 1])
     motor = motion[:, 0] + joint.N * noise * random.normal(size=count)
     load = motion[:, 1] + noise * random.normal(size=count)
-    return Log(
-        name=name,
-        path=Path(f"{name}.csv"),
-        kind="drive",
-        time=np.arange(count) * STEP,
-        motor_angle=motor,
-        load_angle=load,
-        motor_torque=torque,
-        load_torque=None,
-        temperature=None,
-        dynamic_error=motor / joint.N - load,
-        forcing=None,
-        units={"dynamic_error": "rad"},
-    )
+    return rig.log_of_angles(motor, load, torque, ratio=joint.N, step=STEP, name=name)

@@ -112,17 +112,24 @@ def drive_log(
     count = torque.size
     motor = motion[:, 0] + noise * MOTOR_NOISE * random.normal(size=count)
     load = motion[:, 1] + noise * LOAD_NOISE * random.normal(size=count)
+    return log_of_angles(motor, load, torque, ratio=N, step=step, name=name)
+
+
+def log_of_angles(
+    motor: np.ndarray, load: np.ndarray, torque: np.ndarray, *, ratio: float, step: float, name: str
+) -> Log:
+    """A drive log of what was read."""
     return Log(
         name=name,
         path=Path(f"{name}.csv"),
         kind="drive",
-        time=np.arange(count) * step,
+        time=np.arange(torque.size) * step,
         motor_angle=motor,
         load_angle=load,
         motor_torque=torque,
         load_torque=None,
         temperature=None,
-        dynamic_error=motor / N - load,
+        dynamic_error=motor / ratio - load,
         forcing=None,
         units={"dynamic_error": "rad"},
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitting.drive_data import Rig, ready, refuse_twice, rig_of, together
+from fitting.drive_data import Rig, Source, read_logs, ready, rig_of
 from fitting.errors import InputError
 from fitting.logs.drive_file import DriveFile, drive_of, read_drive_file
 from fitting.logs.log import Log, read_log
@@ -120,15 +120,13 @@ def load(
     fitted = sources(logs)
     if not fitted:
         raise InputError("there is no log; give a path or a table")
-    given = [*fitted, *sources(test, first=len(fitted) + 1)]
-    refuse_twice(*([path for path, table in own if table is None] for own in (fitted, given[len(fitted) :])))
-    read = [read_log(path, known, outputs_until=outputs_until, table=table) for path, table in given]
-    both = together(read)
-    tables = {path: table for path, table in given if table is not None}
-    return Data(known, both[: len(fitted)], both[len(fitted) :], tables, outputs_until)
+    tested = sources(test, first=len(fitted) + 1)
+    own, tests = read_logs(fitted, known, test=tested, outputs_until=outputs_until)
+    tables = {path: table for path, table in (*fitted, *tested) if table is not None}
+    return Data(known, own, tests, tables, outputs_until)
 
 
-def sources(logs: Any, *, first: int = 1) -> list[tuple[Path, Any]]:
+def sources(logs: Any, *, first: int = 1) -> list[Source]:
     """The path of each log and None, or what messages call it and its table in memory.
 
     Args:

@@ -10,7 +10,7 @@ from fitting.attribution.decisions import RULES
 from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, Strategy
-from fitting.estimation.experiment import scales
+from fitting.estimation.scales import scales
 from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters

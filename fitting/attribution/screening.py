@@ -16,8 +16,8 @@ from jaxtyping import Float
 from typing_extensions import TypeVar
 
 from fitting.estimation.estimate import Fit
-from fitting.estimation.experiment import scales
 from fitting.estimation.free_parameters import strength_paths
+from fitting.estimation.scales import scales
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import Answered, Sight, batches, follow_on, sight
 from fitting.first_order.spectral_lines import spectral_lines

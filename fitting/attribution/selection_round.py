@@ -24,7 +24,7 @@ from fitting.attribution.support import (
     strength_errors,
 )
 from fitting.estimation.base_fit import leaves_white_noise
-from fitting.estimation.experiment import scales
+from fitting.estimation.scales import scales
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 

@@ -8,7 +8,7 @@ from fitting.api.inspection import inspected
 from fitting.errors import InputError
 from fitting.inspection.columns import Table, read_columns
 from fitting.inspection.inspection import alike
-from fitting.logs.read_table import LOG_SUFFIXES
+from fitting.logs.read_table import LOG_SUFFIXES, format_suffix
 
 
 def show_logs(logs: Iterable[Path], joint: str | None) -> None:
@@ -55,11 +55,7 @@ def _tables(logs: Iterable[Path]) -> list[Table]:
 
 def _inside(folder: Path) -> list[Path]:
     """The logs of a folder, by their names."""
-    found = [p for p in sorted(folder.iterdir()) if p.is_file() and _is_log(p)]
+    found = [p for p in sorted(folder.iterdir()) if p.is_file() and format_suffix(p) in LOG_SUFFIXES]
     if not found:
         raise InputError(f"{folder}: the folder has no log; give one with {', '.join(LOG_SUFFIXES)} files")
     return found
-
-
-def _is_log(path: Path) -> bool:
-    return path.with_suffix("" if path.suffix.lower() == ".gz" else path.suffix).suffix.lower() in LOG_SUFFIXES

@@ -20,6 +20,7 @@ from fitting.estimation.free_parameters import MESH, base_paths, with_priors
 from fitting.estimation.motor_driven import held_at, motor_driven_fit
 from fitting.estimation.outliers import without_glitches, without_lone_errors
 from fitting.estimation.problem import Segmentation, initial_states, segment_length, short_horizon, suggested_substeps
+from fitting.estimation.scales import largest_torque
 from fitting.estimation.starting_values import (
     apart,
     starting_models,
@@ -140,7 +141,7 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     horizon = segment_length(short_horizon(starts[0], training))
     substeps = suggested_substeps(starts[0], training)
     fitted = functools.partial(_fitted, training=training, segmentation=Segmentation(horizon, None, halo, substeps))
-    reach = drive.N * max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in training)
+    reach = drive.N * largest_torque(training)
     loaded = fitted(starts[0].with_effects(SteadyLoad(reach=reach)))
     bare = loaded.model.without_effect(SteadyLoad.name)
     other = fitted(bare)

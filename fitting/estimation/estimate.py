@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.experiment import Stretch, scales
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.linear_response import readout
 from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
+from fitting.estimation.scales import scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from hdjax import Model
 from hdjax.effects.learned import FAMILY

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.engines import with_engine
-from fitting.estimation.experiment import Segments, Stretch, cut, scales
+from fitting.estimation.experiment import Segments, Stretch, cut
 from fitting.estimation.free_parameters import free_parameters
 from fitting.estimation.residual import Engine, Problem, Unknowns
+from fitting.estimation.scales import scales
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.lanes import spread
 

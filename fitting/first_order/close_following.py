@@ -13,6 +13,7 @@ import numpy as np
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.linear_response import Followed, follow
 from fitting.estimation.problem import initial_states
+from fitting.estimation.scales import largest_torque
 from fitting.estimation.steady_torque import SteadyLoad, SteadyMotorTorque
 from hdjax import TwoInertiaModel
 
@@ -42,7 +43,7 @@ def _held(found: Fit, horizon: int) -> Fit:
     segmentation = replace(found.segmentation, horizon=horizon, length=horizon, count=None)
     model = found.model
     if isinstance(model, TwoInertiaModel):
-        reach = max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in found.stretches)
+        reach = largest_torque(found.stretches)
         model = model.with_effects(SteadyMotorTorque(reach=reach), SteadyLoad(reach=float(model.drive.N) * reach))
     start = Start(found.covariance, initial_states(model, segmentation.of(found.stretches)))
     strategy = Strategy(hold_parameters=True, retry_states=False)

@@ -104,6 +104,10 @@ class DriveFile:
         """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""
         return self.columns.get(signal, ColumnMap(signal, None, 1.0))
 
+    def states(self, key: str) -> bool:
+        """Whether [drive] says something of `key`: a value, a tolerance, or that a fit is to find it."""
+        return getattr(self, key) is not None or _SYMBOLS.get(key) in self.tolerances
+
 
 def did_you_mean(word: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
     """A suggestion in brackets, or nothing when no known name is close.

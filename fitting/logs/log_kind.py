@@ -21,7 +21,6 @@ Kind = Literal["drive", "reduced", "quasi-static"]
 _MOST_LIKELY = 3
 _MISSPELT = 0.78
 _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
-_SYMBOLS = {"motor_inertia": "J_m", "load_inertia": "J_l"}
 
 
 def refuse_repeated(path: Path, drive_file: DriveFile, table: RawTable) -> None:
@@ -57,7 +56,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
             return "quasi-static"
     if is_drive:
         for key in _DRIVE_KEYS:
-            if getattr(drive_file, key) is None and _SYMBOLS.get(key) not in drive_file.tolerances:
+            if not drive_file.states(key):
                 raise InputError(
                     f"{drive_file.path}: [drive] {key} is missing, which a log with angles and "
                     f"torque such as {path} needs; add it"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fitting.errors import InputError
+from fitting.logs.extras import needing
 from fitting.logs.raw_table import RawColumn, RawTable, not_numbers
 
 
@@ -21,12 +22,8 @@ def read_mdf(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
     Raises:
         InputError: The extra is not installed, or a name is not unique.
     """
-    try:
+    with needing(path, "MDF files need asammdf; install it", "mdf", "export the log as CSV"):
         from asammdf import MDF  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise InputError(
-            f'{path}: MDF files need asammdf; install it by pip install "hdjax[mdf]", or export the log as CSV'
-        ) from error
     # The library logs what it also raises.
     logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
     with MDF(source) as file:

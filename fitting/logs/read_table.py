@@ -18,6 +18,11 @@ SHEET_SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
 _LARGEST = 2 << 30
 
 
+def format_suffix(path: Path) -> str:
+    """The suffix that tells the format of a log, also of one that is packed by gzip."""
+    return path.with_suffix("").suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+
+
 def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
     """The wanted columns of a log file.
 
@@ -33,7 +38,7 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
         InputError: The file is missing, corrupt or of no known format, or a wanted column is
             not a vector of numbers.
     """
-    suffix = path.with_suffix("").suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    suffix = format_suffix(path)
     known = _READERS.get(suffix)
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: this is no file; give the log file itself")

@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fitting.errors import InputError
+from fitting.logs.extras import needing
 from fitting.logs.raw_table import RawColumn, RawTable
 
 _MOST_LISTED = 32  # elements of an array
@@ -20,6 +20,12 @@ _STEP = re.compile(r"([^\[\]]+)(?:\[([^\[\]]+)\])?")
 
 Message = tuple[str, int, Any]
 """Topic, nanoseconds at which it was received, and the message: an object with fields, or a mapping."""
+
+_EXTRA = (
+    "recordings of robots need mcap and rosbags; install them",
+    "ros",
+    "export the joint's topics as CSV",
+)
 
 
 def read_mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
@@ -33,7 +39,7 @@ def read_mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
     Raises:
         InputError: The extra is not installed, or messages are in another encoding.
     """
-    with _needs_the_extra(path):
+    with needing(path, *_EXTRA):
         from mcap.reader import make_reader  # pyright: ignore[reportMissingImports]
     with source.open("rb") if isinstance(source, Path) else source as file:
         reader = make_reader(file)
@@ -64,7 +70,7 @@ def read_bag(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
     Raises:
         InputError: The extra is not installed, or the file is packed.
     """
-    with _needs_the_extra(path):
+    with needing(path, *_EXTRA):
         from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]
         from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
     if isinstance(source, BytesIO):
@@ -78,17 +84,6 @@ def read_bag(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
                 yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
 
         return _table(path, tuple(dict.fromkeys(c.topic for c in reader.connections)), messages, wanted)
-
-
-@contextmanager
-def _needs_the_extra(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except ImportError as error:
-        raise InputError(
-            f'{path}: recordings of robots need mcap and rosbags; install them by pip install "hdjax[ros]", or '
-            "export the joint's topics as CSV"
-        ) from error
 
 
 def _is_readable(schema: Any, channel: Any) -> bool:
@@ -106,7 +101,7 @@ def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
             f"{path}: the messages of '{channel.topic}' are encoded as {channel.message_encoding!r}, which is not read "
             "here; export the joint's topics as CSV"
         )
-    with _needs_the_extra(path):
+    with needing(path, *_EXTRA):
         from rosbags import typesys  # pyright: ignore[reportMissingImports]
     store = typesys.get_typestore(typesys.Stores.EMPTY)
     text = schema.data.decode()

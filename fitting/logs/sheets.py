@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from fitting.errors import InputError
+from fitting.logs.extras import needing
 from fitting.logs.raw_table import RawColumn, RawTable, places_of
 from fitting.logs.text import Head, head_of
 from fitting.logs.text_cells import column_from_text
@@ -28,12 +29,8 @@ def read_sheets(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> 
     Raises:
         InputError: The extra is not installed, or no sheet holds a table.
     """
-    try:
+    with needing(path, "spreadsheets need fastexcel; install it", "xlsx", "save the table as CSV"):
         import fastexcel  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise InputError(
-            f'{path}: spreadsheets need fastexcel; install it by pip install "hdjax[xlsx]", or save the table as CSV'
-        ) from error
     book = fastexcel.read_excel(source.getvalue() if isinstance(source, BytesIO) else source)
     best: tuple[int, str, Head] | None = None
     for name in book.sheet_names:

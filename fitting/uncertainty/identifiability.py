@@ -10,9 +10,9 @@ from scipy.special import stdtrit
 
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit
-from fitting.estimation.experiment import scales
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import Problem
+from fitting.estimation.scales import scales
 from fitting.formatting import words
 from fitting.uncertainty.sandwich import directions
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty

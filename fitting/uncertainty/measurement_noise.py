@@ -7,9 +7,10 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import REWEIGHTINGS, Fit, weighed, zeros_like
-from fitting.estimation.experiment import Stretch, cut, scales
+from fitting.estimation.experiment import Stretch, cut
 from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
 from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
+from fitting.estimation.scales import scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
 
 # So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdjax.effects import Effect, Motion
+from hdjax.engine.array_rules import UntranslatableError
 from hdjax.engine.equations import Equations, Part
 from hdjax.engine.graph import Graph, Node
 from hdjax.engine.kernel import Lanes, march_arrays, threads
 from hdjax.engine.pointwise import likeness
-from hdjax.engine.translate import UntranslatableError, traced, translated
+from hdjax.engine.translate import traced, translated
 
 # Steps in a sample interval, along a motion that is a straight line in between.
 _STEPS = 2

@@ -12,9 +12,10 @@ from jaxtyping import Array
 
 from hdjax.dynamics import Model
 from hdjax.effects import ActuatorEffect, Conditions, Rubbing
+from hdjax.engine.array_rules import Nodes
 from hdjax.engine.derivatives import Tangent, derivatives
 from hdjax.engine.graph import PARAMETER, VARYING, Graph, Node
-from hdjax.engine.translate import Nodes, traced, translated
+from hdjax.engine.translate import traced, translated
 from hdjax.rubbing import over_step
 
 LOAD, TEMPERATURE = "load torque", "temperature"

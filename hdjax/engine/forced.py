@@ -12,9 +12,10 @@ from jaxtyping import Array
 from hdjax.dynamics import Model
 from hdjax.effects import Conditions
 from hdjax.elementary import cosine_and_sine
+from hdjax.engine.array_rules import Nodes
 from hdjax.engine.equations import DryStep, numbered_leaves
 from hdjax.engine.graph import PARAMETER, VARYING, Graph, Node
-from hdjax.engine.translate import Nodes, traced, translated
+from hdjax.engine.translate import traced, translated
 from hdjax.forcing import Harmonic
 
 

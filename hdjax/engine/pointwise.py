@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hdjax.engine.array_rules import UntranslatableError
 from hdjax.engine.derivatives import Tangent, derivatives
 from hdjax.engine.graph import PARAMETER, VARYING, Graph, Node
-from hdjax.engine.translate import UntranslatableError, traced, translated
+from hdjax.engine.translate import traced, translated
 
 # Numbers that a node has at a time: its operands stay close to the processor.
 _AT_A_TIME = 1 << 14

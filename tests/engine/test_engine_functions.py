@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from llvmlite import ir
 
 from hdjax.elementary import cosine_and_sine, exponential, power
+from hdjax.engine.array_rules import UntranslatableError
 from hdjax.engine.derivatives import derivatives
 from hdjax.engine.emission import F64, I64, Vectors, emitted, is_truth
 from hdjax.engine.graph import PARAMETER, VARYING, Graph
 from hdjax.engine.machine import compiled
-from hdjax.engine.translate import UntranslatableError, traced, translated
+from hdjax.engine.translate import traced, translated
 
 LANES = 8
 
