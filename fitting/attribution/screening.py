@@ -26,6 +26,11 @@ from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 
 
+# What an effect would do along a motion that is off by more than this share is off by as much; the measured motion then
+# takes its place.
+_NEAR = 0.1
+
+
 class Lead(eqx.Module):
     """One form of an effect, as the first look sees it.
 
@@ -87,8 +92,8 @@ def screen(
     free_now = training.free.paths
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS, -np.inf)
-    lost_way = not follows(training)
-    sights = sight(training, seed, measured=lost_way), sight(held_out, seed + 1, measured=lost_way)
+    strays = not follows(training, share=_NEAR)
+    sights = sight(training, seed, measured=strays), sight(held_out, seed + 1, measured=strays)
     known = len(free_now)
     for batch in batches(sights, proposals, follow_on(training, held_out)):
         scores = [_scores(*pair) for pair in zip(sights, batch.answers, strict=True)]

@@ -119,11 +119,11 @@ def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_prog
     return min(found, back, key=lambda fit: fit.objective)
 
 
-def follows(found: Fit) -> bool:
-    """Whether the simulation errs by less than half of how much each output moves."""
+def follows(found: Fit, *, share: float = 0.5) -> bool:
+    """Whether the simulation errs by less than a share (half) of how much each output moves."""
     segments = found.problem.segments
     measured = np.asarray(segments.measured)[np.asarray(segments.weight) > 0]
-    return bool(np.all(np.diag(np.asarray(found.covariance)) < 0.25 * measured.var(axis=0)))
+    return bool(np.all(np.diag(np.asarray(found.covariance)) < share**2 * measured.var(axis=0)))
 
 
 def with_gaps_closed(found: Fit) -> float:

@@ -15,10 +15,10 @@ from fitting.estimation.experiment import (
     cut,
     experiment_from_log,
     experiments_from_log,
-    scales,
     segment_count,
     split,
 )
+from fitting.estimation.scales import scales
 
 COUNT = 47
 LOAD_TORQUE = np.linspace(3.0, -2.0, COUNT)
