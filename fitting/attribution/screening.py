@@ -25,7 +25,6 @@ from fitting.first_order.surrogates import DRAWS, Scores, null_gains
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 
-
 # What an effect would do along a motion that is off by more than this share is off by as much; the measured motion then
 # takes its place.
 _NEAR = 0.1
