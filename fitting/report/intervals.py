@@ -1,5 +1,6 @@
 """Intervals of parameters where something is left that the model does not know."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
@@ -7,10 +8,16 @@ from fitting.attribution.decisions import RULES
 
 NOT_COVERED = "not covered"
 """Flag of a parameter whose interval knows nothing of what is missing."""
+_WITHHELD = "withheld"
+
+
+def is_withheld(estimate: Mapping[str, Any]) -> bool:
+    """Whether no interval is stated, because too much is left that has no name."""
+    return estimate.get("interval") == _WITHHELD
 
 
 def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
-    """Mark the intervals of the drive's own parameters where much is left, and withhold them where it has no name.
+    """Mark the intervals of the drive's own parameters and what follows from them where much is left, and withhold them where it has no name.
 
     What is missing stands in part in the parameters, by more than any standard error tells.
 
@@ -30,9 +37,9 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
     )
     end = "their intervals are withheld" if unexplained and much else "their intervals know nothing of that"
     note = f"{left}: {names} may be off by more than their standard errors, and {end}."
-    for stage in ("before", "after"):
-        for estimate in report[stage]["parameters"].values():
+    for account in (report["before"], report["after"]):
+        for estimate in (*account["parameters"].values(), *account["derived"].values()):
             if unexplained and much:
-                estimate["ci95"], estimate["interval"] = [None, None], "withheld"
+                estimate["ci95"], estimate["interval"] = [None, None], _WITHHELD
             estimate["flag"] = estimate["flag"] or NOT_COVERED
-            estimate["note"] = estimate["note"] or note
+            estimate["note"] = estimate.get("note") or note

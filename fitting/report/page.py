@@ -8,6 +8,7 @@ from markupsafe import Markup, escape
 from plotly.offline import get_plotlyjs
 
 from fitting import formatting
+from fitting.report.intervals import is_withheld
 from fitting.report.parameters import parts_of
 from fitting.report.plots import Plot
 from fitting.report.posterior import QUANTILES
@@ -32,9 +33,13 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         "superscripts": formatting.superscripts,
         "measured": lambda p: formatting.measured(p["value"], p["std"], p["unit"]),
         "in_factor": lambda p, factor: formatting.in_factor(p["value"], p["std"], factor),
-        "interval_in_factor": lambda p, factor: formatting.interval_in_factor(p["ci95"], p["std"], factor),
+        "interval_in_factor": lambda p, factor: (
+            "withheld" if is_withheld(p) else formatting.interval_in_factor(p["ci95"], p["std"], factor)
+        ),
         "value_in_factor": formatting.value_in_factor,
-        "interval": lambda p: formatting.interval(p["ci95"], p["std"], p["unit"]),
+        "interval": lambda p: (
+            "withheld" if is_withheld(p) else formatting.interval(p["ci95"], p["std"], p["unit"])
+        ),
         "family": plain_family,
         "code": _code,
         "p_value": formatting.p_value,

@@ -6,6 +6,7 @@ from typing import Any
 from fitting import formatting
 from fitting.formatting import open_interval, plain
 from fitting.report.fit_text import fit_lines
+from fitting.report.intervals import is_withheld
 from fitting.report.parameters import parts_of
 from fitting.report.proposal import next_lines
 from fitting.report.summary import chance
@@ -64,6 +65,7 @@ def _parameter_line(estimate: Mapping[str, Any]) -> str:
     value, std = estimate["value"], estimate["std"]
     ends = [plain(e, 6) for e in estimate["ci95"] if e is not None]
     span = f"[{', '.join(ends)}]" if len(ends) == 2 else open_interval(estimate["ci95"]).format(*ends)
+    span = "interval withheld" if is_withheld(estimate) else span
     share = f" ({100 * std / abs(value):.2g} %)" if value and std is not None else ""
     flag = f"  {estimate['flag'].upper()}" if estimate["flag"] else ""
     unit = "" if estimate["unit"] == "1" else f" {estimate['unit']}"

@@ -35,7 +35,7 @@ from fitting.report import (
     report_text,
     separating_experiment,
 )
-from fitting.report.intervals import say_what_intervals_hold
+from fitting.report.intervals import is_withheld, say_what_intervals_hold
 from fitting.report.limits import limits, parameter_note
 from fitting.report.plots import decimated, fit_plots, plots
 from fitting.report.summary import _change, _remembering
@@ -729,12 +729,13 @@ def _changed(before: float, after: float | None, *, motor: tuple[float | None, f
 )
 def test_intervals_say_what_is_left(decision: str, times_noise: float, withheld: bool, flagged: bool):
     def account() -> dict[str, Any]:
-        return {"parameters": {"K": {"ci95": [1.0, 2.0], "interval": "quadratic", "flag": None, "note": None}}}
+        omega_0 = {"ci95": [1.0, 2.0], "flag": None}
+        return {"parameters": {"K": omega_0 | {"interval": "quadratic", "note": None}}, "derived": {"omega_0": omega_0}}
 
     report = {"decision": decision, "before": account(), "after": account()}
     say_what_intervals_hold(report, times_noise)
     K = report["after"]["parameters"]["K"]
-    assert (K["ci95"] == [None, None]) == withheld
+    assert (K["ci95"] == [None, None]) == withheld == is_withheld(report["after"]["derived"]["omega_0"])
     assert (K["flag"] is not None) == (K["note"] is not None) == flagged
     assert not flagged or "K may be off" in K["note"]
 
