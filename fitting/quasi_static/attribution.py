@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fitting.attribution.case_evidence import EffectEvidence
+from fitting.attribution.case_evidence import EffectEvidence, RoundEvidence
 from fitting.attribution.decisions import RULES, support
 from fitting.attribution.screening import Screen
 from fitting.attribution.selection_round import Round, Verdict
@@ -134,21 +134,30 @@ def look(
         # No gear twists against its torque.
         verdicts = [v for v in verdicts if v.trial.model.coefficients[0] > 0]
     verdicts.sort(key=lambda verdict: -verdict.gain)
-    if not verdicts or not _is_supported(verdicts[0].gain, verdicts[0].p_value):
-        return Round(before, screened, tuple(verdicts), False)
+    if not verdicts:
+        asked = [_evidence(lead.forms, lead.gain, screened.p_value(lead.gain)) for lead in screened.leads[:1]]
+        return Round(before, screened, (), False, RoundEvidence(tuple(asked), {}, ()))
+    seen = _evidence(verdicts[0].trial.beyond(before), verdicts[0].gain, verdicts[0].p_value)
+    if not _is_supported(seen):
+        return Round(before, screened, tuple(verdicts), False, RoundEvidence((seen,), {}, ()))
     verdicts = _simplest_first(held, verdicts, screened, before, choices)
-    winner = verdicts[0]
+    winner, added = verdicts[0], verdicts[0].trial.beyond(before)
     removed, earlier = before.mean_square - winner.trial.mean_square, base.mean_square - before.mean_square
-    share = math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf
-    accepted = _is_supported(winner.gain, winner.p_value, share)
-    if any(form.of_torque for form in winner.trial.beyond(before)):
-        accepted = accepted and removed > torque_error(held.points, base)
-    return Round(before, screened, tuple(verdicts), accepted)
+    # Of the torque's own error, too, a form that follows the torque must remove more.
+    if any(form.of_torque for form in added) and removed <= torque_error(held.points, base):
+        removed = 0.0
+    share = math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf if removed > 0 else 0.0
+    seen = _evidence(added, winner.gain, winner.p_value, share)
+    return Round(before, screened, tuple(verdicts), _is_supported(seen), RoundEvidence((seen,), {}, ()))
 
 
-def _is_supported(gain: float, p_value: float, removed: float = math.inf) -> bool:
+def _evidence(forms: Sequence[Form], gain: float, p_value: float, removed: float = math.inf) -> EffectEvidence:
+    name = " and ".join(form.name for form in forms)
+    return EffectEvidence(name, gain, p_value, removed, RULES.quasi_static_imperfection)
+
+
+def _is_supported(seen: EffectEvidence) -> bool:
     """Whether an effect gains enough, more than chance, and more than earlier effects may get wrong."""
-    seen = EffectEvidence("", gain, p_value, removed, RULES.quasi_static_imperfection)
     return all(check.holds for check in support(seen))
 
 
@@ -161,7 +170,7 @@ def torque_error(points: Points, base: TwistTrial) -> float:
 def _worth_a_refit(screened: Screen[Lead]) -> list[Lead]:
     """The best forms of each family that come near the best of all, or none where that one is no more than chance."""
     best = screened.leads[0].gain if screened.leads else 0.0
-    if not _is_supported(best, screened.p_value(best)):
+    if not _is_supported(_evidence((), best, screened.p_value(best))):
         return []
     near = [lead for lead in screened.leads if lead.gain >= _RIVAL * best]
     return [lead for i, lead in enumerate(near) if sum(other.families == lead.families for other in near[:i]) < _FORMS]

@@ -66,17 +66,20 @@ def log_dicts(data: QuasiStaticData, rows: Sequence[int], reversals: Sequence[in
     ]
 
 
-def account(known: Mapping[str, Known], training: np.ndarray, selection: np.ndarray) -> dict[str, Any]:
+def account(
+    known: Mapping[str, Known], training: np.ndarray, selection: np.ndarray, test: np.ndarray | None = None
+) -> dict[str, Any]:
     """A fitted equation: figures, and rms errors by part of the data.
 
-    Folds of whole stretches select the model; there are no test data yet.
+    Folds of whole stretches select the model.
 
     Args:
         known: Figures, by name.
         training: Misfit of what was fitted [rad], (n,).
         selection: Likewise of the folds that were left out; schema 1 called them validation.
+        test: Likewise of test data, (m,); None where there are none.
     """
-    return no_account() | {"parameters": estimates(known), "rmse": rmse_dict(training, selection)}
+    return no_account() | {"parameters": estimates(known), "rmse": rmse_dict(training, selection, test)}
 
 
 def no_account() -> dict[str, Any]:
@@ -84,10 +87,12 @@ def no_account() -> dict[str, Any]:
     return {"effects": [], "parameters": {}, "derived": {}, "rmse": rmse_dict(None, None)}
 
 
-def rmse_dict(training: np.ndarray | None, selection: np.ndarray | None) -> dict[str, float | None]:
+def rmse_dict(
+    training: np.ndarray | None, selection: np.ndarray | None, test: np.ndarray | None = None
+) -> dict[str, float | None]:
     """Rms errors by part of the data; arguments as in [`account`][]."""
-    fitted, left_out = (None if part is None else float(np.sqrt(np.mean(part**2))) for part in (training, selection))
-    return {"training": fitted, "selection": left_out, "test": None, "validation": left_out}
+    parts = {"training": training, "selection": selection, "test": test, "validation": selection}
+    return {name: None if one is None else float(np.sqrt(np.mean(one**2))) for name, one in parts.items()}
 
 
 def estimates(known: Mapping[str, Known]) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from fitting.quasi_static.points import Points
 
 START = "start"
 """What names of initial states begin with, be they shape parameters or strengths."""
+REST = "rest"
+"""What names of a rest's own level begin with."""
 
 Columns = Callable[[Points, np.ndarray], np.ndarray]
 
@@ -51,6 +53,11 @@ class Form:
     def size(self) -> int:
         """Number of strengths and shape parameters; where a log begins is none of them."""
         return sum(not name.startswith(START) for name in (*self.strengths, *self.shape_names))
+
+    @property
+    def lasting(self) -> int:
+        """Number of strengths, the first ones, that hold in any log; the others are of one log's start or rest."""
+        return sum(not name.startswith((START, REST)) for name in self.strengths)
 
 
 Terms = tuple[tuple[Form, np.ndarray], ...]

@@ -1,10 +1,11 @@
 """The whole story for quasi-static logs: fit the line, look at what it leaves over, add the effect behind it, refit."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from fitting.attribution.case_evidence import FinalEvidence
-from fitting.attribution.decisions import RULES, Outcome, conclude
+from fitting.attribution.decisions import RULES, Check, Outcome, conclude, support
 from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, is_told, look
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover
@@ -52,6 +53,7 @@ class QuasiStaticLoop:
         dropped: Forms that a later one made superfluous.
         left: What the final model leaves over, where it depends on something.
         forms_tried: Number of forms in the catalogue.
+        checks: Every rule as it was applied.
     """
 
     decision: Outcome
@@ -64,6 +66,7 @@ class QuasiStaticLoop:
     dropped: tuple[str, ...]
     left: Leftover | None
     forms_tried: int
+    checks: tuple[Check, ...]
 
     def told_by(self, finding: Finding) -> tuple[Points, TwistModel, tuple[Form, ...]]:
         """The points and the equation that tell a finding's figures, and its forms there."""
@@ -120,8 +123,11 @@ def close_loop(
             current = held.beside(current, at_rest.terms)
             progress(f"found {at_rest.terms[0][0].name}")
     left = leftover(held, current, base, seed)
+    decision, final_checks = _decide(base, current, left, points.twist_noise)
+    looks = rounds if at_rest is None else (*rounds, at_rest.round)
+    asked = (check for this in looks for seen in this.evidence.asked for check in support(seen))
     return QuasiStaticLoop(
-        decision=_decide(base, current, left, points.twist_noise),
+        decision=decision,
         held=held,
         before=base,
         after=current,
@@ -131,6 +137,7 @@ def close_loop(
         dropped=dropped,
         left=left,
         forms_tried=len(forms),
+        checks=(*(check for check in asked if math.isfinite(check.statistic)), *final_checks),
     )
 
 
@@ -192,9 +199,11 @@ def _findings(held: Held, after: TwistTrial, rounds: list[TwistRound], at_rest: 
     return tuple(sorted(found, key=lambda one: -one.validation_gain))
 
 
-def _decide(base: TwistTrial, after: TwistTrial, left: Leftover | None, noise: float) -> Outcome:
+def _decide(
+    base: TwistTrial, after: TwistTrial, left: Leftover | None, noise: float
+) -> tuple[Outcome, tuple[Check, ...]]:
     """Something unexplained is what predictably depends on something, or what is too large for noise of any colour."""
     names = tuple(form.name for form in after.model.forms)
     explained = left is None and (bool(names) or base.rmse <= RULES.wander * noise)
     seen = FinalEvidence(names, False, (after.rmse / noise,), (base.rmse / noise,), noise_explains=explained)
-    return conclude(seen, replace(RULES, explained=RULES.quasi_static_explained))[0]
+    return conclude(seen, replace(RULES, explained=RULES.quasi_static_explained))

@@ -24,9 +24,10 @@ from fitting.quasi_static.facts import (
 from fitting.quasi_static.lookalikes import lookalikes
 from fitting.quasi_static.loop import Finding, QuasiStaticLoop
 from fitting.quasi_static.noise_colour import DRAWS
-from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.stretches import FOLDS, stretches
+from fitting.quasi_static.test_part import Parted, misfit_on
 from fitting.quasi_static.twist_model import stiffness_of, strengths_of
+from fitting.report.rules import rules_dict
 
 # A residual this much larger than the noise of neighbouring points is slower than they are.
 _NOISE = 2.0
@@ -51,21 +52,24 @@ _ONE_WAY = (
 )
 
 
-def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
+def loop_report(parts: Parted, loop: QuasiStaticLoop) -> dict[str, Any]:
     """The report as JSON has it: finite numbers and nulls only.
 
     Args:
-        data: The logs.
-        loop: On these logs.
+        parts: The logs.
+        loop: On what of them may be fitted.
     """
     points, after = loop.held.points, no_account()
     if loop.after is not loop.before:
-        after = _account(loop, loop.after) | {"effects": [_effect(loop, one) for one in loop.findings]}
+        after = _account(parts, loop.after) | {"effects": [_effect(loop, one) for one in loop.findings]}
+    before = _account(parts, loop.before)
     content = {
         "decision": loop.decision,
+        "judged_on": "selection" if before["rmse"]["test"] is None else "test",
+        "rules": rules_dict(loop.checks),
         "noise": {"dynamic_error": points.twist_noise, "joint_torque": points.torque_noise},
         "torque_range": [float(np.min(points.torque)), float(np.max(points.torque))],
-        "before": _account(loop, loop.before),
+        "before": before,
         "after": after,
         "steps": [{"added": added, "held_out_rmse": trial.rmse} for added, trial in loop.steps],
         "alternatives": _alternatives(loop),
@@ -77,14 +81,35 @@ def loop_report(data: QuasiStaticData, loop: QuasiStaticLoop) -> dict[str, Any]:
         "setting": {"stretches": int(loop.held.stretch[-1]) + 1, "folds": FOLDS},
         "forms_tried": loop.forms_tried,
         "surrogates": DRAWS,
-        "logs": log_dicts(data, points.rows, points.reversals),
+        "logs": _logs(parts),
     }
-    report = framed(data, content)
-    return report | {"summary": _summary(report), "cannot_tell": _limits(report, loop)}
+    report = framed(parts.data, content)
+    return report | {"summary": _summary(report), "cannot_tell": _limits(report, loop, parts)}
 
 
-def _account(loop: QuasiStaticLoop, trial: TwistTrial) -> dict[str, Any]:
-    return account(stiffness_of(loop.held.points, trial.model), trial.model.misfit, trial.held_out)
+def _logs(parts: Parted) -> list[dict[str, Any]]:
+    """The logs, each with its number of test rows, then logs that are test data alone."""
+    tests = {one.points.names[0]: one for one in parts.tests}
+    fitted = log_dicts(parts.data, parts.points.rows, parts.points.reversals)
+    found = [log | {"test": tests.pop(log["name"]).rows if log["name"] in tests else 0} for log in fitted]
+    return found + [
+        {
+            "name": name,
+            "samples": len(one.points.twist) * one.points.rows[0],
+            "held_out": 0,
+            "seconds": one.points.duration,
+            "rows_per_block": one.points.rows[0],
+            "reversals": one.points.reversals[0],
+            "motion": one.points.motion[0],
+            "test": one.rows,
+        }
+        for name, one in tests.items()
+    ]
+
+
+def _account(parts: Parted, trial: TwistTrial) -> dict[str, Any]:
+    test = misfit_on(parts.tests, trial.model, parts.points)
+    return account(stiffness_of(parts.points, trial.model), trial.model.misfit, trial.held_out, test)
 
 
 def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
@@ -177,15 +202,16 @@ def _unexplained(loop: QuasiStaticLoop) -> dict[str, Any]:
 
 def _summary(report: Mapping[str, Any]) -> str:
     """The decision in plain words."""
-    effects, before = report["after"]["effects"], report["before"]["rmse"]["validation"]
+    effects, before = report["after"]["effects"], report["before"]["rmse"][report["judged_on"]]
     families = [one["family"].replace("_", " ") for one in effects]
     if report["decision"] == "model_sufficient":
         return _nothing_found(report, before)
     change = ""
     if effects:
-        change = f" The held-out error falls {_from_to(report)} rms."
+        on = "error on test data" if report["judged_on"] == "test" else "held-out error"
+        change = f" The {on} {_from_to(report, report['judged_on'])} rms."
     for resting in [one["at_rest"] for one in effects if one["at_rest"]][:1]:
-        change += f" While the joint rests it falls {_from_to(resting)}."
+        change += f" While the joint rests the held-out error {_from_to(resting, 'selection')}."
     if report["decision"] == "effect_found":
         count = "A missing effect was" if len(families) == 1 else f"{len(families)} missing effects were"
         return f"{count} found: {formatting.words(families)}.{change}"
@@ -203,8 +229,9 @@ def _summary(report: Mapping[str, Any]) -> str:
 
 def _nothing_found(report: Mapping[str, Any], before: float) -> str:
     noise = report["noise"]["dynamic_error"]
+    on = "test data" if report["judged_on"] == "test" else "held-out stretches"
     errs = (
-        f"on held-out stretches it errs by {formatting.quantity(before, 'rad')} rms "
+        f"on {on} it errs by {formatting.quantity(before, 'rad')} rms "
         f"({formatting.number(before / noise)} times the twist's noise)"
     )
     tried = f"none of the {report['forms_tried']} forms of missing physics that were tried gains more than chance would"
@@ -216,12 +243,23 @@ def _nothing_found(report: Mapping[str, Any], before: float) -> str:
     )
 
 
-def _from_to(accounts: Mapping[str, Any]) -> str:
-    start, end = (accounts[key]["rmse"]["validation"] for key in ("before", "after"))
-    return f"from {formatting.quantity(start, 'rad')} to {formatting.quantity(end, 'rad', like=start)}"
+def _from_to(accounts: Mapping[str, Any], part: str) -> str:
+    start, end = (accounts[key]["rmse"][part] for key in ("before", "after"))
+    verb = "falls" if end < start else "rises"
+    return f"{verb} from {formatting.quantity(start, 'rad')} to {formatting.quantity(end, 'rad', like=start)}"
 
 
-def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
+def _beyond(parts: Parted) -> float:
+    """Share of the test data at torques beyond those that were fitted."""
+    if not parts.tests:
+        return 0.0
+    torque, known = np.concatenate([one.points.torque[one.scored] for one in parts.tests]), parts.points.torque
+    # Points of noisy torques scatter about the ends of the range.
+    margin = 2.0 * parts.points.torque_error
+    return float(np.mean((torque < np.min(known) - margin) | (torque > np.max(known) + margin)))
+
+
+def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> list[str]:
     points, model = loop.held.points, loop.after.model
     parameters = dict(report["after"]["parameters"] or report["before"]["parameters"])
     for one in report["after"]["effects"]:
@@ -230,6 +268,7 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
     friction = parameters.get("hysteresis.friction", {"value": 0.0})["value"]
     slower = loop.decision == "model_sufficient" and loop.after.rmse > _NOISE * points.twist_noise
     error = formatting.quantity(float(abs(loop.before.model.coefficients[0])) * points.torque_error, "rad")
+    unseen = _beyond(parts)
     own = next((one.at_rest.own_stiffness for one in loop.findings if one.at_rest is not None), None)
     notes = [
         (vague, f"{not_identifiable(vague)}." if vague else ""),
@@ -249,6 +288,16 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop) -> list[str]:
             f"{formatting.quantity(own, 'N m/rad')}, which the logs as a whole rule out. Where the stiffness of the "
             "whole logs is none of the gear alone, since it holds friction or an encoder's error, that would be no "
             "creep.",
+        ),
+        (
+            not parts.tests,
+            "The logs are too short to set test data aside: no error is stated on data that no choice has seen. Name "
+            "another log with --test.",
+        ),
+        (
+            unseen > 0,
+            f"{formatting.percent(unseen)} of the test data lie at torques beyond those that were fitted: there the "
+            "equation extrapolates.",
         ),
         few_stretches(int(stretches(model.misfit, points.log, each=2)[-1]) + 1),
         (True, ABOUT_SCALE),

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from fitting.quasi_static.form import Form
+from fitting.quasi_static.form import REST, Form
 from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 
@@ -108,7 +108,7 @@ def _of_a_wave(order: int, what: str) -> tuple[Figure, Figure]:
 
 
 def _friction(points: Points) -> Iterator[Form]:
-    rests = tuple(f"rest {i}" for i in range(int(points.rest.max()) + 1))
+    rests = tuple(f"{REST} {i}" for i in range(int(points.rest.max()) + 1))
     if "both ways" not in points.motion and not rests:
         return
     friction = Figure("friction", lambda own: -own[1] / own[0], "N m", "friction while the joint moves, at its output")

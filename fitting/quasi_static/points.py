@@ -50,6 +50,7 @@ class Points:
         twist_noise: Of a point's twist [rad].
         rows: Rows in a point, by log.
         reversals: Of the torque, by log.
+        reference: Points whose middle torque and mean temperature count; its own where it is None.
     """
 
     torque: np.ndarray
@@ -69,6 +70,7 @@ class Points:
     twist_noise: float
     rows: tuple[int, ...]
     reversals: tuple[int, ...]
+    reference: "Points | None" = None
 
     @cached_property
     def logs(self) -> tuple[np.ndarray, ...]:
@@ -97,8 +99,17 @@ class Points:
     @cached_property
     def centre(self) -> float:
         """Torque about which bends are counted [N m]: zero where both signs occur, else the middle of the range."""
+        if self.reference is not None:
+            return self.reference.centre
         low, high = float(np.min(self.torque)), float(np.max(self.torque))
         return 0.0 if low < 0 < high else 0.5 * (low + high)
+
+    @cached_property
+    def warmth(self) -> np.ndarray:
+        """Temperature above its mean [K], (n,)."""
+        reference = self.temperature if self.reference is None else self.reference.temperature
+        assert self.temperature is not None and reference is not None
+        return self.temperature - np.mean(reference)
 
     @cached_property
     def reach(self) -> float:

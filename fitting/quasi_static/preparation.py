@@ -68,11 +68,7 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
     for log in logs:
         seen = examine(log, drive_file)
         refuse_unfit(seen, log)
-        # The findings of the reader tell of the rows in which torque or angles were not measured.
-        masks = [mask for mask in (log.trusted, log.input_known) if mask is not None]
-        known = replace(
-            _rows(log, np.logical_and.reduce([np.isfinite(log.time), *masks])), trusted=None, input_known=None
-        )
+        known = believed(log)
         speed = speed_of(known, drive_file.reduction_ratio)
         motion = _motion(known, speed)
         wide = _wide_twist(log, drive_file.largest_twist)
@@ -85,6 +81,12 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
         motions.append(motion)
         findings[log.name] = (*seen, *wide, *doubt, *more)
     return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
+
+
+def believed(log: Log) -> Log:
+    """The rows in which torque and angles were measured; findings of the reader tell of the others."""
+    masks = [mask for mask in (log.trusted, log.input_known) if mask is not None]
+    return replace(_rows(log, np.logical_and.reduce([np.isfinite(log.time), *masks])), trusted=None, input_known=None)
 
 
 def torque_of(log: Log) -> np.ndarray:

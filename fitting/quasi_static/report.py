@@ -100,8 +100,12 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def _errors(accounts: list[Mapping[str, Any]], width: int) -> list[str]:
-    parts = {"fitted": "training", "held out": "validation"}
-    values = {label: "".join(f"{plain(a['rmse'][key]):>{width}}" for a in accounts) for label, key in parts.items()}
+    parts = {"fitted": "training", "held out": "selection", "test": "test"}
+    values = {
+        label: "".join(f"{plain(a['rmse'][key]):>{width}}" for a in accounts)
+        for label, key in parts.items()
+        if accounts[0]["rmse"][key] is not None
+    }
     return [f"    {label:10}{shown} rad" for label, shown in values.items()]
 
 

@@ -14,9 +14,9 @@ from fitting.quasi_static.fit import fit_quasi_static
 from fitting.quasi_static.loop import close_loop
 from fitting.quasi_static.loop_content import loop_report
 from fitting.quasi_static.plots import fit_pictures, loop_pictures
-from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import prepare
 from fitting.quasi_static.report import report_text, write_report
+from fitting.quasi_static.test_part import parted
 from fitting.report.plots import Plot
 from fitting.search_options import SearchOptions
 
@@ -57,7 +57,10 @@ def fit_quasi_static_logs(
     Raises:
         InputError: There are test logs.
     """
-    _refuse_test(logs, test)
+    if test:
+        raise InputError(
+            f"{test[0].path}: `hdjax fit` takes no test data of quasi-static logs; leave --test out, or run close-loop"
+        )
     progress("fitting torque-twist curves")
     data = prepare(logs, drive_file)
     found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
@@ -77,23 +80,10 @@ def close_quasi_static_loop(
     Args:
         logs: Of kind "quasi-static", of one drive.
         drive_file: Of the drive.
-        test: Logs of test data, which are refused.
+        test: Logs of test data; where there are none, the end of each log is, if the rest is long enough.
         search: How effects are searched for.
         progress: Told what is being done.
-
-    Raises:
-        InputError: There are test logs.
     """
-    _refuse_test(logs, test)
-    data = prepare(logs, drive_file, at_rest=True)
-    points = points_of(data.logs, data.motion, drive_file.reduction_ratio)
-    loop = close_loop(points, max_effects=search.max_effects, seed=search.seed, progress=progress)
-    return Told(loop_report(data, loop), loop_pictures(loop))
-
-
-def _refuse_test(logs: Sequence[Log], test: Sequence[Log]) -> None:
-    """A rest at the end of a log is what creep is told by, so that no part of these logs is test data."""
-    if test:
-        raise InputError(
-            f"{test[0].path}: --test is for logs of a motion, but {logs[0].path} is quasi-static; leave it out"
-        )
+    parts = parted(logs, drive_file, test)
+    loop = close_loop(parts.points, max_effects=search.max_effects, seed=search.seed, progress=progress)
+    return Told(loop_report(parts, loop), loop_pictures(loop))

@@ -206,8 +206,7 @@ def _warm_compliance(points: Points, shape: np.ndarray) -> np.ndarray:
 
 
 def _warm_drift(points: Points, shape: np.ndarray) -> np.ndarray:
-    assert points.temperature is not None
-    return (points.temperature - np.mean(points.temperature))[:, None]
+    return points.warmth[:, None]
 
 
 def _drift(points: Points, shape: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ def is_withheld(estimate: Mapping[str, Any]) -> bool:
 
 
 def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
-    """Mark the intervals of the drive's own parameters and what follows from them where much is left, and withhold them where it has no name.
+    """Mark the intervals of the drive's own parameters, and of derived figures, where much is left; withhold them where
+    it has no name.
 
     What is missing stands in part in the parameters, by more than any standard error tells.
 

@@ -37,9 +37,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
             "withheld" if is_withheld(p) else formatting.interval_in_factor(p["ci95"], p["std"], factor)
         ),
         "value_in_factor": formatting.value_in_factor,
-        "interval": lambda p: (
-            "withheld" if is_withheld(p) else formatting.interval(p["ci95"], p["std"], p["unit"])
-        ),
+        "interval": lambda p: "withheld" if is_withheld(p) else formatting.interval(p["ci95"], p["std"], p["unit"]),
         "family": plain_family,
         "code": _code,
         "p_value": formatting.p_value,

@@ -18,6 +18,7 @@ from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.report import report_page
 from fitting.quasi_static.rests import RestLook, look_at_rests
+from fitting.quasi_static.test_part import Parted
 from fitting.quasi_static.twist_model import strengths_of
 
 AMPLITUDE, CONSTANT = -5e-5, 0.5
@@ -136,7 +137,7 @@ def test_the_report_tells_a_relaxation_at_rest(tmp_path: Path) -> None:
     data = QuasiStaticData(
         DriveFile(tmp_path / "drive.toml", "joint", RATIO, None, None, None, None, {}), (log,), (how,), {}
     )
-    report = loop_report(data, loop)
+    report = loop_report(Parted(data, loop.held.points, ()), loop)
     (effect,) = report["after"]["effects"]
     assert effect["family"] == "creep" and effect["at_rest"]["rests"] == 1
     before, after = (effect["at_rest"][key]["rmse"]["validation"] for key in ("before", "after"))

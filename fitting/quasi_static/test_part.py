@@ -1,0 +1,154 @@
+"""Test data of quasi-static logs: which points they are, and by how much an equation errs there.
+
+They take no part in any fit, choice or noise estimate. A log's zero, and the states in which it began, hold for that
+log alone: points before the test data tell them, while all else of the equation stays as it was fitted.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from fitting.errors import DataError
+from fitting.estimation.test_part import TEST_SHARE
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.log import Log
+from fitting.quasi_static.attribution import Held
+from fitting.quasi_static.facts import FEW_STRETCHES
+from fitting.quasi_static.form import START
+from fitting.quasi_static.points import Points, points_of
+from fitting.quasi_static.preparation import QuasiStaticData, believed, prepare
+from fitting.quasi_static.twist_model import TwistModel
+
+# Share of a log named as test data, at its beginning, that tells its zero.
+_LEAD = 0.2
+# Of two torque cycles.
+_REVERSALS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """The points of one log that holds test data.
+
+    Attributes:
+        points: Of the whole log.
+        lead: Those that tell its zero and the states in which it began, (n,).
+        scored: Those that tell an error, (n,).
+    """
+
+    points: Points
+    lead: np.ndarray
+    scored: np.ndarray
+
+    @property
+    def rows(self) -> int:
+        """Number of rows that tell an error."""
+        return int(np.sum(self.scored)) * self.points.rows[0]
+
+    @classmethod
+    def of(cls, points: Points, begins: float) -> "Unseen":
+        """Test data from a time on [s]; at rest, where friction has a level of its own, no error is told."""
+        later = points.time >= begins
+        moving = True if points.direction is None else points.direction != 0
+        return cls(points, ~later, later & moving)
+
+
+@dataclass(frozen=True, eq=False)
+class Parted:
+    """Quasi-static logs, and what of them is test data.
+
+    Attributes:
+        data: What may be fitted.
+        points: Of these rows.
+        tests: By log; none where the logs hold too little to be parted.
+    """
+
+    data: QuasiStaticData
+    points: Points
+    tests: tuple[Unseen, ...]
+
+
+def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ()) -> Parted:
+    """Part quasi-static logs into what is fitted and test data.
+
+    Args:
+        logs: Of one drive.
+        drive_file: Of the drive.
+        test: Logs that are test data; where there are none, the end of each log is, unless too little would be left
+            to choose a model by.
+
+    Raises:
+        DataError: A log can't be fitted.
+    """
+    ratio = drive_file.reduction_ratio
+    if test:
+        data = prepare(logs, drive_file, at_rest=True)
+        alone = [prepare([log], drive_file, at_rest=True) for log in test]
+        whole = [points_of(one.logs, one.motion, ratio) for one in alone]
+        tests = tuple(Unseen.of(points, _LEAD * points.duration) for points in whole)
+        data = replace(data, findings=data.findings | {name: f for one in alone for name, f in one.findings.items()})
+        return Parted(data, points_of(data.logs, data.motion, ratio), tests)
+    try:
+        data = prepare([log.rows(0, _border(log)) for log in logs], drive_file, at_rest=True)
+        points = points_of(data.logs, data.motion, ratio)
+    except DataError:
+        points = None
+    if points is None or not _is_enough(points):
+        data = prepare(logs, drive_file, at_rest=True)
+        return Parted(data, points_of(data.logs, data.motion, ratio), ())
+    tests = tuple(
+        Unseen.of(points_of([believed(log)], [motion], ratio), float(log.time[_border(log)] - believed(log).time[0]))
+        for log, motion in zip(logs, data.motion, strict=True)
+    )
+    return Parted(data, points, tests)
+
+
+def _is_enough(points: Points) -> bool:
+    """Whether points without test data can still choose a model: by two torque cycles of each log, or by stretches of
+    the straight line's misfit that hardly know of each other."""
+    return min(points.reversals) >= _REVERSALS or Held.of(points).stretch[-1] + 1 >= FEW_STRETCHES
+
+
+def _border(log: Log) -> int:
+    return len(log) - round(TEST_SHARE * len(log))
+
+
+def misfit_on(tests: Sequence[Unseen], model: TwistModel, fitted: Points) -> np.ndarray | None:
+    """Measured less predicted twist of the test data [rad], (scored,); None where there are none.
+
+    Args:
+        tests: By log.
+        model: The equation.
+        fitted: The points that it was fitted to.
+    """
+    return np.concatenate([_misfit(one, model, fitted) for one in tests]) if tests else None
+
+
+def _misfit(test: Unseen, model: TwistModel, fitted: Points) -> np.ndarray:
+    points = replace(test.points, reference=fitted)
+    left = points.twist - model.coefficients[0] * (points.torque - points.centre)
+    # A form that only says how logs or rests began tells nothing of another one.
+    lasting = [(form, shape) for form, shape in model.terms if form.size]
+    kept = [[not name.startswith(START) for name in form.shape_names] for form, _ in lasting]
+    begun = [int(not all(names)) for names in kept]
+
+    def misfit(starts: Sequence[float]) -> np.ndarray:
+        found, own = left, iter(starts)
+        for (form, shape), names, has_start in zip(lasting, kept, begun, strict=True):
+            columns = form.columns(points, np.array([*shape[names], *itertools.islice(own, has_start)]))
+            strengths = model.coefficients[model.own(form)[0]][: form.lasting]
+            found = found - columns[:, : form.lasting] @ strengths
+        return found - np.mean(found[test.lead])
+
+    starts: Sequence[float] = ()
+    if any(begun):
+        grid = itertools.product((-0.9, 0.0, 0.9), repeat=sum(begun))
+        first = min(grid, key=lambda at: float(np.sum(misfit(at)[test.lead] ** 2)))
+        size = float(np.std(points.twist)) or 1.0
+        # The branch of a loop has kinks: steps of the derivative must reach over them.
+        starts = least_squares(
+            lambda at: misfit(at)[test.lead] / size, first, bounds=(-1.0, 1.0), diff_step=1e-3, max_nfev=25
+        ).x
+    return misfit(starts)[test.scored]

@@ -1,0 +1,89 @@
+"""Test data of quasi-static logs: what an equation errs by where no fit has looked."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import slow_joints
+from slow_joints import RATIO, slow_joint
+
+from fitting.logs.drive_file import DriveFile, read_drive_file
+from fitting.logs.log import Log
+from fitting.quasi_static.told import close_quasi_static_loop
+from fitting.search_options import SearchOptions
+
+NOISE = 4e-6
+LONG: dict[str, Any] = {"cycles": 6.0, "rows": 4000, "twist_noise": NOISE}
+
+
+@pytest.fixture(scope="module")
+def drive_file(tmp_path_factory: pytest.TempPathFactory) -> DriveFile:
+    path = Path(tmp_path_factory.mktemp("drive")) / "drive.toml"
+    path.write_text(
+        f'[drive]\nname = "joint"\nreduction_ratio = {RATIO}\n[columns]\ntwist = "x"\njoint_torque = "torque"\n'
+    )
+    return read_drive_file(path)
+
+
+def report(drive_file: DriveFile, log: Log, *test: Log) -> dict[str, Any]:
+    told = close_quasi_static_loop([log], drive_file, test=test, search=SearchOptions(), progress=lambda message: None)
+    return told.content
+
+
+@pytest.mark.parametrize(
+    ("effect", "options"),
+    [
+        (slow_joints.ripple(3e-5, 2), {"moves": "both ways"}),
+        (slow_joints.sliders(1e-4), {}),
+        (slow_joints.relaxation(0.3, 0.4), {"kind": "triangle"}),
+    ],
+)
+@pytest.mark.parametrize("named", [False, True])
+def test_what_was_found_predicts_test_data_to_the_noise(
+    effect: slow_joints.Effect, options: dict[str, Any], named: bool, drive_file: DriveFile
+):
+    log, _ = slow_joint([effect], **LONG, **options)
+    # A log of its own has another zero, and begins elsewhere in the cycle.
+    other = replace(slow_joint([effect], **LONG, **options, seed=5)[0].rows(700, 4000), name="other")
+    found = report(drive_file, log, *([other] if named else []))
+    assert found["decision"] == "effect_found" and found["judged_on"] == "test"
+    before, after = (found[stage]["rmse"]["test"] for stage in ("before", "after"))
+    # The torque's noise makes up the rest.
+    assert after < 1.5 * NOISE < 0.3 * before
+    assert [log["test"] > 0 for log in found["logs"]] == ([False, True] if named else [True])
+
+
+def test_scrambled_test_data_change_nothing_but_test_figures(drive_file: DriveFile):
+    log, _ = slow_joint([slow_joints.ripple(3e-5, 2)], moves="both ways", **LONG)
+    scrambled = log.dynamic_error.copy()
+    border = len(log) - round(0.2 * len(log))
+    scrambled[border:] = np.random.default_rng(0).permutation(scrambled[border:])
+    one, other = report(drive_file, log), report(drive_file, replace(log, dynamic_error=scrambled))
+    assert one["before"]["rmse"].pop("test") < other["before"]["rmse"].pop("test")
+    assert one["after"]["rmse"].pop("test") < other["after"]["rmse"].pop("test")
+    for found in (one, other):
+        del found["health"], found["summary"]
+    assert one == other
+
+
+def test_too_short_a_log_claims_no_error_on_test_data(drive_file: DriveFile):
+    found = report(drive_file, slow_joint([slow_joints.sliders(1e-4)], cycles=1.6)[0])
+    assert found["decision"] == "effect_found" and found["judged_on"] == "selection"
+    assert found["after"]["rmse"]["test"] is None and found["logs"][0]["test"] == 0
+    assert any("too short to set test data aside" in note for note in found["cannot_tell"])
+
+
+def test_torques_beyond_the_fitted_ones_are_told(drive_file: DriveFile):
+    small, _ = slow_joint(**LONG)
+    large = replace(slow_joint(**LONG, largest=90.0)[0], name="large")
+    told = [note for note in report(drive_file, small, large)["cannot_tell"] if "extrapolates" in note]
+    assert len(told) == 1
+
+
+def test_every_rule_stands_in_the_report(drive_file: DriveFile):
+    found = report(drive_file, slow_joint([slow_joints.sliders(1e-4)], **LONG)[0])
+    names = {check["name"] for check in found["rules"]}
+    assert {"least_gain", "significance", "excess", "explained"} <= names
+    assert all(check["outcome"] in ("holds", "fails") and check["statistic"] is not None for check in found["rules"])
