@@ -43,7 +43,7 @@ class Start(eqx.Module):
     """
 
     covariance: Float[Array | np.ndarray, "outputs outputs"] | None = None
-    states: Float[Array, "segments states"] | None = None
+    states: Float[Array | np.ndarray, "segments states"] | None = None
 
 
 @dataclass(frozen=True)

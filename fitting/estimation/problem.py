@@ -55,7 +55,7 @@ def pose(
     segmentation: Segmentation,
     *,
     hold_parameters: bool = False,
-    states: Float[Array, "segments states"] | None = None,
+    states: Float[Array | np.ndarray, "segments states"] | None = None,
     engine: Engine | None = None,
 ) -> tuple[Problem, Unknowns]:
     """Pose a fit: what is solved, not weighed yet, and where the iteration begins.
@@ -129,7 +129,7 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
 
 
 def states_from(
-    model: Model, near: Model, states: Float[Array, "segments near_states"]
+    model: Model, near: Model, states: Float[Array | np.ndarray, "segments near_states"]
 ) -> Float[Array, "segments states"]:
     """Initial states from those of another model on the same segments: what both have, and hidden ones of the new model
     as if it had long moved like this. From poor states the first step would pull the parameters far away.
@@ -139,10 +139,9 @@ def states_from(
         near: the other model.
         states: its initial states.
     """
-    names = near.state_names
+    names, states = near.state_names, jnp.asarray(np.asarray(states))
     if names == model.state_names:
         return states
-    states = jnp.asarray(np.asarray(states))
     found = _settled(model, states[:, : len(model.motion_states)])
     columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
     return jnp.stack(columns, axis=1)
