@@ -188,6 +188,7 @@ def fit(
         engine=engine,
     )
     swing = float(scales(stretches).x)
+    shown = Shown.of(problem.model, swing)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
@@ -196,7 +197,7 @@ def fit(
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
-        problem = weighed(problem, covariance, swing)
+        problem = weighed(problem, covariance, shown)
         solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
             solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
@@ -211,7 +212,7 @@ def fit(
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=problem.free.unpack(model, values),
-        problem=weighed(problem, covariance, swing) if strategy.reweigh else problem,
+        problem=weighed(problem, covariance, shown) if strategy.reweigh else problem,
         unknowns=unknowns,
         error=jnp.asarray(solution.left_over.error),
         covariance=jnp.asarray(covariance),
@@ -241,11 +242,34 @@ def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution
     return found if mended is None else strategy.solve(problem, mended, NEARBY_DAMPING)
 
 
-def weighed(problem: Problem, covariance: Array | np.ndarray, swing: float) -> Problem:
+class Shown(eqx.Module):
+    """What shows of a unit of each state, for what it counts in a gap.
+
+    Attributes:
+        angles: derivatives of the outputs by the angles.
+        omega_0: natural frequency [rad/s].
+        hidden: units of the hidden states.
+        swing: typical dynamic error [rad].
+    """
+
+    angles: Float[np.ndarray, "outputs angles"]
+    omega_0: float
+    hidden: Float[np.ndarray, " hidden"]
+    swing: float
+
+    @classmethod
+    def of(cls, model: Model, swing: float) -> "Shown":
+        """Of a model's states."""
+        angles = readout(model, model.rest())[:, : len(model.motion_states) // 2]
+        hidden = [np.asarray(e.state_scale()) for e in model.effects if e.states]
+        return cls(angles, float(model.drive.omega_0), np.concatenate([np.zeros(0), *hidden]), swing)
+
+
+def weighed(problem: Problem, covariance: Array | np.ndarray, shown: Shown) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
-    weights = white, _gap_weight(problem, white, swing)
-    return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, tuple(map(jnp.asarray, weights)))
+    gap_weight = np.sqrt(problem.segments.weight.shape[1]) * _gap_weight(white, shown)
+    return replace(problem, whitening=jnp.asarray(white), gap_weight=jnp.asarray(gap_weight))
 
 
 def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
@@ -305,20 +329,16 @@ def whitening(covariance: Float[Array | np.ndarray, "outputs outputs"]) -> Float
     return np.linalg.inv(np.linalg.cholesky(np.asarray(covariance)))
 
 
-def _gap_weight(problem: Problem, white: np.ndarray, swing: float) -> Float[np.ndarray, " states"]:
-    """What the states count in a gap: about what the segment behind it would pay for it.
+def _gap_weight(white: np.ndarray, shown: Shown) -> Float[np.ndarray, " states"]:
+    """What the states count in a gap: about what each sample of the segment behind it would pay for it.
 
     An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
     state by what the error does while it runs through its range. Counted less, the residual that a closed gap costs
     would look too dear.
     """
-    model = problem.model
-    angles = len(model.motion_states) // 2
-    shown = np.linalg.norm(white @ readout(model, model.rest())[:, :angles], axis=0)
-    visible = 0.1 * swing * np.linalg.norm(white[:, -1])
-    hidden = [visible / np.asarray(e.state_scale()) for e in model.effects if e.states]
-    weights = np.concatenate([shown, shown / float(model.drive.omega_0), *hidden])
-    return np.sqrt(problem.segments.weight.shape[1]) * weights
+    angles = np.linalg.norm(white @ shown.angles, axis=0)
+    visible = 0.1 * shown.swing * np.linalg.norm(white[:, -1])
+    return np.concatenate([angles, angles / shown.omega_0, visible / shown.hidden])
 
 
 def half_log_determinant(covariance: Array | np.ndarray) -> float:

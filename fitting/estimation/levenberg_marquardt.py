@@ -9,7 +9,6 @@ iteration; this file tells it how to solve for a step.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -53,14 +52,6 @@ class Chains(eqx.Module):
     closing: Float[Array | np.ndarray, "segments states"]
     index: Int[Array | np.ndarray, " segments"]
 
-    def collect(self, each: Array | np.ndarray) -> Array | np.ndarray:
-        """Sum over the segments of each chain; there are as many places as segments."""
-        if library_of(self.index, each) is jnp:
-            return jax.ops.segment_sum(each, self.index, num_segments=each.shape[0])
-        total = np.zeros(each.shape)
-        np.add.at(total, self.index, each)
-        return total
-
 
 def chains(found: Blocks | Products, joined: Bool[Array | np.ndarray, " segments"]) -> Chains:
     """Follow the linearised motion from segment to segment."""
@@ -92,6 +83,15 @@ def _path_inside(first: np.ndarray, joined: Any, by_state: Any, added: Any) -> A
         return here, here
 
     return jax.lax.scan(follow, jnp.asarray(first), (joined, by_state, added))[1]
+
+
+def _collected(each: Any, index: Any) -> Any:
+    """Sum over the segments of each chain; there are as many places as segments."""
+    if library_of(each, index) is jnp:
+        return jax.ops.segment_sum(each, index, num_segments=each.shape[0])
+    total = np.zeros(each.shape)
+    np.add.at(total, index, each)
+    return total
 
 
 class ArrowSystem(eqx.Module):
@@ -161,8 +161,16 @@ class ArrowSystem(eqx.Module):
         return Unknowns(shared, states + (path.by_first @ first[path.index][:, :, None])[:, :, 0])
 
 
-def normal_equations(found: Products, joined: Bool[Array | np.ndarray, " segments"]) -> ArrowSystem:
-    """The normal equations of a linearised residual, with the gaps closed; by numpy outside programs of JAX."""
+def normal_equations(
+    found: Products, joined: Bool[Array | np.ndarray, " segments"], yardstick: Any = 0.0
+) -> ArrowSystem:
+    """The normal equations of a linearised residual, with the gaps closed; by numpy outside programs of JAX.
+
+    Args:
+        found: of residual and Jacobian.
+        joined: whether a segment starts where the one before it ends.
+        yardstick: what damping of the shared parameters is relative to at least.
+    """
     library = library_of(found.gap, found.before_by_parameter, joined)
     found, joined = on_host((found, joined))
     path = chains(found, joined)
@@ -180,12 +188,12 @@ def normal_equations(found: Products, joined: Bool[Array | np.ndarray, " segment
     shared = library.sum(total[:, :parameters, :parameters], axis=0)
     return ArrowSystem(
         shared=shared,
-        own=path.collect(total[:, mine, mine]),
-        coupling=path.collect(total[:, mine, :parameters]),
+        own=_collected(total[:, mine, mine], path.index),
+        coupling=_collected(total[:, mine, :parameters], path.index),
         shared_gradient=library.sum(total[:, :parameters, parameters + states :], axis=0),
-        own_gradient=path.collect(total[:, mine, parameters + states :]),
+        own_gradient=_collected(total[:, mine, parameters + states :], path.index),
         chains=path,
-        yardstick=library.diagonal(shared),
+        yardstick=library.maximum(library.diagonal(shared), yardstick),
     )
 
 
@@ -331,11 +339,9 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         new, old = (state.ahead, seen, costs, rows, gap), (y, state.found, state.costs, state.rows, state.gap)
         best, found, costs, rows, gap = jax.tree.map(lambda a, b: where(accepted, a, b), new, old)
 
-        system = normal_equations(found, self.joined)
         # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
         # most that it has ever shown (Moré 1978).
-        yardstick = library.maximum(system.yardstick, state.yardstick)
-        system = replace(system, yardstick=yardstick)
+        system = normal_equations(found, self.joined, state.yardstick)
         step = system.step(library.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
         promised = self._promised(found, step)
         # Where the system has no solution to working precision, another step from here is more damped.
@@ -348,7 +354,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gap=gap,
             promised=where(solved, promised, -jnp.inf),
             size=where(solved, size, _SHORTER * size),
-            yardstick=yardstick,
+            yardstick=system.yardstick,
             count=state.count + 1,
             accepted=accepted,
         )

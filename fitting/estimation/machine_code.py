@@ -39,12 +39,19 @@ def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
         unknowns: where.
         kernel: of the problem's model.
     """
-    segments, free = problem.segments, problem.free
+    free = problem.free
     # Outside a program of JAX numpy does this, for which nothing is compiled.
     library = jnp if is_traced(problem, unknowns) else np
     values = free.values(unknowns.parameters)
     model = problem.model.replace(dict(zip(free.paths, values, strict=True))) if free.paths else problem.model
     slopes = library.asarray(free.slopes(model)) * library.asarray(problem.active)
+    own = library.asarray(values, dtype=float).reshape(-1), slopes, unknowns.states
+    return _data(problem, kernel, *own, library=library)
+
+
+def _data(problem: Problem, kernel: Kernel, free: Any, slopes: Any, states: Any, *, library: Any) -> Lanes:
+    """The same for what is free, and initial states."""
+    segments = problem.segments
     _, others, _ = split_model(problem.model, kernel.paths)
     constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
     whole = library.any(library.asarray(segments.joined))
@@ -52,10 +59,10 @@ def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
     named = {"load torque": segments.load_torque, "temperature": segments.temperature}
     beside = [named[name] for name in kernel.signals]
     return Lanes(
-        free=library.asarray(values, dtype=float).reshape(-1),
+        free=free,
         slopes=slopes,
         constants=library.pad(constants, (0, -constants.size % _CONSTANTS)),
-        states=unknowns.states,
+        states=states,
         knots=segments.torque.knots,
         measured=segments.measured,
         weight=segments.weight,
@@ -211,9 +218,11 @@ def task(problem: Problem, unknowns: Unknowns) -> Task | None:
     kernel, free = problem.kernel, problem.free
     if kernel is None:
         return None
+    # Replaced by each look.
+    blank = np.zeros(len(free.paths))
     return Task(
         address=kernel.jacobian,
-        lanes=on_host(_as_logged(problem, unknowns, kernel)),
+        lanes=on_host(_data(problem, kernel, blank, blank, unknowns.states, library=np)),
         acting=_acting(problem, kernel),
         logarithmic=np.array(free.logarithmic, dtype=bool),
         scale=np.asarray(free.scale),
