@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from fitting.estimation.free_parameters import LARGEST_LOG
 from fitting.estimation.residual import LOST, Blocks, Problem, Products, Unknowns
 from hdjax import PiecewisePolynomial
-from hdjax.compilation import is_traced, library_of, on_host
+from hdjax.compilation import is_traced, jit_small, library_of, on_host, some_at_a_time
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
@@ -93,7 +93,7 @@ class Acting(eqx.Module):
         logged."""
         values = jnp.asarray(lanes.free[np.array(self.places, dtype=int)])
         torque, slopes = actuated(self.effects, self.paths, values, self.torque)
-        return eqx.tree_at(lambda s: s.signals, lanes, (torque, *lanes.signals[1:], *slopes))
+        return replace(lanes, signals=(torque, *lanes.signals[1:], *slopes))
 
 
 def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
@@ -103,24 +103,31 @@ def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
     return Acting(effects, paths, kernel.acting, problem.segments.torque) if effects else None
 
 
-class _Actuators(eqx.Module):
-    """Effects on the torque, on their own."""
-
-    effects: tuple[ActuatorEffect, ...]
-
-
-@eqx.filter_jit
 def actuated(
     actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
-) -> tuple[Array, tuple[Array, ...]]:
+) -> tuple[Any, tuple[Any, ...]]:
     """The torque that acts, and its derivatives by the parameters at the paths."""
+    if is_traced(values, torque):
+        return _actuated(tuple(actuators), paths, values, torque)
+    return some_at_a_time(
+        lambda *own: _actuated(tuple(actuators), paths, values, PiecewisePolynomial(*own)),
+        torque.knots,
+        torque.coefficients,
+    )
+
+
+@jit_small
+def _actuated(
+    actuators: tuple[ActuatorEffect, ...], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
+) -> tuple[Array, tuple[Array, ...]]:
+    """[`actuated`][] of so many segments."""
 
     def places(own: tuple[ActuatorEffect, ...]) -> list[Any]:
         by_name = {e.name: e for e in own}
         return [getattr(by_name[name], field) for name, field in (p.split(".") for p in paths)]
 
     def acts(values: Array) -> Array:
-        own = tuple(actuators)
+        own = actuators
         if paths:
             own = eqx.tree_at(places, own, list(values))
 
@@ -218,12 +225,15 @@ def task(problem: Problem, unknowns: Unknowns) -> Task | None:
     kernel, free = problem.kernel, problem.free
     if kernel is None:
         return None
-    # Replaced by each look.
-    blank = np.zeros(len(free.paths))
+    acting, values = _acting(problem, kernel), np.asarray([*free.values(unknowns.parameters)], dtype=float)
+    lanes = on_host(_data(problem, kernel, values, np.zeros(values.size), unknowns.states, library=np))
+    # Where nothing moves the torque, what acts is one for all looks.
+    if acting is not None and not np.asarray(problem.active).any():
+        lanes, acting = acting.on(lanes), None
     return Task(
         address=kernel.jacobian,
-        lanes=on_host(_data(problem, kernel, blank, blank, unknowns.states, library=np)),
-        acting=_acting(problem, kernel),
+        lanes=lanes,
+        acting=acting,
         logarithmic=np.array(free.logarithmic, dtype=bool),
         scale=np.asarray(free.scale),
         active=np.asarray(problem.active),

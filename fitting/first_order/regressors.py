@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import strength_paths
-from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial, some_at_a_time
+from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial
 from fitting.first_order.internal_states import Memory, memory_of, own_between, own_states
 from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
 from hdjax import Drive, Model, PiecewisePolynomial
-from hdjax.compilation import jit_small
+from hdjax.compilation import jit_small, some_at_a_time
 from hdjax.effects import (
     ActuatorEffect,
     Effect,
