@@ -140,7 +140,7 @@ class Fit(eqx.Module):
 
     def with_all_free(self) -> "Fit":
         """The same with fixed parameters counted as free, so that the data are asked what they say of them."""
-        return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
+        return eqx.tree_at(lambda f: f.problem.active, self, jnp.asarray(np.ones(self.problem.active.shape)))
 
     @property
     def dynamic_error_std(self) -> float:
@@ -283,7 +283,7 @@ def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unkno
     length = weight.shape[1]
     apart = zeros_like(problem.segments.joined)
     for samples in _growing(problem, length):
-        masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
+        masked = jnp.asarray(np.asarray(weight) * (np.arange(length) < samples)[None, :])
         part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
         part, unknowns = on_all_devices(part, unknowns)
         unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING, least_progress=least_progress).unknowns
@@ -308,7 +308,7 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
     better = (new < 0.99 * old) & suspect
     if not better.any():
         return None
-    return Unknowns(parameters, jnp.where(better[:, None], fresh.states, found.unknowns.states))
+    return Unknowns(parameters, jnp.asarray(np.where(better[:, None], fresh.states, found.unknowns.states)))
 
 
 def zeros_like(array: Array) -> Array:

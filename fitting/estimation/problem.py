@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,6 +13,7 @@ from fitting.estimation.free_parameters import free_parameters
 from fitting.estimation.residual import Engine, Problem, Unknowns
 from fitting.estimation.scales import scales
 from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.engine.pointwise import at_instants
 from hdjax.lanes import spread
 
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
@@ -124,8 +123,9 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
         columns += [N * rate[:, 0], rate[:, 0] - rate[:, 1]]
     else:
         columns = [value[:, 0], rate[:, 0]]
-    motion = jnp.asarray(np.stack(columns, axis=1))
-    return _settled(model, motion) if any(e.states for e in model.effects) else motion
+    motion = np.stack(columns, axis=1)
+    hidden = any(e.states for e in model.effects)
+    return jnp.asarray(at_instants(_settled, (motion, 1), (model, 0)) if hidden else motion)
 
 
 def states_from(
@@ -139,17 +139,16 @@ def states_from(
         near: the other model.
         states: its initial states.
     """
-    names, states = near.state_names, jnp.asarray(np.asarray(states))
+    names, states = near.state_names, np.asarray(states)
     if names == model.state_names:
-        return states
-    found = _settled(model, states[:, : len(model.motion_states)])
+        return jnp.asarray(states)
+    found = at_instants(_settled, (states[:, : len(model.motion_states)], 1), (model, 0))
     columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
-    return jnp.stack(columns, axis=1)
+    return jnp.asarray(np.stack(columns, axis=1))
 
 
-@eqx.filter_jit
-def _settled(model: Model, motion: Array) -> Array:
-    return jax.vmap(model.settled)(motion)
+def _settled(motion: Array, model: Model) -> Array:
+    return model.settled(motion)
 
 
 def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -104,7 +104,9 @@ def _by_strength(function: Callable[..., Any], stacked: Effect, model: Model, *l
     instants = own.shape[1:-1]
     each = jax.tree.map(lambda a: a[:, None], stacked)
     strengths = np.stack([np.asarray(value) for value in _strengths(each)], axis=-1)
-    flat = [(jax.tree.map(lambda a: np.reshape(a, (-1, *a.shape[len(instants) :])), tree), 1) for tree in looked_at]
+    flat = [
+        (jax.tree.map(lambda a: np.asarray(a).reshape(-1, *a.shape[len(instants) :]), tree), 1) for tree in looked_at
+    ]
     states = own.reshape(own.shape[0], math.prod(instants), own.shape[-1])
     found = slopes_at_instants(function, (strengths, 2), (each, 2), (model, 0), *flat, (states, 2))
 
