@@ -134,8 +134,9 @@ class ArrowSystem(eqx.Module):
         solved = _solve_scaled(own, right)
         response, own_step = solved[:, :, :-1], solved[:, :, -1]
         shared = self.shared + damping * library.diag(library.where(self.yardstick > 0, self.yardstick, 1.0))
-        coupling = self.coupling.reshape(-1, shared.shape[0]).T
-        matrix = shared - coupling @ response.reshape(-1, shared.shape[0])
+        rows = own_step.size, shared.shape[0]
+        coupling = self.coupling.reshape(rows).T
+        matrix = shared - coupling @ response.reshape(rows)
         gradient = self.shared_gradient @ share - coupling @ own_step.reshape(-1)
         return matrix, gradient, response, own_step
 
