@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,8 +29,8 @@ from fitting.estimation.machine_code import task
 from fitting.estimation.problem import Segmentation, pose, short_horizon
 from fitting.estimation.residual import Problem, Unknowns, blocks
 from fitting.estimation.scales import scales
-from fitting.estimation.solve import _WIDTH as WIDTH
 from hdjax import Model, sampled
+from hdjax.compilation import on_host
 from hdjax.effects import CATALOGUE, Effect, Scales
 from hdjax.engine.kernel import _MADE
 from hdjax.engine.march import tableau
@@ -123,18 +122,11 @@ def least(call: Callable[[], Any], repeats: int) -> float:
     return min(waited(call)[1] for _ in range(repeats))
 
 
-_look = eqx.filter_jit(lambda own, unknowns: own.look(unknowns))
-
-
 def as_fitted(ready: Problem, unknowns: Unknowns) -> Callable[[], Any]:
-    """What a fit calls: a program with room for more parameters, which models share; where an effect changes the
-    torque, no program."""
-    count = len(ready.free.paths)
-    more = -count % WIDTH
-    padded = np.pad(np.asarray(unknowns.parameters), (0, more))
-    own, wide = task(ready, unknowns, count + more), dataclasses.replace(unknowns, parameters=jnp.asarray(padded))
+    """What a fit calls."""
+    own, here = task(ready, unknowns), on_host(unknowns)
     assert own is not None
-    return (lambda: _look(own, wide)) if own.acting is None else lambda: own.look(wide)
+    return lambda: own.look(here)
 
 
 def both(name: str, problem: Problem, unknowns: Unknowns, repeats: int) -> Engines:

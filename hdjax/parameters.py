@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -51,7 +52,9 @@ class ParameterInfo:
 
 def as_scalar(value: Any) -> Array:
     """Turn a number into a floating-point scalar array of JAX's default precision."""
-    # By way of numpy, since JAX would compile a program that converts a Python number.
+    # Arrays that are one stay as they are; from numbers by way of numpy, since JAX would compile a program for them.
+    if isinstance(value, jax.Array) and value.dtype == np.dtype(jnp.result_type(float)):
+        return value
     return jnp.asarray(np.asarray(value) if isinstance(value, float | int) else value, dtype=float)
 
 

@@ -180,7 +180,7 @@ def trained(
     if near is not None:
         states = states_from(model, near.model, near.unknowns.states)
         if own_states is not None:
-            states = jnp.concatenate([states[:, : -own_states.shape[1]], jnp.asarray(own_states)], axis=1)
+            states = jnp.asarray(np.hstack([np.asarray(states)[:, : -own_states.shape[1]], own_states]))
         start = Start(near.covariance, states)
     strategy = replace(strategy, least_progress=study.setting.least_progress)
     segmentation = study.setting.segmentation

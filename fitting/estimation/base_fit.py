@@ -240,7 +240,7 @@ def need_double_precision() -> None:
     Raises:
         ValueError: JAX computes in single precision.
     """
-    if jnp.zeros(0).dtype != jnp.float64:
+    if jnp.result_type(float) != jnp.float64:
         raise ValueError('fits need double precision: call jax.config.update("jax_enable_x64", True) first')
 
 

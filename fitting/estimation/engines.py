@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -63,18 +62,11 @@ def _ready(problem: Problem, values: bool) -> tuple[Problem, str | None]:
     return dataclasses.replace(problem, kernel=made), None
 
 
-def linearise(problem: Problem, unknowns: Unknowns, width: int | None = None) -> Blocks:
-    """Residual and Jacobian of a problem at some point, by its engine.
-
-    Args:
-        problem: what is solved.
-        unknowns: where.
-        width: columns of the derivatives by parameters, those behind the last parameter zero; one each where None.
-    """
+def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
+    """Residual and Jacobian of a problem at some point, by its engine."""
     if problem.kernel is not None:
-        return blocks_by_machine_code(problem, unknowns, width)
-    found = _linearise_by_xla(problem, unknowns)
-    return found if width is None else _widened(found, width)
+        return blocks_by_machine_code(problem, unknowns)
+    return _linearise_by_xla(problem, unknowns)
 
 
 _linearise_by_xla = jit_lanes(blocks)
@@ -86,14 +78,6 @@ def rows_at(problem: Problem, unknowns: Unknowns) -> Float[Array | np.ndarray, "
     if problem.kernel is not None:
         return rows_by_machine_code(problem, unknowns)
     return _linearise_by_xla(problem, unknowns).residual
-
-
-def _widened(found: Blocks, width: int) -> Blocks:
-    def wide(columns: Array) -> Array:
-        return jnp.asarray(np.pad(np.asarray(columns), [(0, 0)] * 2 + [(0, width - columns.shape[-1])]))
-
-    places = (found.by_parameter, found.before_by_parameter)
-    return eqx.tree_at(lambda b: (b.by_parameter, b.before_by_parameter), found, tuple(map(wide, places)))
 
 
 def blocks_inside(problem: Problem, unknowns: Unknowns) -> Blocks:

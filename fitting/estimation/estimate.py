@@ -44,7 +44,7 @@ class Start(eqx.Module):
     """
 
     covariance: Float[Array | np.ndarray, "outputs outputs"] | None = None
-    states: Float[Array, "segments states"] | None = None
+    states: Float[Array | np.ndarray, "segments states"] | None = None
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Fit(eqx.Module):
 
     def with_all_free(self) -> "Fit":
         """The same with fixed parameters counted as free, so that the data are asked what they say of them."""
-        return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
+        return eqx.tree_at(lambda f: f.problem.active, self, jnp.asarray(np.ones(self.problem.active.shape)))
 
     @property
     def principal_std(self) -> float:
@@ -188,21 +188,17 @@ def fit(
         states=start.states,
         engine=engine,
     )
-    swing = float(scales(stretches, model).x)
-    moves = swing * of_twist(model)[-1]
+    moves = float(scales(stretches, model).x) * of_twist(model)[-1]
+    shown = Shown.of(problem.model, moves)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
     if covariance is None:
-        covariance = (
-            evaluate(problem, unknowns).covariance
-            if scale_matters
-            else np.array([[moves**2]])
-        )
+        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[moves**2]])
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
-        problem = weighed(problem, covariance, swing)
+        problem = weighed(problem, covariance, shown)
         solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
             solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
@@ -217,7 +213,7 @@ def fit(
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=problem.free.unpack(model, values),
-        problem=weighed(problem, covariance, swing) if strategy.reweigh else problem,
+        problem=weighed(problem, covariance, shown) if strategy.reweigh else problem,
         unknowns=unknowns,
         error=jnp.asarray(solution.left_over.error),
         covariance=jnp.asarray(covariance),
@@ -247,11 +243,43 @@ def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution
     return found if mended is None else strategy.solve(problem, mended, NEARBY_DAMPING)
 
 
-def weighed(problem: Problem, covariance: Array | np.ndarray, swing: float) -> Problem:
+class Shown(eqx.Module):
+    """What shows of a unit of each state, for what it counts in a gap.
+
+    Attributes:
+        angles: derivatives of the outputs by the angles.
+        rates: likewise by the rates.
+        omega_0: natural frequency [rad/s].
+        hidden: units of the hidden states.
+        swing: of the principal output, as the spring is wound.
+        sides: each side's angle over that of the output, where other signals than both angles are measured.
+    """
+
+    angles: Float[np.ndarray, "outputs angles"]
+    rates: Float[np.ndarray, "outputs angles"]
+    omega_0: float
+    hidden: Float[np.ndarray, " hidden"]
+    swing: float
+    sides: Float[np.ndarray, " angles"] | None
+
+    @classmethod
+    def of(cls, model: Model, swing: float) -> "Shown":
+        """Of a model's states."""
+        count = len(model.motion_states) // 2
+        slopes = readout(model, model.rest())
+        hidden = np.concatenate([np.zeros(0), *(np.asarray(e.state_scale()) for e in model.effects if e.states)])
+        sides = None
+        if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:
+            sides = np.array([float(model.drive.N), 1.0])
+        own = slopes[:, :count], slopes[:, count : 2 * count]
+        return cls(*own, float(model.drive.omega_0), hidden, swing, sides)
+
+
+def weighed(problem: Problem, covariance: Array | np.ndarray, shown: Shown) -> Problem:
     """The problem, weighed by the covariance of the outputs' errors."""
     white = whitening(covariance)
-    weights = white, _gap_weight(problem, white, swing)
-    return eqx.tree_at(lambda p: (p.whitening, p.gap_weight), problem, tuple(map(jnp.asarray, weights)))
+    gap_weight = np.sqrt(problem.segments.weight.shape[1]) * _gap_weight(white, shown)
+    return replace(problem, whitening=jnp.asarray(white), gap_weight=jnp.asarray(gap_weight))
 
 
 def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
@@ -265,7 +293,7 @@ def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unkno
     length = weight.shape[1]
     apart = zeros_like(problem.segments.joined)
     for samples in _growing(problem, length):
-        masked = weight * (jnp.arange(length) < samples).astype(weight.dtype)[None, :]
+        masked = jnp.asarray(np.asarray(weight) * (np.arange(length) < samples)[None, :])
         part = eqx.tree_at(lambda p: (p.segments.weight, p.segments.joined), problem, (masked, apart))
         part, unknowns = on_all_devices(part, unknowns)
         unknowns = solve(part, unknowns, _WINDOW_STEPS, FIRST_DAMPING, least_progress=least_progress).unknowns
@@ -290,7 +318,7 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
     better = (new < 0.99 * old) & suspect
     if not better.any():
         return None
-    return Unknowns(parameters, jnp.where(better[:, None], fresh.states, found.unknowns.states))
+    return Unknowns(parameters, jnp.asarray(np.where(better[:, None], fresh.states, found.unknowns.states)))
 
 
 def zeros_like(array: Array) -> Array:
@@ -311,26 +339,20 @@ def whitening(covariance: Float[Array | np.ndarray, "outputs outputs"]) -> Float
     return np.linalg.inv(np.linalg.cholesky(np.asarray(covariance)))
 
 
-def _gap_weight(problem: Problem, white: np.ndarray, swing: float) -> Float[np.ndarray, " states"]:
-    """What the states count in a gap: about what the segment behind it would pay for it.
+def _gap_weight(white: np.ndarray, shown: Shown) -> Float[np.ndarray, " states"]:
+    """What the states count in a gap: about what each sample of the segment behind it would pay for it.
 
     An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
     state by what the error does while it runs through its range. Counted less, the residual that a closed gap costs
     would look too dear.
     """
-    model = problem.model
-    angles = len(model.motion_states) // 2
-    slopes = white @ readout(model, model.rest())
-    shown = np.linalg.norm(slopes[:, :angles], axis=0)
-    if model.measured != BOTH_ANGLES and isinstance(model, TwoInertiaModel):
+    angles = np.linalg.norm(white @ shown.angles, axis=0)
+    if shown.sides is not None:
         # What no sensor sees shows as what it drives does.
-        rates = np.linalg.norm(slopes[:, angles : 2 * angles], axis=0) * float(model.drive.omega_0)
-        sides = np.array([float(model.drive.N), 1.0])
-        shown = np.max(np.maximum(shown, rates) * sides) / sides
-    visible = 0.1 * swing * of_twist(model)[-1] * np.linalg.norm(white[:, -1])
-    hidden = [visible / np.asarray(e.state_scale()) for e in model.effects if e.states]
-    weights = np.concatenate([shown, shown / float(model.drive.omega_0), *hidden])
-    return np.sqrt(problem.segments.weight.shape[1]) * weights
+        rates = np.linalg.norm(white @ shown.rates, axis=0) * shown.omega_0
+        angles = np.max(np.maximum(angles, rates) * shown.sides) / shown.sides
+    visible = 0.1 * shown.swing * np.linalg.norm(white[:, -1])
+    return np.concatenate([angles, angles / shown.omega_0, visible / shown.hidden])
 
 
 def half_log_determinant(covariance: Array | np.ndarray) -> float:

@@ -62,13 +62,13 @@ class FreeParameters(eqx.Module):
             entries = [entry(library, *own) for own in zip(values, self.logarithmic, scale, strict=True)]
         return jnp.asarray(library.stack(entries) if entries else np.zeros(0))
 
-    def unpack(self, model: Model, vector: Float[Array, " parameters"]) -> Model:
+    def unpack(self, model: Model, vector: Float[Array | np.ndarray, " parameters"]) -> Model:
         """The model with the values that the vector stands for."""
         if not self.paths:
             return model
         return model.replace(dict(zip(self.paths, self.values(vector), strict=True)))
 
-    def values(self, vector: Float[Array, " parameters"]) -> list[Any]:
+    def values(self, vector: Float[Array | np.ndarray, " parameters"]) -> list[Any]:
         """The physical values that the vector stands for."""
         library, (entries, scale) = _library(vector, self.scale)
         return [
@@ -81,7 +81,7 @@ class FreeParameters(eqx.Module):
         return self._each(model, lambda library, v, positive, s: v if positive else s)
 
 
-def _library(*arrays: Array) -> tuple[Any, Sequence[Any]]:
+def _library(*arrays: Any) -> tuple[Any, Sequence[Any]]:
     """What to calculate with, and the arrays for it: JAX inside a program; outside it would compile one for each
     operation, so there numpy."""
     if any(isinstance(array, Tracer) for array in arrays):

@@ -19,7 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from fitting.estimation.residual import Blocks, Products, Unknowns, moved_gap
-from hdjax.where import where
+from hdjax.compilation import library_of, on_host
 
 # Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
 # keeps more is followed by a bolder one.
@@ -47,32 +47,51 @@ class Chains(eqx.Module):
         index: the chain of each segment.
     """
 
-    by_parameter: Float[Array, "segments states parameters"]
-    by_first: Float[Array, "segments states states"]
-    closing: Float[Array, "segments states"]
-    index: Int[Array, " segments"]
-
-    def collect(self, each: Array) -> Array:
-        """Sum over the segments of each chain; there are as many places as segments."""
-        return jax.ops.segment_sum(each, self.index, num_segments=each.shape[0])
+    by_parameter: Float[Array | np.ndarray, "segments states parameters"]
+    by_first: Float[Array | np.ndarray, "segments states states"]
+    closing: Float[Array | np.ndarray, "segments states"]
+    index: Int[Array | np.ndarray, " segments"]
 
 
-def chains(found: Blocks | Products, joined: Bool[Array, " segments"]) -> Chains:
+def chains(found: Blocks | Products, joined: Bool[Array | np.ndarray, " segments"]) -> Chains:
     """Follow the linearised motion from segment to segment."""
+    library = library_of(found.gap, found.before_by_parameter, joined)
     states, parameters = found.before_by_parameter.shape[1:]
-    first = jnp.concatenate([jnp.zeros((states, parameters)), jnp.eye(states), jnp.zeros((states, 1))], axis=1)
-    added = jnp.concatenate(
-        [found.before_by_parameter, jnp.zeros_like(found.before_by_state), -found.gap[:, :, None]], axis=2
+    first = np.concatenate([np.zeros((states, parameters)), np.eye(states), np.zeros((states, 1))], axis=1)
+    added = library.concatenate(
+        [found.before_by_parameter, library.zeros_like(found.before_by_state), -found.gap[:, :, None]], axis=2
     )
+    path = (_path_inside if library is jnp else _path)(first, joined, found.before_by_state, added)
+    index = library.cumsum(library.where(joined, 0, 1)) - 1
+    return Chains(path[..., :parameters], path[..., parameters:-1], path[..., -1], library.maximum(index, 0))
+
+
+def _path(first: np.ndarray, joined: Any, by_state: Any, added: Any) -> Any:
+    """What becomes of the first state of each chain, segment by segment: `by_state @ before + added`."""
+    path = np.tile(first, (len(added), 1, 1))
+    for here in np.flatnonzero(joined):
+        path[here] = by_state[here] @ path[here - 1] + added[here]
+    return path
+
+
+def _path_inside(first: np.ndarray, joined: Any, by_state: Any, added: Any) -> Any:
+    """[`_path`][] inside a program of JAX."""
 
     def follow(before, inputs):
         continues, by_state, own = inputs
-        here = where(continues, by_state @ before + own, first)
+        here = jnp.where(continues, by_state @ before + own, first)
         return here, here
 
-    _, path = jax.lax.scan(follow, first, (joined, found.before_by_state, added))
-    index = jnp.cumsum(where(joined, 0, 1)) - 1
-    return Chains(path[..., :parameters], path[..., parameters:-1], path[..., -1], jnp.maximum(index, 0))
+    return jax.lax.scan(follow, jnp.asarray(first), (joined, by_state, added))[1]
+
+
+def _collected(each: Any, index: Any) -> Any:
+    """Sum over the segments of each chain; there are as many places as segments."""
+    if library_of(each, index) is jnp:
+        return jax.ops.segment_sum(each, index, num_segments=each.shape[0])
+    total = np.zeros(each.shape)
+    np.add.at(total, index, each)
+    return total
 
 
 class ArrowSystem(eqx.Module):
@@ -89,15 +108,15 @@ class ArrowSystem(eqx.Module):
         yardstick: what damping of the shared parameters is relative to.
     """
 
-    shared: Float[Array, "parameters parameters"]
-    own: Float[Array, "segments states states"]
-    coupling: Float[Array, "segments states parameters"]
-    shared_gradient: Float[Array, "parameters 2"]
-    own_gradient: Float[Array, "segments states 2"]
+    shared: Float[Array | np.ndarray, "parameters parameters"]
+    own: Float[Array | np.ndarray, "segments states states"]
+    coupling: Float[Array | np.ndarray, "segments states parameters"]
+    shared_gradient: Float[Array | np.ndarray, "parameters 2"]
+    own_gradient: Float[Array | np.ndarray, "segments states 2"]
     chains: Chains
-    yardstick: Float[Array, " parameters"]
+    yardstick: Float[Array | np.ndarray, " parameters"]
 
-    def eliminate(self, damping: Array, closing: Array) -> tuple[Array, Array, Array, Array]:
+    def eliminate(self, damping: Any, closing: Any) -> tuple[Any, Any, Any, Any]:
         """Solve each chain for its own first state.
 
         Args:
@@ -108,89 +127,120 @@ class ArrowSystem(eqx.Module):
             The reduced matrix and gradient of the shared parameters, and each chain's response `own^-1 coupling`
             and `own^-1 own_gradient`.
         """
-        share = jnp.stack([jnp.ones_like(closing), closing])
+        library = library_of(self.own, damping, closing)
+        share = library.stack([library.ones_like(closing), closing])
         own = self.own + damping * _diagonal(self.own)
-        right = jnp.concatenate([self.coupling, (self.own_gradient @ share)[:, :, None]], axis=2)
-        solved = jax.vmap(_solve_scaled)(own, right)
+        right = library.concatenate([self.coupling, (self.own_gradient @ share)[:, :, None]], axis=2)
+        solved = _solve_scaled(own, right)
         response, own_step = solved[:, :, :-1], solved[:, :, -1]
-        shared = self.shared + damping * jnp.diag(where(self.yardstick > 0, self.yardstick, 1.0))
-        matrix = shared - jnp.einsum("sqp,sqr->pr", self.coupling, response)
-        gradient = self.shared_gradient @ share - jnp.einsum("sqp,sq->p", self.coupling, own_step)
+        shared = self.shared + damping * library.diag(library.where(self.yardstick > 0, self.yardstick, 1.0))
+        rows = own_step.size, shared.shape[0]
+        coupling = self.coupling.reshape(rows).T
+        matrix = shared - coupling @ response.reshape(rows)
+        gradient = self.shared_gradient @ share - coupling @ own_step.reshape(-1)
         return matrix, gradient, response, own_step
 
-    def step(self, damping: Array, longest: Float[Array, " parameters"] | float = jnp.inf) -> Unknowns:
+    def step(self, damping: Any, longest: Float[Array | np.ndarray, " parameters"] | float = jnp.inf) -> Unknowns:
         """The damped Gauss-Newton step; damping holds back the closing of the gaps as well.
 
         Args:
             damping: relative to the diagonals, see [`ArrowSystem.eliminate`][].
             longest: how far each shared parameter may go; where one would go farther, all else suits where it goes.
         """
+        library = library_of(self.own, damping)
         closing = 1.0 / (1.0 + damping)
         matrix, gradient, response, own_step = self.eliminate(damping, closing)
         wanted = -_solve_scaled(matrix, gradient[:, None])[:, 0]
-        held = jnp.abs(wanted) > longest
-        ends = where(held, jnp.sign(wanted) * longest, 0.0)
-        left = where(held, 0.0, gradient + matrix @ ends)
-        others = where(held[:, None] | held[None, :], 0.0, matrix)
+        held = library.abs(wanted) > longest
+        ends = library.where(held, library.sign(wanted) * longest, 0.0)
+        left = library.where(held, 0.0, gradient + matrix @ ends)
+        others = library.where(held[:, None] | held[None, :], 0.0, matrix)
         shared = ends - _solve_scaled(others, left[:, None])[:, 0]
-        first = -own_step - jnp.einsum("sqp,p->sq", response, shared)
+        first = -own_step - response @ shared
         path = self.chains
-        states = jnp.einsum("sqp,p->sq", path.by_parameter, shared)
-        states = states + jnp.einsum("sqk,sk->sq", path.by_first, first[path.index]) + closing * path.closing
-        return Unknowns(shared, states)
+        states = path.by_parameter @ shared + closing * path.closing
+        return Unknowns(shared, states + (path.by_first @ first[path.index][:, :, None])[:, :, 0])
 
 
-def normal_equations(found: Products, joined: Bool[Array, " segments"]) -> ArrowSystem:
-    """The normal equations of a linearised residual, with the gaps closed."""
+def normal_equations(
+    found: Products, joined: Bool[Array | np.ndarray, " segments"], yardstick: Any = 0.0
+) -> ArrowSystem:
+    """The normal equations of a linearised residual, with the gaps closed; by numpy outside programs of JAX.
+
+    Args:
+        found: of residual and Jacobian.
+        joined: whether a segment starts where the one before it ends.
+        yardstick: what damping of the shared parameters is relative to at least.
+    """
+    library = library_of(found.gap, found.before_by_parameter, joined)
+    found, joined = on_host((found, joined))
     path = chains(found, joined)
     states, parameters = found.before_by_parameter.shape[1:]
     # From (parameters, first state, residual, closing) to (parameters, own state, residual), segment by segment.
-    through = jnp.concatenate(
-        [path.by_parameter, path.by_first, jnp.zeros_like(path.closing)[..., None], path.closing[..., None]], axis=2
+    through = library.concatenate(
+        [path.by_parameter, path.by_first, library.zeros_like(path.closing)[..., None], path.closing[..., None]], axis=2
     )
-    above = jnp.broadcast_to(jnp.eye(parameters, through.shape[2]), (through.shape[0], parameters, through.shape[2]))
-    below = jnp.broadcast_to(jnp.eye(1, through.shape[2], parameters + states), (through.shape[0], 1, through.shape[2]))
-    change = jnp.concatenate([above, through, below], axis=1)
-    total = jnp.einsum("sia,sij,sjb->sab", change, found.products, change)
+    segments, columns = len(through), through.shape[2]
+    above = library.broadcast_to(library.eye(parameters, columns), (segments, parameters, columns))
+    below = library.broadcast_to(library.eye(1, columns, parameters + states), (segments, 1, columns))
+    change = library.concatenate([above, through, below], axis=1)
+    total = library.swapaxes(change, 1, 2) @ found.products @ change
     mine = slice(parameters, parameters + states)
-    shared = jnp.sum(total[:, :parameters, :parameters], axis=0)
+    shared = library.sum(total[:, :parameters, :parameters], axis=0)
     return ArrowSystem(
         shared=shared,
-        own=path.collect(total[:, mine, mine]),
-        coupling=path.collect(total[:, mine, :parameters]),
-        shared_gradient=jnp.sum(total[:, :parameters, parameters + states :], axis=0),
-        own_gradient=path.collect(total[:, mine, parameters + states :]),
+        own=_collected(total[:, mine, mine], path.index),
+        coupling=_collected(total[:, mine, :parameters], path.index),
+        shared_gradient=library.sum(total[:, :parameters, parameters + states :], axis=0),
+        own_gradient=_collected(total[:, mine, parameters + states :], path.index),
         chains=path,
-        yardstick=jnp.diagonal(shared),
+        yardstick=library.maximum(library.diagonal(shared), yardstick),
     )
 
 
-def project(found: Blocks, joined: Bool[Array, " segments"]) -> Float[Array, "segments rows parameters"]:
+def project(
+    found: Blocks, joined: Bool[Array | np.ndarray, " segments"]
+) -> Float[Array | np.ndarray, "segments rows parameters"]:
     """The parameters' columns without what each chain's own first state could do as well."""
     system = normal_equations(Products.of(found), joined)
-    _, _, response, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
+    _, _, response, _ = system.eliminate(np.zeros(()), np.ones(()))
     path = system.chains
-    moved = path.by_parameter - jnp.einsum("sqk,skp->sqp", path.by_first, response[path.index])
-    return found.by_parameter + jnp.einsum("srq,sqp->srp", found.by_state, moved)
+    moved = path.by_parameter - path.by_first @ response[path.index]
+    return found.by_parameter + found.by_state @ moved
 
 
-def _diagonal(matrix: Array) -> Array:
+def _diagonal(matrix: Any) -> Any:
     """The diagonal part of each matrix; where it is zero (padding), ones."""
-    d = jnp.diagonal(matrix, axis1=-2, axis2=-1)
-    return where(d > 0, d, 1.0)[..., None] * jnp.broadcast_to(jnp.eye(d.shape[-1]), matrix.shape)
+    library = library_of(matrix)
+    d = library.diagonal(matrix, axis1=-2, axis2=-1)
+    return library.where(d > 0, d, 1.0)[..., None] * np.broadcast_to(np.eye(d.shape[-1]), matrix.shape)
 
 
-def _solve_scaled(matrix: Array, right: Array) -> Array:
-    """Solve a symmetric positive system after scaling its diagonal to one; a direction without information does not
-    move."""
-    d = jnp.diagonal(matrix)
-    scale = where(d > 0, 1.0 / jnp.sqrt(where(d > 0, d, 1.0)), 0.0)
-    empty = where(d > 0, 0.0, 1.0)
-    scaled = matrix * scale[:, None] * scale[None, :] + jnp.diag(empty + 1e-13)
-    lower = jax.lax.linalg.cholesky(scaled, symmetrize_input=False)
-    half = jax.lax.linalg.triangular_solve(lower, scale[:, None] * right, left_side=True, lower=True)
-    whole = jax.lax.linalg.triangular_solve(lower, half, left_side=True, lower=True, transpose_a=True)
-    return scale[:, None] * whole
+def _solve_scaled(matrix: Any, right: Any) -> Any:
+    """Solve symmetric positive systems after scaling their diagonals to one; a direction without information does not
+    move. Without a solution to working precision, no numbers."""
+    library = library_of(matrix, right)
+    matrix, right = on_host((matrix, right))
+    d = library.diagonal(matrix, axis1=-2, axis2=-1)[..., None]
+    scale = library.where(d > 0, 1.0 / library.sqrt(library.where(d > 0, d, 1.0)), 0.0)
+    empty = library.where(d > 0, 0.0, 1.0)
+    scaled = matrix * scale * library.swapaxes(scale, -1, -2)
+    scaled = scaled + (empty + 1e-13) * np.broadcast_to(np.eye(matrix.shape[-1]), matrix.shape)
+    if library is jnp:
+        lower = jax.lax.linalg.cholesky(scaled, symmetrize_input=False)
+        half = jax.lax.linalg.triangular_solve(lower, scale * right, left_side=True, lower=True)
+        return scale * jax.lax.linalg.triangular_solve(lower, half, left_side=True, lower=True, transpose_a=True)
+    lower = _cholesky(scaled)
+    half = np.linalg.solve(lower, scale * right)
+    return scale * np.linalg.solve(np.swapaxes(lower, -1, -2), half)
+
+
+def _cholesky(matrix: np.ndarray) -> np.ndarray:
+    """The factors of matrices; no numbers where one is not positive."""
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return np.stack([_cholesky(m) for m in matrix]) if matrix.ndim > 2 else np.full(matrix.shape, np.nan)
 
 
 class Iteration(eqx.Module):
@@ -212,13 +262,13 @@ class Iteration(eqx.Module):
     ahead: Unknowns
     found: Products
     costs: Float[Array | np.ndarray, " latest"]
-    rows: Float[Array | np.ndarray, ""]
-    gap: Float[Array | np.ndarray, ""]
-    promised: Float[Array | np.ndarray, ""]
-    size: Float[Array | np.ndarray, ""]
+    rows: Float[Array | np.ndarray | np.float64, ""]
+    gap: Float[Array | np.ndarray | np.float64, ""]
+    promised: Float[Array | np.ndarray | np.float64, ""]
+    size: Float[Array | np.ndarray | np.float64, ""]
     yardstick: Float[Array | np.ndarray, " parameters"]
-    count: Int[Array | np.ndarray, ""]
-    accepted: Bool[Array | np.ndarray, ""]
+    count: Int[Array | np.ndarray | np.int64, ""]
+    accepted: Bool[Array | np.ndarray | np.bool_, ""]
 
 
 class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -247,8 +297,8 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         least_progress: share of the sum of squares that a few steps must take off it.
     """
 
-    joined: Bool[Array, " segments"]
-    gap_weight: Float[Array, " states"]
+    joined: Bool[Array | np.ndarray, " segments"]
+    gap_weight: Float[Array | np.ndarray, " states"]
     damping: Float[Array | np.ndarray, ""]
     most_steps: Int[Array | np.ndarray, ""]
     rows: Float[Array | np.ndarray, ""]
@@ -276,28 +326,27 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state: Iteration, tags) -> tuple[Unknowns, Iteration, Products]:
         _, seen = fn(state.ahead, args)
-        weight = self.gap_weight[None]
-        rows, gap = seen.square, jnp.sum((seen.gap * weight) ** 2)
+        library = library_of(state.count, seen.gap)
+        where = library.where
+        rows, gap = seen.square, library.sum((seen.gap * self.gap_weight[None]) ** 2)
         cost, before, first = 0.5 * (rows + gap), state.costs[0], state.count == 0
         kept = first | (cost - before <= _KEPT * state.promised)
         well = ~first & (cost - before < _WELL * state.promised)
-        slight = jnp.abs(cost - before) < _SLIGHT * before
+        slight = library.abs(cost - before) < _SLIGHT * before
         closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * state.rows)
         accepted = kept | slight | closing
         size = state.size * where(kept, where(well, _LONGER, 1.0), where(accepted, 1.0, _SHORTER))
-        costs = jnp.concatenate([cost[None], state.costs[:-1]])
+        costs = library.concatenate([cost[None], state.costs[:-1]])
         new, old = (state.ahead, seen, costs, rows, gap), (y, state.found, state.costs, state.rows, state.gap)
         best, found, costs, rows, gap = jax.tree.map(lambda a, b: where(accepted, a, b), new, old)
 
-        system = normal_equations(found, self.joined)
         # A parameter that has run to where it hardly shows must not be set free there: its damping is relative to the
         # most that it has ever shown (Moré 1978).
-        yardstick = jnp.maximum(system.yardstick, state.yardstick)
-        system = eqx.tree_at(lambda s: s.yardstick, system, yardstick)
-        step = system.step(jnp.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
+        system = normal_equations(found, self.joined, state.yardstick)
+        step = system.step(library.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
         promised = self._promised(found, step)
         # Where the system has no solution to working precision, another step from here is more damped.
-        solved = jnp.isfinite(promised)
+        solved = library.isfinite(promised)
         after = Iteration(
             ahead=jax.tree.map(lambda a, b: where(solved, a + b, a), best, step),
             found=found,
@@ -306,35 +355,39 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gap=gap,
             promised=where(solved, promised, -jnp.inf),
             size=where(solved, size, _SHORTER * size),
-            yardstick=yardstick,
+            yardstick=system.yardstick,
             count=state.count + 1,
             accepted=accepted,
         )
         return best, after, found
 
-    def _promised(self, found: Products, step: Unknowns) -> Float[Array, ""]:
+    def _promised(self, found: Products, step: Unknowns) -> Any:
         """By how much half the sum of squares changes along a step, to second order."""
+        library = library_of(found.gap, step.states)
         segments = step.states.shape[0]
-        own = jnp.broadcast_to(step.parameters, (segments, step.parameters.size))
-        column = jnp.concatenate([own, step.states, jnp.zeros((segments, 1))], axis=1)
-        changed = jnp.einsum("sij,sj->si", found.products, column)
+        own = library.broadcast_to(step.parameters, (segments, step.parameters.size))
+        column = library.concatenate([own, step.states, library.zeros((segments, 1))], axis=1)
+        changed = (found.products @ column[:, :, None])[:, :, 0]
         gap, moved = (g * self.gap_weight[None] for g in (found.gap, moved_gap(found, self.joined, step)))
-        rows = jnp.sum(changed[:, -1]) + 0.5 * jnp.sum(column * changed)
-        return rows + jnp.sum(moved * (gap + 0.5 * moved))
+        rows = library.sum(changed[:, -1]) + 0.5 * library.sum(column * changed)
+        return rows + library.sum(moved * (gap + 0.5 * moved))
+
+    def ended(self, y: Unknowns, state: Iteration) -> tuple[Any, Any]:
+        """Whether the next step promises next to nothing; and whether to stop all the same."""
+        library = library_of(state.count, y.states)
+        newest, oldest = state.costs[0], state.costs[-1]
+        small = library.abs(state.promised) < self.rtol * newest / self.rows
+        # Rounding may leave nothing of a step that still promises something.
+        still = [library.all(a == b) for a, b in zip(jax.tree.leaves(state.ahead), jax.tree.leaves(y), strict=True)]
+        small = small | (library.isfinite(state.promised) & still[0] & still[1])
+        # To close gaps may cost more than it takes off: without a least progress none is asked for.
+        stalled = (self.least_progress > 0) & (oldest < (1.0 + self.least_progress) * newest)
+        done = (state.count > 0) & (small | stalled)
+        return done, ~done & (state.count >= self.most_steps)
 
     def terminate(self, fn, y, args, options, state: Iteration, tags):
         """Whether to stop: by the decrease that the next step promises."""
-        costs = jnp.asarray(state.costs)
-        newest, oldest = costs[0], costs[-1]
-        small = jnp.abs(state.promised) < self.rtol * newest / self.rows
-        # Rounding may leave nothing of a step that still promises something.
-        still = [jnp.all(a == b) for a, b in zip(jax.tree.leaves(state.ahead), jax.tree.leaves(y), strict=True)]
-        small = small | (jnp.isfinite(state.promised) & jnp.all(jnp.stack(still)))
-        # To close gaps may cost more than it takes off: without a least progress none is asked for.
-        least = jnp.asarray(self.least_progress)
-        stalled = (least > 0) & (oldest - newest < least * newest)
-        done = (state.count > 0) & (small | stalled)
-        late = ~done & (state.count >= self.most_steps)
+        done, late = self.ended(y, state)
         successful, most = optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         return done | late, optx.RESULTS.where(late, most, successful)
 

@@ -5,8 +5,6 @@ model answers a force is the same for all of them, so that it is computed once: 
 the deviation on, two more add what a force that runs in a straight line through the interval does.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,9 +26,6 @@ from hdjax.simulate import march
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
 """Where a sample interval, from -1 to 1, is looked into; exact for a sextic's mean and a quintic's first moment."""
-
-# Segments that a program of JAX takes at a time.
-_SEGMENTS = 32
 
 
 class Followed(eqx.Module):
@@ -119,23 +114,7 @@ def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments inte
     effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
     if not effects:
         return np.asarray(segments.torque.coefficients)
-    knots, logged = segments.torque.knots, segments.torque.coefficients
-    return some_at_a_time(
-        lambda *torque: actuated(effects, (), jnp.zeros(0), PiecewisePolynomial(*torque))[0], knots, logged
-    )
-
-
-def some_at_a_time(program: Callable[..., Array], *arrays: Array | np.ndarray) -> np.ndarray:
-    """What a program of JAX makes of segments, so many at a time that logs of all lengths share it.
-
-    Args:
-        program: from arrays whose first axis is one of segments to such an array.
-        arrays: of all segments.
-    """
-    count = len(arrays[0])
-    places = (np.minimum(np.arange(start, start + _SEGMENTS), count - 1) for start in range(0, count, _SEGMENTS))
-    found = [np.asarray(program(*(jnp.asarray(np.asarray(a)[own]) for a in arrays))) for own in places]
-    return np.concatenate(found)[:count]
+    return np.asarray(actuated(effects, (), jnp.asarray(np.zeros(0)), segments.torque)[0])
 
 
 def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray) -> np.ndarray:

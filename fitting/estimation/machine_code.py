@@ -2,61 +2,67 @@
 program for each model."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import LARGEST_LOG
 from fitting.estimation.residual import LOST, Blocks, Problem, Products, Unknowns
 from hdjax import PiecewisePolynomial
+from hdjax.compilation import is_traced, jit_small, library_of, on_host, some_at_a_time
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
-from hdjax.engine.kernel import Mode, Wanted, march_arrays, result_shapes
+from hdjax.engine.kernel import Mode, Wanted, march_arrays
 
 # The model's constants come in tables of so many, so that few sizes of them make few programs.
 _CONSTANTS = 32
 
 
-def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | None = None) -> Lanes:
-    """What the machine code needs of a problem; arguments as in [`_as_logged`][]."""
+def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
+    """What the machine code needs of a problem."""
     acting = _acting(problem, kernel)
-    lanes = _as_logged(problem, unknowns, kernel, width)
+    lanes = _as_logged(problem, unknowns, kernel)
     return lanes if acting is None else acting.on(lanes)
 
 
-def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int | None) -> Lanes:
+def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
     """What the machine code needs of a problem, with the torque as it was logged.
 
     Args:
         problem: what is solved.
         unknowns: where.
         kernel: of the problem's model.
-        width: columns of the derivatives by parameters, those behind the last parameter zero; one each where None.
     """
-    segments, free = problem.segments, problem.free
+    free = problem.free
     # Outside a program of JAX numpy does this, for which nothing is compiled.
-    library: Any = jnp if _is_traced((problem, unknowns)) else np
+    library = jnp if is_traced(problem, unknowns) else np
     values = free.values(unknowns.parameters)
     model = problem.model.replace(dict(zip(free.paths, values, strict=True))) if free.paths else problem.model
-    slopes = free.slopes(model) * library.asarray(problem.active)
+    slopes = library.asarray(free.slopes(model)) * library.asarray(problem.active)
+    own = library.asarray(values, dtype=float).reshape(-1), slopes, unknowns.states
+    return _data(problem, kernel, *own, library=library)
+
+
+def _data(problem: Problem, kernel: Kernel, free: Any, slopes: Any, states: Any, *, library: Any) -> Lanes:
+    """The same for what is free, and initial states."""
+    segments = problem.segments
     _, others, _ = split_model(problem.model, kernel.paths)
     constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
-    more = 0 if width is None else width - len(free.paths)
     whole = library.any(library.asarray(segments.joined))
     numbers = [library.asarray(problem.substeps), whole, threads()]
     named = {"load torque": segments.load_torque, "temperature": segments.temperature}
     beside = [named[name] for name in kernel.signals]
     return Lanes(
-        free=library.pad(library.asarray(values, dtype=float).reshape(-1), (0, more)),
-        slopes=library.pad(library.asarray(slopes), (0, more)),
+        free=free,
+        slopes=slopes,
         constants=library.pad(constants, (0, -constants.size % _CONSTANTS)),
-        states=unknowns.states,
+        states=states,
         knots=segments.torque.knots,
         measured=segments.measured,
         weight=segments.weight,
@@ -65,10 +71,6 @@ def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel, width: int 
         settings=library.stack([library.asarray(n, dtype=np.int64) for n in numbers]),
         signals=(segments.torque.coefficients, *(s.coefficients for s in beside if s is not None)),
     )
-
-
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 class Acting(eqx.Module):
@@ -91,7 +93,7 @@ class Acting(eqx.Module):
         logged."""
         values = jnp.asarray(lanes.free[np.array(self.places, dtype=int)])
         torque, slopes = actuated(self.effects, self.paths, values, self.torque)
-        return eqx.tree_at(lambda s: s.signals, lanes, (torque, *lanes.signals[1:], *slopes))
+        return replace(lanes, signals=(torque, *lanes.signals[1:], *slopes))
 
 
 def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
@@ -101,24 +103,31 @@ def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
     return Acting(effects, paths, kernel.acting, problem.segments.torque) if effects else None
 
 
-class _Actuators(eqx.Module):
-    """Effects on the torque, on their own."""
-
-    effects: tuple[ActuatorEffect, ...]
-
-
-@eqx.filter_jit
 def actuated(
     actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
-) -> tuple[Array, tuple[Array, ...]]:
+) -> tuple[Any, tuple[Any, ...]]:
     """The torque that acts, and its derivatives by the parameters at the paths."""
+    if is_traced(values, torque):
+        return _actuated(tuple(actuators), paths, values, torque)
+    return some_at_a_time(
+        lambda *own: _actuated(tuple(actuators), paths, values, PiecewisePolynomial(*own)),
+        torque.knots,
+        torque.coefficients,
+    )
+
+
+@jit_small
+def _actuated(
+    actuators: tuple[ActuatorEffect, ...], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
+) -> tuple[Array, tuple[Array, ...]]:
+    """[`actuated`][] of so many segments."""
 
     def places(own: tuple[ActuatorEffect, ...]) -> list[Any]:
         by_name = {e.name: e for e in own}
         return [getattr(by_name[name], field) for name, field in (p.split(".") for p in paths)]
 
     def acts(values: Array) -> Array:
-        own = tuple(actuators)
+        own = actuators
         if paths:
             own = eqx.tree_at(places, own, list(values))
 
@@ -135,17 +144,18 @@ def actuated(
     return found, tuple(moved)
 
 
-def blocks_by_machine_code(problem: Problem, unknowns: Unknowns, width: int | None = None) -> Blocks:
-    """[`fitting.estimation.residual.blocks`][] by machine code; arguments as in [`lanes_of`][]."""
+def blocks_by_machine_code(problem: Problem, unknowns: Unknowns) -> Blocks:
+    """[`fitting.estimation.residual.blocks`][] by machine code."""
     kernel = problem.kernel
     assert kernel is not None
-    lanes = lanes_of(problem, unknowns, kernel, width)
+    lanes = lanes_of(problem, unknowns, kernel)
     found = _march(kernel.jacobian, lanes, kernel.hidden, "jacobian")
     gap, before_by_parameter, before_by_state = _ends(lanes, found)
+    assert found.by_parameter is not None and found.by_state is not None
     return Blocks(
-        residual=jnp.asarray(found.rows),
-        by_parameter=jnp.asarray(found.by_parameter),
-        by_state=jnp.asarray(found.by_state),
+        residual=found.rows,
+        by_parameter=found.by_parameter,
+        by_state=found.by_state,
         gap=gap,
         before_by_parameter=before_by_parameter,
         before_by_state=before_by_state,
@@ -164,11 +174,11 @@ def rows_by_machine_code(problem: Problem, unknowns: Unknowns) -> Float[np.ndarr
 
 def _march(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian") -> Marched:
     """Outside a program of JAX none is compiled."""
-    return (march_lanes if _is_traced((address, lanes)) else march_arrays)(address, lanes, hidden, mode, wanted)
+    return (march_lanes if is_traced(address, lanes) else march_arrays)(address, lanes, hidden, mode, wanted)
 
 
 class Task(eqx.Module):
-    """A problem that can be looked at from any point, by numpy or within a program of JAX.
+    """A problem that can be looked at from any point, outside programs of JAX.
 
     Attributes:
         address: of the machine code.
@@ -176,7 +186,7 @@ class Task(eqx.Module):
         acting: effects on the logged torque; None where there are none.
         logarithmic: which parameters move by their logarithm.
         scale: unit of each of the others.
-        active: 1 for a parameter that may move, 0 for one that is held, or that there is not.
+        active: 1 for a parameter that may move, 0 for one that is held.
         centre: what is known beforehand of each parameter's entry, see
             [`fitting.estimation.free_parameters.FreeParameters`][].
         precision: likewise.
@@ -193,60 +203,49 @@ class Task(eqx.Module):
     precision: np.ndarray
     hidden: int = eqx.field(static=True)
 
-    def look(self, unknowns: Unknowns) -> tuple[Products, Float[Array, "segments rows"]]:
+    def look(self, unknowns: Unknowns) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
         """The normal equations of the residual at a point, and its rows."""
         vector = unknowns.parameters
-        library: Any = jnp if _is_traced((self, unknowns)) else np
-        if library is np:
-            vector = np.asarray(vector)
-        power = library.exp(library.clip(vector, -LARGEST_LOG, LARGEST_LOG))
-        value = library.where(self.logarithmic, power, vector * self.scale)
-        slope = library.where(self.logarithmic, value, self.scale) * self.active
-        lanes = eqx.tree_at(lambda s: (s.free, s.slopes, s.states), self.lanes, (value, slope, unknowns.states))
+        with np.errstate(over="ignore"):
+            power = np.exp(np.clip(vector, -LARGEST_LOG, LARGEST_LOG))
+        value = np.where(self.logarithmic, power, vector * self.scale)
+        slope = np.where(self.logarithmic, value, self.scale) * self.active
+        lanes = replace(self.lanes, free=value, slopes=slope, states=unknowns.states)
         if self.acting is not None:
             lanes = self.acting.on(lanes)
-        found = _march(self.address, lanes, self.hidden, "jacobian", "products")
+        found = march_arrays(self.address, lanes, self.hidden, "jacobian", "products")
         assert found.products is not None
         products = Products(found.products, *_ends(lanes, found))
         off = self.precision * (vector - self.centre)
-        return products.beside_prior(off, self.precision * self.active), jnp.asarray(found.rows)
-
-    def blank(self) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
-        """Zeros like what a look finds."""
-        shapes = result_shapes(self.lanes, self.hidden, "jacobian", "products")
-        rows, end, _, _, by_parameter, by_state, products = map(np.zeros, shapes)
-        return Products(products, end, by_parameter, by_state), rows
+        return products.beside_prior(off, self.precision * self.active), np.asarray(found.rows)
 
 
-def task(problem: Problem, unknowns: Unknowns, width: int) -> Task | None:
-    """A problem ready to be looked at by machine code; None where there is none.
-
-    Args:
-        problem: what is solved.
-        unknowns: any.
-        width: room for the parameters.
-    """
-    kernel = problem.kernel
+def task(problem: Problem, unknowns: Unknowns) -> Task | None:
+    """A problem ready to be looked at by machine code, from any unknowns; None where there is none."""
+    kernel, free = problem.kernel, problem.free
     if kernel is None:
         return None
-    free = problem.free
-    more = (0, width - len(free.paths))
+    acting, values = _acting(problem, kernel), np.asarray([*free.values(unknowns.parameters)], dtype=float)
+    lanes = on_host(_data(problem, kernel, values, np.zeros(values.size), unknowns.states, library=np))
+    # Where nothing moves the torque, what acts is one for all looks.
+    if acting is not None and not np.asarray(problem.active).any():
+        lanes, acting = acting.on(lanes), None
     return Task(
         address=kernel.jacobian,
-        lanes=_as_logged(problem, unknowns, kernel, width),
-        acting=_acting(problem, kernel),
-        logarithmic=np.pad(np.array(free.logarithmic, dtype=bool), more),
-        scale=np.pad(np.asarray(free.scale), more, constant_values=1.0),
-        active=np.pad(np.asarray(problem.active), more),
-        centre=np.pad(np.asarray(free.centre), more),
-        precision=np.pad(np.asarray(free.precision), more),
+        lanes=lanes,
+        acting=acting,
+        logarithmic=np.array(free.logarithmic, dtype=bool),
+        scale=np.asarray(free.scale),
+        active=np.asarray(problem.active),
+        centre=np.asarray(free.centre),
+        precision=np.asarray(free.precision),
         hidden=kernel.hidden,
     )
 
 
-def _ends(lanes: Lanes, found: Marched) -> tuple[Array, Array, Array]:
+def _ends(lanes: Lanes, found: Marched) -> tuple[Any, Any, Any]:
     """The gap before each segment, and the derivatives of the end of the segment before."""
-    library: Any = jnp if _is_traced((lanes, found)) else np
+    library = library_of(lanes.states, found.end)
     joined, gap = library.asarray(lanes.joined)[:, None] > 0, _gap(lanes, found)
     near = library.abs(gap) < LOST
 
@@ -257,7 +256,7 @@ def _ends(lanes: Lanes, found: Marched) -> tuple[Array, Array, Array]:
     # A state that has run away stands for itself: nothing before it moves the gap.
     own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
     by_parameter, by_state = before(found.end_by_parameter), before(found.end_by_state) + own
-    return jnp.asarray(gap), jnp.asarray(by_parameter), jnp.asarray(by_state)
+    return gap, by_parameter, by_state
 
 
 def residual_by_machine_code(
@@ -271,13 +270,13 @@ def residual_by_machine_code(
     return jnp.asarray(found.rows), _gap(lanes, found)
 
 
-def _gap(lanes: Lanes, found: Marched) -> Array:
+def _gap(lanes: Lanes, found: Marched) -> Any:
     """How far each joined segment starts from where the one before it ends."""
-    library: Any = jnp if _is_traced((lanes, found)) else np
+    library = library_of(lanes.states, found.end)
     with np.errstate(invalid="ignore"):
         gap = library.asarray(lanes.states) - library.roll(found.end, 1, axis=0)
     joined = library.asarray(lanes.joined)[:, None] > 0
-    return jnp.asarray(library.where(joined, library.where(library.abs(gap) < LOST, gap, LOST), 0.0))
+    return library.where(joined, library.where(library.abs(gap) < LOST, gap, LOST), 0.0)
 
 
 def simulated(
@@ -287,7 +286,7 @@ def simulated(
     kernel = problem.kernel
     assert kernel is not None and kernel.values is not None
     lanes = lanes_of(problem, unknowns, kernel)
-    library: Any = jnp if _is_traced(lanes) else np
+    library = jnp if is_traced(lanes) else np
     segments, samples, outputs = lanes.measured.shape
     settings = library.asarray(lanes.settings) * np.array([1, 0, 1]) + np.array([0, 1, 0])
     plain = np.zeros(lanes.measured.shape), np.ones(lanes.weight.shape), -np.eye(outputs), settings

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,6 +15,7 @@ from fitting.estimation.residual import Engine, Problem, Unknowns
 from fitting.estimation.scales import scales
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.dynamics import BOTH_ANGLES
+from hdjax.engine.pointwise import at_instants
 from hdjax.lanes import spread
 
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
@@ -57,7 +56,7 @@ def pose(
     segmentation: Segmentation,
     *,
     hold_parameters: bool = False,
-    states: Float[Array, "segments states"] | None = None,
+    states: Float[Array | np.ndarray, "segments states"] | None = None,
     engine: Engine | None = None,
 ) -> tuple[Problem, Unknowns]:
     """Pose a fit: what is solved, not weighed yet, and where the iteration begins.
@@ -105,8 +104,7 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
     sees of the motion is put in by the equations.
     """
     if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:
-        found = jnp.asarray(observed_states(model, segments))
-        return _settled(model, found) if any(e.states for e in model.effects) else found
+        return _with_own_states(model, observed_states(model, segments))
     length = segments.measured.shape[1]
     measured, knots = np.asarray(segments.measured), segments.knots
     step = float(np.median(np.diff(knots)))
@@ -130,12 +128,19 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
         columns += [N * rate[:, 0], rate[:, 0] - rate[:, 1]]
     else:
         columns = [value[:, 0], rate[:, 0]]
-    motion = jnp.asarray(np.stack(columns, axis=1))
-    return _settled(model, motion) if any(e.states for e in model.effects) else motion
+    return _with_own_states(model, np.stack(columns, axis=1))
+
+
+def _with_own_states(
+    model: Model, motion: Float[np.ndarray, "segments motion_states"]
+) -> Float[Array, "segments states"]:
+    """The motion's states with those of the effects, as if the drive had long moved like this."""
+    hidden = any(e.states for e in model.effects)
+    return jnp.asarray(at_instants(_settled, (motion, 1), (model, 0)) if hidden else motion)
 
 
 def states_from(
-    model: Model, near: Model, states: Float[Array, "segments near_states"]
+    model: Model, near: Model, states: Float[Array | np.ndarray, "segments near_states"]
 ) -> Float[Array, "segments states"]:
     """Initial states from those of another model on the same segments: what both have, and hidden ones of the new model
     as if it had long moved like this. From poor states the first step would pull the parameters far away.
@@ -145,18 +150,16 @@ def states_from(
         near: the other model.
         states: its initial states.
     """
-    names = near.state_names
+    names, states = near.state_names, np.asarray(states)
     if names == model.state_names:
-        return states
-    states = jnp.asarray(np.asarray(states))
-    found = _settled(model, states[:, : len(model.motion_states)])
+        return jnp.asarray(states)
+    found = at_instants(_settled, (states[:, : len(model.motion_states)], 1), (model, 0))
     columns = [states[:, names.index(n)] if n in names else found[:, i] for i, n in enumerate(model.state_names)]
-    return jnp.stack(columns, axis=1)
+    return jnp.asarray(np.stack(columns, axis=1))
 
 
-@eqx.filter_jit
-def _settled(model: Model, motion: Array) -> Array:
-    return jax.vmap(model.settled)(motion)
+def _settled(motion: Array, model: Model) -> Array:
+    return model.settled(motion)
 
 
 def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

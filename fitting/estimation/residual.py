@@ -1,7 +1,7 @@
 """Measured minus simulated on every segment, and its derivatives: the one program that all fits run."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import diffrax as dfx
 import equinox as eqx
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from fitting.estimation.experiment import Segments
 from fitting.estimation.free_parameters import FreeParameters
 from hdjax import Model
+from hdjax.compilation import library_of
 from hdjax.engine import Kernel
 from hdjax.simulate import march, simulate
 from hdjax.where import where
@@ -65,8 +66,8 @@ class Problem(eqx.Module):
 class Unknowns(eqx.Module):
     """What is fitted: the free parameters, and the initial state of each segment."""
 
-    parameters: Float[Array, " parameters"]
-    states: Float[Array, "segments states"]
+    parameters: Float[Array | np.ndarray, " parameters"]
+    states: Float[Array | np.ndarray, "segments states"]
 
 
 class Blocks(eqx.Module):
@@ -82,12 +83,12 @@ class Blocks(eqx.Module):
         before_by_state: likewise, with respect to the initial state of the segment before.
     """
 
-    residual: Float[Array, "segments rows"]
-    by_parameter: Float[Array, "segments rows parameters"]
-    by_state: Float[Array, "segments rows states"]
-    gap: Float[Array, "segments states"]
-    before_by_parameter: Float[Array, "segments states parameters"]
-    before_by_state: Float[Array, "segments states states"]
+    residual: Float[Array | np.ndarray, "segments rows"]
+    by_parameter: Float[Array | np.ndarray, "segments rows parameters"]
+    by_state: Float[Array | np.ndarray, "segments rows states"]
+    gap: Float[Array | np.ndarray, "segments states"]
+    before_by_parameter: Float[Array | np.ndarray, "segments states parameters"]
+    before_by_state: Float[Array | np.ndarray, "segments states states"]
 
 
 class Products(eqx.Module):
@@ -108,9 +109,10 @@ class Products(eqx.Module):
     @staticmethod
     def of(found: Blocks) -> "Products":
         """Those of a residual with its Jacobian."""
-        columns = jnp.concatenate([found.by_parameter, found.by_state, found.residual[:, :, None]], axis=2)
+        library = library_of(found.residual, found.by_state)
+        columns = library.concatenate([found.by_parameter, found.by_state, found.residual[:, :, None]], axis=2)
         ends = found.gap, found.before_by_parameter, found.before_by_state
-        return Products(jnp.einsum("sri,srj->sij", columns, columns), *ends)
+        return Products(library.swapaxes(columns, 1, 2) @ columns, *ends)
 
     def beside_prior(
         self, off: Float[Array | np.ndarray, " parameters"], slope: Float[Array | np.ndarray, " parameters"]
@@ -121,16 +123,16 @@ class Products(eqx.Module):
             off: how many standard deviations each parameter's entry is off.
             slope: derivative of that by the entry; zero for a parameter that is held.
         """
-        library: Any = np if isinstance(self.products, np.ndarray) else jnp
+        library = library_of(self.products, off, slope)
         more = self.products.shape[1] - off.size - 1
         rows = library.concatenate([library.diag(slope), library.zeros((off.size, more)), off[:, None]], axis=1)
         first = (library.arange(self.products.shape[0]) == 0).astype(float)[:, None, None]
         return replace(self, products=self.products + first * (rows.T @ rows)[None])
 
     @property
-    def square(self) -> Float[Array, ""]:
+    def square(self) -> Float[Array | np.ndarray | np.float64, ""]:
         """Sum of squares of the residual."""
-        return jnp.sum(self.products[:, -1, -1])
+        return library_of(self.products).sum(self.products[:, -1, -1])
 
 
 @eqx.filter_jit
@@ -207,10 +209,11 @@ def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments
     model = problem.free.unpack(problem.model, unknowns.parameters)
     motion = len(model.motion_states)
     scale = [e.state_scale() for e in model.effects if e.states]
-    hidden = unknowns.states[:, motion:]
+    states = jnp.asarray(unknowns.states)
+    hidden = states[:, motion:]
     if not scale:
         return hidden
-    expected = jax.vmap(model.settled)(unknowns.states[:, :motion])[:, motion:]
+    expected = jax.vmap(model.settled)(states[:, :motion])[:, motion:]
     return (hidden - expected) / jax.lax.stop_gradient(jnp.concatenate(scale))[None, :]
 
 
@@ -259,8 +262,8 @@ class LinearisedResidual(eqx.Module):
     """What the least squares solver of optimistix minimises the squares of: residual and weighted gaps. (Their
     derivatives are carried along by [`fitting.estimation.engines.residual_with_blocks`][].)"""
 
-    rows: Float[Array, "segments rows"]
-    gap: Float[Array, "segments states"]
+    rows: Float[Array | np.ndarray, "segments rows"]
+    gap: Float[Array | np.ndarray, "segments states"]
 
 
 def seen_residual(found: Blocks, gap_weight: Float[Array, " states"]) -> LinearisedResidual:
@@ -282,14 +285,15 @@ def moved_residual(
 
 
 def moved_gap(
-    found: Blocks | Products, joined: Bool[Array, " segments"], tangent: Unknowns
-) -> Float[Array, "segments states"]:
+    found: Blocks | Products, joined: Bool[Array | np.ndarray, " segments"], tangent: Unknowns
+) -> Float[Array | np.ndarray, "segments states"]:
     """How the gaps change along a tangent, parts of which may be None."""
-    gap = jnp.zeros_like(found.gap)
+    library = library_of(found.gap, tangent.parameters, tangent.states)
+    gap = library.zeros_like(found.gap)
     if tangent.parameters is not None:
-        gap = gap - jnp.einsum("sqp,p->sq", found.before_by_parameter, tangent.parameters)
+        gap = gap - found.before_by_parameter @ tangent.parameters
     if tangent.states is not None:
-        before = jnp.roll(tangent.states, 1, axis=0)
-        own = where(joined[:, None], tangent.states, 0.0)
-        gap = gap + own - jnp.einsum("sqk,sk->sq", found.before_by_state, before)
+        before = library.roll(tangent.states, 1, axis=0)
+        own = library.where(joined[:, None], tangent.states, 0.0)
+        gap = gap + own - (found.before_by_state @ before[:, :, None])[:, :, 0]
     return gap

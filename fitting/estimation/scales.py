@@ -14,7 +14,7 @@ from hdjax.effects import Scales
 
 def largest_torque(stretches: Sequence[Stretch]) -> float:
     """The largest motor torque of the logs [N m], in size."""
-    return max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in stretches)
+    return max(float(np.max(np.abs(np.asarray(s.experiment.torque.coefficients)[:, 0]))) for s in stretches)
 
 
 def of_twist(model: Model) -> Float[np.ndarray, " outputs"]:

@@ -236,6 +236,8 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: b
         return np.stack([spring, cubic, damper], axis=1), right
     right = -against(x, curvatures)
     if isinstance(model.drive, Drive):
-        forcing = u * float(model.drive.k_T / (model.drive.N * model.drive.J_m)) - T_l / float(model.drive.J_l)
+        forcing = u * float(model.drive.k_T) / (float(model.drive.N) * float(model.drive.J_m)) - T_l / float(
+            model.drive.J_l
+        )
         return np.stack([spring, cubic, damper], axis=1), right + against(forcing, tests)
     return np.stack([spring, cubic, damper, -against(u, tests)], axis=1), right

@@ -80,7 +80,7 @@ def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directio
     problem = fit.at_solution
     slopes = FirstStates.of(linearise(problem, fit.unknowns), problem.segments.joined).by_first
     chain = np.cumsum(~np.asarray(problem.segments.joined)) - 1
-    return _orthonormal(slopes, chain)[:, : problem.segments.measured[0].size], chain
+    return _orthonormal(slopes, chain)[:, : np.asarray(problem.segments.measured)[0].size], chain
 
 
 def _orthonormal(slopes: np.ndarray, chain: np.ndarray) -> np.ndarray:

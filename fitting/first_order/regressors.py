@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import strength_paths
-from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial, some_at_a_time
+from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial
 from fitting.first_order.internal_states import Memory, memory_of, own_between, own_states
 from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
 from hdjax import Drive, Model, PiecewisePolynomial
-from hdjax.compilation import jit_small
+from hdjax.compilation import jit_small, some_at_a_time
 from hdjax.dynamics import JOINT_TORQUE
 from hdjax.effects import (
     ActuatorEffect,
@@ -108,7 +108,9 @@ def _by_strength(function: Callable[..., Any], stacked: Effect, model: Model, *l
     instants = own.shape[1:-1]
     each = jax.tree.map(lambda a: a[:, None], stacked)
     strengths = np.stack([np.asarray(value) for value in _strengths(each)], axis=-1)
-    flat = [(jax.tree.map(lambda a: np.reshape(a, (-1, *a.shape[len(instants) :])), tree), 1) for tree in looked_at]
+    flat = [
+        (jax.tree.map(lambda a: np.asarray(a).reshape(-1, *a.shape[len(instants) :]), tree), 1) for tree in looked_at
+    ]
     states = own.reshape(own.shape[0], math.prod(instants), own.shape[-1])
     found = slopes_at_instants(function, (strengths, 2), (each, 2), (model, 0), *flat, (states, 2))
 
@@ -188,7 +190,9 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
     return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
 
 
-def _readings(seen: Along, stacked: Effect, states: np.ndarray) -> Float[np.ndarray, "segments samples outputs columns"]:
+def _readings(
+    seen: Along, stacked: Effect, states: np.ndarray
+) -> Float[np.ndarray, "segments samples outputs columns"]:
     """Derivatives of the outputs at the samples, where the motion stays as it is."""
     own = np.moveaxis(states[:, :-1], 2, 0)
     return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], own=own)

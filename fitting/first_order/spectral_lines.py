@@ -7,6 +7,8 @@ from fitting.estimation.estimate import Fit
 
 # A line stands out of the median of so many frequencies around it.
 _NEIGHBOURS = 41
+# Frequencies from one line to the next at least: the window spreads a line over so many.
+_APART = 8
 # By this factor in power at least: among 10,000 frequencies of noise the largest is about 10 times the mean.
 STANDS_OUT = 15.0
 """Power of a line against the median of its surroundings, at least."""
@@ -22,9 +24,6 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
         fit: a fit.
         most: how many lines at most.
     """
-    # Loaded here, where effects are looked for: a plain fit does without.
-    from scipy.signal import find_peaks
-
     # Along the longest stretch, samples without weight zero.
     series = max(reversed(fit.by_stretch(fit.white_error)), key=len)
     count = series.shape[0]
@@ -37,10 +36,21 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     ratio = power / around
     # The lowest frequencies are drift, not lines: fewer than two periods in the log.
     ratio[:4] = 0.0
-    peaks, _ = find_peaks(ratio, height=STANDS_OUT, distance=8)
+    peaks = _peaks(ratio)
     strongest = peaks[np.argsort(power[peaks] - around[peaks])[::-1][:most]]
     step = float(np.median(np.diff(fit.stretches[0].experiment.time)))
     return tuple((2.0 * np.pi * ((strongest + _off_the_grid(power, strongest)) / (2 * count * step))).tolist())
+
+
+def _peaks(ratio: np.ndarray) -> np.ndarray:
+    """Places of the maxima that stand out, the higher one of any two that are close; in rising order."""
+    inner = ratio[1:-1]
+    found = np.flatnonzero((inner > ratio[:-2]) & (inner > ratio[2:]) & (inner >= STANDS_OUT)) + 1
+    kept: list[int] = []
+    for place in found[np.argsort(-ratio[found])].tolist():
+        if all(abs(place - other) >= _APART for other in kept):
+            kept.append(place)
+    return np.array(sorted(kept), dtype=int)
 
 
 def surroundings(power: Float[np.ndarray, " n"], *, neighbours: int = _NEIGHBOURS // 2) -> Float[np.ndarray, " n"]:

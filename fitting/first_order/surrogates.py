@@ -26,16 +26,17 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     weight = np.asarray(fit.problem.segments.weight) > 0
     error = fit.white_error
     series = error[weight].T
-    samples = series.shape[1]
-    length = prev_fast_len(samples, real=True)
+    length: Any = prev_fast_len(series.shape[1], real=True)
     spectrum = without_lines(np.fft.rfft(series[:, :length]))
-    found = np.zeros((DRAWS, *error.shape))
+    place = (np.cumsum(weight).reshape(weight.shape) - 1) % length
+    found = np.empty((DRAWS, *error.shape))
     for draw in range(DRAWS):
         turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
         # Noise has no mean; what mean there is may be the very thing that is looked for.
         turn[0] = 0.0
         surrogate: Any = irfft(spectrum * turn[None, :], n=length, overwrite_x=True, workers=-1)
-        found[draw][weight] = np.pad(surrogate, ((0, 0), (0, samples - length)), mode="wrap").T
+        found[draw] = surrogate.T[place]
+    found *= weight[..., None]
     return found.reshape(DRAWS, error.shape[0], -1)
 
 

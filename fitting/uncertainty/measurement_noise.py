@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import REWEIGHTINGS, Fit, weighed, zeros_like
+from fitting.estimation.estimate import REWEIGHTINGS, Fit, Shown, weighed, zeros_like
 from fitting.estimation.experiment import Stretch, cut
 from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
 from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
@@ -102,6 +102,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     piece = min(length, int(np.round(np.clip(half_period, 6 * every, 24 * every))))
     held = eqx.tree_at(lambda p: p.active, found.problem, zeros_like(found.problem.active))
     swing = float(scales(found.stretches, found.model).x)
+    shown = Shown.of(found.problem.model, swing * of_twist(found.model)[-1])
     anew = smoothed = _Pieces(np.zeros(found.covariance.shape))
     # A piece is the head of a segment; segments that begin later have other heads.
     for offset in range(0, length - piece + 1, piece):
@@ -117,7 +118,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         part, unknowns = on_all_devices(part, unknowns)
         covariance, before = found.covariance, np.full(len(found.covariance), np.inf)
         for turn in range(REWEIGHTINGS):
-            part = weighed(part, covariance, swing)
+            part = weighed(part, covariance, shown)
             damping = NEARBY_DAMPING if turn else FIRST_DAMPING
             solution = solve(part, unknowns, _STEPS, damping, least_progress=_LEAST_PROGRESS)
             unknowns, covariance = solution.unknowns, solution.left_over.covariance

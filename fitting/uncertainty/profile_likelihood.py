@@ -243,6 +243,7 @@ def _solve_lanes(
             throw=False,
         )
         square = 2.0 * solution.state.costs[0]
-        return solution.value.parameters, solution.value.states, where(jnp.isfinite(square), square, jnp.inf)
+        found = jnp.asarray(solution.value.parameters), jnp.asarray(solution.value.states)
+        return *found, where(jnp.isfinite(square), square, jnp.inf)
 
     return jax.vmap(one)(parameters, states)

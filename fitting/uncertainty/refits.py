@@ -62,6 +62,6 @@ def _refits(problem: Problem, start: Unknowns, at_start: Blocks, measured: Array
 
         begin = start, jnp.full((), jnp.inf), jnp.zeros((), int)
         unknowns, moved, _ = jax.lax.while_loop(goes_on, improved, begin)
-        return unknowns.parameters, moved
+        return jnp.asarray(unknowns.parameters), moved
 
     return jax.lax.map(refit, measured, batch_size=_BATCH)

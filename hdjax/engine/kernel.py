@@ -177,9 +177,8 @@ def _operands(address: Int[Array | np.ndarray, ""], lanes: Lanes, wanted: Wanted
     asked = np.array([get_args(Wanted).index(wanted)])
     # Outside a program of JAX none is compiled for it.
     library = jnp if isinstance(lanes.settings, Tracer) else np
-    lanes = eqx.tree_at(lambda given: given.settings, lanes, library.concatenate([lanes.settings, asked]))
-    operands = [getattr(lanes, f.name) for f in dataclasses.fields(lanes) if f.name != "signals"]
-    return [address, *operands, *lanes.signals]
+    operands = vars(lanes) | {"settings": library.concatenate([lanes.settings, asked])}
+    return [address, *(operands[f.name] for f in dataclasses.fields(lanes) if f.name != "signals"), *lanes.signals]
 
 
 def result_shapes(lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted) -> list[tuple[int, ...]]:
