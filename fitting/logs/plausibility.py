@@ -20,6 +20,8 @@ MOMENTUM_CORRELATION = 0.98
 MOMENTUM_TOLERANCE = 0.15
 FEWEST = 50
 _GAP = 5.0
+# Condition number of what two columns must tell apart.
+_APART = 30.0
 
 
 def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
@@ -55,6 +57,20 @@ def _slow(values: np.ndarray) -> tuple[np.ndarray, float]:
     return modes, float(modes @ modes) / 2 / variance if variance > 0 else 0.0
 
 
+def _at_rest(slow_motor: np.ndarray, slow_load: np.ndarray) -> float:
+    """Load angle over motor angle in motion so slow that the spring is not wound.
+
+    A spring lets the load swing out by a share that grows with the square of the frequency. Where the modes do not tell
+    the two apart, their mean ratio counts.
+    """
+    squares = np.arange(1.0, SLOW_MODES + 1) ** 2
+    columns = np.stack([slow_motor, squares * slow_motor], axis=1)
+    norms = np.linalg.norm(columns, axis=0)
+    if np.linalg.cond(columns / norms) > _APART:
+        return float(slow_motor @ slow_load / norms[0] ** 2)
+    return float((np.linalg.lstsq(columns / norms, slow_load)[0] / norms)[0])
+
+
 def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     """Slope of the load angle against the motor angle in slow motion, against 1/N."""
     ratio = drive_file.reduction_ratio
@@ -67,7 +83,7 @@ def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     norms = float(slow_motor @ slow_motor), float(slow_load @ slow_load)
     if abs(cross) < SLOW_CORRELATION * np.sqrt(norms[0] * norms[1]):
         return
-    slope = cross / norms[0]
+    slope = _at_rest(slow_motor, slow_load)
     where = "load_angle against motor_angle"
     if ratio > 1.5 and abs(abs(slope) / ratio - 1) < RATIO_TOLERANCE:
         yield Finding(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import joints
 import rig
 from fitting.drive_data import ready_log
 from fitting.errors import DataError
@@ -395,3 +396,12 @@ def test_lara8_joint_2(tmp_path: Path, shared: Path, ratio: int, refused: bool) 
     # Both encoders are absolute and were never zeroed together.
     assert any("off zero" in finding.what for finding in findings)
     assert any(finding.severity == "refusal" for finding in findings) == refused
+
+
+def test_a_soft_spring_is_no_wrong_ratio():
+    # The slowest motion of this log is a fifth of the antiresonance.
+    joint = joints.with_friction(joints.drawn(0), 0.2, 0.2)
+    log = joints.log_of(joint)
+    assert not [f for f in examine(log, drive_file(joint.N)) if "the angles say" in f.what]
+    (refused,) = [f for f in examine(log, drive_file(1.2 * joint.N)) if "the angles say" in f.what]
+    assert refused.severity == "refusal"
