@@ -15,7 +15,7 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _Tree = TypeVar("_Tree")
 
-# Lanes that a program takes at a time.
+# Programs are made for multiples of so many lanes.
 _LANES = 32
 # Compiling well takes longer than what it saves where there is little work.
 _SMALL: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
@@ -52,17 +52,19 @@ def library_of(*arrays: Any) -> Any:
     return jnp if any(isinstance(array, Tracer) for array in arrays) else np
 
 
-def some_at_a_time(program: Callable[..., Any], *arrays: Array | np.ndarray) -> Any:
-    """What a program of JAX makes of lanes, so many at a time that data of all sizes share it.
+def some_at_a_time(program: Callable[..., Any], *arrays: Array | np.ndarray, most: int = _LANES) -> Any:
+    """What a program of JAX makes of lanes, so many at a time that data of all sizes share few programs.
 
     Args:
         program: from arrays whose first axis is one of lanes to a tree of such arrays.
         arrays: of all lanes.
+        most: lanes at a time; of a program that is called often, calls cost more than programs.
     """
     count = len(arrays[0])
     if count <= _LANES:
         return on_host(program(*(jnp.asarray(np.asarray(a)) for a in arrays)))
-    places = (np.minimum(np.arange(start, start + _LANES), count - 1) for start in range(0, count, _LANES))
+    size = -(-count // (_LANES * -(-count // most))) * _LANES
+    places = (np.minimum(np.arange(start, start + size), count - 1) for start in range(0, count, size))
     found = [on_host(program(*(jnp.asarray(np.asarray(a)[own]) for a in arrays))) for own in places]
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *found)
 

@@ -89,6 +89,8 @@ def _collected(each: Any, index: Any) -> Any:
     """Sum over the segments of each chain; there are as many places as segments."""
     if library_of(each, index) is jnp:
         return jax.ops.segment_sum(each, index, num_segments=each.shape[0])
+    if index[-1] == len(each) - 1:
+        return each
     total = np.zeros(each.shape)
     np.add.at(total, index, each)
     return total

@@ -22,6 +22,8 @@ from hdjax.engine.kernel import Mode, Wanted, march_arrays
 
 # The model's constants come in tables of so many, so that few sizes of them make few programs.
 _CONSTANTS = 32
+# Segments whose torque a program of JAX changes at a time.
+_SEGMENTS = 256
 
 
 def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
@@ -113,6 +115,7 @@ def actuated(
         lambda *own: _actuated(tuple(actuators), paths, values, PiecewisePolynomial(*own)),
         torque.knots,
         torque.coefficients,
+        most=_SEGMENTS,
     )
 
 

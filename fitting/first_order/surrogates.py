@@ -26,7 +26,7 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
     weight = np.asarray(fit.problem.segments.weight) > 0
     error = fit.white_error
     series = error[weight].T
-    length: Any = prev_fast_len(series.shape[1], real=True)
+    length = int(prev_fast_len(series.shape[1], real=True) or 1)
     spectrum = without_lines(np.fft.rfft(series[:, :length]))
     place = (np.cumsum(weight).reshape(weight.shape) - 1) % length
     found = np.empty((DRAWS, *error.shape))
