@@ -38,7 +38,7 @@ class Experiment(eqx.Module):
         origin: when the log starts, on the clock of `time` [s].
         log: the name of the log that it is a part of.
         rate_std: relative standard deviation of the sample interval, as far as the log's stamps leave it open.
-        outputs: names of what was measured, see [`hdjax.dynamics.OUTPUTS`][].
+        outputs: names of what was measured, see `hdjax.dynamics.OUTPUTS`.
     """
 
     name: str = eqx.field(static=True)
@@ -213,7 +213,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
 
 
 def fitted_outputs(log: Log) -> tuple[str, ...]:
-    """Names of what a fit of a log explains, of [`hdjax.dynamics.OUTPUTS`][], the principal one last."""
+    """Names of what a fit of a log explains, of `hdjax.dynamics.OUTPUTS`, the principal one last."""
     return BOTH_ANGLES if log.outputs == ("motor_angle", "load_angle") else log.outputs
 
 

@@ -47,7 +47,7 @@ def unknowns(inspection: Inspection) -> dict[str, str]:
     joint = inspection.joint
     missing: dict[str, str] = {}
     both = set(_ANGLES) <= set(joint.signals)
-    if both and "reduction_ratio" not in drive_tables(inspection)["drive"]:
+    if (both or joint.kind == "motor side") and "reduction_ratio" not in drive_tables(inspection)["drive"]:
         missing["[drive] reduction_ratio"] = _why_no_ratio(inspection)
     if joint.kind in ("drive", "motor side"):
         missing |= {f"[drive] {key}": what for key, what in _INERTIAS.items()}

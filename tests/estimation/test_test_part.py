@@ -47,8 +47,9 @@ def without_test(found: dict) -> dict:
     """A report without what tells of test data, of the health of logs, and of the time that it took."""
     kept = {k: v for k, v in found.items() if k not in ("health", "seconds", "summary")}
     for stage in ("before", "after"):
-        for name in ("rmse", "rmse_motor_angle"):
-            kept[stage][name] = {k: v for k, v in kept[stage][name].items() if k not in ("test", "validation")}
+        for parts in (kept[stage]["rmse"], kept[stage]["rmse_motor_angle"], *kept[stage]["rmse_of_outputs"].values()):
+            for part in ("test", "validation"):
+                parts.pop(part, None)
     return kept
 
 
