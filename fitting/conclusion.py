@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import FinalEvidence
-from fitting.attribution.decisions import RULES, Outcome, conclude
+from fitting.attribution.decisions import Outcome, conclude
+from fitting.attribution.rules import RULES
 from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
 from fitting.discrepancy.challenge import Challenge

@@ -18,7 +18,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from fitting.attribution.case_evidence import CaseEvidence, case_evidence
-from fitting.attribution.decisions import RULES, Decision, DecisionRules, decide
+from fitting.attribution.decisions import Decision, decide
+from fitting.attribution.rules import RULES, DecisionRules
 
 # What each rule is where it is switched off: it then lets everything pass. The others decide what is evidence.
 OFF: Mapping[str, float] = {

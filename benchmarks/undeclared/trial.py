@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.drive_data import Rig, experiments, read_rig, ready_log
 from fitting.errors import DataError
 from fitting.estimation.experiment import Stretch

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.attribution.study import LEAST_PROGRESS, Study
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import Fit, Start, Strategy, fit

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, challenge, first_pass, lasting_share, to_the_end, trained
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, Strategy

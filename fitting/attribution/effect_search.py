@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, attempt, gone_on, halo_for
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round, look
 from fitting.attribution.study import Data, Setting, Study
 from fitting.attribution.support import Standing, leaves_imperfection

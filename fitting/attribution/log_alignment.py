@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from fitting.attribution.candidate_fit import Trial, attempt
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.attribution.study import Data, Study
 from fitting.estimation.estimate import Fit, segments_of_logs
 from fitting.estimation.experiment import Stretch

@@ -11,7 +11,8 @@ from typing_extensions import TypeVar
 from fitting.attribution.candidate_fit import Trial, long_gains
 from fitting.attribution.candidate_refit import begin, go_on, try_hold
 from fitting.attribution.case_evidence import EffectEvidence, Rival, RoundEvidence
-from fitting.attribution.decisions import RULES, compete, leader, support, tie
+from fitting.attribution.decisions import compete, leader, support, tie
+from fitting.attribution.rules import RULES
 from fitting.attribution.score import block_scores
 from fitting.attribution.screening import Lead, Screen, screen
 from fitting.attribution.shortlist import first_of_each_family, further_forms, possible_ties, worth_a_refit

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit, needed_substeps
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation

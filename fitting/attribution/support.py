@@ -8,7 +8,8 @@ from jaxtyping import Float
 
 from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.case_evidence import NoiseEvidence
-from fitting.attribution.decisions import RULES, DecisionRules, only_noise
+from fitting.attribution.decisions import only_noise
+from fitting.attribution.rules import RULES, DecisionRules
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import effect_paths, strength_paths
 from fitting.uncertainty.measurement_noise import MeasurementNoise

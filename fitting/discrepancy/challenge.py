@@ -7,8 +7,9 @@ import numpy as np
 
 from fitting.attribution.candidate_fit import Trial, long_gains
 from fitting.attribution.case_evidence import ChallengeEvidence, ModelEvidence
-from fitting.attribution.decisions import RULES, names_stand, next_question
+from fitting.attribution.decisions import names_stand, next_question
 from fitting.attribution.effect_search import refitted_without
+from fitting.attribution.rules import RULES
 from fitting.attribution.study import Study
 from fitting.attribution.support import (
     Standing,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from fitting.attribution.candidate_fit import Trial, challenge
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.attribution.study import Study
 from fitting.discrepancy.dynamic_laws import Remembered, Remembering, remembering
 from fitting.discrepancy.variable_selection import (

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import effect_paths
 from fitting.first_order.gains import (

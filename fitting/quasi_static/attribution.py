@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fitting.attribution.case_evidence import EffectEvidence, RoundEvidence
-from fitting.attribution.decisions import RULES, support
+from fitting.attribution.decisions import support
+from fitting.attribution.rules import RULES
 from fitting.attribution.screening import Screen
 from fitting.attribution.selection_round import Round, Verdict
 from fitting.attribution.shortlist import NEARLY

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.interpolate import BSpline
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.quasi_static.attribution import Held, TwistTrial, torque_error
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.points import Points

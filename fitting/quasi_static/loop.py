@@ -5,7 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from fitting.attribution.case_evidence import FinalEvidence
-from fitting.attribution.decisions import RULES, Check, Outcome, conclude, support
+from fitting.attribution.decisions import Check, Outcome, conclude, support
+from fitting.attribution.rules import RULES
 from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, is_told, look
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.leftover import Leftover, leftover

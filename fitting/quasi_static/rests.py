@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
 from fitting.quasi_static.form import START, Form, Terms
 from fitting.quasi_static.intervals import Figure

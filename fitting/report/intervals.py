@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 
 NOT_COVERED = "not covered"
 """Flag of a parameter whose interval knows nothing of what is missing."""

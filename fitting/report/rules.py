@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from fitting.attribution.decisions import Check, rules_table
+from fitting.attribution.decisions import Check
+from fitting.attribution.rules import rules_table
 
 # The one threshold that each form has for itself, in the code of the effect.
 _OF_LAWS = {"unit": "share of rms", "meaning": "of what earlier effects removed that their laws may get wrong"}
@@ -41,7 +42,7 @@ def rules_page() -> str:
         [
             "# Rules of decision",
             "",
-            "Every threshold that decides what a loop says (`fitting/attribution/decisions.py`). A report has each",
+            "Every threshold that decides what a loop says (`fitting/attribution/rules.py`). A report has each",
             "rule with its statistic and its outcome, under `rules` and in the section *Why this decision*. The page",
             "is what `fitting.report.rules.rules_page()` gives.",
             "",

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.report.outputs import principal
 from fitting.report.separating import plain_family
 from fitting.report.unknown import place_and_variables

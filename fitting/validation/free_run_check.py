@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands

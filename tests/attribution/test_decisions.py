@@ -19,7 +19,8 @@ from fitting.attribution.case_evidence import (
     RoundEvidence,
     case_evidence,
 )
-from fitting.attribution.decisions import RULES, conclude, decide, leader, support, tie
+from fitting.attribution.decisions import conclude, decide, leader, support, tie
+from fitting.attribution.rules import RULES
 from fitting.files import finite
 from fitting.report.rules import rules_page
 from undeclared.replay import OFF, differing

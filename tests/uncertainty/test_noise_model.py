@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 import rig
-from fitting.attribution.decisions import RULES
+from fitting.attribution.rules import RULES
 from fitting.attribution.support import is_noise, noise_of_torque
 from fitting.estimation.engines import with_engine
 from fitting.estimation.estimate import Fit, fit
