@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 
 from fitting.errors import InputError
-from fitting.estimation.experiment import Experiment, experiments_from_log
+from fitting.estimation.experiment import Experiment, experiments_from_log, fitted_outputs
 from fitting.estimation.test_part import TEST_SHARE, parted, whole_test_log
 from fitting.logs.checks import examine, refuse_unfit
 from fitting.logs.drive_file import DriveFile, read_drive_file
@@ -161,7 +161,8 @@ def base_model(drive_file: DriveFile, log: Log) -> Model:
         return ReducedModel(ReducedDrive(mu=1.0, omega_0=1.0))
     known = {"J_m": drive_file.motor_inertia or 1.0, "J_l": drive_file.load_inertia or 1.0, "k_T": 1.0}
     priors = tuple(Prior(path, known[path], tolerance) for path, tolerance in drive_file.tolerances.items())
-    return TwoInertiaModel(Drive(N=drive_file.reduction_ratio, K=1.0, priors=priors, **known))
+    drive = Drive(N=drive_file.reduction_ratio, K=1.0, priors=priors, **known)
+    return TwoInertiaModel(drive, measured=fitted_outputs(log))
 
 
 def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment, ...]:

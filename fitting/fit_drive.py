@@ -14,6 +14,7 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
+from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import long_fit
 from fitting.outcome import Finding
 from fitting.progress import Progress, silent
@@ -46,7 +47,9 @@ class FitOnly(eqx.Module):
         seconds: where the time went.
         by_load: whether K, alpha and B_sp are those of the load's own equation, see
             [`fitting.estimation.motor_driven`][], since the motion does not follow from the torque.
-        assumed: then, what the load's equation was given of the inertia of which nothing was known.
+        by_friction: whether all parameters are those of a fit beside friction of the motor, see
+            [`fitting.estimation.beside_friction`][], for the same reason; the load was not seen.
+        assumed: where by load, what the load's equation was given of the inertia of which nothing was known.
     """
 
     account: Account
@@ -61,6 +64,7 @@ class FitOnly(eqx.Module):
     posterior: Posterior | None
     seconds: dict[str, float]
     by_load: bool = eqx.field(static=True)
+    by_friction: bool = eqx.field(static=True)
     assumed: dict[str, float]
     decision: ClassVar[str] = "fit_only"
     findings: ClassVar[tuple[Finding, ...]] = ()
@@ -115,7 +119,8 @@ def fit_only(
     clock.lap("measurement noise")
     progress("final fit over long horizons")
     told_by = told_by_load(base)
-    base, assumed = (base, {}) if told_by is None else _without_priors(base)
+    by_friction = told_by is not None and not sees_twist(base.stretches)
+    base, assumed = (base, {}) if told_by is None or by_friction else _without_priors(base)
     found = base if is_held(base) else long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs")
@@ -146,7 +151,8 @@ def fit_only(
         bands=bands,
         posterior=draws,
         seconds=clock.laps,
-        by_load=told_by is not None,
+        by_load=told_by is not None and not by_friction,
+        by_friction=by_friction,
         assumed=assumed,
     )
 

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -27,6 +27,20 @@ from hdjax.parameters import ParameterInfo, as_scalar, own_parameters, own_value
 from hdjax.signals import PiecewisePolynomial
 
 State = Float[Array, " states"]
+
+BOTH_ANGLES = ("motor_turn", "dynamic_error")
+"""What is seen of a drive with an encoder on either side."""
+
+OUTPUTS = {
+    "motor_turn": "rad",
+    "motor_angle": "rad",
+    "load_angle": "rad",
+    "dynamic_error": "rad",
+    "motor_velocity": "rad/s",
+    "load_velocity": "rad/s",
+    "joint_torque": "N m",
+}
+"""What sensors may read, with its unit. `motor_turn` is theta_m/N, all else as DESIGN names it."""
 _Kind = TypeVar("_Kind", bound=Effect)
 
 
@@ -36,6 +50,7 @@ class Model(eqx.Module):
     drive: eqx.AbstractVar[Drive | ReducedDrive]
     effects: eqx.AbstractVar[tuple[Effect, ...]]
     motion_states: eqx.AbstractClassVar[tuple[str, ...]]
+    measured: eqx.AbstractVar[tuple[str, ...]]
 
     @abc.abstractmethod
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
@@ -72,7 +87,8 @@ class Model(eqx.Module):
 
     @abc.abstractmethod
     def outputs(self, state: State) -> Float[Array, " outputs"]:
-        """What the encoders read: (theta_m/N, dynamic error) [rad], or the dynamic error alone."""
+        """What the sensors read: the quantities that `measured` names, of [`OUTPUTS`][]; the last one is the principal
+        output, by which a fit is judged."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -168,6 +184,7 @@ class TwoInertiaModel(Model):
 
     drive: Drive
     effects: tuple[Effect, ...] = ()
+    measured: tuple[str, ...] = eqx.field(static=True, default=BOTH_ANGLES)
     motion_states: ClassVar[tuple[str, ...]] = ("theta_m", "theta_l", "omega_m", "omega_l")
 
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
@@ -220,17 +237,28 @@ class TwoInertiaModel(Model):
         taken = (effect.inertia_taken(self.drive) for effect in self._of(kind))
         return sum(taken, jnp.zeros_like(self.drive.J_l))
 
-    def outputs(self, state: State) -> Float[Array, "2"]:
+    def outputs(self, state: State) -> Float[Array, " outputs"]:
         theta_m, theta_l, omega_m, omega_l = (state[i] for i in range(4))
         for effect in self._of(SensorEffect):
             theta_m, theta_l = effect.reading(theta_m, theta_l, omega_m, omega_l)
-        return jnp.stack([theta_m / self.drive.N, theta_m / self.drive.N - theta_l])
+        turn = theta_m / self.drive.N
+        readings: dict[str, Callable[[], Array]] = {
+            "motor_turn": lambda: turn,
+            "motor_angle": lambda: theta_m,
+            "load_angle": lambda: theta_l,
+            "dynamic_error": lambda: turn - theta_l,
+            "motor_velocity": lambda: omega_m,
+            "load_velocity": lambda: omega_l,
+            "joint_torque": lambda: self._mesh_torque(self.motion(state), self._own_states(tuple(state))),
+        }
+        return jnp.stack([readings[name]() for name in self.measured])
 
 
 class TwistModel(Model):
     """The dynamic error alone. States: x, v."""
 
     motion_states: ClassVar[tuple[str, ...]] = ("x", "v")
+    measured: ClassVar[tuple[str, ...]] = ("dynamic_error",)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
         return Motion(x=state[0], v=state[1], **vars(conditions))

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from fitting.estimation.beside_friction import fits_of_starts, held_beside, refitted_beside
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import MESH, base_paths, with_priors
@@ -23,6 +24,7 @@ from fitting.estimation.problem import Segmentation, initial_states, segment_len
 from fitting.estimation.scales import largest_torque
 from fitting.estimation.starting_values import (
     apart,
+    sees_twist,
     starting_models,
     starts_blind_to_loads,
     with_starting_inertias,
@@ -61,17 +63,12 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         DataError: where the data supply no starting values.
     """
     training = without_glitches(training)
-    priors = ()
-    if isinstance(model, TwoInertiaModel):
-        # What the base model lacks would go into inertias that are free, before the load's equation is asked.
-        priors = model.drive.priors
-        model = with_priors(with_starting_inertias(model, training), ())
-    best, start = _coarse_fit(starting_models(model, training), training, halo)
-    if not is_held(best):
-        best = _beside_loads(best, training, halo)
-    if priors:
-        start = with_priors(start, priors)
-        best = _with_inertias_free(best, priors)
+    if sees_twist(training):
+        best, start = _fit_of_twist(model, training, halo)
+    else:
+        alone, beside, start = fits_of_starts(starting_models(model, training), training, halo)
+        much = alone.objective - beside.objective > -np.log(_MUCH)
+        best = held_beside(beside, start, training, halo) if much else alone
     if is_held(best):
         return eqx.tree_at(lambda f: f.problem.model, best, start)
     horizon = short_horizon(best.model, training)
@@ -89,6 +86,22 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
             start=Start(states=best.unknowns.states),
         )
     return eqx.tree_at(lambda f: f.problem.model, best, start)
+
+
+def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
+    """The fit over short horizons where the dynamic error was measured, and where it started."""
+    priors = ()
+    if isinstance(model, TwoInertiaModel):
+        # What the base model lacks would go into inertias that are free, before the load's equation is asked.
+        priors = model.drive.priors
+        model = with_priors(with_starting_inertias(model, training), ())
+    best, start = _coarse_fit(starting_models(model, training), training, halo)
+    if not is_held(best):
+        best = _beside_loads(best, training, halo)
+    if priors:
+        start = with_priors(start, priors)
+        best = _with_inertias_free(best, priors)
+    return best, start
 
 
 def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
@@ -207,9 +220,12 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
 
 
 def told_by_load(found: Fit) -> Fit | None:
-    """The fit of the load's own equation whose values a base fit holds; None where it holds none, or others."""
+    """The fit whose values a base fit holds, of the load's own equation or beside friction of the motor; None where it
+    holds none, or others."""
     if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
         return None
+    if not sees_twist(found.stretches):
+        return refitted_beside(found)
     driven = motor_driven_fit(with_priors(found.model, ()), found.stretches)
     if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
         return None

@@ -16,9 +16,10 @@ from fitting.estimation.linear_response import readout
 from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
-from fitting.estimation.scales import scales
+from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
-from hdjax import Model
+from hdjax import Model, TwoInertiaModel
+from hdjax.dynamics import BOTH_ANGLES
 from hdjax.effects.learned import FAMILY
 
 REWEIGHTINGS = 3
@@ -187,12 +188,12 @@ def fit(
         states=start.states,
         engine=engine,
     )
-    swing = float(scales(stretches).x)
+    swing = float(scales(stretches, model).x)
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
     if covariance is None:
-        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[swing**2]])
+        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[(swing * of_twist(model)[-1]) ** 2]])
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
@@ -314,8 +315,14 @@ def _gap_weight(problem: Problem, white: np.ndarray, swing: float) -> Float[np.n
     """
     model = problem.model
     angles = len(model.motion_states) // 2
-    shown = np.linalg.norm(white @ readout(model, model.rest())[:, :angles], axis=0)
-    visible = 0.1 * swing * np.linalg.norm(white[:, -1])
+    slopes = white @ readout(model, model.rest())
+    shown = np.linalg.norm(slopes[:, :angles], axis=0)
+    if model.measured != BOTH_ANGLES and isinstance(model, TwoInertiaModel):
+        # What no sensor sees shows as what it drives does.
+        rates = np.linalg.norm(slopes[:, angles : 2 * angles], axis=0) * float(model.drive.omega_0)
+        sides = np.array([float(model.drive.N), 1.0])
+        shown = np.max(np.maximum(shown, rates) * sides) / sides
+    visible = 0.1 * swing * of_twist(model)[-1] * np.linalg.norm(white[:, -1])
     hidden = [visible / np.asarray(e.state_scale()) for e in model.effects if e.states]
     weights = np.concatenate([shown, shown / float(model.drive.omega_0), *hidden])
     return np.sqrt(problem.segments.weight.shape[1]) * weights

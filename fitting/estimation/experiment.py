@@ -13,6 +13,7 @@ from fitting.errors import DataError
 from fitting.logs.gaps import bridged
 from fitting.logs.log import Log
 from hdjax import Hold, PiecewisePolynomial, sampled
+from hdjax.dynamics import BOTH_ANGLES
 
 # Both assumed: a Runge-Kutta step this much longer than the others is cut; so many samples may be put in per row.
 _LONGEST_STEP = 1.5
@@ -27,8 +28,9 @@ class Experiment(eqx.Module):
         time: sample stamps [s].
         torque: motor torque [N m] or forcing, as logged, between samples.
         load_torque: torque on the load [N m], or None.
-        measured: (theta_m/N, dynamic error) [rad] by row, or the dynamic error alone.
-        motor_angle: measured motor angle [rad], or None in a reduced log.
+        measured: outputs by row; (theta_m/N, dynamic error) [rad], or the dynamic error alone, where `outputs` does not
+            say otherwise. The last one is the principal output, by which a fit is judged.
+        motor_angle: measured motor angle [rad], or what the motor's velocity makes of it; None where neither is known.
         weight: 1 for a sample whose outputs count, 0 for one that was put in or is not believed; None where all count.
             The outputs of a sample without weight are something finite in between.
         rows: which samples are rows of the log, the others having been put in; None where all are.
@@ -36,6 +38,7 @@ class Experiment(eqx.Module):
         origin: when the log starts, on the clock of `time` [s].
         log: the name of the log that it is a part of.
         rate_std: relative standard deviation of the sample interval, as far as the log's stamps leave it open.
+        outputs: names of what was measured, see [`hdjax.dynamics.OUTPUTS`][].
     """
 
     name: str = eqx.field(static=True)
@@ -50,9 +53,15 @@ class Experiment(eqx.Module):
     origin: float = eqx.field(static=True, default=0.0)
     log: str = eqx.field(static=True, default="")
     rate_std: float = eqx.field(static=True, default=0.0)
+    outputs: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __len__(self) -> int:
         return self.time.size
+
+    def output(self, name: str) -> Float[np.ndarray, " n"] | None:
+        """A measured output by its name; None where it was not measured."""
+        names = self.outputs or BOTH_ANGLES[-self.measured.shape[1] :]
+        return self.measured[:, names.index(name)] if name in names else None
 
     @property
     def time_step(self) -> float:
@@ -178,10 +187,8 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
     # What a digital drive commands is held on both sides; what sensors measure runs on, and straight lines follow it.
     load_hold = hold if hold == "zero-order" else "linear"
     load_torque = _channel(log, log.load_torque, time, load_hold) if drive_log else None
-    columns = [log.dynamic_error]
-    if drive_log:
-        assert log.motor_angle is not None and N is not None
-        columns.insert(0, log.motor_angle / N)
+    outputs = fitted_outputs(log)
+    columns = [_column(log, name, N) for name in outputs]
     weight = rows.astype(float)
     if log.trusted is not None:
         weight[rows] = log.trusted
@@ -194,14 +201,38 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
         torque=torque,
         load_torque=load_torque,
         measured=measured,
-        motor_angle=_filled(log, log.motor_angle, time, rows) if drive_log and log.motor_angle is not None else None,
+        motor_angle=_motor_angle(log, time, rows) if drive_log else None,
         weight=None if weight.all() else weight,
         rows=None if rows.all() else rows,
         temperature=_channel(log, log.temperature, time, "linear"),
         origin=float(log.time[0]),
         log=log.name,
         rate_std=log.rate_std,
+        outputs=outputs,
     )
+
+
+def fitted_outputs(log: Log) -> tuple[str, ...]:
+    """Names of what a fit of a log explains, of [`hdjax.dynamics.OUTPUTS`][], the principal one last."""
+    return BOTH_ANGLES if log.outputs == ("motor_angle", "load_angle") else log.outputs
+
+
+def _column(log: Log, output: str, N: float | None) -> np.ndarray:
+    """What was measured of an output."""
+    if output == "motor_turn":
+        assert log.motor_angle is not None and N is not None
+        return log.motor_angle / N
+    return getattr(log, output)
+
+
+def _motor_angle(log: Log, time: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
+    """The motor's angle on the grid; where it was not measured, its velocity over time."""
+    if log.motor_angle is not None:
+        return _filled(log, log.motor_angle, time, rows)
+    if log.motor_velocity is None:
+        return None
+    velocity = _filled(log, log.motor_velocity, time, rows)
+    return np.append(0.0, np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)))
 
 
 def _channel(log: Log, values: np.ndarray | None, time: np.ndarray, hold: Hold) -> PiecewisePolynomial | None:

@@ -12,9 +12,11 @@ from jaxtyping import Array, Float
 from fitting.estimation.engines import with_engine
 from fitting.estimation.experiment import Segments, Stretch, cut
 from fitting.estimation.free_parameters import free_parameters
+from fitting.estimation.observed_states import observed_states
 from fitting.estimation.residual import Engine, Problem, Unknowns
 from fitting.estimation.scales import scales
 from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.dynamics import BOTH_ANGLES
 from hdjax.lanes import spread
 
 # Segments are no longer than this; longer simulations join several, which are then lanes of one program.
@@ -99,8 +101,12 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
     """Each segment's first state from a local polynomial, through its first samples and, where the log goes on, the
     last ones of the segment before; hidden states as if it had long moved like this.
 
-    A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed.
+    A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed. What no sensor
+    sees of the motion is put in by the equations.
     """
+    if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:
+        found = jnp.asarray(observed_states(model, segments))
+        return _settled(model, found) if any(e.states for e in model.effects) else found
     length = segments.measured.shape[1]
     measured, knots = np.asarray(segments.measured), segments.knots
     step = float(np.median(np.diff(knots)))
@@ -163,7 +169,7 @@ def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray,
 
 def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, float]:
     """Units for parameters that may be zero: what makes each term visible at the measured twist."""
-    motion = scales(stretches)
+    motion = scales(stretches, model)
     drive = model.drive
     stiffness = float(drive.stiffness)
     damping = stiffness * motion.x / motion.v if motion.v > 0 else 1.0
@@ -175,7 +181,7 @@ def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, floa
 def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
     """The fastest oscillation of the dynamic error on the data [rad/s], hardening at full twist included."""
     drive = model.drive
-    stiffening = max(0.0, 3.0 * float(drive.alpha) * scales(stretches).x_max ** 2)
+    stiffening = max(0.0, 3.0 * float(drive.alpha) * scales(stretches, model).x_max ** 2)
     return float(drive.omega_0) * float(np.sqrt(1.0 + stiffening))
 
 

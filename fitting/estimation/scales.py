@@ -1,11 +1,14 @@
 """Orders of magnitude of what was measured."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
+from fitting.estimation.driven_load import Seen, seen_load, seen_motor, twist
 from fitting.estimation.experiment import Stretch
-from hdjax import Model, TwoInertiaModel
+from hdjax import Drive, Model, TwoInertiaModel
+from hdjax.dynamics import BOTH_ANGLES
 from hdjax.effects import Scales
 
 
@@ -14,14 +17,24 @@ def largest_torque(stretches: Sequence[Stretch]) -> float:
     return max(float(np.max(np.abs(s.experiment.torque.coefficients[:, 0]))) for s in stretches)
 
 
+def of_twist(model: Model) -> Float[np.ndarray, " outputs"]:
+    """What a radian of twist, as it swings at the natural frequency, is in each output."""
+    drive = model.drive
+    if not isinstance(drive, Drive) or model.measured == BOTH_ANGLES:
+        return np.ones(len(model.measured))
+    N, omega = float(drive.N), float(drive.omega_0)
+    other = {"motor_angle": N, "motor_velocity": N * omega, "load_velocity": omega, "joint_torque": float(drive.K)}
+    return np.array([other.get(name, 1.0) for name in model.measured])
+
+
 def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
-    """Orders of magnitude of the measured motion.
+    """Orders of magnitude of the motion.
 
     Args:
         stretches: the data.
-        model: supplies the natural frequency and the reduction ratio where it is given.
+        model: supplies the natural frequency and the reduction ratio, and the twist where that was not measured.
     """
-    x = np.concatenate([s.experiment.measured[s.start : s.stop, -1] for s in stretches])
+    x = np.concatenate([twist(s, model) for s in stretches])
     x = x - np.median(x)
     step = stretches[0].experiment.time_step
 
@@ -32,7 +45,7 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
 
     angles = [s.experiment.motor_angle[s.start : s.stop] for s in stretches if s.experiment.motor_angle is not None]
     motor = float(np.sqrt(np.mean([rate(a) ** 2 for a in angles]))) if angles else 1.0
-    output = [rate(s.experiment.measured[s.start : s.stop, 0]) for s in stretches]
+    output = [_speed(s, model, rate) for s in stretches]
     temperature, change = _temperature(stretches)
     return Scales(
         x=float(np.std(x)),
@@ -47,6 +60,16 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
         temperature=temperature,
         temperature_change=change,
     )
+
+
+def _speed(stretch: Stretch, model: Model | None, rate: Callable[[np.ndarray], float]) -> float:
+    """Rms rate of the first output; of the side that is seen where that is no turn of the output [rad/s]."""
+    experiment, part = stretch.experiment, slice(stretch.start, stretch.stop)
+    seen = Seen(experiment.measured[:, 0], 0)
+    if isinstance(model, TwoInertiaModel) and experiment.output("motor_turn") is None:
+        seen = seen_motor(experiment, float(model.drive.N)) or seen_load(experiment) or seen
+    values = seen.values[part]
+    return float(np.sqrt(np.mean(values**2))) if seen.order else rate(values)
 
 
 def _temperature(stretches: Sequence[Stretch]) -> tuple[float | None, float]:

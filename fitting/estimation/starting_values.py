@@ -15,12 +15,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from fitting.errors import DataError
+from fitting.estimation import weak_form
+from fitting.estimation.driven_load import starts_from_motor
 from fitting.estimation.experiment import Stretch
+from fitting.estimation.weak_form import WIDTHS, blind_functions, bump_functions
 from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 
 # Starts whose stiffness differs by less than this (in its logarithm) end in the same minimum.
 _DISTINCT = 0.1
-_WIDTHS = (12, 24, 48, 96, 192, 384)
 
 
 def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
@@ -34,14 +36,29 @@ def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, 
     Raises:
         DataError: where no weak form gives a positive stiffness.
     """
-    found = _estimates(model, stretches, blind=False)
-    if not found:
-        names = ", ".join(s.name for s in stretches)
-        raise DataError(
-            f"{names}: the dynamic error does not follow from the torque by any positive stiffness; check the signs "
-            "and units of motor_torque, motor_angle and load_angle in the drive file"
-        )
+    if not sees_twist(stretches):
+        assert isinstance(model, TwoInertiaModel)
+        return _distinct(model, _usable(starts_from_motor(model, stretches), stretches, "the motor's motion"))
+    found = _usable(_estimates(model, stretches, blind=False), stretches, "the dynamic error")
     return _distinct(model, [*found, *_estimates(model, stretches, blind=True)])
+
+
+def sees_twist(stretches: Sequence[Stretch]) -> bool:
+    """Whether the dynamic error was measured."""
+    return all(s.experiment.output("dynamic_error") is not None for s in stretches)
+
+
+def _usable(found: list[dict[str, float]], stretches: Sequence[Stretch], what: str) -> list[dict[str, float]]:
+    """The estimates, where there are any."""
+    if found:
+        return found
+    outputs = dict.fromkeys(name for s in stretches for name in s.experiment.outputs)
+    logged = ["motor_angle", "load_angle"] if not outputs or "dynamic_error" in outputs else list(outputs)
+    raise DataError(
+        f"{', '.join(s.name for s in stretches)}: {what} does not follow from the torque by any positive stiffness; "
+        f"check the signs and units of motor_torque{', ' if len(logged) > 1 else ''}{', '.join(logged[:-1])} and "
+        f"{logged[-1]} in the drive file"
+    )
 
 
 def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
@@ -71,7 +88,7 @@ def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch])
     wanted = [p.path for p in model.drive.priors if np.isinf(p.tolerance) and p.path in ("J_m", "J_l")]
     if not wanted:
         return model
-    found = [_momentum(model, stretches, width, wanted) for width in _WIDTHS]
+    found = [_momentum(model, stretches, width, wanted) for width in WIDTHS]
     usable = [(missed, values) for missed, values in filter(None, found) if min(values) > 0]
     if not usable:
         names = ", ".join(s.name for s in stretches)
@@ -92,7 +109,7 @@ def _momentum(
         if len(stretch) < 3 * width:
             continue
         experiment, part = stretch.experiment, slice(stretch.start, stretch.stop)
-        tests, slopes, curvatures = _test_functions(width, experiment.time_step)
+        tests, slopes, curvatures = bump_functions(width, experiment.time_step)
         output = experiment.measured[part, 0] - experiment.measured[stretch.start, 0]
         load = output - experiment.measured[part, -1]
         N, u = float(drive.N), np.asarray(experiment.torque.coefficients)[part, 0] * float(drive.k_T)
@@ -101,8 +118,7 @@ def _momentum(
         hop, dt = max(1, width // 4), experiment.time_step
 
         def against(signal: np.ndarray, functions: np.ndarray, hop: int = hop, dt: float = dt) -> np.ndarray:
-            windows = np.lib.stride_tricks.sliding_window_view(signal, width)[::hop]
-            return (windows @ functions.T).ravel() * dt
+            return weak_form.against(signal, functions, hop) * dt
 
         momenta = {"J_m": N**2 * against(output, curvatures), "J_l": against(load, curvatures)}
         friction = -against(output, slopes), against(direction, tests)
@@ -128,7 +144,7 @@ def _momentum(
 def _estimates(
     model: Model, stretches: Sequence[Stretch], *, blind: bool, equations: tuple[str, ...] | None = None
 ) -> list[dict[str, float]]:
-    forms = itertools.product(_WIDTHS, _equations(model) if equations is None else equations)
+    forms = itertools.product(WIDTHS, _equations(model) if equations is None else equations)
     estimates = (_weak_form(model, stretches, width, equation, blind=blind) for width, equation in forms)
     return [estimate for estimate in estimates if estimate is not None]
 
@@ -204,12 +220,11 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: b
     u = np.asarray(experiment.torque.coefficients)[part, 0]
     load = experiment.load_torque
     T_l = np.zeros_like(u) if load is None else np.asarray(load.coefficients)[part, 0]
-    tests, slopes, curvatures = _blind_functions(width, dt) if blind else _test_functions(width, dt)
+    tests, slopes, curvatures = blind_functions(width, dt) if blind else bump_functions(width, dt)
     hop = max(1, width // 4)
 
     def against(signal: np.ndarray, functions: np.ndarray) -> np.ndarray:
-        windows = np.lib.stride_tricks.sliding_window_view(signal, width)[::hop]
-        return (windows @ functions.T).ravel() * dt
+        return weak_form.against(signal, functions, hop) * dt
 
     spring, cubic, damper = against(x, tests), against(x**3, tests), -against(x, slopes)
     if equation == "load":
@@ -224,28 +239,3 @@ def _rows(model: Model, stretch: Stretch, width: int, equation: str, *, blind: b
         forcing = u * float(model.drive.k_T / (model.drive.N * model.drive.J_m)) - T_l / float(model.drive.J_l)
         return np.stack([spring, cubic, damper], axis=1), right + against(forcing, tests)
     return np.stack([spring, cubic, damper, -against(u, tests)], axis=1), right
-
-
-def _test_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A bump (1 - s^2)^4 and its modulations, with first and second derivatives, sampled on the window."""
-    t = (np.arange(width) - 0.5 * (width - 1)) * dt
-    half = 0.5 * width * dt
-    s = t / half
-    bump = np.polynomial.Polynomial([1, 0, -1]) ** 4
-    p, dp, ddp = bump(s), bump.deriv(1)(s) / half, bump.deriv(2)(s) / half**2
-    tests, slopes, curvatures = [], [], []
-    for k in range(4):
-        w = np.pi * k / half
-        for phase in (0.0, -0.5 * np.pi) if k else (0.0,):
-            c, dc = np.cos(w * t + phase), -w * np.sin(w * t + phase)
-            tests.append(p * c)
-            slopes.append(dp * c + p * dc)
-            curvatures.append(ddp * c + 2 * dp * dc - w**2 * p * c)
-    return np.stack(tests), np.stack(slopes), np.stack(curvatures)
-
-
-def _blind_functions(width: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The modulations, each less so much of the bump that nothing is left of a constant."""
-    tests, slopes, curvatures = _test_functions(width, dt)
-    share = tests[1:].sum(axis=1, keepdims=True) / tests[0].sum()
-    return tests[1:] - share * tests[0], slopes[1:] - share * slopes[0], curvatures[1:] - share * curvatures[0]

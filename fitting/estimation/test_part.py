@@ -7,7 +7,7 @@ from fitting.estimation.free_run import WINDOW
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.log import Log
 from fitting.logs.masks import masked
-from fitting.logs.zeroing import zeroed
+from fitting.logs.zeroing import counted_from, zeroed
 
 TEST_SHARE = 0.2
 """Share of a log, at its end, that is test data where no other log is named for it."""
@@ -38,7 +38,7 @@ def parted(log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE) -> tup
         end = masked(end)
     except DataError:
         return known, None
-    return known, replace(end, dynamic_error=end.dynamic_error - known.zero, zero=known.zero)
+    return known, counted_from(end, known.zero)
 
 
 def whole_test_log(log: Log, drive_file: DriveFile) -> Log:
@@ -49,4 +49,4 @@ def whole_test_log(log: Log, drive_file: DriveFile) -> Log:
     """
     ready = masked(log)
     zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file).zero
-    return replace(ready, dynamic_error=ready.dynamic_error - zero, zero=zero)
+    return counted_from(ready, zero)

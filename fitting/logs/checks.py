@@ -58,7 +58,7 @@ def refuse_unfit(findings: Iterable[Finding], log: Log) -> None:
 def _known(log: Log, signal: str) -> np.ndarray | None:
     """The values of a signal that checks may look at."""
     values = getattr(log, signal)
-    if values is None or signal not in OUTPUTS:
+    if values is None or signal not in (*log.outputs, *OUTPUTS):
         return values
     return values[: log.outputs_until]
 
@@ -99,10 +99,9 @@ def _excitation(log: Log) -> Iterator[Finding]:
 
 
 def _response(log: Log) -> Iterator[Finding]:
-    outputs = ("motor_angle", "load_angle") if log.kind == "drive" else ("dynamic_error",)
-    stuck = [name for name in outputs if _is_constant(_known(log, name))]
+    stuck = [name for name in log.outputs if _is_constant(_known(log, name))]
     for name in stuck:
-        hopeless = stuck == list(outputs)
+        hopeless = stuck == list(log.outputs)
         yield Finding(
             "refusal" if hopeless else "warning",
             f"{name} never changes",
@@ -120,11 +119,11 @@ def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
         if values is not None and not _is_constant(values):
             yield from _inputs(name, values, log.time)
             yield from _quantised(log, name, values, 1.0, float(np.std(values)))
-    if log.kind != "drive":
-        twist = _known(log, "dynamic_error")
-        assert twist is not None
-        if not _is_constant(twist):
-            yield from _quantised(log, "dynamic_error", twist, 1.0, float(np.std(twist)))
+    if log.dynamic_error is None or log.kind != "drive":
+        for name in log.outputs:
+            values = _known(log, name)
+            if values is not None and not _is_constant(values):
+                yield from _quantised(log, name, values, 1.0, float(np.std(values)))
         return
     motor, load = _known(log, "motor_angle"), _known(log, "load_angle")
     assert motor is not None and load is not None
@@ -176,7 +175,7 @@ def _quantised(log: Log, name: str, values: np.ndarray, side: float, spread: flo
     if not on_grid or not (few or share > COARSE_STEP):
         return
     unit = _UNITS.get(name) or log.units.get(name, "")
-    about = "of the rms dynamic error" if name.endswith("_angle") else "of its own rms"
+    about = "of the rms dynamic error" if name.endswith("_angle") and log.dynamic_error is not None else "of its own rms"
     yield Finding(
         "note",
         f"the values lie {step:.4g} {unit} apart, which is {100 * share:.2g} % {about}",

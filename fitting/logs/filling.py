@@ -1,6 +1,6 @@
 """What is unknown of a log's signals: which rows count, and what stands in the others."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ from fitting.errors import DataError, InputError
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
 from fitting.logs.gaps import SHORTEST, pieces
-from fitting.logs.log_kind import OPTIONAL_SIGNALS, OUTPUTS
+from fitting.logs.log_kind import OPTIONAL_SIGNALS
 from fitting.logs.time_stamps import TimeBase
 
 _FEWEST_INPUTS = 50
@@ -19,6 +19,7 @@ def trusted_rows(
     path: Path,
     drive_file: DriveFile,
     signals: dict[str, np.ndarray],
+    outputs: Sequence[str],
     outputs_until: int | None,
     asked: int | None,
     *,
@@ -30,11 +31,11 @@ def trusted_rows(
         path: The log, for messages.
         drive_file: Names the columns, for messages.
         signals: By name; outputs that are unknown are filled.
+        outputs: Their names.
         outputs_until: Rows in which the outputs are known, or None for all.
         asked: How many samples of each output are wanted there, or None for all.
         own_clocks: Whether rows are the stamps of all channels, so that each lacks those of the others.
     """
-    outputs = [name for name in OUTPUTS if name in signals]
     count = len(signals[outputs[0]])
     trusted, findings = np.ones(count, dtype=bool), []
     rows = np.arange(count)

@@ -40,7 +40,7 @@ def without_repeats(log: Log) -> Log:
         log: A drive log or a reduced log, as read.
     """
     until = len(log) if log.outputs_until is None else min(log.outputs_until, len(log))
-    names = ("motor_angle", "load_angle") if log.kind == "drive" else ("dynamic_error",)
+    names, angles = log.outputs, ("motor_angle", "load_angle")
     known = np.ones(len(log), dtype=bool) if log.trusted is None else log.trusted
     channels, findings, moved = {}, [], ()
     for name in names:
@@ -53,7 +53,7 @@ def without_repeats(log: Log) -> Log:
         channels[name] = values
     if not findings:
         return log
-    if log.kind == "drive" and log.outputs_until is None:
+    if names == angles and log.outputs_until is None:
         ratio = _ratio(log)
         motor, load, moved = angles_together(log.time, channels["motor_angle"], channels["load_angle"], ratio, log.path)
         channels = {"motor_angle": motor, "load_angle": load}
@@ -62,15 +62,16 @@ def without_repeats(log: Log) -> Log:
         name: np.where(np.isfinite(v), v, np.interp(log.time, log.time[np.isfinite(v)], v[np.isfinite(v)]))
         for name, v in channels.items()
     }
-    if log.kind == "drive":
+    if names == angles:
         change = {name: filled[name] - getattr(log, name) for name in names}
+        assert log.dynamic_error is not None
         filled["dynamic_error"] = log.dynamic_error + change["motor_angle"] / _ratio(log) - change["load_angle"]
     return replace(log, trusted=trusted, findings=(*log.findings, *findings, *moved), **filled)
 
 
 def _ratio(log: Log) -> float:
     """N, as the dynamic error was made with it."""
-    assert log.motor_angle is not None and log.load_angle is not None
+    assert log.motor_angle is not None and log.load_angle is not None and log.dynamic_error is not None
     output = log.dynamic_error + log.zero + log.load_angle
     most = int(np.argmax(np.abs(output)))
     return float(log.motor_angle[most] / output[most]) if output[most] else 1.0

@@ -23,10 +23,12 @@ from fitting.logs.log_kind import (
     REDUCED_SIGNALS,
     VELOCITIES,
     Kind,
+    drive_outputs,
     kind_of,
     listing,
     needed_signals,
     refuse_repeated,
+    told_of_subset,
 )
 from fitting.logs.own_clocks import later_names, mended_base, with_own_clocks
 from fitting.logs.raw_table import RawColumn, RawTable
@@ -51,27 +53,26 @@ class Log:
     Attributes:
         name: Stem of the file.
         path: The file.
-        kind: "drive" (angles and torque), "reduced" (dynamic error and forcing) or "quasi-static" (twist and joint
-            torque).
+        kind: "drive" (motor torque and what it moves), "reduced" (dynamic error and forcing) or "quasi-static" (twist
+            and joint torque).
         time: Stamps [s], strictly increasing, in the file's own origin, (n,).
         motor_angle: theta_m [rad], (n,), or None for a reduced log.
         load_angle: theta_l [rad], (n,), or None.
         motor_torque: T_m [N m], (n,), or None.
         load_torque: T_l [N m], positive along +theta_l, (n,), or None.
         temperature: [K], (n,), or None.
-        dynamic_error: x, (n,); theta_m/N - theta_l [rad] in a drive log, less `zero`.
+        dynamic_error: x, (n,); theta_m/N - theta_l [rad] in a drive log, less `zero`, None where it lacks an angle.
         forcing: F, (n,), or None for a drive log.
         units: Units of `dynamic_error` and, in a reduced log, of `forcing`.
         findings: What was seen while reading; `health.examine` adds to it.
-        motor_velocity: theta_m' [rad/s] as logged, (n,), NaN where unknown, or None; only checked against.
+        motor_velocity: theta_m' [rad/s] as logged, (n,), or None; NaN where unknown and only checked against.
         load_velocity: theta_l' [rad/s], likewise.
         outputs_until: Rows in which the output columns are known, or None for all. Nothing may look at later outputs.
         trusted: Rows whose outputs were measured and are believed, (n,), or None for all. Others hold something finite.
         input_known: Rows in which motor torque or forcing was sampled, (n,), or None for all.
         pieces: First row and one past the last of each stretch between gaps, or None for the whole log.
         zero: What was taken off the dynamic error, since no torque explains it.
-        joint_torque: That the drive passes on [N m], positive where it twists the drive positively, (n,), or None
-            but for a quasi-static log.
+        joint_torque: That the drive passes on [N m], positive where it twists the drive positively, (n,), or None.
         rate_std: Relative standard deviation of the sample interval, as far as rounded stamps leave it open.
     """
 
@@ -84,7 +85,7 @@ class Log:
     motor_torque: np.ndarray | None
     load_torque: np.ndarray | None
     temperature: np.ndarray | None
-    dynamic_error: np.ndarray
+    dynamic_error: np.ndarray | None
     forcing: np.ndarray | None
     units: dict[str, str]
     findings: tuple[Finding, ...] = ()
@@ -100,6 +101,13 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The signals that a fit is to explain, as they were logged."""
+        if self.kind != "drive":
+            return ("dynamic_error",)
+        return drive_outputs([name for name, value in vars(self).items() if isinstance(value, np.ndarray)])
 
     def rows(self, start: int, stop: int) -> "Log":
         """Rows `start` to `stop` (exclusive) as a log of their own, with the stretches between gaps that lie there."""
@@ -144,12 +152,13 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     refuse_repeated(path, drive_file, table)
     kind = kind_of(path, drive_file, table, raw)
     required = needed_signals(kind, raw)
+    joined = (*joined, *(told_of_subset(path, drive_file, table, raw) if kind == "drive" else ()))
     raw, start, stop, told = _inhabited(path, drive_file, table, raw, required)
-    asked, outputs_until = outputs_until, _rows_until(outputs_until, raw, start)
+    asked, outputs_until = outputs_until, _rows_until(outputs_until, raw, required[:-1], start)
     channels = {}
     for signal in raw:
         if signal != "time":
-            is_output = outputs_until is not None and signal in (*OUTPUTS, *VELOCITIES)
+            is_output = outputs_until is not None and signal in (*required[:-1], *OUTPUTS)
             column = _cut(raw[signal], start, stop, start + outputs_until if is_output and outputs_until else stop)
             channels[signal] = channel(path, drive_file, signal, column, first_row=start)
     if kind == "quasi-static" and "time" not in raw and not (drive_file.sample_rate or table.sample_rate):
@@ -164,7 +173,8 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
     signals = {name: found.values[base.rows] for name, found in channels.items()}
     findings += _put_together(path, drive_file, base.time, signals, outputs_until)
     own_clocks = "time" in raw and raw["time"].time is not None
-    trusted, untold = trusted_rows(path, drive_file, signals, outputs_until, asked, own_clocks=own_clocks)
+    seen = required[:-1]
+    trusted, untold = trusted_rows(path, drive_file, signals, seen, outputs_until, asked, own_clocks=own_clocks)
     known, spans, gaps = input_rows(path, drive_file, base, signals, required[-1], outputs_until)
     findings += [*untold, *gaps, *interpolated(path, drive_file, base.time, signals)]
     log = Log(
@@ -191,7 +201,8 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
         rate_std=base.rate_std,
     )
     for array in (log.time, log.dynamic_error, *signals.values()):
-        array.setflags(write=False)
+        if array is not None:
+            array.setflags(write=False)
     return log
 
 
@@ -209,11 +220,11 @@ def _put_together(
     return moved
 
 
-def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], start: int) -> int | None:
+def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], outputs: Sequence[str], start: int) -> int | None:
     """Rows in which so many samples of each output are: more than these where a channel is slower than the log."""
     if asked is None:
         return None
-    known = [np.flatnonzero(np.isfinite(raw[s].values[start:])) for s in OUTPUTS if s in raw]
+    known = [np.flatnonzero(np.isfinite(raw[s].values[start:])) for s in outputs]
     return max((int(rows[asked - 1]) + 1 for rows in known if len(rows) >= asked), default=asked)
 
 
@@ -224,8 +235,10 @@ def _in_memory(path: Path, source: Any, wanted: list[str]) -> RawTable:
     return table_of(path, source, wanted)
 
 
-def _twist(path: Path, drive_file: DriveFile, kind: Kind, signals: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The dynamic error, which in a quasi-static log is a twist."""
+def _twist(path: Path, drive_file: DriveFile, kind: Kind, signals: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """The dynamic error, which in a quasi-static log is a twist; None for a drive log that lacks an angle."""
+    if kind == "drive" and not ("motor_angle" in signals and "load_angle" in signals):
+        return None
     if kind == "reduced" or "load_angle" not in signals:
         return signals["twist"] if "twist" in signals else signals["dynamic_error"]
     if "motor_angle" not in signals:

@@ -1,20 +1,22 @@
 """Which kind of log a table is, and which of its columns that kind needs."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Literal
 
 from fitting.errors import InputError
 from fitting.logs.column_names import likely_columns
 from fitting.logs.drive_file import SIGNALS, DriveFile, did_you_mean
+from fitting.logs.findings import Finding
 from fitting.logs.raw_table import RawColumn, RawTable, split_unit
 
 DRIVE_SIGNALS = ("motor_angle", "load_angle", "motor_torque")
 REDUCED_SIGNALS = ("dynamic_error", "forcing")
 TWIST_SIGNALS = (("twist",), ("dynamic_error",), ("motor_angle", "load_angle"), ("load_angle",))
-OUTPUTS = ("motor_angle", "load_angle", "dynamic_error", "twist")
+OUTPUTS = ("motor_angle", "load_angle", "dynamic_error", "twist", "motor_velocity", "load_velocity")
 OPTIONAL_SIGNALS = ("load_torque", "temperature")
 VELOCITIES = ("motor_velocity", "load_velocity")
+SIDES = (("motor_angle", "motor_velocity"), ("load_angle", "load_velocity"))
 
 Kind = Literal["drive", "reduced", "quasi-static"]
 
@@ -44,16 +46,17 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
             f"{path}: there is no column '{column}'{did_you_mean(column, table.names)}, which "
             f"[columns] {signal} of {drive_file.path} names; {listing(table)}"
         )
-    is_drive = all(signal in raw for signal in DRIVE_SIGNALS)
+    stated = drive_file.columns
+    has_angles = all(signal in raw for signal in DRIVE_SIGNALS)
     is_reduced = all(signal in raw for signal in REDUCED_SIGNALS)
-    if is_drive and is_reduced:
+    if has_angles and is_reduced:
         # A drive log may carry a derived dynamic error; only a stated one displaces the angles.
-        is_drive = not all(signal in drive_file.columns for signal in REDUCED_SIGNALS)
+        has_angles = not all(signal in stated for signal in REDUCED_SIGNALS)
     if "joint_torque" in raw and twist_signals(raw):
-        stated = drive_file.columns
         only_stated = "joint_torque" in stated and not ("motor_torque" in stated or "forcing" in stated)
-        if only_stated or not (is_drive or is_reduced):
+        if only_stated or not (has_angles or is_reduced or "motor_torque" in stated):
             return "quasi-static"
+    is_drive = has_angles or (not is_reduced and "motor_torque" in raw and bool(drive_outputs(raw)))
     if is_drive:
         for key in _DRIVE_KEYS:
             if not drive_file.states(key):
@@ -64,22 +67,47 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
         return "drive"
     if is_reduced:
         return "reduced"
-    begun = any(s in raw for s in REDUCED_SIGNALS) and not any(s in raw for s in DRIVE_SIGNALS)
-    missing = [s for s in (REDUCED_SIGNALS if begun else DRIVE_SIGNALS) if s not in raw]
-    taken = [drive_file.column_of(signal).column for signal in raw]
-    free = [name for name in table.names if split_unit(name)[0] not in taken]
+    missing = _missing(raw)
+    free = _unnamed(drive_file, table, raw)
     likely = likely_columns(missing[0], free)[:_MOST_LIKELY]
     could_be = f" ({' or '.join(repr(name[:60]) for name in likely)} could be it)" if likely else ""
     example = likely[0][:60] if likely else "..."
     # The name of another signal is like this one's as well.
     hint = did_you_mean(missing[0], free, cutoff=_MISSPELT) or could_be
-    velocity = missing[0].replace("angle", "velocity")
-    if velocity in raw and velocity != missing[0]:
-        hint = f" ({velocity} cannot stand in for it: integrated, it drifts by more than the twist)"
     raise InputError(
         f"{path}: no column for {', '.join(missing)}{hint}; {listing(table)}, so say which one it is in the drive "
         f'file, e.g. [columns] {missing[0]} = {{ column = "{example}" }}, or let `hdjax init` guess'
     )
+
+
+def _missing(raw: Mapping[str, RawColumn]) -> list[str]:
+    """What a log lacks to be one that can be fitted, the most likely kind taken."""
+    if any(s in raw for s in REDUCED_SIGNALS) and not any(s in raw for s in DRIVE_SIGNALS):
+        return [s for s in REDUCED_SIGNALS if s not in raw]
+    if drive_outputs(raw):
+        return ["motor_torque"]
+    return [s for s in DRIVE_SIGNALS if s not in raw]
+
+
+def _unnamed(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]) -> list[str]:
+    """Columns that are no signal yet."""
+    taken = [drive_file.column_of(signal).column for signal in raw]
+    return [name for name in table.names if split_unit(name)[0] not in taken]
+
+
+def told_of_subset(
+    path: Path, drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]
+) -> tuple[Finding, ...]:
+    """What is to be said of a drive log that lacks an angle: what it is fitted to, and which column may be the angle."""
+    seen, lacks = drive_outputs(raw), [angle for angle, _ in SIDES if angle not in raw]
+    if not lacks or not seen:
+        return ()
+    free = _unnamed(drive_file, table, raw)
+    likely = [(angle, name) for angle in lacks for name in likely_columns(angle, free)[:1]]
+    could_be = "".join(f"; the column '{name[:60]}' could be {angle}, so name it if it is" for angle, name in likely)
+    what = f"there is no {' and no '.join(lacks)}"
+    consequence = f"the drive is fitted to {' and '.join(seen)} under motor_torque{could_be}"
+    return (Finding("warning" if likely else "note", what, "all columns", consequence),)
 
 
 def listing(table: RawTable) -> str:
@@ -93,7 +121,19 @@ def needed_signals(kind: Kind, raw: Mapping[str, RawColumn]) -> tuple[str, ...]:
     """The signals of a log, its input last."""
     if kind == "quasi-static":
         return (*twist_signals(raw), "joint_torque")
-    return DRIVE_SIGNALS if kind == "drive" else REDUCED_SIGNALS
+    return (*drive_outputs(raw), "motor_torque") if kind == "drive" else REDUCED_SIGNALS
+
+
+def drive_outputs(signals: Collection[str]) -> tuple[str, ...]:
+    """The outputs that a drive log is fitted to, the principal one last.
+
+    Both angles hold all; a velocity beside the angle of its side mostly is the angle's derivative, and is only checked
+    against it.
+    """
+    sides = [next((s for s in side if s in signals), None) for side in SIDES]
+    if sides == ["motor_angle", "load_angle"]:
+        return ("motor_angle", "load_angle")
+    return (*(s for s in sides if s is not None), *(s for s in ("joint_torque",) if s in signals))
 
 
 def twist_signals(raw: Mapping[str, RawColumn]) -> tuple[str, ...]:

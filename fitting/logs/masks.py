@@ -70,13 +70,11 @@ def _untrusted(log: Log) -> Iterator[tuple[np.ndarray, Finding]]:
     until = log.outputs_until
     known = np.ones(len(log), dtype=bool) if log.trusted is None else log.trusted
     known = known[:until]
-    if log.kind == "reduced":
-        yield from _of_channel("dynamic_error", log.dynamic_error[:until], None, known, log.time[:until])
-        return
-    assert log.motor_angle is not None and log.load_angle is not None
-    motor, load = log.motor_angle[:until], log.load_angle[:until]
-    yield from _of_channel("motor_angle", motor, load, known, log.time[:until])
-    yield from _of_channel("load_angle", load, motor, known, log.time[:until])
+    channels = {name: getattr(log, name)[:until] for name in log.outputs}
+    for name, values in channels.items():
+        others = [other for key, other in channels.items() if key != name]
+        # What moves meanwhile tells a stuck sensor from rest.
+        yield from _of_channel(name, values, others[0] if others else None, known, log.time[:until])
 
 
 def _of_channel(
@@ -84,6 +82,7 @@ def _of_channel(
 ) -> Iterator[tuple[np.ndarray, Finding]]:
     if len(values) < 12 or np.all(values == values[0]):
         return
+    mover = "the other angle" if name.endswith("_angle") else "another sensor"
     spikes = np.setdiff1d(glitches(values, time), np.flatnonzero(~known))
     if len(spikes):
         yield (
@@ -112,7 +111,7 @@ def _of_channel(
             rows,
             Finding(
                 "warning",
-                f"{name} holds one value for {len(rows)} rows while the other angle moves",
+                f"{name} holds one value for {len(rows)} rows while {mover} moves",
                 f"{name}, data rows {rows[0] + 1} to {rows[-1] + 1}",
                 "the sensor is stuck there, so that these samples have no weight in the fit",
             ),

@@ -29,6 +29,8 @@ def zeroed(log: Log, drive_file: DriveFile) -> Log:
     Returns:
         The log, its `zero`, and a finding where there is something to tell.
     """
+    if log.dynamic_error is None:
+        return log
     with np.errstate(all="ignore"):
         known = slice(log.outputs_until) if log.trusted is None else log.trusted[: log.outputs_until]
         x = log.dynamic_error[: log.outputs_until][known]
@@ -50,7 +52,12 @@ def zeroed(log: Log, drive_file: DriveFile) -> Log:
         f"the sensors were not zeroed together, so that it is counted from {offset:.7g} {unit}"
         + ("" if unexplained else "; a steady load looks the same, so that alpha may be the one around this point"),
     )
-    return replace(log, dynamic_error=log.dynamic_error - offset, zero=offset, findings=(*log.findings, finding))
+    return replace(counted_from(log, offset), findings=(*log.findings, finding))
+
+
+def counted_from(log: Log, zero: float) -> Log:
+    """The log with its dynamic error, where it has one, counted from a zero."""
+    return log if log.dynamic_error is None else replace(log, dynamic_error=log.dynamic_error - zero, zero=zero)
 
 
 def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: float) -> float:
@@ -59,6 +66,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
     Weak form as for the starting values: the load's equation J_l theta_l'' = p(x) + B x', or that of the reduced drive
     with b u on its right, times test functions and integrated by parts.
     """
+    assert log.dynamic_error is not None
     best, root = np.inf, middle
     x = log.dynamic_error - middle
     for width in _WIDTHS:

@@ -102,7 +102,7 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
     if not fit.free.paths:
         return Identifiability({}, (), (), {})
     estimates = found.estimates
-    x_max = scales(fit.stretches).x_max
+    x_max = scales(fit.stretches, fit.model).x_max
     x_unit = "rad" if isinstance(fit.model.drive, Drive) else "[x]"
     known, first = fit.model.parameters(), fit.problem.model
     bounds = {

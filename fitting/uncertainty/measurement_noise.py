@@ -10,7 +10,7 @@ from fitting.estimation.estimate import REWEIGHTINGS, Fit, weighed, zeros_like
 from fitting.estimation.experiment import Stretch, cut
 from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
 from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
-from fitting.estimation.scales import scales
+from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
 
 # So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.
@@ -101,7 +101,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
     every = 1.0 / np.mean(np.concatenate([s.weight for s in found.stretches]))
     piece = min(length, int(np.round(np.clip(half_period, 6 * every, 24 * every))))
     held = eqx.tree_at(lambda p: p.active, found.problem, zeros_like(found.problem.active))
-    swing = float(scales(found.stretches).x)
+    swing = float(scales(found.stretches, found.model).x)
     anew = smoothed = _Pieces(np.zeros(found.covariance.shape))
     # A piece is the head of a segment; segments that begin later have other heads.
     for offset in range(0, length - piece + 1, piece):
@@ -129,7 +129,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         anew = anew.and_more(covariance * head.sum(), float(head.sum()), _states_freedom(part, seen))
         smoothed = smoothed.and_more(*_smoothed(part, seen, piece))
     # Logs that were simulated without noise show the solver's error.
-    return jnp.asarray(_of_both(anew, smoothed) + (_EXACT * swing) ** 2 * np.eye(len(found.covariance)))
+    return jnp.asarray(_of_both(anew, smoothed) + np.diag((_EXACT * swing * of_twist(found.model)) ** 2))
 
 
 def _of_both(anew: _Pieces, smoothed: _Pieces) -> Float[np.ndarray, "outputs outputs"]:

@@ -43,6 +43,10 @@ class Pushed(Model):
         return self.model.effects
 
     @property
+    def measured(self) -> tuple[str, ...]:
+        return self.model.state_names
+
+    @property
     def state_names(self) -> tuple[str, ...]:
         return (*self.model.state_names, "passed")
 

@@ -1,0 +1,79 @@
+"""A base fit where the dynamic error was not measured, with and without friction of the motor beside it.
+
+The base model can take energy from the motor only through the mesh, so that friction of the motor leads its fit to any
+K. Where both angles were measured, the load's own equation tells (see [`fitting.estimation.motor_driven`][]). Here
+friction is fitted beside the drive instead, and holds its parameters where it explains most of what is left.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from fitting.estimation.estimate import Fit, Strategy, fit
+from fitting.estimation.experiment import Stretch
+from fitting.estimation.free_parameters import base_paths, fitted_paths
+from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
+from fitting.estimation.scales import largest_torque, scales
+from hdjax import Model
+from hdjax.effects import MotorFriction
+
+# Friction that a fit begins with, over the largest torque; it moves by its logarithm.
+_BEGIN = 0.05
+# Iterations that tell a start that leads somewhere from one that does not.
+_TRIAL_STEPS = 10
+# Share of the rms speed over which the sign of friction turns.
+_TURN = 0.01
+
+
+def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Fit, Model]:
+    """The fit of the drive alone, that of the drive beside friction of its motor, and where they started.
+
+    Args:
+        starts: models with starting values.
+        training: the data.
+        halo: intervals of torque before a segment.
+    """
+    # Judged on equally short segments, a start with the wrong frequency can't hide.
+    horizon = min(short_horizon(s, training) for s in starts)
+    substeps = max(suggested_substeps(s, training) for s in starts)
+    segmentation = Segmentation(horizon, segment_length(horizon), halo, substeps)
+    fitted = functools.partial(_fitted, training=training, segmentation=segmentation)
+    rubbing = [(fitted(beside_friction(s, training), Strategy(_TRIAL_STEPS)), s) for s in starts]
+    best, start = min(rubbing, key=lambda pair: pair[0].objective)
+    beside = fitted(best.model)
+    alone = fitted(start)
+    if beside.objective < alone.objective:
+        # Where friction is small, the drive beside it is near the drive alone.
+        other = fitted(beside.model.without_effect(MotorFriction.name))
+        alone = min(alone, other, key=lambda f: f.objective)
+    return alone, beside, start
+
+
+def beside_friction(model: Model, training: Sequence[Stretch]) -> Model:
+    """The model with friction on the motor that a fit may begin with."""
+    speed = scales(training, model).omega_m
+    friction = MotorFriction(T_c=_BEGIN * largest_torque(training), transition=_TURN * speed)
+    return model.with_effects(friction)
+
+
+def held_beside(beside: Fit, start: Model, training: Sequence[Stretch], halo: int) -> Fit:
+    """The base model with its parameters held at what they are beside friction."""
+    told = start.replace({path: beside.model.get(path) for path in base_paths(start)})
+    horizon = short_horizon(told, training)
+    segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
+    return _fitted(told, Strategy(hold_parameters=True), training=training, segmentation=segmentation)
+
+
+def refitted_beside(held: Fit) -> Fit:
+    """The fit beside friction that a base fit's values are of."""
+    return _fitted(
+        beside_friction(held.model, held.stretches), training=held.stretches, segmentation=held.segmentation
+    )
+
+
+def _fitted(
+    model: Model, strategy: Strategy = Strategy(), *, training: Sequence[Stretch], segmentation: Segmentation
+) -> Fit:
+    paths = [p for p in fitted_paths(model) if not p.endswith(".transition")]
+    return fit(model, training, paths, segmentation, strategy=strategy)
