@@ -396,7 +396,7 @@ def main() -> None:
         if isinstance(row.result, Fit):
             f = row.result
             shape = f"{f.error.shape[0]} x {f.error.shape[1]}, {f.substeps} substeps"
-            rms = f.dynamic_error_std / NOISE
+            rms = f.principal_std / NOISE
             print(f"ours {label}, {key}: {shape}, {f.steps} steps, converged {f.converged}, x error {rms:.4f} noise")
     model, stretches = ours["x", "short"].result.model, reduced.stretches
     angle = natural_frequency(model, stretches) / RATE

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from fitting.errors import InputError
 from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, Trajectory, TwoInertiaModel, sampled, simulate
 from hdjax.drive import Prior
+from hdjax.dynamics import BOTH_ANGLES, OUTPUTS
 from hdjax.effects import BY_NAME, Effect
 from hdjax.effects.learned import LEARNED, Learned, LearnedFriction, LearnedPeriodic
 from hdjax.effects.learned_axes import (
@@ -71,6 +72,7 @@ def to_json(stored: StoredModel) -> str:
     content = {
         "schema": SCHEMA,
         "kind": "two-inertia" if isinstance(model, TwoInertiaModel) else "reduced",
+        "measured": list(model.measured),
         "drive": _values(model.drive),
         "priors": [_prior(p) for p in model.drive.priors] if isinstance(model.drive, Drive) else [],
         "effects": [{"name": e.name, "parameters": _values(e)} | _learned_content(e) for e in model.effects],
@@ -190,7 +192,11 @@ def _stored(content: Any) -> StoredModel:
         raise ValueError(f"schema {content['schema']!r} where {SCHEMA!r} was expected")
     effects = tuple(_effect(e) for e in content["effects"])
     if content["kind"] == "two-inertia":
-        model: Model = TwoInertiaModel(Drive(**content["drive"], priors=_priors(content.get("priors", ()))), effects)
+        drive = Drive(**content["drive"], priors=_priors(content.get("priors", ())))
+        measured = tuple(content.get("measured", BOTH_ANGLES))
+        if not measured or not OUTPUTS.keys() >= set(measured):
+            raise ValueError(f"measured is {measured}")
+        model: Model = TwoInertiaModel(drive, effects, measured)
     else:
         model = ReducedModel(ReducedDrive(**content["drive"]), effects)
     for path, (value, info) in model.parameters().items():
@@ -199,7 +205,7 @@ def _stored(content: Any) -> StoredModel:
     if content["torque_hold"] not in HOLDS:
         raise ValueError(f"torque_hold {content['torque_hold']!r}")
     noise = jnp.asarray(content["noise_covariance"], dtype=float)
-    outputs = 2 if isinstance(model, TwoInertiaModel) else 1
+    outputs = len(model.measured)
     if noise.shape != (outputs, outputs) or not bool(jnp.all(jnp.isfinite(noise))):
         raise ValueError("noise_covariance has the wrong shape")
     if np.min(np.linalg.eigvalsh(np.asarray(noise))) <= 0:

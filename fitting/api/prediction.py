@@ -13,8 +13,8 @@ from fitting.api.data import Data
 from fitting.api.results import Result
 from fitting.drive_data import WHY_NOT_QUASI_STATIC, experiments
 from fitting.errors import DataError, InputError
-from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_run import WINDOW, FreeRun, free_run
+from fitting.estimation.experiment import Stretch, fitted_outputs
+from fitting.estimation.free_run import WINDOW, FreeRun, as_logged, free_run
 from fitting.files import write_whole
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
@@ -44,10 +44,10 @@ class Prediction:
 
     @property
     def table(self) -> pl.DataFrame:
-        """Time [s] and predicted dynamic error [rad, or the log's unit], one row a sample."""
-        return pl.DataFrame(
-            {"time": self.run.time[self.rows], "dynamic_error": self.run.predicted[self.rows] + self.zero}
-        )
+        """Time [s] and predicted outputs [SI, or a reduced log's unit], the principal one first, one row a sample."""
+        zeros = {"dynamic_error": self.zero}
+        found = {name: (predicted + zeros.get(name, 0.0)) for name, (predicted, _) in self.run.outputs.items()}
+        return pl.DataFrame({"time": self.run.time[self.rows]} | {name: v[self.rows] for name, v in found.items()})
 
     def save(self, path: str | PathLike[str]) -> Path:
         """Write the table as CSV."""
@@ -55,7 +55,7 @@ class Prediction:
         return Path(path)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw measured and predicted dynamic error on axes of matplotlib; made where not given."""
+        """Draw measured and predicted principal output on axes of matplotlib; made where not given."""
         return _drawn({"predicted": self.run}, axes)
 
     def summary(self) -> str:
@@ -72,7 +72,7 @@ class Comparison:
 
     Attributes:
         runs: Free runs by model, one a log.
-        noise: Rms measurement noise of the dynamic error that each model knows of.
+        noise: Rms measurement noise of the principal output that each model knows of.
     """
 
     runs: dict[str, tuple[FreeRun, ...]]
@@ -138,11 +138,13 @@ def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
     logs = [data.ready(log) for log in (*data.logs, *data.test)]
     stored = {name: _stored(model)[0] for name, model in models.items()}
     runs = {name: tuple(run for log in logs for run in _runs(one, name, data, log)[0]) for name, one in stored.items()}
-    return Comparison(runs, {name: float(np.sqrt(np.asarray(one.noise)[-1, -1])) for name, one in stored.items()})
+    factors = {name: as_logged(one.model)[1][-1] for name, one in stored.items()}
+    noise = {name: factors[name] * float(np.sqrt(np.asarray(one.noise)[-1, -1])) for name, one in stored.items()}
+    return Comparison(runs, noise)
 
 
 def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:
-    """The measured dynamic error of one log, and what models predict of it."""
+    """The measured principal output of one log, and what models predict of it."""
     import matplotlib.pyplot as plt
 
     place = plt.subplots()[1] if axes is None else axes
@@ -150,7 +152,7 @@ def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:
     place.plot(first.time, first.measured, color=MEASURED, linewidth=3.0, label="measured")
     for name, run in runs.items():
         place.plot(run.time, run.predicted, linewidth=1.2, label=name)
-    place.set(xlabel="time [s]", ylabel="dynamic error", title=first.name)
+    place.set(xlabel="time [s]", ylabel=first.output.replace("_", " "), title=first.name)
     place.legend(frameon=False)
     return place
 
@@ -172,6 +174,12 @@ def _runs(stored: StoredModel, name: str, data: Data, log: Log) -> tuple[tuple[F
     if (log.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
             f"{log.path}: a {log.kind} log, but {name} is a model of the other kind; give a log like those fitted"
+        )
+    needed, seen = as_logged(stored.model)[0], log.outputs
+    if stored.model.measured != fitted_outputs(log):
+        raise InputError(
+            f"{log.path}: the log has {' and '.join(seen)}, but {name} was fitted to {' and '.join(needed)}; give a log "
+            "with these"
         )
     warm = [e.name for e in stored.model.effects if e.needs_temperature]
     if warm and log.temperature is None:

@@ -8,7 +8,7 @@ from fitting.errors import InputError
 
 
 def predict(model: Path, log: Path, /, *, drive: DriveFileOption, out: Path) -> None:
-    """Run a fitted model freely along a log and write the dynamic error that it predicts.
+    """Run a fitted model freely along a log and write the outputs that it predicts.
 
     The log's outputs are used in the first 50 samples only, for the initial state.
 
@@ -19,7 +19,8 @@ def predict(model: Path, log: Path, /, *, drive: DriveFileOption, out: Path) -> 
     log
         The log that supplies torque and time stamps.
     out
-        CSV file with the columns time, dynamic_error.
+        CSV file with the columns time and each output that the model was fitted to, the principal one first
+        (dynamic_error where it can be formed).
     """
     start_jax()
     from fitting.commands.run_predict import write_prediction

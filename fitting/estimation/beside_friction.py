@@ -8,8 +8,6 @@ friction is fitted beside the drive instead, and holds its parameters where it e
 import functools
 from collections.abc import Sequence
 
-import numpy as np
-
 from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths, fitted_paths
@@ -67,9 +65,7 @@ def held_beside(beside: Fit, start: Model, training: Sequence[Stretch], halo: in
 
 def refitted_beside(held: Fit) -> Fit:
     """The fit beside friction that a base fit's values are of."""
-    return _fitted(
-        beside_friction(held.model, held.stretches), training=held.stretches, segmentation=held.segmentation
-    )
+    return _fitted(beside_friction(held.model, held.stretches), training=held.stretches, segmentation=held.segmentation)
 
 
 def _fitted(

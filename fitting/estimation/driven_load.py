@@ -160,8 +160,10 @@ class _Balance:
     def _against(self, values: Signal, part: _Part, derivatives: int) -> Signal:
         """A signal's derivative of an order against the test functions."""
         functions = bump_functions(self.width, part.time_step)[derivatives]
-        return (-1.0) ** derivatives * against(values - values[0] if derivatives else values, functions, self.hop) * (
-            part.time_step
+        return (
+            (-1.0) ** derivatives
+            * against(values - values[0] if derivatives else values, functions, self.hop)
+            * (part.time_step)
         )
 
     def _of_motor(self, part: _Part) -> list[Signal]:

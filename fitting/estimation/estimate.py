@@ -144,8 +144,8 @@ class Fit(eqx.Module):
         return eqx.tree_at(lambda f: f.problem.active, self, jnp.ones_like(self.problem.active))
 
     @property
-    def dynamic_error_std(self) -> float:
-        """Rms of what is left of the dynamic error [rad]."""
+    def principal_std(self) -> float:
+        """Rms of what is left of the principal output."""
         return float(np.sqrt(self.covariance[-1, -1]))
 
 
@@ -193,7 +193,11 @@ def fit(
     scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
     if covariance is None:
-        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[(swing * of_twist(model)[-1]) ** 2]])
+        covariance = (
+            evaluate(problem, unknowns).covariance
+            if scale_matters
+            else np.array([[(swing * of_twist(model)[-1]) ** 2]])
+        )
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):

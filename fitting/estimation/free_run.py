@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from fitting.estimation.driven_load import twist
 from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch, cut
@@ -18,8 +19,23 @@ from hdjax import Model, TwoInertiaModel
 WINDOW = 50
 """Samples from which the initial state is taken."""
 
+# Periods of the antiresonance that show a twist which no sensor sees, and share of a stretch at most, both assumed.
+_PERIODS, _MOST = 1.0, 0.25
+
 # 99 % point of chi-squared with as many degrees of freedom as there are rates (one or two).
 _REST_LIMIT = {1: 6.63, 2: 9.21}
+
+
+Pair = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
+"""Of an output: predicted and measured."""
+
+
+def window(model: Model, stretches: Sequence[Stretch]) -> int:
+    """Samples from which the initial state is taken: [`WINDOW`][], or as many as show a twist that no sensor sees."""
+    if not isinstance(model, TwoInertiaModel) or "dynamic_error" in model.measured:
+        return WINDOW
+    period = 2 * np.pi * np.sqrt(float(model.drive.J_l / model.drive.K)) / stretches[0].experiment.time_step
+    return int(np.clip(_PERIODS * period, WINDOW, max(WINDOW, _MOST * min(len(s) for s in stretches))))
 
 
 class FreeRun(eqx.Module):
@@ -28,20 +44,33 @@ class FreeRun(eqx.Module):
     Attributes:
         name: the log's name.
         time: sample stamps [s].
-        predicted: dynamic error [rad].
+        predicted: principal output, the dynamic error [rad] where that was measured.
         measured: likewise.
-        motor_angle: predicted motor angle [rad], or None for a reduced model.
+        beside: the other outputs, predicted and measured, by their names in the log.
         weight: 1 for a sample whose measurement counts, 0 for the others; None where all count.
-        measured_motor_angle: [rad], or None for a reduced model.
+        output: name of the principal output.
+        largest_twist: [rad], measured, or what the model makes of what was measured.
     """
 
     name: str = eqx.field(static=True)
     time: Float[np.ndarray, " n"]
     predicted: Float[np.ndarray, " n"]
     measured: Float[np.ndarray, " n"]
-    motor_angle: Float[np.ndarray, " n"] | None
+    beside: dict[str, Pair] | None = None
     weight: Float[np.ndarray, " n"] | None = None
-    measured_motor_angle: Float[np.ndarray, " n"] | None = None
+    output: str = eqx.field(static=True, default="dynamic_error")
+    largest_twist: float = 0.0
+
+    @property
+    def outputs(self) -> dict[str, Pair]:
+        """All outputs, predicted and measured, the principal one first."""
+        return {self.output: (self.predicted, self.measured)} | (self.beside or {})
+
+    @property
+    def motor_angle(self) -> Float[np.ndarray, " n"] | None:
+        """Predicted motor angle [rad]; None where it is no output."""
+        found = self.outputs.get("motor_angle")
+        return None if found is None else found[0]
 
     @property
     def counts(self) -> Bool[np.ndarray, " n"]:
@@ -50,28 +79,26 @@ class FreeRun(eqx.Module):
 
     @property
     def squared_error(self) -> Float[np.ndarray, " counted"]:
-        """Squares of measured minus predicted [rad^2], of the samples that count."""
+        """Squares of measured minus predicted principal output, of the samples that count."""
         return ((self.measured - self.predicted) ** 2)[self.counts]
 
     @property
     def rmse(self) -> float:
-        """Rms of measured minus predicted [rad]."""
+        """Rms of measured minus predicted principal output."""
         return rms_error((self,))
 
 
-def rms_error(runs: Sequence[FreeRun]) -> float:
-    """Rms of measured minus predicted over several runs [rad]; infinite where a run left the numbers."""
-    return _rms(np.concatenate([r.squared_error for r in runs]))
+def rms_error(runs: Sequence[FreeRun], output: str | None = None) -> float:
+    """Rms of measured minus predicted over several runs; infinite where a run left the numbers.
 
-
-def motor_rms_error(runs: Sequence[FreeRun]) -> float | None:
-    """Likewise of the motor's angle; None for a reduced model."""
-    errors = [
-        (r.measured_motor_angle - r.motor_angle)[r.counts]
-        for r in runs
-        if r.motor_angle is not None and r.measured_motor_angle is not None
-    ]
-    return _rms(np.concatenate(errors) ** 2) if errors else None
+    Args:
+        runs: the runs.
+        output: by its name; the principal one where not given.
+    """
+    if output is None:
+        return _rms(np.concatenate([r.squared_error for r in runs]))
+    pairs = [(run.outputs[output], run.counts) for run in runs]
+    return _rms(np.concatenate([((measured - predicted) ** 2)[counts] for (predicted, measured), counts in pairs]))
 
 
 def _rms(square: Float[np.ndarray, " counted"]) -> float:
@@ -108,21 +135,32 @@ def free_run(
         n = len(stretch)
         part = slice(stretch.start, stretch.stop)
         measured = stretch.experiment.measured[part]
-        motor = measured_motor = None
-        if isinstance(model, TwoInertiaModel):
-            motor, measured_motor = (y[:, 0] * float(model.drive.N) for y in (output[:n], measured))
+        pairs = {
+            told: (factor * output[:n, k], factor * measured[:, k])
+            for k, (told, factor) in enumerate(zip(*as_logged(model), strict=True))
+        }
+        principal = list(pairs)[-1]
+        predicted, seen = pairs.pop(principal)
         runs.append(
             FreeRun(
                 name=stretch.name,
                 time=stretch.experiment.time[part],
-                predicted=output[:n, -1],
-                measured=measured[:, -1],
-                motor_angle=motor,
+                predicted=predicted,
+                measured=seen,
+                beside=pairs,
                 weight=stretch.weight,
-                measured_motor_angle=measured_motor,
+                output=principal,
+                largest_twist=float(np.max(np.abs(twist(stretch, model)))),
             )
         )
     return tuple(runs)
+
+
+def as_logged(model: Model) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """What a log calls each output of a model, and what makes it of the output in the log's unit."""
+    names = tuple("motor_angle" if name == "motor_turn" else name for name in model.measured)
+    N = float(model.drive.N) if isinstance(model, TwoInertiaModel) else 1.0
+    return names, tuple(N if name == "motor_turn" else 1.0 for name in model.measured)
 
 
 def whole_simulations(
@@ -153,8 +191,9 @@ def fitted_starts(
     like: Fit | None = None,
 ) -> Fit:
     """Initial states fitted to the first samples of each stretch; arguments as in [`free_run`][]."""
-    windows = [s.beginning(WINDOW) for s in stretches]
-    paths, length, count = (), max(WINDOW, *(len(w) for w in windows)), len(stretches)
+    samples = window(model, stretches)
+    windows = [s.beginning(samples) for s in stretches]
+    paths, length, count = (), max(samples, *(len(w) for w in windows)), len(stretches)
     if like is not None and _holds(like, count, length):
         paths, (count, length) = like.free.paths, like.problem.segments.weight.shape
     return fit(

@@ -2,10 +2,10 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg import expm
 
 from fitting.estimation.experiment import Segments
-from hdjax import Drive, TwoInertiaModel
+from fitting.estimation.linear_drive import over_a_step, readings
+from hdjax import TwoInertiaModel
 
 # Periods of the slower resonance over which a first state shows.
 _PERIODS = 1.0
@@ -34,8 +34,8 @@ def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndar
     angles = np.flatnonzero(turns)
     begin = measured[:, 0, angles[0]] / turns[angles[0]] if angles.size else np.zeros(len(measured))
     measured = measured[:, :samples] - begin[:, None, None] * turns
-    across, pushes = _discrete(drive, step)
-    reads = _reads(model)
+    across, pushes = over_a_step(drive, step)
+    reads = readings(model)
     powers, forced = [np.eye(4)], np.zeros((len(measured), samples, 4))
     torque = np.asarray(segments.torque.coefficients)[:, segments.halo :]
     load = None if segments.load_torque is None else np.asarray(segments.load_torque.coefficients)
@@ -55,38 +55,10 @@ def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndar
     return states + begin[:, None] * np.array([N, 1.0, 0.0, 0.0])
 
 
-def _discrete(drive: Drive, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """The state after a step by the state before it, and by torque and slope of the torque on motor and load."""
-    N, J_m, J_l, K, B, k_T = (float(getattr(drive, p)) for p in ("N", "J_m", "J_l", "K", "B_sp", "k_T"))
-    mesh = np.array([K / N, -K, B / N, -B])
-    rates = np.zeros((8, 8))
-    rates[0, 2] = rates[1, 3] = 1.0
-    rates[2, :4], rates[3, :4] = -mesh / (N * J_m), mesh / J_l
-    rates[2, 4], rates[3, 6] = k_T / J_m, 1.0 / J_l
-    rates[4, 5] = rates[6, 7] = 1.0
-    across = expm(step * rates)
-    return across[:4, :4], across[:4, 4:]
-
-
 def _pushed(coefficients: np.ndarray, by: np.ndarray) -> np.ndarray:
     """What a torque does to the state over a step: its value and slope."""
     count = min(coefficients.shape[-1], 2)
     return coefficients[:, :count] @ by[:, :count].T
-
-
-def _reads(model: TwoInertiaModel) -> Float[np.ndarray, "outputs 4"]:
-    """The outputs by the state."""
-    N, K, B = (float(getattr(model.drive, p)) for p in ("N", "K", "B_sp"))
-    rows = {
-        "motor_turn": [1.0 / N, 0.0, 0.0, 0.0],
-        "motor_angle": [1.0, 0.0, 0.0, 0.0],
-        "load_angle": [0.0, 1.0, 0.0, 0.0],
-        "dynamic_error": [1.0 / N, -1.0, 0.0, 0.0],
-        "motor_velocity": [0.0, 0.0, 1.0, 0.0],
-        "load_velocity": [0.0, 0.0, 0.0, 1.0],
-        "joint_torque": [K / N, -K, B / N, -B],
-    }
-    return np.array([rows[name] for name in model.measured])
 
 
 def _noise(values: Float[np.ndarray, "segments samples outputs"]) -> Float[np.ndarray, " outputs"]:

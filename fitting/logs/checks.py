@@ -175,7 +175,9 @@ def _quantised(log: Log, name: str, values: np.ndarray, side: float, spread: flo
     if not on_grid or not (few or share > COARSE_STEP):
         return
     unit = _UNITS.get(name) or log.units.get(name, "")
-    about = "of the rms dynamic error" if name.endswith("_angle") and log.dynamic_error is not None else "of its own rms"
+    about = (
+        "of the rms dynamic error" if name.endswith("_angle") and log.dynamic_error is not None else "of its own rms"
+    )
     yield Finding(
         "note",
         f"the values lie {step:.4g} {unit} apart, which is {100 * share:.2g} % {about}",

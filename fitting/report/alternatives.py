@@ -34,11 +34,11 @@ def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, A
     return {
         "family": verdict.family,
         "name": verdict.name,
-        "selection_rmse": trial.held_out.dynamic_error_std,
+        "selection_rmse": trial.held_out.principal_std,
         "separable": verdict.separable,
         "separating_experiment": experiment,
         "instead_of": winner.name,
-        "selection_rmse_of_found": None if winner.trial is None else winner.trial.held_out.dynamic_error_std,
+        "selection_rmse_of_found": None if winner.trial is None else winner.trial.held_out.principal_std,
     }
 
 

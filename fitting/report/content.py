@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
 from fitting.files import finite
 from fitting.logs import findings
 from fitting.next_experiment.proposal import NextExperiment
@@ -18,6 +16,7 @@ from fitting.report.fit_content import fit_dict, meaning
 from fitting.report.intervals import say_what_intervals_hold
 from fitting.report.limits import identifiability_dict, largest_twist, limits
 from fitting.report.outcome import Outcome
+from fitting.report.outputs import noise_of_outputs, units_of_outputs
 from fitting.report.parameters import PARTS, account_dict, effect_dict, no_account
 from fitting.report.posterior import posterior_dict
 from fitting.report.proposal import proposal_dict
@@ -49,8 +48,9 @@ def report_dict(
         name: the drive's.
         next_experiment: that would tell more.
     """
-    units = {"dynamic_error": "rad", "forcing": "N m"} | dict(units or {})
-    noise = float(np.sqrt(np.asarray(outcome.noise)[-1, -1]))
+    units = {"dynamic_error": "rad", "forcing": "N m"} | units_of_outputs(outcome.stored) | dict(units or {})
+    noise = noise_of_outputs(outcome.stored)
+    output = list(noise)[-1]
     x_max = largest_twist(outcome)
     is_loop = isinstance(outcome, Loop)
     start = None if is_loop else outcome.start
@@ -65,9 +65,10 @@ def report_dict(
         "times_noise": outcome.times_noise if is_loop else None,
         "rules": rules_dict(outcome.checks) if is_loop else [],
         "evidence": dataclasses.asdict(outcome.case) if is_loop else None,
+        "output": output,
         "units": units,
-        "noise": {
-            "dynamic_error": noise,
+        "noise": noise
+        | {
             "memory": outcome.noise_memory if is_loop else None,
             "torque": outcome.torque_noise if is_loop else None,
         },
@@ -82,7 +83,7 @@ def report_dict(
         "posterior": None,
         "meaning": [],
         "dropped": list(outcome.dropped),
-        "unexplained": unexplained(outcome, noise),
+        "unexplained": unexplained(outcome, noise[output]),
         "unknown": unknown_dict(outcome, units),
         "cannot_tell": [],
         "next_experiment": proposal_dict(next_experiment, units, logs_reach=x_max),
@@ -91,7 +92,7 @@ def report_dict(
         "versions": {"python": platform.python_version()} | {lib: version(lib) for lib in _LIBRARIES},
     }
     if not is_loop:
-        report |= fit_dict(outcome, noise) | {"posterior": posterior_dict(outcome.posterior)}
+        report |= fit_dict(outcome, noise[output]) | {"posterior": posterior_dict(outcome.posterior)}
     report = finite(report)
     if is_loop:
         say_what_intervals_hold(report, outcome.times_noise)

@@ -5,6 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.fit_drive import FitOnly
+from fitting.report.outputs import in_words
 from fitting.uncertainty.prediction_band import coverage
 from fitting.validation.frequency_response import (
     FrequencyResponse,
@@ -26,7 +27,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
 
     Args:
         fitted: the fit.
-        noise: rms measurement noise of the dynamic error.
+        noise: rms measurement noise of the principal output.
     """
     g, account = fitted.goodness, fitted.account
     return {
@@ -130,14 +131,12 @@ def _response_dict(found: FrequencyResponse | None) -> dict[str, Any] | None:
 
 def _response_sentences(found: FrequencyResponse) -> list[str]:
     """What the frequency response shows."""
-    said = []
+    said, output = [], in_words(found.output)
     band = coherent_band(found)
     if band:
-        said.append(
-            f"The dynamic error follows the {found.source} linearly from {_range(*band)} (coherence above 0.9)."
-        )
+        said.append(f"The {output} follows the {found.source} linearly from {_range(*band)} (coherence above 0.9).")
     else:
-        said.append(f"Nowhere does the dynamic error follow the {found.source} linearly (coherence above 0.9).")
+        said.append(f"Nowhere does the {output} follow the {found.source} linearly (coherence above 0.9).")
     own, seen = _hertz(found.resonance), resonance_seen(found)
     if not excites_resonance(found):
         said.append(f"The log does not excite the model's resonance at {own}.")

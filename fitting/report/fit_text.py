@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fitting.formatting import open_interval, p_value, percent, plain
+from fitting.report.outputs import in_words, others, outputs, principal
 from fitting.report.parameters import parts_of
 from fitting.report.posterior import QUANTILES
 from fitting.report.proposal import next_lines
@@ -99,21 +100,25 @@ def _correlations(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _goodness(report: Mapping[str, Any]) -> list[str]:
-    g, rmse, unit = report["goodness"], report["before"]["rmse"], report["units"]["dynamic_error"]
+    g, rmse, (output, unit, _) = report["goodness"], report["before"]["rmse"], principal(report)
     sides = parts_of(report)
     rows = [
-        ["free run", *sides, ""],
+        [f"free run, {output}", *sides, ""],
         ["fit", *(plain(g["fit_percent"][s]) for s in sides), "%"],
         ["rms error", *(plain(rmse[s]) for s in sides), unit],
         ["rms error / noise", *(plain(g["rmse_over_noise"][s], 3) for s in sides), ""],
     ]
+    for other in others(report):
+        errors = report["before"]["rmse_of_outputs"][other]
+        rows.append([f"rms error of {in_words(other)}", *(plain(errors[s]) for s in sides), report["units"][other]])
     met = "converged" if g["converged"] else "NOT CONVERGED"
     samples = sum(log["samples"] for log in report["logs"])
     left = ", ".join(f"{output} {plain(v, 3)}" for output, v in g["error_over_noise"].items())
     test = sum(log["test"] for log in report["logs"])
     return _table(rows, left=(0, len(sides) + 1)) + _prose(
         [
-            f"measurement noise {plain(report['noise']['dynamic_error'])} {unit} rms",
+            "measurement noise, rms: "
+            + ", ".join(f"{in_words(o)} {plain(report['noise'][o])} {report['units'][o]}" for o in outputs(report)),
             f"{report['judged_on']} samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
             f"left over in short simulations, in units of the noise: {left}",
             f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from fitting import formatting
 from fitting.report.outcome import Outcome
 from fitting.report.separating import plain_family
@@ -161,4 +159,4 @@ def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def largest_twist(outcome: Outcome) -> float:
     """The largest dynamic error on training data."""
-    return max(float(np.max(np.abs(run.measured))) for run in outcome.before.training)
+    return max(run.largest_twist for run in outcome.before.training)

@@ -9,6 +9,7 @@ from plotly.offline import get_plotlyjs
 
 from fitting import formatting
 from fitting.report.intervals import is_withheld
+from fitting.report.outputs import in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.plots import Plot
 from fitting.report.posterior import QUANTILES
@@ -44,6 +45,7 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         "symbol": _symbol,
     }
     final = report["after"] if report["after"]["parameters"] else report["before"]
+    output, unit, noise = principal(report)
     template = "fit.html.jinja" if report["decision"] == "fit_only" else "loop.html.jinja"
     return (
         environment(filters)
@@ -51,8 +53,12 @@ def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
         .render(
             report=report,
             parts=parts_of(report),
-            noise=report["noise"]["dynamic_error"],
-            x_unit=report["units"]["dynamic_error"],
+            output=output,
+            noise=noise,
+            x_unit=unit,
+            twist_unit=report["units"]["dynamic_error"],
+            others=others(report),
+            in_words=in_words,
             chance=lambda effect: chance(effect, report),
             rows=parameter_rows(report, final),
             changes=changes(report),

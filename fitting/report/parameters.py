@@ -41,7 +41,7 @@ def account_dict(
         x_max: the largest measured twist.
         start: the model that the fit started from, where that is known.
     """
-    figures = derived(account, drive_figures, x_max)
+    figures, by_output = derived(account, drive_figures, x_max), account.rmse_of_outputs
     base = [path for path in account.uncertainty.estimates if "." not in path]
     return {
         "effects": [],
@@ -49,14 +49,15 @@ def account_dict(
         "derived": {name: _derived_dict(name, q) for name, q in figures.items()},
         "correlations": _correlations(account.uncertainty),
         "rmse": _NO_PARTS | account.rmse,
-        "rmse_motor_angle": _NO_PARTS | account.motor_rmse,
+        "rmse_motor_angle": _NO_PARTS | by_output.get("motor_angle", {}),
+        "rmse_of_outputs": {output: _NO_PARTS | parts for output, parts in by_output.items()},
     }
 
 
 def no_account() -> dict[str, Any]:
     """Likewise where no second model was fitted."""
     empty = {"effects": [], "parameters": {}, "derived": {}, "correlations": []}
-    return empty | {"rmse": dict(_NO_PARTS), "rmse_motor_angle": dict(_NO_PARTS)}
+    return empty | {"rmse": dict(_NO_PARTS), "rmse_motor_angle": dict(_NO_PARTS), "rmse_of_outputs": {}}
 
 
 def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start: Model | None = None) -> dict[str, Any]:

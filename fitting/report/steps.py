@@ -7,6 +7,7 @@ from fitting import formatting
 from fitting.attribution.candidate_fit import Trial
 from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
+from fitting.report.outputs import principal
 
 # In units of the measurement noise: what leaves nothing but noise, and what a free run may be off without a word.
 _NOISE, _OFF = 1.2, 3.0
@@ -28,7 +29,7 @@ def steps(outcome: Outcome) -> list[dict[str, Any]]:
 
 
 def _step(added: str | None, trial: Trial, seconds: float) -> dict[str, Any]:
-    return {"added": added, "selection_segments_rmse": trial.held_out.dynamic_error_std, "segment_seconds": seconds}
+    return {"added": added, "selection_segments_rmse": trial.held_out.principal_std, "segment_seconds": seconds}
 
 
 def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | None:
@@ -40,11 +41,10 @@ def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | No
     """
     if not report["steps"]:
         return None
-    last, noise = report["steps"][-1], report["noise"]["dynamic_error"]
+    last, (_, unit, noise) = report["steps"][-1], principal(report)
     short = last["selection_segments_rmse"]
     if short is None or short > _NOISE * noise or (free is not None and free < _OFF * noise):
         return None
-    unit = report["units"]["dynamic_error"]
     return (
         f"Over {formatting.quantity(last['segment_seconds'], 's')} at a time the model errs by "
         f"{formatting.quantity(short, unit)} rms ({formatting.number(short / noise)} times the noise) on selection "

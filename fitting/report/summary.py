@@ -5,6 +5,7 @@ from typing import Any
 
 from fitting import formatting
 from fitting.attribution.decisions import RULES
+from fitting.report.outputs import principal
 from fitting.report.separating import plain_family
 from fitting.report.unknown import place_and_variables
 
@@ -16,8 +17,7 @@ _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight",
 
 def summary(report: Mapping[str, Any]) -> str:
     """The decision in plain words."""
-    unit = report["units"]["dynamic_error"]
-    noise = report["noise"]["dynamic_error"]
+    _, unit, noise = principal(report)
     on = report["judged_on"]
     before, after = (report[stage]["rmse"][on] for stage in ("before", "after"))
     families = list(dict.fromkeys(e["family"] for e in report["after"]["effects"] if e["family"] != "unknown"))
@@ -99,14 +99,14 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
     """What became of the error by what was found."""
     on = report["judged_on"]
     before, after = (report[stage]["rmse"][on] for stage in ("before", "after"))
-    unit, s = report["units"]["dynamic_error"], "" if several else "s"
-    then, now = _rmse(before, unit), _against_noise(after, report["noise"]["dynamic_error"], unit, like=before)
+    (output, unit, noise), s = principal(report), "" if several else "s"
+    then, now = _rmse(before, unit), _against_noise(after, noise, unit, like=before)
     motor = [report[stage]["rmse_motor_angle"][on] for stage in ("before", "after")]
     if not _falls(before, after) and _falls(*motor):
         first, last = (_rmse(value, "rad", motor[0]) for value in motor)
         return (
             f"{subject} show{s} in the motor's angle, whose error on {on} data falls by {_removed(*motor)}, from "
-            f"{first} to {last}. Hardly in the dynamic error, which is off by {then} before and {now} after."
+            f"{first} to {last}. Hardly in the {output}, which is off by {then} before and {now} after."
         )
     if before is not None and (after is None or after > before):
         where = f"short segments alone; over whole stretches of {on} data the error rises"

@@ -7,6 +7,7 @@ from fitting import formatting
 from fitting.formatting import open_interval, plain
 from fitting.report.fit_text import fit_lines
 from fitting.report.intervals import is_withheld
+from fitting.report.outputs import in_words, others, principal
 from fitting.report.parameters import parts_of
 from fitting.report.proposal import next_lines
 from fitting.report.summary import chance
@@ -22,9 +23,9 @@ def report_text(report: Mapping[str, Any]) -> str:
 
 
 def _loop_lines(report: Mapping[str, Any]) -> list[str]:
-    unit = report["units"]["dynamic_error"]
+    output, unit, noise = principal(report)
     final = report["after"] if report["after"]["parameters"] else report["before"]
-    lines = ["[Decision]", f"    {report['summary']}", "[Rms error of the free runs]"]
+    lines = ["[Decision]", f"    {report['summary']}", f"[Rms error of the {output} in free runs]"]
     shown = [("model", report["before"])]
     if report["after"]["effects"]:
         shown = [("before", report["before"]), ("after", report["after"])]
@@ -33,10 +34,10 @@ def _loop_lines(report: Mapping[str, Any]) -> list[str]:
         values = "".join(f"{plain(a['rmse'][part]):>14}" for _, a in shown)
         lines.append(f"    {part:12}{values} {unit}")
     on = report["judged_on"]
-    if report["after"]["effects"] and report["before"]["rmse_motor_angle"][on] is not None:
-        values = "".join(f"{plain(a['rmse_motor_angle'][on]):>14}" for _, a in shown)
-        lines.append(f"    {'motor angle':12}{values} rad, {on}")
-    lines.append(f"    {'noise':12}{plain(report['noise']['dynamic_error']):>14} {unit}")
+    for other in others(report):
+        values = "".join(f"{plain(a['rmse_of_outputs'][other][on]):>14}" for _, a in shown)
+        lines.append(f"    {in_words(other):12}{values} {report['units'][other]}, {on}")
+    lines.append(f"    {'noise':12}{plain(noise):>14} {unit}")
     lines.append("[Parameters]")
     lines += _parameter_lines(final["parameters"])
     for effect in report["after"]["effects"]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from fitting.estimation.engines import linearise, with_engine
 from fitting.estimation.estimate import Fit, whitening
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_run import WINDOW, FreeRun, fitted_starts, free_run, whole_simulations
+from fitting.estimation.free_run import FreeRun, fitted_starts, free_run, whole_simulations, window
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.uncertainty.noise_model import spread_by_torque
 from fitting.uncertainty.normal_law import NORMAL_95
@@ -101,8 +101,9 @@ def prediction_bands(
     driven = np.zeros(by_parameter.shape[:2])
     if torque_noise > 0.0:
         driven = spread_by_torque(with_engine(whole), Unknowns(fitted.free.pack(fitted.model), states), torque_noise)
+    seen = window(fitted.model, stretches)
     return tuple(
-        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance)
+        _band(run, by_parameter[i, :n], by_state[i, :n], driven[i, :n], white, found.covariance, seen)
         for i, (run, n) in enumerate(zip(runs, map(len, stretches), strict=True))
     )
 
@@ -126,6 +127,7 @@ def _band(
     driven: np.ndarray,
     white: np.ndarray,
     covariance: np.ndarray,
+    window: int,
 ) -> PredictionBand:
     """The band of one run, from the derivatives of its outputs, and what noise of the torque drives; it has no width
     where they left the numbers."""
@@ -134,8 +136,8 @@ def _band(
     if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
         unknown = np.full(len(by_parameter), np.nan)
         return PredictionBand(run, unknown, unknown, std_noise, driven)
-    seen = np.einsum("ij,njs->nis", white, by_state[:WINDOW]).reshape(-1, by_state.shape[2])
-    moved = np.einsum("ij,njp->nip", white, by_parameter[:WINDOW]).reshape(-1, by_parameter.shape[2])
+    seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
+    moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
     # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
     size = np.linalg.norm(seen, axis=0)
     size = np.where(size > 0, size, 1.0)

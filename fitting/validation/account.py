@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from fitting.estimation.engines import why_not
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
-from fitting.estimation.free_run import FreeRun, free_run, motor_rms_error, rms_error
+from fitting.estimation.free_run import FreeRun, free_run, rms_error
 from fitting.uncertainty.identifiability import Identifiability, identifiability
 from fitting.uncertainty.profile_likelihood import with_profiles
 from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
@@ -45,14 +45,14 @@ class Account(eqx.Module):
 
     @property
     def rmse(self) -> dict[str, float]:
-        """Rms error of the dynamic error on each part of the data [rad]."""
+        """Rms error of the principal output on each part of the data."""
         return {name: rms_error(runs) for name, runs in self.parts().items()}
 
     @property
-    def motor_rmse(self) -> dict[str, float]:
-        """Likewise of the motor's angle; nothing for a reduced model."""
-        found = {name: motor_rms_error(runs) for name, runs in self.parts().items()}
-        return {name: value for name, value in found.items() if value is not None}
+    def rmse_of_outputs(self) -> dict[str, dict[str, float]]:
+        """Likewise of each output, by its name in the log."""
+        outputs = next(iter(self.parts().values()))[0].outputs
+        return {o: {name: rms_error(runs, o) for name, runs in self.parts().items()} for o in outputs}
 
     @property
     def judged(self) -> tuple[FreeRun, ...]:

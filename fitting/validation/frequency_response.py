@@ -8,13 +8,17 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.linalg import expm
 
-from fitting.estimation.experiment import Experiment
+from fitting.estimation.driven_load import twist
+from fitting.estimation.experiment import Experiment, Stretch
+from fitting.estimation.linear_drive import over_a_step, rates_of, readings
 from fitting.validation.welch import cross_density, density
-from hdjax import Drive, Hold, Model
+from hdjax import Drive, Hold, Model, TwoInertiaModel
 
 # Averages that a coherence needs to mean something, and the window that they leave at least.
 _AVERAGES = 8
 _SHORTEST, _LONGEST = 128, 1 << 15
+# How many times the drive as a whole integrates the torque into an output.
+_ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1, "load_velocity": 1}
 # Lines across the width of the resonance.
 _LINES = 8
 # Deviation of a sample from its place on the grid, as a share of the step, that is no matter.
@@ -33,12 +37,12 @@ _NEAR = 2.0
 
 
 class FrequencyResponse(eqx.Module):
-    """Frequency response from motor torque (or forcing) to dynamic error.
+    """Frequency response from motor torque (or forcing) to the principal output, mostly the dynamic error.
 
     Attributes:
         frequency: without zero [Hz].
         measured: H1 estimate, cross-spectrum over input spectrum.
-        coherence: share of the dynamic error's power that follows linearly from the input.
+        coherence: share of the output's power that follows linearly from the input.
         input_density: power spectral density of the input.
         noise_coherence: what the coherence would be if measurement noise were all that disturbs it.
         model: of the fitted drive, linearised, with the hold of the torque.
@@ -46,6 +50,8 @@ class FrequencyResponse(eqx.Module):
         width: of its peak at half power [Hz].
         averages: windows behind the estimate.
         source: what the input is called.
+        output: what was measured, the model's principal output.
+        order: how many times the drive as a whole integrates the torque into it.
     """
 
     frequency: Float[np.ndarray, " frequencies"]
@@ -58,6 +64,8 @@ class FrequencyResponse(eqx.Module):
     width: float
     averages: int = eqx.field(static=True)
     source: str = eqx.field(static=True)
+    output: str = eqx.field(static=True, default="dynamic_error")
+    order: int = eqx.field(static=True, default=0)
 
     @property
     def resolution(self) -> float:
@@ -77,13 +85,15 @@ def frequency_response(
         model: fitted; its stiffness is linearised as its mean slope over the measured twist.
         experiments: the logs.
         hold: what the torque does between samples.
-        noise: rms measurement noise of the dynamic error.
+        noise: rms measurement noise of the output.
 
     Returns:
         The responses; None where the logs are too short, or the input does not move.
     """
     step = max(e.time_step for e in experiments)
-    signals = [_on_grid(e, step) for e in experiments]
+    output = model.measured[-1]
+    order = _ORDER.get(output, 0)
+    signals = [_differenced(*_on_grid(e, step), order) for e in experiments]
     slope = _mean_slope(model, experiments)
     resonance = math.sqrt(slope) / (2 * math.pi)
     width = abs(float(model.drive.mu)) / (2 * math.pi)
@@ -100,23 +110,32 @@ def frequency_response(
     kept = slice(1, -1 if window % 2 == 0 else None)
     frequency, S_uu, S_xx, S_ux = frequency[kept], S_uu[kept], S_xx[kept], S_ux[kept]
     tiny = np.finfo(float).tiny
-    noise_density = 2.0 * step * noise**2
+    # Of a side that turns freely, accelerations: what drifts would hide the resonance.
+    differences = (np.exp(2j * np.pi * frequency * step) - 1.0) ** order
+    noise_density = 2.0 * step * noise**2 * np.abs(differences) ** 2
     return FrequencyResponse(
         frequency=frequency,
-        measured=S_ux / np.maximum(S_uu, tiny),
+        measured=S_ux / np.maximum(S_uu, tiny) / differences,
         coherence=np.clip(np.abs(S_ux) ** 2 / np.maximum(S_uu * S_xx, tiny), 0.0, 1.0),
         input_density=S_uu,
         noise_coherence=np.clip(1.0 - noise_density / np.maximum(S_xx, tiny), 0.0, 1.0),
-        model=_linear_response(frequency, slope, float(model.drive.mu), _input_gain(model), hold=hold, step=step),
+        model=_model_response(model, frequency, slope, hold=hold, step=step),
         resonance=resonance,
         width=width,
         averages=sum(windows),
         source="torque" if isinstance(model.drive, Drive) else "forcing",
+        output=output,
+        order=order,
     )
 
 
+def _differenced(u: np.ndarray, y: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """An input, and the differences of an output."""
+    return (u[: u.size - order], np.diff(y, n=order)) if order else (u, y)
+
+
 def _on_grid(experiment: Experiment, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Input and dynamic error at even distances."""
+    """Input and principal output at even distances."""
     time = experiment.time
     u, x = np.asarray(experiment.torque.coefficients)[:, 0], experiment.measured[:, -1]
     grid = time[0] + step * np.arange(int((time[-1] - time[0]) / step + 1e-6) + 1)
@@ -135,7 +154,7 @@ def _window(samples: Sequence[int], step: float, width: float) -> int:
 
 def _mean_slope(model: Model, experiments: Sequence[Experiment]) -> float:
     """Square of the natural frequency, of the stiffness averaged over the measured twist."""
-    x = np.concatenate([e.measured[:, -1] for e in experiments])
+    x = np.concatenate([twist(Stretch(e, 0, len(e)), model) for e in experiments])
     hardening = max(1.0 + 3.0 * float(model.drive.alpha) * float(np.mean(x**2)), 0.0)
     return float(model.drive.omega_0) ** 2 * hardening
 
@@ -144,6 +163,23 @@ def _input_gain(model: Model) -> float:
     """Acceleration of the dynamic error per unit of input."""
     drive = model.drive
     return float(drive.reduced().gain if isinstance(drive, Drive) else drive.gain)
+
+
+def _model_response(model: Model, frequency: np.ndarray, slope: float, *, hold: Hold, step: float) -> np.ndarray:
+    """Response of the linearised drive's principal output to a sampled torque, from sample to sample."""
+    if model.measured[-1] == "dynamic_error":
+        return _linear_response(frequency, slope, float(model.drive.mu), _input_gain(model), hold=hold, step=step)
+    assert isinstance(model, TwoInertiaModel)
+    reads = readings(model)[-1]
+    if hold not in ("zero-order", "linear"):
+        by_state, by_torque = rates_of(model.drive)
+        s = 2j * np.pi * frequency[:, None, None]
+        return np.linalg.solve(s * np.eye(4) - by_state, by_torque[None, :, :1])[:, :, 0] @ reads
+    across, pushes = over_a_step(model.drive, step)
+    z = np.exp(2j * np.pi * frequency * step)[:, None, None]
+    rising = 0.0 if hold == "zero-order" else (z - 1.0) / step
+    driven = pushes[:, :1] + pushes[:, 1:2] * rising
+    return np.linalg.solve(z * np.eye(4) - across, np.broadcast_to(driven, (frequency.size, 4, 1)))[:, :, 0] @ reads
 
 
 def _linear_response(
@@ -183,7 +219,7 @@ def resonance_seen(found: FrequencyResponse) -> float | None:
     # A line beyond the excited ones is coherent by chance now and then; what holds the resonance is in one piece.
     near = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / found.resonance)) < math.log(_NEAR))
     band = min(_bands(near), key=lambda b: float(np.min(np.abs(found.frequency[b] - found.resonance))))
-    peak = int(band[np.argmax(np.abs(found.measured[band]))])
+    peak = int(band[np.argmax(np.abs(found.measured[band]) * found.frequency[band] ** found.order)])
     return float(found.frequency[peak]) if band[0] < peak < band[-1] else None
 
 

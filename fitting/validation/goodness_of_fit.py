@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.estimate import Fit
-from fitting.estimation.free_run import FreeRun
+from fitting.estimation.free_run import FreeRun, as_logged
 from fitting.estimation.outliers import left_out
 from fitting.validation.account import Account, excess
 
@@ -68,7 +68,7 @@ def goodness(fit: Fit, account: Account, noise: Float[Array, "outputs outputs"])
     log_likelihood = -0.5 * samples * (outputs * (math.log(2 * math.pi) + 1) + float(log_determinant))
     count = parameters + states + outputs * (outputs + 1) // 2
     freedom = samples * outputs - parameters - states
-    names = ("motor angle", "dynamic error")[-outputs:]
+    names = [name.replace("_", " ") for name in as_logged(fit.model)[0]]
     return Goodness(
         fit_percent={name: fit_percent(runs) for name, runs in account.parts().items()},
         data=samples * outputs,

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.estimation.estimate import Fit
+from fitting.estimation.linear_response import follow
 from fitting.estimation.whiteness import autocorrelation, left_over
 from fitting.validation.welch import density
 from hdjax import TwoInertiaModel
@@ -59,11 +60,11 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     simulated = (np.asarray(segments.measured) - np.asarray(fit.error))[weight]
     step = fit.stretches[0].experiment.time_step
     frequency, power = density(residual, step=step, window=min(2048, residual.size))
-    x = simulated[:, -1]
+    x = _simulated(fit, "dynamic_error", simulated, weight)
     quantities = {"x": x, "v": np.gradient(x, step)}
     order = amplitude = np.zeros(0)
     if isinstance(fit.model, TwoInertiaModel):
-        theta_m = simulated[:, 0] * float(fit.model.drive.N)
+        theta_m = _simulated(fit, "motor_turn", simulated, weight) * float(fit.model.drive.N)
         speed = np.gradient(theta_m, step)
         # Segment borders are jumps of the simulated motion, not motion.
         speed = np.clip(speed, *np.quantile(speed, [0.001, 0.999]))
@@ -81,6 +82,17 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
         dependence={name: _dependence(residual, q) for name, q in quantities.items()},
         rms=float(np.sqrt(np.mean(residual**2))),
     )
+
+
+def _simulated(fit: Fit, output: str, simulated: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """What a fit's model makes of an output, whether it was measured or not, of samples with weight."""
+    model = fit.model
+    if output in model.measured:
+        return simulated[:, model.measured.index(output)]
+    assert isinstance(model, TwoInertiaModel)
+    states = follow(fit.at_solution, fit.unknowns).states[:, :-1][weight]
+    turn = states[:, 0] / float(model.drive.N)
+    return turn if output == "motor_turn" else turn - states[:, 1]
 
 
 def order_amplitude(residual: np.ndarray, angle: np.ndarray, orders: np.ndarray) -> np.ndarray:

@@ -73,8 +73,8 @@ def test_logs_that_begin_in_other_phases(begun):
         line = Phasors(LearnedMeshTorque, OMEGA, np.full(2, 1j * LINE), np.ones(2), 1.0).effect
         return attempt(base.model.with_effects(line), study, HOLDS[0], start=base)
 
-    assert with_line(clocked).training.dynamic_error_std == pytest.approx(NOISE, rel=0.05)
-    assert with_line(study).training.dynamic_error_std > 2 * NOISE
+    assert with_line(clocked).training.principal_std == pytest.approx(NOISE, rel=0.05)
+    assert with_line(study).training.principal_std > 2 * NOISE
 
 
 @pytest.mark.parametrize(("phases", "logs"), [((0.4, 0.4), 2), ((None, None), 2), ((None, 0.4), 2), ((0.4, 2.3), 1)])

@@ -216,7 +216,7 @@ def test_an_error_of_the_mesh_is_told_from_a_torque():
     found = learn(trial, study)
     assert found is not None and is_supported(found)
     assert found.chosen.form is LearnedMeshError and found.chosen.variables == ("theta_m",)
-    assert found.trial.held_out.dynamic_error_std < 0.1 * trial.held_out.dynamic_error_std
+    assert found.trial.held_out.principal_std < 0.1 * trial.held_out.principal_std
     curve = curve_of(found)
     assert (curve.place, curve.quantity) == ("mesh angle", "error")
     error, inside = misfit(curve, amplitude * np.cos(2 * curve.at[:, 0]))

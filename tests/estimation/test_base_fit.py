@@ -46,7 +46,7 @@ TRUTH = {"mu": rig.MU, "omega_0": rig.OMEGA_0, "alpha": rig.REDUCED_ALPHA, "gain
 def test_a_plain_log(found: Fit):
     assert found.converged
     assert_recovered(found, TRUTH)
-    assert found.dynamic_error_std == pytest.approx(NOISE, rel=0.1)
+    assert found.principal_std == pytest.approx(NOISE, rel=0.1)
     # Gaussian noise has no outliers: the data are the very ones that were given.
     assert left_out(found.stretches) == 0
     assert found.stretches[0].experiment.weight is None
@@ -105,7 +105,7 @@ def test_spikes_cost_no_more_than_their_samples(found: Fit, clean, size: float):
     for path, estimate in estimates.items():
         # A hundredth of the information moves an estimate by about a tenth of its standard error.
         assert abs(float(spoiled.model.get(path)) - estimate.value) < 0.5 * estimate.std, path
-    assert spoiled.dynamic_error_std == pytest.approx(found.dynamic_error_std, rel=0.05)
+    assert spoiled.principal_std == pytest.approx(found.principal_std, rel=0.05)
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def test_a_drive_is_recovered(found: Fit):
     assert rig.ALPHA > 10 * estimates["alpha"].std
     assert 0.7 > 10 * estimates["B_sp"].std
     # Nothing but the encoders' noise is left (2000 samples: 1.6 % of a standard deviation).
-    assert found.dynamic_error_std == pytest.approx(X_NOISE, rel=0.06)
+    assert found.principal_std == pytest.approx(X_NOISE, rel=0.06)
     assert float(np.sqrt(found.covariance[0, 0])) == pytest.approx(rig.MOTOR_NOISE / rig.N, rel=0.06)
 
 
@@ -100,7 +100,7 @@ def test_held_parameters_do_not_move(found: Fit, stretches):
     assert held.objective > found.objective + 0.5
     # The states did move: at the truth, they bring the error down to the noise.
     right = drive_fit(rig.drive_model(), stretches, strategy=Strategy(hold_parameters=True))
-    assert right.dynamic_error_std == pytest.approx(found.dynamic_error_std, rel=0.02)
+    assert right.principal_std == pytest.approx(found.principal_std, rel=0.02)
 
 
 def test_several_logs_jointly(found: Fit):
@@ -134,7 +134,7 @@ def test_a_reduced_drive_is_recovered(omega_0: float, mu: float, gain: float):
     estimates = uncertainty(result).estimates
     for path, value in REDUCED_TRUTH.items():
         assert abs(float(start.get(path)) - value) > 10 * estimates[path].std, path
-    assert result.dynamic_error_std == pytest.approx(1e-3, rel=0.1)
+    assert result.principal_std == pytest.approx(1e-3, rel=0.1)
 
 
 def test_steps_follow_the_accuracy_of_the_log():
@@ -212,5 +212,5 @@ def test_a_segment_that_runs_away_is_lost(found: Fit):
     assert not lost(found).any()
     error = np.array(found.error)
     error[1, 5, 0] = np.nan
-    error[2, 7, 1] = 1e7 * found.dynamic_error_std
+    error[2, 7, 1] = 1e7 * found.principal_std
     assert np.flatnonzero(lost(replace(found, error=jnp.asarray(error)))).tolist() == [1, 2]

@@ -9,7 +9,7 @@ import pytest
 import fitting.estimation.free_run as module
 import rig
 from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log
-from fitting.estimation.free_run import WINDOW, FreeRun, free_run, motor_rms_error, rms_error
+from fitting.estimation.free_run import WINDOW, FreeRun, free_run, rms_error
 from hdjax import Model
 
 COUNT = 600
@@ -44,7 +44,7 @@ def test_the_truth_is_reproduced(moving: Experiment):
     # The free motor drifts off with the error of its rate.
     assert np.max(np.abs(found.motor_angle - truth[:, 0])) < 0.02
     drift = np.sqrt(np.mean((moving.motor_angle[:COUNT] - found.motor_angle) ** 2))
-    assert motor_rms_error((found,)) == pytest.approx(drift, rel=1e-9)
+    assert rms_error((found,), "motor_angle") == pytest.approx(drift, rel=1e-9)
     np.testing.assert_array_equal(found.time, moving.time[:COUNT])
 
 

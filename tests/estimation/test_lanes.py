@@ -24,7 +24,7 @@ start = model.replace({"omega_0": 1.02 * model.drive.omega_0})
 # Machine code shares lanes among threads; the devices are XLA's.
 found = fit(start, [Stretch(experiment, 0, 2048)], base_paths(model), Segmentation(128), engine="XLA")
 devices = len(found.problem.segments.measured.sharding.device_set)
-print(json.dumps([devices, found.unknowns.parameters.tolist(), float(found.dynamic_error_std)]))
+print(json.dumps([devices, found.unknowns.parameters.tolist(), float(found.principal_std)]))
 """
 
 

@@ -52,8 +52,8 @@ def test_what_springs_remember_comes_from_the_whole_motion():
         model, [Stretch(logged, 0, COUNT)], paths, Segmentation(HORIZON, substeps=4), strategy=Strategy(max_steps=25)
     )
     carried = with_memory_carried(short)
-    assert carried.horizon == HORIZON and carried.dynamic_error_std < 0.75 * short.dynamic_error_std
-    assert carried.dynamic_error_std < 1.6 * NOISE
+    assert carried.horizon == HORIZON and carried.principal_std < 0.75 * short.principal_std
+    assert carried.principal_std < 1.6 * NOISE
     found = {name: float(carried.model.get(f"{guess.name}.{name}")) for name in truth}
     assert found == pytest.approx(truth, rel=0.1)
     assert float(carried.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=2e-3)

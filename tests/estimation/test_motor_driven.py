@@ -57,7 +57,7 @@ def test_a_torque_on_the_load_is_part_of_it():
     with_load = motor_driven_fit(model_of(RUBBING), stretches_of(RUBBING, load_torque=pushed))
     without = motor_driven_fit(model_of(RUBBING), stretches_of(RUBBING))
     assert with_load is not None and without is not None
-    assert with_load.dynamic_error_std > 3.0 * without.dynamic_error_std
+    assert with_load.principal_std > 3.0 * without.principal_std
 
 
 def test_another_stiffness_leaves_more(stretches):

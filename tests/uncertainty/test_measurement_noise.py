@@ -41,8 +41,8 @@ def test_no_good_model_is_needed():
     right, off = held(), held(omega_0=1.02 * rig.OMEGA_0)
     assert rms(right) == pytest.approx(NOISE, rel=CLOSE)
     # A frequency 2 % off leaves much more over many periods than over half of one.
-    assert off.dynamic_error_std > 1e-2
-    assert rms(off) < 0.2 * off.dynamic_error_std
+    assert off.principal_std > 1e-2
+    assert rms(off) < 0.2 * off.principal_std
 
 
 @pytest.mark.parametrize(("bias", "most"), [(0.0, 1.0), (1.0, _MOTION), (5.0, 1.0)])

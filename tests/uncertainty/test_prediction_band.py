@@ -101,7 +101,7 @@ def test_a_drive_has_two_outputs():
     found = fit(rig.drive_model(), [Stretch(experiment, 0, 512)], ("K", "B_sp"), Segmentation(256, substeps=1, count=2))
     known = uncertainty(found)
     (result,) = prediction_bands(found, known, [Stretch(experiment, 0, 512)], noise=found.covariance)
-    assert result.std_noise == pytest.approx(found.dynamic_error_std, rel=1e-9)
+    assert result.std_noise == pytest.approx(found.principal_std, rel=1e-9)
     # A certain model leaves the window's noise alone.
     certain = eqx.tree_at(lambda u: u.covariance, known, 0.0 * known.covariance)
     (sure,) = prediction_bands(found, certain, [Stretch(experiment, 0, 512)], noise=found.covariance)

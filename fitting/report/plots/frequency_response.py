@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fitting.formatting import axis_label, pretty_unit, scaled_unit
+from fitting.report.outputs import in_words
 from fitting.report.plots.axes import AFTER, MEASURED, axis, axis_scale, figure, line_trace, note, vertical_line
 from fitting.report.plots.plot import Plot
 from fitting.validation.frequency_response import FrequencyResponse, strong_lines
@@ -20,14 +21,14 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
 
     Args:
         found: the responses.
-        units: of `dynamic_error` and `forcing`.
+        units: of the output and of `forcing`.
     """
     kept = _shown(found)
     frequency = found.frequency[kept]
     measured = np.where(found.coherence > _MEANINGLESS, found.measured, np.nan)
     curves = (("measured (H1)", MEASURED, measured[kept]), ("model", AFTER, found.model[kept]))
     largest = float(np.max(np.abs(found.model)))
-    factor, unit = scaled_unit(largest, units.get("dynamic_error", "rad"))
+    factor, unit = scaled_unit(largest, units.get(found.output, "rad"))
     traces = []
     for name, color, response in curves:
         traces.append(line_trace(frequency, factor * np.abs(response), name=name, color=color))
@@ -50,12 +51,13 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
         "shapes": [vertical_line(x=found.resonance)],
         "annotations": [note("natural frequency", x=float(np.log10(found.resonance)))],
     }
+    output = in_words(found.output)
     return Plot(
         "frequency-response",
         "look",
-        f"Frequency response from {found.source} to dynamic error",
+        f"Frequency response from {found.source} to {output}",
         "Measured: cross-spectrum over input spectrum (H1). Model: the fitted drive with its stiffness averaged over "
-        "the measured twist. Coherence is the share of the dynamic error's power that follows linearly from the "
+        f"the measured twist. Coherence is the share of the {output}'s power that follows linearly from the "
         f"{found.source}; where it is below {_MEANINGLESS}, the measured curve means nothing and is not drawn.",
         figure(traces, 560, **layout),
     )

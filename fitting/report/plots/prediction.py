@@ -6,6 +6,7 @@ import numpy as np
 
 from fitting.estimation.free_run import FreeRun
 from fitting.formatting import axis_label, percent, scaled_unit
+from fitting.report.outputs import in_words
 from fitting.report.plots.axes import MEASURED, axis, figure, names_and_colors
 from fitting.report.plots.long_trace import long_trace
 from fitting.report.plots.plot import Figure, Plot
@@ -31,7 +32,7 @@ def predictions(
         runs: the same stretch by the base model and by the final one.
         part: of the data that the stretch is.
         omega_0: natural frequency [rad/s], for the first view.
-        unit: of the dynamic error.
+        unit: of the principal output.
         key: of the plot.
         band: of the first run.
     """
@@ -52,7 +53,9 @@ def predictions(
     layout = {
         "xaxis": axis("time [s]", range=list(window), anchor="y2"),
         "yaxis": axis(
-            axis_label("dynamic error", label), domain=[0.42, 1], range=_span(factor * first.measured[shown], visible)
+            axis_label(in_words(first.output), label),
+            domain=[0.42, 1],
+            range=_span(factor * first.measured[shown], visible),
         ),
         "yaxis2": axis(
             axis_label("error", error_label),

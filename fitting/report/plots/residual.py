@@ -144,7 +144,7 @@ def _band(limit: float) -> Figure:
     }
 
 
-def dependences(before: ResidualDiagnostics, after: ResidualDiagnostics | None, *, unit: str) -> Plot:
+def dependences(before: ResidualDiagnostics, after: ResidualDiagnostics | None, *, unit: str, twist_unit: str) -> Plot:
     """Mean residual against twist, twist rate, motor angle and motor speed."""
     residuals = [r for r in (before, after) if r is not None]
     largest = max(float(np.max(np.abs(d.mean), initial=0.0)) for d in before.dependence.values())
@@ -154,7 +154,7 @@ def dependences(before: ResidualDiagnostics, after: ResidualDiagnostics | None, 
     layout: dict[str, Any] = {"grid": {"rows": rows, "columns": 2, "pattern": "independent", "ygap": 0.32}}
     for i, quantity in enumerate(before.dependence):
         suffix = "" if i == 0 else str(i + 1)
-        scale, x_label = _quantity_scale(quantity, before, unit)
+        scale, x_label = _quantity_scale(quantity, before, twist_unit)
         for (name, color), residual in zip(names_and_colors(after is not None), residuals, strict=False):
             part = residual.dependence[quantity]
             traces.append(

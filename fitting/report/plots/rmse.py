@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from fitting.formatting import axis_label, scaled_unit
+from fitting.report.outputs import in_words
 from fitting.report.plots.axes import axis, axis_scale, figure, names_and_colors, note, numbers, text, vertical_line
 from fitting.report.plots.plot import Plot
 from fitting.validation.account import Account
@@ -12,6 +13,7 @@ from fitting.validation.account import Account
 
 def rmse_bars(before: Account, after: Account | None, *, noise: float, unit: str) -> Plot:
     """Rms error on each part of the data against the measurement noise."""
+    output = in_words(before.judged[0].output)
     accounts = [before] if after is None else [before, after]
     values = [list(a.rmse.values()) for a in accounts]
     finite = [v for pair in values for v in pair if np.isfinite(v)]
@@ -34,7 +36,7 @@ def rmse_bars(before: Account, after: Account | None, *, noise: float, unit: str
     layout: dict[str, Any] = {
         "barmode": "group",
         "bargap": 0.35,
-        "xaxis": axis(axis_label("rms error of the dynamic error", label), rangemode="tozero", exponentformat="power"),
+        "xaxis": axis(axis_label(f"rms error of the {output}", label), rangemode="tozero", exponentformat="power"),
         "yaxis": axis("", autorange="reversed", showgrid=False),
         "shapes": [vertical_line(x=factor * noise)],
         "annotations": [note("noise", x=float(np.log10(factor * noise)) if wide else factor * noise)],
