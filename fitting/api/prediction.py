@@ -178,8 +178,8 @@ def _runs(stored: StoredModel, name: str, data: Data, log: Log) -> tuple[tuple[F
     needed, seen = as_logged(stored.model)[0], log.outputs
     if stored.model.measured != fitted_outputs(log):
         raise InputError(
-            f"{log.path}: the log has {' and '.join(seen)}, but {name} was fitted to {' and '.join(needed)}; give a log "
-            "with these"
+            f"{log.path}: the log has {' and '.join(seen)}, but {name} was fitted to {' and '.join(needed)}; give a "
+            "log with these"
         )
     warm = [e.name for e in stored.model.effects if e.needs_temperature]
     if warm and log.temperature is None:

@@ -4,8 +4,8 @@ Behind the mesh the load answers the motor's turn q = theta_m/N and the torque o
 
     theta_l = G q + (G_0 / J_l) T_l,   G = (c_B s + c_K) G_0,   G_0 = 1 / (s^2 + c_B s + c_K),
 
-with c_K = K/J_l (the square of the antiresonance) and c_B = B_sp/J_l. For given c_K and c_B, what was measured is linear
-in all else,
+with c_K = K/J_l (the square of the antiresonance) and c_B = B_sp/J_l. For given c_K and c_B, what was measured is
+linear in all else,
 
     N k_T T_m + G T_l = N^2 J_m q'' + J_l (G q)'' + friction of the motor      (momentum of the motor)
     tau + G T_l = J_l (G q)''                                                   (a sensor of the joint torque)
@@ -226,7 +226,7 @@ class _Balance:
         def share(logarithms: np.ndarray) -> float:
             return self.missed(*_coefficients(logarithms))[0]
 
-        first = min(([w, np.log(_DAMPING)] for w in grid), key=share)
+        first = min((np.array([w, np.log(_DAMPING)]) for w in grid), key=share)
         around = np.array([first, [first[0] + grid[1] - grid[0], first[1]], [first[0], first[1] - 1.0]])
         options = {"maxiter": _STEPS, "initial_simplex": around}
         found = minimize(share, first, method="Nelder-Mead", options=options)
@@ -236,7 +236,7 @@ class _Balance:
         return missed, {"K": J_l * c_K, "B_sp": J_l * c_B, "alpha": 0.0} | inertias
 
 
-def _coefficients(logarithms: np.ndarray | Sequence[float]) -> tuple[float, float]:
+def _coefficients(logarithms: np.ndarray) -> tuple[float, float]:
     """c_K and c_B of an antiresonance and a damping ratio, by their logarithms."""
     omega, damping = np.exp(logarithms[0]), np.exp(np.clip(logarithms[1], -12.0, 2.0))
     return float(omega**2), float(2.0 * damping * omega)

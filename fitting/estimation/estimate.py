@@ -189,6 +189,7 @@ def fit(
         engine=engine,
     )
     swing = float(scales(stretches, model).x)
+    moves = swing * of_twist(model)[-1]
     # The scale of a single output changes nothing but the say of the hidden states' prior.
     scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
@@ -196,7 +197,7 @@ def fit(
         covariance = (
             evaluate(problem, unknowns).covariance
             if scale_matters
-            else np.array([[(swing * of_twist(model)[-1]) ** 2]])
+            else np.array([[moves**2]])
         )
     objective, steps = np.inf, 0
     solution = None

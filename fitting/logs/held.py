@@ -64,15 +64,14 @@ def without_repeats(log: Log) -> Log:
     }
     if names == angles:
         change = {name: filled[name] - getattr(log, name) for name in names}
-        assert log.dynamic_error is not None
-        filled["dynamic_error"] = log.dynamic_error + change["motor_angle"] / _ratio(log) - change["load_angle"]
+        filled["dynamic_error"] = log.twist + change["motor_angle"] / _ratio(log) - change["load_angle"]
     return replace(log, trusted=trusted, findings=(*log.findings, *findings, *moved), **filled)
 
 
 def _ratio(log: Log) -> float:
     """N, as the dynamic error was made with it."""
-    assert log.motor_angle is not None and log.load_angle is not None and log.dynamic_error is not None
-    output = log.dynamic_error + log.zero + log.load_angle
+    assert log.motor_angle is not None and log.load_angle is not None
+    output = log.twist + log.zero + log.load_angle
     most = int(np.argmax(np.abs(output)))
     return float(log.motor_angle[most] / output[most]) if output[most] else 1.0
 

@@ -103,6 +103,12 @@ class Log:
         return len(self.time)
 
     @property
+    def twist(self) -> np.ndarray:
+        """The dynamic error of a log that has one, (n,)."""
+        assert self.dynamic_error is not None
+        return self.dynamic_error
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         """The signals that a fit is to explain, as they were logged."""
         if self.kind != "drive":

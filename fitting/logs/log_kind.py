@@ -98,7 +98,7 @@ def _unnamed(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn
 def told_of_subset(
     path: Path, drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]
 ) -> tuple[Finding, ...]:
-    """What is to be said of a drive log that lacks an angle: what it is fitted to, and which column may be the angle."""
+    """What is to be said of a drive log that lacks an angle: what it is fitted to, and what may be the angle."""
     seen, lacks = drive_outputs(raw), [angle for angle, _ in SIDES if angle not in raw]
     if not lacks or not seen:
         return ()

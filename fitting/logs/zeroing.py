@@ -66,9 +66,8 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
     Weak form as for the starting values: the load's equation J_l theta_l'' = p(x) + B x', or that of the reduced drive
     with b u on its right, times test functions and integrated by parts.
     """
-    assert log.dynamic_error is not None
     best, root = np.inf, middle
-    x = log.dynamic_error - middle
+    x = log.twist - middle
     for width in _WIDTHS:
         windows = _windows(log, width)
         if len(windows) < _FEWEST:

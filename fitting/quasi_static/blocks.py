@@ -79,7 +79,7 @@ def _average(log: Log, most: int) -> dict[str, np.ndarray]:
         "path": np.insert(found["torque"], firsts, extremes),
         "blocks": blocks,
         # Blocks of one size, whose centres are evenly spaced as third differences want them.
-        "noise": np.array([noise(means(values, size)) for values in (torque, log.dynamic_error)]),
+        "noise": np.array([noise(means(values, size)) for values in (torque, log.twist)]),
     }
 
 

@@ -153,7 +153,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
 def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[str, np.ndarray]:
     size = math.ceil(len(log) / most)
     smooth, error = without_noise(torque_of(log))
-    twist = means(log.dynamic_error - np.mean(log.dynamic_error), size)
+    twist = means(log.twist - np.mean(log.twist), size)
     columns = {
         "torque": smooth,
         "logged_torque": torque_of(log),

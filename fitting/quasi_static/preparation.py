@@ -105,7 +105,7 @@ def _wide_twist(log: Log, most: float | None) -> tuple[Finding, ...]:
     Raises:
         DataError: The twist is wider than the drive file says.
     """
-    span = float(np.ptp(log.dynamic_error))
+    span = float(np.ptp(log.twist))
     if span <= (most or GEAR_TWIST):
         return ()
     limit = most or _TURN
@@ -139,7 +139,7 @@ def _refuse_mix_ups(log: Log, speed: np.ndarray, *, moves: bool, must_follow: bo
         moves: Whether the joint moved.
         must_follow: Whether the torque must be seen in the twist.
     """
-    torque, twist = torque_of(log), log.dynamic_error
+    torque, twist = torque_of(log), log.twist
     slope, classical, robust = compliance(log, speed, moves=moves)
     if slope < -robust:
         raise DataError(

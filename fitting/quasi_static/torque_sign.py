@@ -42,7 +42,7 @@ def compliance(log: Log, speed: np.ndarray, *, moves: bool) -> Compliance:
         speed: Of the joint in these rows [rad/s], (n,).
         moves: Whether the joint moved.
     """
-    torque, twist = log.joint_torque, log.dynamic_error
+    torque, twist = log.joint_torque, log.twist
     assert torque is not None
     size = max(1, len(log) // _BLOCKS)
     columns = [torque, np.ones_like(torque), *(_of_motion(log, speed) if moves else ())]
