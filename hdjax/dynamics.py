@@ -31,6 +31,7 @@ State = Float[Array, " states"]
 BOTH_ANGLES = ("motor_turn", "dynamic_error")
 """What is seen of a drive with an encoder on either side."""
 
+JOINT_TORQUE = "joint_torque"
 OUTPUTS = {
     "motor_turn": "rad",
     "motor_angle": "rad",
@@ -38,7 +39,7 @@ OUTPUTS = {
     "dynamic_error": "rad",
     "motor_velocity": "rad/s",
     "load_velocity": "rad/s",
-    "joint_torque": "N m",
+    JOINT_TORQUE: "N m",
 }
 """What sensors may read, with its unit. `motor_turn` is theta_m/N, all else as DESIGN names it."""
 _Kind = TypeVar("_Kind", bound=Effect)
@@ -249,7 +250,7 @@ class TwoInertiaModel(Model):
             "dynamic_error": lambda: turn - theta_l,
             "motor_velocity": lambda: omega_m,
             "load_velocity": lambda: omega_l,
-            "joint_torque": lambda: self._mesh_torque(self.motion(state), self._own_states(tuple(state))),
+            JOINT_TORQUE: lambda: self._mesh_torque(self.motion(state), self._own_states(tuple(state))),
         }
         return jnp.stack([readings[name]() for name in self.measured])
 

@@ -78,5 +78,6 @@ def _driven(stretch: Stretch) -> Stretch:
     slope = np.append(np.diff(acceleration) / np.diff(whole.time), 0.0)
     pieces = jnp.asarray(np.stack([acceleration, slope], axis=1))
     torque = PiecewisePolynomial(whole.torque.knots, pieces)
-    experiment = replace(whole, torque=torque, measured=whole.measured[:, 1:], motor_angle=None)
+    own = {"measured": whole.measured[:, 1:], "outputs": ("dynamic_error",), "motor_angle": None}
+    experiment = replace(whole, torque=torque, **own)
     return Stretch(experiment, stretch.start, stretch.stop)

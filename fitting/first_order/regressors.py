@@ -18,6 +18,7 @@ from fitting.first_order.internal_states import Memory, memory_of, own_between, 
 from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
 from hdjax import Drive, Model, PiecewisePolynomial
 from hdjax.compilation import jit_small
+from hdjax.dynamics import JOINT_TORQUE
 from hdjax.effects import (
     ActuatorEffect,
     Effect,
@@ -81,7 +82,10 @@ def regressors(
     if _READING in added:
         return Regressors(None, added[_READING]), None
     lands, sizes = [seen.carried[name] for name in added], list(added.values())
-    return Regressors(Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))), memory
+    forces = Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))
+    # A sensor of the joint torque reads what is added to it.
+    read = isinstance(stacked, MeshTorqueEffect | MeshGeometryEffect) and JOINT_TORQUE in seen.model.measured
+    return Regressors(forces, _finite(_readings(seen, stacked, states)) if read else None), memory
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
@@ -176,13 +180,18 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
     model, segments, followed = seen.model, seen.segments, seen.followed
     inputs = inputs_at(model, segments, PART * segments.width[..., None])
     rates = _by_strength(_rates, stacked, model, followed.between, inputs, own=own_between(states))
-    own = np.moveaxis(states[:, :-1], 2, 0)
-    reading = _by_strength(_outputs, stacked, model, followed.states[:, :-1], own=own)
+    reading = _readings(seen, stacked, states)
     # A rate of each state at each node is a part.
     parts = [[ends * weight for weight in by] for ends, by in carriers(followed)]
     lands = np.concatenate([first + second for first, second in zip(*parts, strict=True)], axis=-1)
     sizes = rates.reshape(*rates.shape[:2], -1, rates.shape[-1])
     return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
+
+
+def _readings(seen: Along, stacked: Effect, states: np.ndarray) -> Float[np.ndarray, "segments samples outputs columns"]:
+    """Derivatives of the outputs at the samples, where the motion stays as it is."""
+    own = np.moveaxis(states[:, :-1], 2, 0)
+    return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], own=own)
 
 
 def _rates(strengths: Array, effect: Effect, model: Model, state: Array, inputs: Inputs, own: Array) -> Array:
