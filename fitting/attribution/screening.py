@@ -6,6 +6,7 @@ each effect's strength and gain to first order (a score test), on held-out data 
 surrogates of the residual gives the law of the best gain where there is nothing to find.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Generic
@@ -18,6 +19,7 @@ from typing_extensions import TypeVar
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.scales import scales
+from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import Answered, Sight, batches, follow_on, sight
 from fitting.first_order.spectral_lines import spectral_lines
@@ -88,16 +90,19 @@ def screen(
     forms = [form for form in catalogue if form.name not in present]
     found = applicable(forms, lines, has_motor=isinstance(model, TwoInertiaModel))
     proposals = tuple(effect for effects in found.values() for effect in effects)
-    free_now = training.free.paths
+    strays = not follows(training, share=_NEAR)
+    # Held parameters stay: the motion of a model that strays tells nothing of them where no sensor sees the twist.
+    stay = strays and _was_held(training) and not sees_twist(training.stretches)
+    free_now = () if stay else training.free.paths
+    skipped = len(training.free.paths) - len(free_now)
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS, -np.inf)
-    strays = not follows(training, share=_NEAR)
     sights = sight(training, seed, measured=strays), sight(held_out, seed + 1, measured=strays)
     known = len(free_now)
     for batch in batches(sights, proposals, follow_on(training, held_out)):
         scores = [_scores(*pair) for pair in zip(sights, batch.answers, strict=True)]
         for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
-            fitted, unseen = (score.columns([*range(known), *(known + c for c in own)]) for score in scores)
+            fitted, unseen = (score.columns([*range(known), *(skipped + known + c for c in own)]) for score in scores)
             columns = list(range(known, known + len(own)))
             paths = strength_paths(effect)
             info = model.with_effects(effect).parameters()
@@ -112,6 +117,13 @@ def screen(
             leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
+
+
+def _was_held(fit: Fit) -> bool:
+    """Whether the parameters of a fit were held: it has not moved them, but for rounding."""
+    return all(
+        math.isclose(float(fit.model.get(p)), float(fit.problem.model.get(p)), rel_tol=1e-12) for p in fit.free.paths
+    )
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:

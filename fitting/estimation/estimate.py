@@ -194,11 +194,7 @@ def fit(
     scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
     covariance = start.covariance
     if covariance is None:
-        covariance = (
-            evaluate(problem, unknowns).covariance
-            if scale_matters
-            else np.array([[moves**2]])
-        )
+        covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[moves**2]])
     objective, steps = np.inf, 0
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):

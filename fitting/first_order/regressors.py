@@ -188,7 +188,9 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
     return Regressors(Forces(lands, _finite(sizes)), _finite(reading))
 
 
-def _readings(seen: Along, stacked: Effect, states: np.ndarray) -> Float[np.ndarray, "segments samples outputs columns"]:
+def _readings(
+    seen: Along, stacked: Effect, states: np.ndarray
+) -> Float[np.ndarray, "segments samples outputs columns"]:
     """Derivatives of the outputs at the samples, where the motion stays as it is."""
     own = np.moveaxis(states[:, :-1], 2, 0)
     return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], own=own)
