@@ -4,6 +4,7 @@ The equations once more in plain numpy (DESIGN 2.1), all joints of a draw side b
 simulator.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 import rig
 from fitting.logs.log import Log
 
+SENSORS = ("motor_angle", "load_angle", "motor_velocity", "load_velocity", "joint_torque")
 COUNT, STEP = 5000, 2e-3
 
 
@@ -101,3 +103,24 @@ def log_of(joint: Joint, *, seed: int = 0, count: int = COUNT, name: str = "join
     motor = motion[:, 0] + joint.N * noise * random.normal(size=count)
     load = motion[:, 1] + noise * random.normal(size=count)
     return rig.log_of_angles(motor, load, torque, ratio=joint.N, step=STEP, name=name)
+
+
+def log_of_sensors(
+    joint: Joint, sensors: Sequence[str], *, seed: int = 0, count: int = COUNT, noise: float = 1e-3, name: str = "joint"
+) -> Log:
+    """Its log by some sensors, each with white noise of so large a share of what the twist does to it."""
+    random = np.random.default_rng(20_000 + seed)
+    torque = torque_of(joint, count=count, seed=seed)
+    theta_m, theta_l, omega_m, omega_l = motion_of(joint, torque).T
+    x, v = theta_m / joint.N - theta_l, omega_m / joint.N - omega_l
+    tau = joint.K * (x + joint.alpha * x**3) + joint.B_sp * v
+    read = {
+        "motor_angle": (theta_m, joint.N * np.std(x)),
+        "load_angle": (theta_l, np.std(x)),
+        "motor_velocity": (omega_m, joint.N * np.std(v)),
+        "load_velocity": (omega_l, np.std(v)),
+        "joint_torque": (tau, np.std(tau)),
+    }
+    seen = {s: read[s][0] + noise * read[s][1] * random.normal(size=count) for s in sensors}
+    log = rig.log_of_angles(theta_m, theta_l, torque, ratio=joint.N, step=STEP, name=name)
+    return replace(log, dynamic_error=None, **(dict.fromkeys(SENSORS) | seen))

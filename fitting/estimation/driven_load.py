@@ -26,6 +26,8 @@ from fitting.estimation.weak_form import WIDTHS, against, bump_functions
 from hdjax import Drive, Model, TwoInertiaModel
 
 Signal = Float[np.ndarray, " samples"]
+Rows = Float[np.ndarray, " rows"]
+"""A signal against test functions."""
 Order = Literal[0, 1]
 """0 for an angle, 1 for a velocity."""
 
@@ -128,10 +130,10 @@ class _Equation(NamedTuple):
         known: the inertias that are not wanted.
     """
 
-    inertias: dict[str, Signal]
-    beside: list[Signal]
-    right: Signal
-    whole: Signal
+    inertias: dict[str, Rows]
+    beside: list[Rows]
+    right: Rows
+    whole: Rows
     known: dict[str, float]
 
     def rows(self, wanted: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +159,7 @@ class _Balance:
         parts = [_Part.of(s, model) for s in stretches if len(s) >= 3 * width]
         return cls(model, [p for p in parts if p is not None], width) if parts and None not in parts else None
 
-    def _against(self, values: Signal, part: _Part, derivatives: int) -> Signal:
+    def _against(self, values: Signal, part: _Part, derivatives: int) -> Rows:
         """A signal's derivative of an order against the test functions."""
         functions = bump_functions(self.width, part.time_step)[derivatives]
         return (
@@ -166,7 +168,7 @@ class _Balance:
             * (part.time_step)
         )
 
-    def _of_motor(self, part: _Part) -> list[Signal]:
+    def _of_motor(self, part: _Part) -> list[Rows]:
         """Of the motor: acceleration, direction, speed, a constant; and the torque."""
         values, order = part.motor
         speed = np.gradient(values) if order == 0 else values
@@ -195,7 +197,7 @@ class _Balance:
             share = _NO_START
         return share, dict(zip(self.wanted, map(float, inertias), strict=True))
 
-    def _equations(self, part: _Part, of_motor: list[Signal], c_K: float, c_B: float) -> Iterator["_Equation"]:
+    def _equations(self, part: _Part, of_motor: list[Rows], c_K: float, c_B: float) -> Iterator["_Equation"]:
         """What holds of one stretch."""
         N, drive = float(self.model.drive.N), self.model.drive
         known = {path: float(getattr(drive, path)) for path in ("J_m", "J_l") if path not in self.wanted}

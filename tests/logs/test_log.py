@@ -158,19 +158,10 @@ def test_every_format_tells_which_column_is_missing(tmp_path: Path, kind: str) -
     one_sentence(error, str(path), "motor_torque", "did you mean", "motor_torqe", "[columns]")
 
 
-def test_a_missing_angle_is_told_by_what_names_say(tmp_path: Path) -> None:
-    table = rig()
-    table["q_link"] = table.pop("load_angle")
-    with pytest.raises(InputError) as error:
-        read_log(save(tmp_path, table), drive(tmp_path))
-    one_sentence(error, "load_angle", "'q_link' could be it", 'load_angle = { column = "q_link" }', "`hdjax init`")
-    assert "did you mean" not in str(error.value)
-
-
 def test_a_log_cannot_be_changed(tmp_path: Path) -> None:
     log = read_log(save(tmp_path, rig()), drive(tmp_path))
     with pytest.raises(ValueError, match="read-only"):
-        log.dynamic_error[0] = 1.0
+        log.twist[0] = 1.0
 
 
 UNITS = """

@@ -1,0 +1,138 @@
+"""A drive seen by some of its sensors: starting values, first states, fits and reports of any subset of outputs."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import joints
+from fitting.estimation.base_fit import base_fit, is_held, told_by_load
+from fitting.estimation.driven_load import through_load, twist
+from fitting.estimation.experiment import Stretch, experiment_from_log, whole
+from fitting.estimation.linear_drive import readings
+from fitting.estimation.linear_response import readout
+from fitting.estimation.observed_states import observed_states
+from fitting.estimation.problem import Segmentation
+from fitting.estimation.starting_values import starting_models
+from fitting.fit_drive import fit_only
+from fitting.report.content import report_dict
+from fitting.uncertainty.standard_errors import uncertainty
+from hdjax import Drive, TwoInertiaModel
+from hdjax.drive import Prior
+from hdjax.dynamics import OUTPUTS
+
+JOINT = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05)
+COUNT = 2500
+SUBSETS = [
+    ("motor_angle",),
+    ("motor_velocity",),
+    ("motor_angle", "joint_torque"),
+    ("motor_velocity", "joint_torque"),
+    ("motor_velocity", "load_velocity"),
+    ("motor_angle", "load_velocity"),
+]
+
+
+def stretches_of(joint: joints.Joint, sensors: Sequence[str], *, noise: float = 1e-3) -> tuple[Stretch, ...]:
+    log = joints.log_of_sensors(joint, sensors, count=COUNT, noise=noise)
+    return whole([experiment_from_log(log, hold="zero-order", N=joint.N)])
+
+
+def model_of(stretches: Sequence[Stretch], *, free: bool = False, K: float = 1.0) -> TwoInertiaModel:
+    """The joint's model, its inertias known or not at all."""
+    priors = (Prior("J_m", 1.0, np.inf), Prior("J_l", 1.0, np.inf)) if free else ()
+    own = {"J_m": 1.0, "J_l": 1.0} if free else {"J_m": JOINT.J_m, "J_l": JOINT.J_l}
+    return TwoInertiaModel(Drive(N=JOINT.N, K=K, priors=priors, **own), measured=stretches[0].experiment.outputs)
+
+
+def true_model(measured: tuple[str, ...]) -> TwoInertiaModel:
+    drive = Drive(N=JOINT.N, J_m=JOINT.J_m, J_l=JOINT.J_l, K=JOINT.K, B_sp=JOINT.B_sp)
+    return TwoInertiaModel(drive, measured=measured)
+
+
+@pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
+@pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
+def test_stiffness_and_inertias_follow_from_any_subset(sensors: tuple[str, ...], free: bool):
+    stretches = stretches_of(JOINT, sensors)
+    found = base_fit(model_of(stretches, free=free), stretches)
+    estimates = uncertainty(found).estimates
+    assert not is_held(found) and estimates["K"].std < 1e-3 * JOINT.K
+    for path in ("K", "B_sp", *(("J_m", "J_l") if free else ())):
+        assert abs(estimates[path].value - getattr(JOINT, path)) < 4.0 * estimates[path].std, (path, estimates[path])
+
+
+def test_friction_of_the_motor_does_not_mislead_what_sees_no_twist():
+    stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
+    found = base_fit(model_of(stretches, free=True), stretches)
+    told = told_by_load(found)
+    assert is_held(found) and told is not None
+    estimates = uncertainty(told).estimates
+    for path in ("K", "J_m", "J_l"):
+        assert estimates[path].std < 0.005 * getattr(JOINT, path)
+        assert abs(float(found.model.get(path)) - getattr(JOINT, path)) < 4.0 * estimates[path].std
+
+
+def test_starting_values_are_near_although_friction_takes_half_of_the_torque():
+    stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
+    model = model_of(stretches, free=True)
+    starts = starting_models(model, stretches)
+    off = [max(abs(float(s.get(p)) / getattr(JOINT, p) - 1.0) for p in ("K", "J_m", "J_l")) for s in starts]
+    assert min(off) < 0.2, off
+
+
+@given(st.floats(1.0, 30.0), st.floats(0.01, 3.0))
+@settings(max_examples=20, deadline=None)
+def test_load_answers_a_sinusoid_as_its_transfer_function_says(omega: float, damping: float):
+    step, c_K, s = 1e-3, 100.0, 1j * omega
+    time = step * np.arange(40_000)
+    found = through_load(np.sin(omega * time), c_K, damping + 0.5, step)[-5000:]
+    gain = (c_K + (damping + 0.5) * s) / (s**2 + (damping + 0.5) * s + c_K)
+    expected = np.imag(gain * np.exp(s * time[-5000:]))
+    # Straight lines between samples, and what is left of the start.
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(gain) + 1e-3)
+
+
+def test_the_linear_drive_reads_what_the_model_reads():
+    model = true_model(tuple(OUTPUTS))
+    np.testing.assert_allclose(readings(model), readout(model, model.rest()), rtol=1e-12)
+
+
+@pytest.mark.parametrize("sensors", [*SUBSETS, ("load_angle",)], ids="+".join)
+def test_first_states_are_those_of_the_motion(sensors: tuple[str, ...]):
+    (stretch,) = stretches_of(JOINT, sensors, noise=0.0)
+    segments = Segmentation(256).of([stretch])
+    found = observed_states(true_model(sensors), segments)
+    motion = joints.motion_of(JOINT, joints.torque_of(JOINT, count=COUNT))[::256]
+    x, v = (states[:, i] / JOINT.N - states[:, i + 1] for states in (motion,) for i in (0, 2))
+    assert np.max(np.abs(found[: len(x), 0] / JOINT.N - found[: len(x), 1] - x)) < 1e-3 * np.max(np.abs(x))
+    assert np.max(np.abs(found[: len(x), 2] / JOINT.N - found[: len(x), 3] - v)) < 1e-3 * np.max(np.abs(v))
+
+
+@pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
+def test_an_unseen_twist_is_known_by_its_size(sensors: tuple[str, ...]):
+    (stretch,) = stretches_of(JOINT, sensors)
+    motion = joints.motion_of(JOINT, joints.torque_of(JOINT, count=COUNT))
+    x = motion[:, 0] / JOINT.N - motion[:, 1]
+    assert np.std(twist(stretch, true_model(sensors))) == pytest.approx(np.std(x), rel=0.05)
+
+
+def test_reports_tell_each_output_in_its_unit():
+    stretches = stretches_of(JOINT, ("motor_angle", "joint_torque"))
+    experiments = {"zero-order": tuple(s.experiment for s in stretches)}
+    report = report_dict(fit_only(model_of(stretches), experiments, hold="zero-order"))
+    assert report["output"] == "joint_torque" and report["units"]["joint_torque"] == "N m"
+    assert set(report["before"]["rmse_of_outputs"]) == {"joint_torque", "motor_angle"}
+    for output, values in report["before"]["rmse_of_outputs"].items():
+        assert values["training"] == pytest.approx(report["noise"][output], rel=0.1)
+        assert report["goodness"]["error_over_noise"][output.replace("_", " ")] == pytest.approx(1.0, rel=0.1)
+    assert report["before"]["rmse"]["training"] == report["before"]["rmse_of_outputs"]["joint_torque"]["training"]
+    assert "joint torque" in report["frequency_response"]["says"][0]
+
+
+def test_a_joint_torque_is_that_of_the_mesh():
+    model = true_model(("joint_torque",))
+    state = jnp.array([1.0, 0.018, 5.0, 0.03])
+    assert float(model.outputs(state)[0]) == pytest.approx(JOINT.K * 0.002 + JOINT.B_sp * 0.07, rel=1e-12)

@@ -1,0 +1,77 @@
+"""Which outputs a drive log is fitted to, and what is said where an angle is lacking."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import joints
+from fitting.drive_data import base_model, ready_log
+from fitting.errors import InputError
+from fitting.logs.drive_file import read_drive_file
+from fitting.logs.log import Log, read_log
+from hdjax.dynamics import BOTH_ANGLES
+
+JOINT = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05)
+DRIVE = "[drive]\nreduction_ratio = 50\nmotor_inertia = 4e-5\nload_inertia = 0.2\nlargest_twist = 0.5\n"
+ALL = joints.log_of_sensors(JOINT, joints.SENSORS, count=600)
+
+
+def read(folder: Path, columns: dict[str, str], text: str = DRIVE, **options) -> Log:
+    """The log with some signals under the names of its columns."""
+    values = {"time": ALL.time} | {name: getattr(ALL, signal) for name, signal in columns.items()}
+    head = ",".join(values)
+    np.savetxt(folder / "log.csv", np.stack([*values.values()], 1), "%.12g", ",", header=head, comments="")
+    (folder / "drive.toml").write_text(text)
+    return read_log(folder / "log.csv", read_drive_file(folder / "drive.toml"), **options)
+
+
+def named(*signals: str) -> dict[str, str]:
+    return {signal: signal for signal in signals}
+
+
+@pytest.mark.parametrize(
+    ("signals", "outputs"),
+    [
+        (("motor_angle",), ("motor_angle",)),
+        (("motor_velocity",), ("motor_velocity",)),
+        (("motor_angle", "motor_velocity"), ("motor_angle",)),
+        (("motor_angle", "load_velocity"), ("motor_angle", "load_velocity")),
+        (("motor_velocity", "load_velocity"), ("motor_velocity", "load_velocity")),
+        (("motor_angle", "joint_torque"), ("motor_angle", "joint_torque")),
+        (("motor_angle", "load_angle", "motor_velocity", "joint_torque"), ("motor_angle", "load_angle")),
+    ],
+)
+def test_the_outputs_are_those_that_were_logged(tmp_path: Path, signals: tuple[str, ...], outputs: tuple[str, ...]):
+    log = read(tmp_path, named("motor_torque", *signals))
+    assert log.kind == "drive" and log.outputs == outputs
+    measured = base_model(read_drive_file(tmp_path / "drive.toml"), log).measured
+    assert measured == (BOTH_ANGLES if len(outputs) == 2 and outputs[1] == "load_angle" else outputs)
+    assert (log.dynamic_error is None) == ("load_angle" not in outputs)
+
+
+def test_a_log_without_a_load_angle_says_so_and_names_what_could_be_it(tmp_path: Path):
+    log = read(tmp_path, named("motor_torque", "motor_angle"))
+    assert [f.severity for f in log.findings] == ["note"] and "no load_angle" in log.findings[0].what
+    log = read(tmp_path, named("motor_torque", "motor_angle") | {"q_link": "load_angle"})
+    assert log.findings[0].severity == "warning" and "'q_link' could be load_angle" in log.findings[0].consequence
+
+
+def test_a_log_without_a_torque_is_refused_for_the_torque(tmp_path: Path):
+    with pytest.raises(InputError, match="no column for motor_torque") as error:
+        read(tmp_path, named("motor_angle", "load_velocity"))
+    assert "load_angle" not in str(error.value)
+
+
+def test_outputs_beyond_those_asked_for_are_not_looked_at(tmp_path: Path):
+    columns = named("motor_torque", "motor_angle", "joint_torque")
+    log = read(tmp_path, columns, outputs_until=50)
+    assert log.trusted is not None and log.trusted.sum() == 50
+    assert np.ptp(log.joint_torque[50:]) == 0.0 and np.ptp(log.motor_angle[50:]) == 0.0
+    ready = ready_log(tmp_path / "log.csv", read_drive_file(tmp_path / "drive.toml"), outputs_until=50)
+    assert ready.dynamic_error is None and ready.zero == 0.0
+
+
+def test_twist_and_joint_torque_beside_a_torque_stay_quasi_static(tmp_path: Path):
+    columns = named("motor_torque", "joint_torque") | {"twist": "load_angle"}
+    assert read(tmp_path, columns).kind == "quasi-static"
