@@ -47,7 +47,7 @@ def unknowns(inspection: Inspection) -> dict[str, str]:
     joint = inspection.joint
     missing: dict[str, str] = {}
     both = set(_ANGLES) <= set(joint.signals)
-    if both and "reduction_ratio" not in drive_tables(inspection)["drive"]:
+    if (both or joint.kind == "motor side") and "reduction_ratio" not in drive_tables(inspection)["drive"]:
         missing["[drive] reduction_ratio"] = _why_no_ratio(inspection)
     if joint.kind in ("drive", "motor side"):
         missing |= {f"[drive] {key}": what for key, what in _INERTIAS.items()}
@@ -125,9 +125,9 @@ def _spare(inspection: Inspection, signal: str) -> bool:
 
 
 def _unseen_angles(inspection: Inspection) -> list[str]:
-    """The angles that a log of one side lacks, and that no doubtful column may be."""
+    """The angles that a log of the load side lacks, and that no doubtful column may be."""
     joint = inspection.joint
-    if joint.kind != "motor side":
+    if joint.kind != "motor side" or {"motor_angle", "motor_velocity"} & set(joint.signals):
         return []
     maybe = {signal for shares in joint.open.values() for signal in shares}
     return [signal for signal in _ANGLES if signal not in joint.signals and signal not in maybe]

@@ -7,6 +7,7 @@ from fitting.inspection.inspection import Inspection
 
 # rad^-2, of the piecewise stiffness in vendors' catalogues (effects.md).
 _ALPHAS = (1e5, 4.5e5)
+_OUTPUTS = ("motor_angle", "motor_velocity", "load_angle", "load_velocity", "joint_torque")
 _VISIBLE = 0.01  # change of stiffness below which alpha is hardly identifiable; assumed
 
 
@@ -53,10 +54,14 @@ def _of_alpha(moved: Excitation) -> Iterator[str]:
 
 
 def _of_motor_side(inspection: Inspection, moved: Excitation) -> Iterator[str]:
-    angle = next(s for s in ("motor_angle", "load_angle", "motor_velocity") if s in inspection.joint.signals)
-    yield f"One side alone ({angle} and torque): the whole inertia and friction show in any motion."
-    yield "K and B_sp show only where the torque reaches the resonance; alpha and effects of the mesh hardly."
-    yield "A second angle, or a joint torque, would tell them: look for one in the log."
+    has = [s for s in _OUTPUTS if s in inspection.joint.signals]
+    if not any(s.startswith("motor") for s in has):
+        yield f"One side alone ({' and '.join(has)} and torque): without the motor's motion no fit can be made."
+        return
+    side = "One side alone" if len(has) == 1 else "No twist"
+    yield f"{side} ({' and '.join(has)} and torque): K, B_sp and inertias, where the torque reaches the resonance."
+    yield "The motor side shows antiresonance and resonance, of which both inertias and K follow with the ratio."
+    yield "alpha and effects of the mesh show poorly: a second angle would tell them, so look for one in the log."
 
 
 def _of_quasi_static(inspection: Inspection, moved: Excitation) -> Iterator[str]:
@@ -77,6 +82,6 @@ def _of_nothing(inspection: Inspection) -> Iterator[str]:
     has = ", ".join(found) if found else "no signal"
     yield f"No fit can be made of what was recognised ({has})."
     yield (
-        "A drive log needs motor torque and an angle of each side, a quasi-static one a twist (or both angles) and the "
-        "joint torque, a reduced one a dynamic error and a forcing."
+        "A drive log needs motor torque and the motor's angle or velocity, a quasi-static one a twist (or both "
+        "angles) and the joint torque, a reduced one a dynamic error and a forcing."
     )

@@ -56,7 +56,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
         only_stated = "joint_torque" in stated and not ("motor_torque" in stated or "forcing" in stated)
         if only_stated or not (has_angles or is_reduced or "motor_torque" in stated):
             return "quasi-static"
-    is_drive = has_angles or (not is_reduced and "motor_torque" in raw and bool(drive_outputs(raw)))
+    is_drive = has_angles or (not is_reduced and "motor_torque" in raw and sees_motor(raw))
     if is_drive:
         for key in _DRIVE_KEYS:
             if not drive_file.states(key):
@@ -84,9 +84,9 @@ def _missing(raw: Mapping[str, RawColumn]) -> list[str]:
     """What a log lacks to be one that can be fitted, the most likely kind taken."""
     if any(s in raw for s in REDUCED_SIGNALS) and not any(s in raw for s in DRIVE_SIGNALS):
         return [s for s in REDUCED_SIGNALS if s not in raw]
-    if drive_outputs(raw):
+    if sees_motor(raw) and "motor_torque" not in raw:
         return ["motor_torque"]
-    return [s for s in DRIVE_SIGNALS if s not in raw]
+    return [s for s in ("motor_angle", "motor_torque") if s not in raw]
 
 
 def _unnamed(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]) -> list[str]:
@@ -122,6 +122,11 @@ def needed_signals(kind: Kind, raw: Mapping[str, RawColumn]) -> tuple[str, ...]:
     if kind == "quasi-static":
         return (*twist_signals(raw), "joint_torque")
     return (*drive_outputs(raw), "motor_torque") if kind == "drive" else REDUCED_SIGNALS
+
+
+def sees_motor(signals: Collection[str]) -> bool:
+    """Whether the motor's motion was logged, without which no drive log can be fitted."""
+    return any(signal in signals for signal in SIDES[0])
 
 
 def drive_outputs(signals: Collection[str]) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     """
     g, account = fitted.goodness, fitted.account
     return {
-        "parameters_from": "load equation" if fitted.by_load else "torque",
+        "parameters_from": _parameters_from(fitted),
         "assumed": dict(fitted.assumed),
         "goodness": {
             "fit_percent": dict(g.fit_percent),
@@ -65,14 +65,27 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
     }
 
 
+def _parameters_from(fitted: FitOnly) -> str:
+    """What tells the parameters."""
+    if fitted.by_friction:
+        return "torque beside friction"
+    return "load equation" if fitted.by_load else "torque"
+
+
 def meaning(report: Mapping[str, Any]) -> list[str]:
     """What to make of a fit's report, most important first, a sentence or two each."""
     verdicts = {t["name"].split(" of ")[0]: t["verdict"] for t in report["residual_tests"]}
     on = report["judged_on"]
     rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"][on]
     notes = []
-    by_load = report["parameters_from"] == "load equation"
-    if by_load:
+    by_load = report["parameters_from"] != "torque"
+    if report["parameters_from"] == "torque beside friction":
+        notes.append(
+            "The motor does not move as the logged torque says: friction or something else of that size acts on it. "
+            "The parameters are therefore those of a fit with Coulomb and viscous friction on the motor. The errors below "
+            "are those of free runs without friction. `hdjax close-loop` looks for what acts on the motor."
+        )
+    elif by_load:
         notes.append(
             "The motor does not move as the logged torque says: friction or something else of that size acts on it. K, "
             "alpha and B_sp are therefore those of the load's own equation, driven by the motor's motion as measured. "

@@ -77,7 +77,7 @@ def limits(report: Mapping[str, Any]) -> list[str]:
         told += [e.get("note") for path, e in effect.items() if path not in silent]
         told += [_absence(effect, unit, paths) for unit, paths in _absent(effect).items()]
     told += [d["sentence"] for d in found["directions"] if not silent.issuperset(d["members"])]
-    notes = list(dict.fromkeys(n for n in told if n))
+    notes = list(dict.fromkeys(n for n in told if n)) + _unseen(report)
     notes += [h["sentence"] for h in found["held"]]
     notes += [_of_prior(path, e) for path, e in final["parameters"].items() if (e.get("prior") or {}).get("tolerance")]
     for other in report["alternatives"]:
@@ -98,6 +98,28 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     notes += [drifting] if drifting else []
     own = [c for c in final["correlations"] if not any(n.startswith(learned) for n in c["between"])]
     return notes + _correlated([c for c in own if not silent.intersection(c["between"])])
+
+
+def _unseen(report: Mapping[str, Any]) -> list[str]:
+    """What no sensor saw."""
+    seen = set(report["before"]["rmse_of_outputs"])
+    if "dynamic_error" in seen:
+        return []
+    notes = [
+        "No sensor saw the twist: it is what the model makes of what was measured. Effects in the mesh show only as "
+        "far as they move what was measured."
+    ]
+    if not seen & {"load_angle", "load_velocity", "joint_torque"}:
+        notes.append(
+            "Nothing was measured on the load side: friction and other torques on the load are told from those on the "
+            "motor by the motor's motion alone."
+        )
+    if not any(output.endswith("_angle") for output in seen):
+        notes.append(
+            "Velocities tell no angle: it is integrated from them, so that effects which depend on an angle are told "
+            "poorly."
+        )
+    return notes
 
 
 def _of_prior(path: str, estimate: Mapping[str, Any]) -> str:

@@ -306,7 +306,7 @@ def test_predict_needs_outputs_in_the_window_and_torque_throughout(tmp_path: Pat
     model = write_model(tmp_path, rig.drive_model())
     assert run("predict", model, log, "--drive", write_drive(tmp_path), "--out", out) == 0
     found = read_table(out)
-    assert list(found) == ["time", "dynamic_error"]
+    assert list(found) == ["time", "dynamic_error", "motor_angle"]
     whole = table()
     x = whole["motor_angle"] / rig.N - whole["load_angle"]
     noise = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
