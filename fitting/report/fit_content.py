@@ -82,8 +82,8 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
     if report["parameters_from"] == "torque beside friction":
         notes.append(
             "The motor does not move as the logged torque says: friction or something else of that size acts on it. "
-            "The parameters are therefore those of a fit with Coulomb and viscous friction on the motor. The errors below "
-            "are those of free runs without friction. `hdjax close-loop` looks for what acts on the motor."
+            "The parameters are therefore those of a fit with Coulomb and viscous friction on the motor. The "
+            "errors below are those of free runs without friction. `hdjax close-loop` looks for what acts on the motor."
         )
     elif by_load:
         notes.append(
