@@ -125,9 +125,9 @@ def _spare(inspection: Inspection, signal: str) -> bool:
 
 
 def _unseen_angles(inspection: Inspection) -> list[str]:
-    """The angles that a log of one side lacks, and that no doubtful column may be."""
+    """The angles that a log of the load side lacks, and that no doubtful column may be."""
     joint = inspection.joint
-    if joint.kind != "motor side":
+    if joint.kind != "motor side" or {"motor_angle", "motor_velocity"} & set(joint.signals):
         return []
     maybe = {signal for shares in joint.open.values() for signal in shares}
     return [signal for signal in _ANGLES if signal not in joint.signals and signal not in maybe]
