@@ -8,7 +8,8 @@ import numpy as np
 
 from hdjax import ReducedDrive, ReducedModel
 from hdjax.fourier import harmonic_series
-from hdjax.response.continuation import Branch, folds, frequency_response
+from hdjax.response.continuation import Branch, frequency_response
+from hdjax.response.fold import folds
 
 MU, ALPHA, LEVEL, START, END, HARMONICS, POINTS = 0.1, 1.0, 0.3, 0.1, 2.5, 9, 1000
 SAMPLES = 64

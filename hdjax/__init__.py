@@ -1,5 +1,12 @@
 """hdjax: the dynamic error of harmonic drives, simulated in JAX."""
 
+import os
+import sys
+
+# `python -m hdjax` loads JAX here, before the command line can silence XLA (`fitting.commands.start`).
+if sys.argv[0] == "-m":
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.dynamics import Model, MotorDrivenModel, ReducedModel, TwoInertiaModel
 from hdjax.forcing import Chirp, Harmonic, MultiHarmonic, random_phase_multisine

@@ -63,7 +63,8 @@ def swept_sine() -> dict[str, Any]:
 def floquet() -> dict[str, Any]:
     """A frequency response through its folds: stability, multipliers, folds and peak."""
     from hdjax.fourier import harmonic_series
-    from hdjax.response.continuation import folds, frequency_response
+    from hdjax.response.continuation import frequency_response
+    from hdjax.response.fold import folds
     from hdjax.response.resonance import peak
 
     branch = frequency_response(_duffing(), harmonic_series(1.0, 0.4), 0.1, 2.5, points=200)

@@ -101,7 +101,7 @@ def _amplitude_pictures(drive: Drive | ReducedDrive, A: float) -> dict[str, Any]
     from hdjax.fourier import harmonic_series
     from hdjax.response.amplitudes import error_map, settled
     from hdjax.response.coexisting import from_both_ends
-    from hdjax.response.continuation import folds
+    from hdjax.response.fold import folds
     from hdjax.response.multiple_scales import PrimaryResonance
     from hdjax.response.plots import error_map_plot, frequency_response_plot
     from hdjax.response.resonance import backbone, peak

@@ -27,16 +27,6 @@ def of_twist(model: Model) -> Float[np.ndarray, " outputs"]:
     return np.array([other.get(name, 1.0) for name in model.measured])
 
 
-def of_twist(model: Model) -> Float[np.ndarray, " outputs"]:
-    """What a radian of twist, as it swings at the natural frequency, is in each output."""
-    drive = model.drive
-    if not isinstance(drive, Drive) or model.measured == BOTH_ANGLES:
-        return np.ones(len(model.measured))
-    N, omega = float(drive.N), float(drive.omega_0)
-    other = {"motor_angle": N, "motor_velocity": N * omega, "load_velocity": omega, "joint_torque": float(drive.K)}
-    return np.array([other.get(name, 1.0) for name in model.measured])
-
-
 def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
     """Orders of magnitude of the motion.
 

@@ -15,7 +15,8 @@ from hdjax.design.steady import Range, balanced, followed, largest_swing, motion
 from hdjax.drive import restoring
 from hdjax.effects import ActuatorEffect, LoadSideEffect
 from hdjax.parameters import Scalar
-from hdjax.response.continuation import Branch, folds
+from hdjax.response.continuation import Branch
+from hdjax.response.fold import folds
 from hdjax.response.harmonic_balance import BalancedMotion, SteadyState
 from hdjax.where import where
 

@@ -6,9 +6,10 @@ Pictures are in `hdjax.response.plots`, which loads matplotlib.
 from hdjax.response.amplitudes import AmplitudeCheck, AmplitudeRow, ErrorMap, check_amplitudes, error_map, settled
 from hdjax.response.attractors import Attractor, Basins, attractors
 from hdjax.response.coexisting import from_both_ends
-from hdjax.response.continuation import Branch, Folds, FoldTrack, folds, follow, follow_fold, frequency_response
+from hdjax.response.continuation import Branch, follow, frequency_response
 from hdjax.response.critical_speeds import CriticalSpeed, SpeedBand, can_persist, critical_speeds, speeds_to_avoid
 from hdjax.response.floquet import is_stable, multipliers
+from hdjax.response.fold import Folds, FoldTrack, folds, follow_fold
 from hdjax.response.harmonic_balance import SteadyState, balance, solve
 from hdjax.response.lyapunov import PhasePortrait, critical_energy, energy, in_basin_estimate, phase_portrait, saddle
 from hdjax.response.multiple_scales import (

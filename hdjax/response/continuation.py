@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax import lax
 from jax.core import Tracer
 from jax.scipy.linalg import lu_factor, lu_solve
@@ -23,11 +22,9 @@ from hdjax.where import where
 
 _TOLERANCE = 1e-9
 _SOLVED = 1e-11
-_FOLD_SOLVED = 1e-8
 _CORRECTIONS = 2
 _CHORDS = 5
 _ITERATIONS = 8
-_FOLD_TOLERANCE = 1e-11
 
 
 class Branch(eqx.Module):
@@ -83,22 +80,6 @@ class Branch(eqx.Module):
         """The system's residual at a scaled value of the parameter; `omega` holds where it is not the parameter."""
         value = scaled * self.scale
         return self.at(value).residual(unknowns, value if self.parameter == "omega" else omega)
-
-
-class Folds(eqx.Module):
-    """Folds of a branch, where two motions meet and the response jumps.
-
-    Attributes:
-        value: the branch's parameter at each fold.
-        unknowns: the system's unknowns there.
-        null_vector: the direction in which the motion can change while the parameter stands still.
-        exists: which entries are folds.
-    """
-
-    value: Float[Array, " folds"]
-    unknowns: Float[Array, "folds unknowns"]
-    null_vector: Float[Array, "folds unknowns"]
-    exists: Bool[Array, " folds"]
 
 
 def frequency_response(
@@ -190,7 +171,7 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
     u_0, _ = find_root(branch.at(start), first, guess)
     p_0, p_1 = start / scale, end / scale
     start_and_end = lax.stop_gradient((u_0, p_0, p_1))
-    found = _continued(lambda u, p: still.residual(u, p, still_omega), *start_and_end, steps)
+    found = continued(lambda u, p: still.residual(u, p, still_omega), *start_and_end, steps)
     count, complete = _end(found, p_0, p_1, _longest_step(p_0, p_1, steps), positive=parameter == "omega")
     path = jnp.concatenate([found.states, found.params[:, None]], axis=1)
     predicted, tangents = _interpolated(path, found.tangents, count, p_1, points)
@@ -298,92 +279,7 @@ def _floquet_steps(branch: Branch) -> int:
     return min(resolving_steps(turns), 4096)
 
 
-@eqx.filter_jit
-def folds(branch: Branch, *, at_most: int = 4) -> Folds:
-    """Locate the folds of a branch; their values have gradients with respect to everything in `branch.system`.
-
-    Args:
-        branch: from [`frequency_response`][] or [`follow`][].
-        at_most: folds to look for, the first along the branch.
-    """
-    slope = branch.tangents[:, -1]
-    turns = (slope[1:] * slope[:-1] <= 0.0) & branch.valid[1:] & branch.valid[:-1]
-    (index,) = jnp.nonzero(turns, size=at_most, fill_value=0)
-    exists = jnp.arange(at_most) < jnp.sum(turns)
-    n = branch.unknowns.shape[1]
-
-    def locate(i: Array) -> tuple[Array, Array]:
-        # Where the branch turns back, its direction is the null vector.
-        guess = jnp.concatenate([branch.unknowns[i], branch.value[i, None] / branch.scale, branch.tangents[i, :-1]])
-
-        def residual(y: Array, given: tuple[BalancedMotion, Array]) -> Array:
-            return _fold_residual(eqx.tree_at(lambda b: b.system, branch, given[0]), y, given[1])
-
-        solver = optx.Newton(_FOLD_TOLERANCE, _FOLD_TOLERANCE)
-        given = (branch.system, branch.omega[i])
-        y = optx.root_find(residual, solver, lax.stop_gradient(guess), given, max_steps=30, throw=False).value
-        left = jnp.max(jnp.abs(residual(y, given)))
-        return y, jnp.isfinite(left) & (left < _FOLD_SOLVED)
-
-    y, converged = jax.vmap(locate)(index)
-    y = where((exists & converged)[:, None], y, 0.0)
-    return Folds(y[:, n] * branch.scale, y[:, :n], y[:, n + 1 :], exists & converged)
-
-
-def _fold_residual(branch: Branch, y: Array, omega: Array) -> Array:
-    """Zero where (unknowns, scaled parameter, null vector) are a fold (Seydel 2010, chapter 5)."""
-    n = branch.unknowns.shape[1]
-    u, p, v = y[:n], y[n], y[n + 1 :]
-    left, along = jax.jvp(lambda u: branch.residual(u, p, omega), (u,), (v,))
-    return jnp.concatenate([left, along, jnp.sum(v * v, keepdims=True) - 1.0])
-
-
-class FoldTrack(eqx.Module):
-    """A fold in the plane of two parameters: the edge of the region where several motions coexist.
-
-    Attributes:
-        second: the second parameter.
-        value: the branch's own parameter at the fold.
-        valid: which entries are folds.
-    """
-
-    second: Float[Array, " steps"]
-    value: Float[Array, " steps"]
-    valid: Bool[Array, " steps"]
-
-
-def follow_fold(
-    branch: Branch, fold: int, parameter: str, start: ArrayLike, end: ArrayLike, *, steps: int = 200
-) -> FoldTrack:
-    """Track a fold of a branch in a second parameter, through cusps.
-
-    Args:
-        branch: whose fold to track.
-        fold: its index in `folds(branch)`.
-        parameter: the second parameter, named as in [`follow`][].
-        start: its value in the branch.
-        end: where to stop.
-        steps: of the continuation, at most.
-    """
-    return _follow_fold(branch, fold, parameter, as_scalar(start), as_scalar(end), steps)
-
-
-@eqx.filter_jit
-def _follow_fold(branch, fold, parameter, start, end, steps) -> FoldTrack:
-    found = folds(branch)
-    second = jnp.maximum(jnp.abs(start), jnp.abs(end))
-
-    def residual(y: Array, q: Array) -> Array:
-        moved = eqx.tree_at(lambda b: b.system, branch, branch.system.with_parameter(parameter, q * second))
-        return _fold_residual(moved, y, branch.omega[0])
-
-    y_0 = jnp.concatenate([found.unknowns[fold], found.value[fold, None] / branch.scale, found.null_vector[fold]])
-    track = _continued(residual, y_0, start / second, end / second, steps)
-    valid = (jnp.arange(steps + 1) < track.n_valid) & found.exists[fold]
-    return FoldTrack(track.params * second, track.states[:, branch.unknowns.shape[1]] * branch.scale, valid)
-
-
-def _continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int):
+def continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int):
     """JaxCont's pseudo-arclength continuation, with steps that suit unknowns and a parameter of order one."""
     # Loaded here: JaxCont loads matplotlib, which takes as long as JAX. Its constants must not belong to this program.
     with jax.ensure_compile_time_eval():

@@ -11,8 +11,9 @@ from matplotlib.patches import Patch
 
 from hdjax.response.amplitudes import GOOD, ErrorMap
 from hdjax.response.attractors import Basins
-from hdjax.response.continuation import Branch, Folds
+from hdjax.response.continuation import Branch
 from hdjax.response.critical_speeds import SpeedBand, can_persist, swing
+from hdjax.response.fold import Folds
 from hdjax.response.lyapunov import PhasePortrait
 from hdjax.response.modulation import Branches
 from hdjax.response.poincare import PoincareSection

@@ -21,7 +21,8 @@ from hdjax.response.amplitudes import (
 )
 from hdjax.response.attractors import Attractor, Basins
 from hdjax.response.coexisting import from_both_ends
-from hdjax.response.continuation import Branch, folds, frequency_response
+from hdjax.response.continuation import Branch, frequency_response
+from hdjax.response.fold import folds
 from hdjax.response.lyapunov import phase_portrait
 from hdjax.response.multiple_scales import PrimaryResonance
 from hdjax.response.plots import (

@@ -12,7 +12,8 @@ from branches import assert_whole, left_over, path, row, turns
 from orbits import duffing, duffing_rates, period_error
 
 from hdjax.fourier import harmonic_series
-from hdjax.response.continuation import Branch, Folds, folds, follow_fold, frequency_response
+from hdjax.response.continuation import Branch, frequency_response
+from hdjax.response.fold import Folds, folds, follow_fold
 from hdjax.response.harmonic_balance import balance
 
 HARMONICS, POINTS = 11, 300

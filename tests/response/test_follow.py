@@ -11,7 +11,8 @@ from orbits import duffing, duffing_rates, duffing_slope, multipliers, period_er
 from hdjax import Drive, TwoInertiaModel
 from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness
 from hdjax.fourier import FourierSeries, harmonic_series
-from hdjax.response.continuation import Branch, folds, follow, frequency_response
+from hdjax.response.continuation import Branch, follow, frequency_response
+from hdjax.response.fold import folds
 from hdjax.response.harmonic_balance import balance
 
 
