@@ -98,7 +98,7 @@ def simulate(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
     """Outputs of a problem's model on each segment, and the state it ends in, by the engine that suits it."""
-    ready = with_engine(problem, values=True)
+    ready = with_engine(problem)
     return _simulate_by_xla(problem, unknowns) if ready.kernel is None else simulated(ready, unknowns)
 
 

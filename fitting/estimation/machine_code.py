@@ -285,15 +285,16 @@ def _gap(lanes: Lanes, found: Marched) -> Any:
 def simulated(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
-    """[`fitting.estimation.residual.simulate_segments`][] by machine code that has no derivatives."""
+    """[`fitting.estimation.residual.simulate_segments`][] by the machine code that has derivatives, without
+    computing them."""
     kernel = problem.kernel
-    assert kernel is not None and kernel.values is not None
+    assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel)
     library = jnp if is_traced(lanes) else np
     segments, samples, outputs = lanes.measured.shape
     settings = library.asarray(lanes.settings) * np.array([1, 0, 1]) + np.array([0, 1, 0])
     plain = np.zeros(lanes.measured.shape), np.ones(lanes.weight.shape), -np.eye(outputs), settings
     lanes = eqx.tree_at(lambda s: (s.measured, s.weight, s.whitening, s.settings), lanes, plain)
-    found = _march(kernel.values, lanes, kernel.hidden, "values")
+    found = _march(kernel.jacobian, lanes, kernel.hidden, "jacobian", "rows")
     rows = found.rows[:, : samples * outputs].reshape(segments, samples, outputs)
     return jnp.asarray(library.where(library.abs(rows) < LOST, rows, np.inf)), jnp.asarray(found.end)

@@ -13,7 +13,7 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.dynamics import Model, State
 from hdjax.effects import Conditions, Effect, Motion
 from hdjax.engine.equations import LOAD, TEMPERATURE, split_model
-from hdjax.engine.kernel import Lanes, Marched, Mode, kernel, march_arrays, threads
+from hdjax.engine.kernel import Lanes, Marched, Wanted, kernel, march_arrays, threads
 
 
 class Pushed(Model):
@@ -126,11 +126,11 @@ def response(
     zeros = (jnp.asarray(np.zeros(())),) * count
     pushed = Pushed.of(model, zeros, zeros)
     around = {"loaded": LOAD in beside, "warm": TEMPERATURE in beside}
-    made = kernel(pushed, pushed.forces, **around, solver=solver, values=True)
+    made = kernel(pushed, pushed.forces, **around, solver=solver)
     _, others, _ = split_model(pushed, pushed.forces)
     signals = [torque, *(beside[name] for name in made.signals)]
 
-    def marched(states: np.ndarray, knots: np.ndarray, signals: list[np.ndarray], mode: Mode) -> Marched:
+    def marched(states: np.ndarray, knots: np.ndarray, signals: list[np.ndarray], wanted: Wanted) -> Marched:
         many, length = knots.shape[0], knots.shape[1] - 1
         data = Lanes(
             free=np.zeros(2 * count),
@@ -145,10 +145,9 @@ def response(
             settings=np.array([substeps, 1, threads()]),
             signals=tuple(signals),
         )
-        assert made.values is not None
-        return march_arrays(made.jacobian if mode == "jacobian" else made.values, data, made.hidden, mode)
+        return march_arrays(made.jacobian, data, made.hidden, "jacobian", wanted)
 
-    values = marched(states, knots, signals, "values")
+    values = marched(states, knots, signals, "rows")
     states = np.concatenate([values.rows.reshape(segments, samples, count), values.end[:, None, :-1]], axis=1)
     states = np.where(np.abs(states) < LOST, states, np.nan)
     pairs = np.stack([knots[:, :-1], knots[:, 1:]], axis=-1).reshape(-1, 2)
