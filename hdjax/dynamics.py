@@ -88,7 +88,7 @@ class Model(eqx.Module):
 
     @abc.abstractmethod
     def outputs(self, state: State) -> Float[Array, " outputs"]:
-        """What the sensors read: the quantities that `measured` names, of [`OUTPUTS`][]; the last one is the principal
+        """What the sensors read: the quantities that `measured` names, of `OUTPUTS`; the last one is the principal
         output, by which a fit is judged."""
 
     @property

@@ -4,7 +4,7 @@ beside this file.
 The truth is this script's own: the equations of two inertias (DESIGN 2.1) integrated by scipy, dry friction with a
 corner that its step control resolves. It shares no code with the simulator.
 
-    python benchmarks/joints.py --draws 3 --seed 0 [--kinds NAME ...] [--only-fit]
+    python benchmarks/sensor_subsets.py --draws 3 --seed 0 [--kinds NAME ...] [--only-fit]
 """
 
 import argparse
