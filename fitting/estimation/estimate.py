@@ -12,14 +12,13 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from fitting.estimation.engines import linearise
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters
-from fitting.estimation.linear_response import readout
 from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
 from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
-from hdjax import Model, TwoInertiaModel
-from hdjax.dynamics import BOTH_ANGLES
+from fitting.estimation.weighing import Shown, weighed
+from hdjax import Model
 from hdjax.effects.learned import FAMILY
 
 REWEIGHTINGS = 3
@@ -243,45 +242,6 @@ def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution
     return found if mended is None else strategy.solve(problem, mended, NEARBY_DAMPING)
 
 
-class Shown(eqx.Module):
-    """What shows of a unit of each state, for what it counts in a gap.
-
-    Attributes:
-        angles: derivatives of the outputs by the angles.
-        rates: likewise by the rates.
-        omega_0: natural frequency [rad/s].
-        hidden: units of the hidden states.
-        swing: of the principal output, as the spring is wound.
-        sides: each side's angle over that of the output, where other signals than both angles are measured.
-    """
-
-    angles: Float[np.ndarray, "outputs angles"]
-    rates: Float[np.ndarray, "outputs angles"]
-    omega_0: float
-    hidden: Float[np.ndarray, " hidden"]
-    swing: float
-    sides: Float[np.ndarray, " angles"] | None
-
-    @classmethod
-    def of(cls, model: Model, swing: float) -> "Shown":
-        """Of a model's states."""
-        count = len(model.motion_states) // 2
-        slopes = readout(model, model.rest())
-        hidden = np.concatenate([np.zeros(0), *(np.asarray(e.state_scale()) for e in model.effects if e.states)])
-        sides = None
-        if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:
-            sides = np.array([float(model.drive.N), 1.0])
-        own = slopes[:, :count], slopes[:, count : 2 * count]
-        return cls(*own, float(model.drive.omega_0), hidden, swing, sides)
-
-
-def weighed(problem: Problem, covariance: Array | np.ndarray, shown: Shown) -> Problem:
-    """The problem, weighed by the covariance of the outputs' errors."""
-    white = whitening(covariance)
-    gap_weight = np.sqrt(problem.segments.weight.shape[1]) * _gap_weight(white, shown)
-    return replace(problem, whitening=jnp.asarray(white), gap_weight=jnp.asarray(gap_weight))
-
-
 def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
     """Fit the first samples of each segment, then ever more of them, until it is all of them.
 
@@ -332,27 +292,6 @@ def _growing(problem: Problem, length: int) -> list[int]:
     half = np.pi / float(problem.model.drive.omega_0) / float(np.median(np.diff(knots)))
     first = min(length, max(4, round(half)))
     return [first * 4**k for k in range(10) if first * 4**k < length] + [length]
-
-
-def whitening(covariance: Float[Array | np.ndarray, "outputs outputs"]) -> Float[np.ndarray, "outputs outputs"]:
-    """W with `W covariance W^T = 1`."""
-    return np.linalg.inv(np.linalg.cholesky(np.asarray(covariance)))
-
-
-def _gap_weight(white: np.ndarray, shown: Shown) -> Float[np.ndarray, " states"]:
-    """What the states count in a gap: about what each sample of the segment behind it would pay for it.
-
-    An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
-    state by what the error does while it runs through its range. Counted less, the residual that a closed gap costs
-    would look too dear.
-    """
-    angles = np.linalg.norm(white @ shown.angles, axis=0)
-    if shown.sides is not None:
-        # What no sensor sees shows as what it drives does.
-        rates = np.linalg.norm(white @ shown.rates, axis=0) * shown.omega_0
-        angles = np.max(np.maximum(angles, rates) * shown.sides) / shown.sides
-    visible = 0.1 * shown.swing * np.linalg.norm(white[:, -1])
-    return np.concatenate([angles, angles / shown.omega_0, visible / shown.hidden])
 
 
 def half_log_determinant(covariance: Array | np.ndarray) -> float:

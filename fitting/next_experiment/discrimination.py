@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.estimation.estimate import whitening
 from fitting.estimation.free_parameters import FreeParameters, free_parameters
+from fitting.estimation.weighing import whitening
 from fitting.next_experiment.excitation import Excitation, Limits
 from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
 from hdjax.lanes import jit_lanes

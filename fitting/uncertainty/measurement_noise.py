@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import REWEIGHTINGS, Fit, Shown, weighed, zeros_like
+from fitting.estimation.estimate import REWEIGHTINGS, Fit, zeros_like
 from fitting.estimation.experiment import Stretch, cut
 from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
 from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
+from fitting.estimation.weighing import Shown, weighed
 
 # So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.
 _SAMPLES = 2500

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitting.estimation.engines import linearise, with_engine
-from fitting.estimation.estimate import Fit, whitening
+from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_run import FreeRun, fitted_starts, free_run, whole_simulations, window
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.weighing import whitening
 from fitting.uncertainty.noise_model import spread_by_torque
 from fitting.uncertainty.normal_law import NORMAL_95
 from fitting.uncertainty.standard_errors import Uncertainty
