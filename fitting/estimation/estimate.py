@@ -198,7 +198,7 @@ def fit(
     solution = None
     for turn in range(_MOST_REWEIGHTINGS if strategy.reweigh and scale_matters else 1):
         problem = weighed(problem, covariance, shown)
-        solution = strategy.solve(problem, unknowns, FIRST_DAMPING if solution is None else solution.nearby_damping)
+        solution = strategy.solve(problem, unknowns, NEARBY_DAMPING if turn else FIRST_DAMPING)
         if turn == 0 and segmentation.horizon <= _LONGEST_RETRY * problem.segments.weight.shape[1]:
             solution = _with_poor_states_retried(problem, unknowns, solution, strategy)
         unknowns, covariance = solution.unknowns, solution.left_over.covariance

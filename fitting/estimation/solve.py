@@ -22,8 +22,6 @@ FIRST_DAMPING, NEARBY_DAMPING = 1e-3, 1e-9
 """Damping of the first step, relative to the diagonal of J^T J: from a start, and from the solution under other
 weights."""
 
-# Under other weights a step is this much bolder than the last one under the old ones, which may have been held back.
-_BOLDER = 0.01
 # A step that would carry a positive parameter farther (a factor e) was promised by a slope that does not reach so far:
 # a corner that leaps to zero shows no slope there, and never comes back.
 _LONGEST_LOG = 1.0
@@ -51,19 +49,12 @@ class Solution(eqx.Module):
         left_over: by the model there.
         success: whether the next step promised next to nothing.
         steps: how many were taken.
-        damping: that a further step would have.
     """
 
     unknowns: Unknowns
     left_over: LeftOver
     success: bool = eqx.field(static=True)
     steps: int = eqx.field(static=True)
-    damping: float = eqx.field(static=True)
-
-    @property
-    def nearby_damping(self) -> float:
-        """Damping of the first step under other weights. Where a corner holds steps back, it still does."""
-        return max(NEARBY_DAMPING, _BOLDER * self.damping)
 
 
 def solve(
@@ -103,9 +94,7 @@ def solve(
                 break
             seen, rows = look(state.ahead)
     unknowns = Unknowns(jnp.asarray(best.parameters), jnp.asarray(best.states))
-    return Solution(
-        unknowns, _left_over(problem, found), bool(done and finite), int(state.count), damping / float(state.size)
-    )
+    return Solution(unknowns, _left_over(problem, found), bool(done and finite), int(state.count))
 
 
 def _sight_of(problem: Problem, start: Unknowns) -> Callable[[Unknowns], tuple[Products, Array | np.ndarray]]:
