@@ -182,9 +182,8 @@ def test_quasi_static_logs_go_through_the_same_verbs(tmp_path: Path):
     with pytest.raises(InputError, match="quasi-static"):
         found.with_next_experiment()
     both = fitting.load(columns, drive={"drive": {"name": "joint"}}, test=columns)
-    for verb in (fitting.fit, fitting.close_loop):
-        with pytest.raises(InputError, match="log 2: --test is for logs of a motion"):
-            verb(both)
+    with pytest.raises(InputError, match="log 2: `hdjax fit` takes no test data"):
+        fitting.fit(both)
 
 
 def test_single_precision_is_refused_with_the_remedy():
