@@ -160,6 +160,11 @@ def test_a_model_is_simulated_under_any_torque(closed: fitting.LoopResult):
     assert motion.dynamic_error.shape == (200,) and np.isfinite(motion.dynamic_error).all()
 
 
+def test_a_named_log_is_test_data_from_beginning_to_end(closed: fitting.LoopResult):
+    counted = {log["name"]: (log["training"] + log["selection"], log["test"]) for log in closed.report["logs"]}
+    assert counted == {"log 1": (COUNT, 0), "log 2": (0, COUNT)}
+
+
 def test_test_logs_are_named(closed: fitting.LoopResult):
     data = fitting.load([arrays(), arrays(seed=1)], drive=DRIVE)
     assert [log.name for log in data.with_test("log 2").test] == ["log 2"]

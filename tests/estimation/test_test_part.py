@@ -9,6 +9,7 @@ import pytest
 
 import rig
 from fitting.commands.run_fit import close_loop_on_logs
+from fitting.drive_data import read_rig
 from fitting.estimation.test_part import parted
 from fitting.logs.drive_file import read_drive_file
 from fitting.logs.log import read_log
@@ -92,7 +93,6 @@ def test_another_log_is_test_data_from_beginning_to_end(tmp_path: Path):
         (tmp_path / name).mkdir()
     path, drive = write_logs(tmp_path / "one", False)
     other, _ = write_logs(tmp_path / "two", False)
-    close_loop_on_logs([path], drive, tmp_path / "out", SearchOptions(max_effects=0), test=[other])
-    found = json.loads((tmp_path / "out" / "report.json").read_text())
-    counted = {log["name"]: (log["training"] + log["selection"], log["test"]) for log in found["logs"]}
-    assert counted == {"one/log": (COUNT, 0), "two/log": (0, COUNT)}
+    found = read_rig([path], drive, test=[other])
+    assert [(e.name, len(e)) for e in found.experiments["zero-order"]] == [("one/log", COUNT)]
+    assert [(e.name, len(e)) for e in found.test["zero-order"]] == [("two/log", COUNT)]

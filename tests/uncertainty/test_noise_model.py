@@ -1,5 +1,6 @@
 """Noise of sensors and torque channel, from innovations: against what the rig was given."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +26,12 @@ from fitting.uncertainty.noise_model import NoiseModel, SensorNoise, _filtered, 
 from fitting.uncertainty.prediction_band import prediction_bands
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Hold
+from hdjax.effects import CATALOGUE, Effect
+from hdjax.effects.actuation import TorqueBias
+from hdjax.effects.friction import CoulombFriction
+from hdjax.effects.kinematic import KinematicError
+from hdjax.effects.load import GravityLoad
+from hdjax.effects.sensing import LoadEncoderEccentricity
 
 COUNT, STD = 3000, 0.01
 OUTPUTS = np.array([[1.0, 1.0], [1.0, 1.0]]) * (rig.MOTOR_NOISE / rig.N) ** 2 + np.diag([0.0, rig.LOAD_NOISE**2])
@@ -188,9 +195,15 @@ def test_bands_hold_what_noise_of_the_torque_drives(noisy: Fit):
     assert np.mean([band.inside[50:] for band in wide]) == pytest.approx(0.95, abs=0.05)
 
 
-def test_the_loop_says_that_the_model_suffices_and_the_torque_is_noisy():
-    data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (noisy_experiment(count=4000),)}
-    loop = close_loop(rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0), data, hold="zero-order")
+# One form for each place in the equations and on the sensors.
+FEW = (CoulombFriction, KinematicError, GravityLoad, TorqueBias, LoadEncoderEccentricity)
+
+
+@pytest.mark.parametrize("catalogue", [FEW, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["few", "all"])
+def test_the_loop_says_that_the_model_suffices_and_the_torque_is_noisy(catalogue: Sequence[type[Effect]]):
+    data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (noisy_experiment(count=COUNT),)}
+    begun = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
+    loop = close_loop(begun, data, hold="zero-order", catalogue=catalogue)
     assert loop.decision == "model_sufficient" and loop.unknown is None
     assert loop.torque_noise == pytest.approx(STD, rel=0.1)
     for path, truth in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}.items():
