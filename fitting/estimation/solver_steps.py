@@ -18,8 +18,8 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     Args:
         found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
         tolerance: largest rms difference in units of the residual's standard deviation.
-        shift: by how many standard errors the difference may move the parameters, coefficients of learned functions
-            aside. An error too small to be seen in a sample adds up over all of them.
+        shift: by how many standard errors the difference may move a parameter. An error too small to be seen in a
+            sample adds up over all of them.
         most: where to stop.
     """
     problem, substeps = found.at_solution, found.substeps
@@ -48,8 +48,9 @@ def _moved(
     change: Float[np.ndarray, "segments rows"],
     gap: Float[np.ndarray, "segments states"],
 ) -> float:
-    """How far a change of a fit's residual moves its parameters, coefficients of learned functions aside, in standard
-    errors of their joint estimate.
+    """How many standard errors a change of a fit's residual moves any of its parameters at most.
+
+    Coefficients of learned functions do not count, nor what the data do not tell: a corner too sharp to be seen, say.
 
     Args:
         found: the fit.
@@ -65,9 +66,10 @@ def _moved(
     information, gradient = products[:-1, :-1], products[:-1, -1]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    named = _named(found)
-    moved, covariance = (inverse @ (scale * gradient))[named], inverse[np.ix_(named, named)]
-    return float(np.sqrt(max(0.0, moved @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ moved)))
+    moved, error = scale * (inverse @ (scale * gradient)), scale * np.sqrt(np.diag(inverse))
+    # Entries of the free vector are of order one.
+    told = _named(found) & (error > 0.0) & (error < 1.0)
+    return float(np.max(np.abs(moved[told]) / error[told], initial=0.0))
 
 
 def _named(found: Fit) -> Bool[np.ndarray, " parameters"]:
