@@ -23,7 +23,7 @@ from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import Answered, Sight, batches, follow_on, sight
 from fitting.first_order.spectral_lines import spectral_lines
-from fitting.first_order.surrogates import DRAWS, Scores, null_gains
+from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 
@@ -96,7 +96,7 @@ def screen(
     free_now = () if stay else training.free.paths
     skipped = len(training.free.paths) - len(free_now)
     leads: dict[str, Lead] = {}
-    chance = np.full(DRAWS, -np.inf)
+    chance = np.full(DRAWS * PARTNERS, -np.inf)
     sights = sight(training, seed, measured=strays), sight(held_out, seed + 1, measured=strays)
     known = len(free_now)
     for batch in batches(sights, proposals, follow_on(training, held_out)):

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 
 from fitting.attribution.rules import RULES
-from fitting.estimation.estimate import Fit, needed_substeps
+from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation
+from fitting.estimation.solver_steps import needed_substeps
 from fitting.progress import Progress, silent
 from hdjax import Hold
 

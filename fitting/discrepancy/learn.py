@@ -29,10 +29,9 @@ from fitting.discrepancy.variable_selection import (
 )
 from fitting.estimation.base_fit import leaves_white_noise
 from fitting.estimation.estimate import Fit
-from fitting.first_order.gains import surrogate_gains
 from fitting.first_order.linearised_fit import motion_states
 from fitting.first_order.motion import place_of, unit_reading
-from fitting.first_order.surrogates import surrogates
+from fitting.first_order.surrogates import chance_of_gain
 from hdjax import Model, sampled
 from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import Learned, LearnedReading
@@ -115,8 +114,9 @@ def learn(before: Trial, study: Study) -> Unknown | None:
         gain = remembered[1].gain_over(before)
         chosen, trial, p_value = *remembered, memory.screen.p_value(gain)
     elif best is not None:
-        gain = before.held_out.objective - best[1].held_out.objective
-        chosen, trial, p_value = *best, _p_value(seen, before, best[0], gain, study.seed)
+        chosen, trial = best
+        gain = before.held_out.objective - trial.held_out.objective
+        p_value = chance_of_gain(before.held_out, trial.held_out, study.seed)
     else:
         return None
     instants = seen.instants
@@ -273,14 +273,3 @@ def _penalised(trial: Trial) -> float:
     """The training objective, with what each parameter would gain on noise (Schwarz 1978)."""
     samples = float(trial.training.problem.segments.count)
     return trial.training.objective + 0.5 * len(trial.training.free.paths) * np.log(samples) / samples
-
-
-def _p_value(seen: LearnedLook, before: Trial, chosen: Candidate, gain: float, seed: int) -> float:
-    unseen = learned_look(before.held_out)
-    null = surrogate_gains(
-        (seen.look, unseen.look),
-        (seen.acting(chosen.form), unseen.acting(chosen.form)),
-        (sizes_along(chosen, seen), sizes_along(chosen, unseen)),
-        (surrogates(before.training, seed), surrogates(before.held_out, seed + 1)),
-    )
-    return (1 + int(np.sum(null >= gain))) / (1 + null.size)

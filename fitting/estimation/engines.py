@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.machine_code import (
     blocks_by_machine_code,
+    plain_residual_by_machine_code,
     residual_by_machine_code,
-    rows_by_machine_code,
     simulated,
 )
 from fitting.estimation.residual import (
@@ -72,12 +72,15 @@ def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
 _linearise_by_xla = jit_lanes(blocks)
 
 
-def rows_at(problem: Problem, unknowns: Unknowns) -> Float[Array | np.ndarray, "segments rows"]:
-    """The rows of a problem's residual at some point: by machine code without derivatives, or by the program of XLA
-    that computes these too, so that no other is compiled."""
+def residual_at(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[Array | np.ndarray, "segments rows"], Float[Array | np.ndarray, "segments states"]]:
+    """[`fitting.estimation.residual.residual`][] at some point: by machine code without derivatives, or by the program
+    of XLA that computes these too, so that no other is compiled."""
     if problem.kernel is not None:
-        return rows_by_machine_code(problem, unknowns)
-    return _linearise_by_xla(problem, unknowns).residual
+        return plain_residual_by_machine_code(problem, unknowns)
+    found = _linearise_by_xla(problem, unknowns)
+    return found.residual, found.gap
 
 
 def blocks_inside(problem: Problem, unknowns: Unknowns) -> Blocks:

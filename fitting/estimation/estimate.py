@@ -9,17 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from fitting.estimation.engines import linearise
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.problem import Segmentation, initial_states, on_all_devices, pose
-from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import RUNAWAY, Engine, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, Solution, evaluate, solve
 from fitting.estimation.weighing import Shown, weighed
 from hdjax import Model
-from hdjax.effects.learned import FAMILY
 
 REWEIGHTINGS = 3
 """Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
@@ -309,48 +306,3 @@ def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
     """The segments in which the simulation runs away."""
     return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))
-
-
-def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.inf, most: int = 16) -> int:
-    """Solver steps in a sample interval that keep the step error below a fraction of the residual.
-
-    Args:
-        found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
-        tolerance: largest rms difference in units of the residual's standard deviation.
-        shift: by how many standard errors the difference may move the parameters, coefficients of learned functions
-            aside. An error too small to be seen in a sample adds up over all of them.
-        most: where to stop.
-    """
-    problem, substeps = found.at_solution, found.substeps
-    columns = None
-    if np.isfinite(shift):
-        slopes = linearise(problem, found.unknowns)
-        columns = FirstStates.of(slopes, problem.segments.joined).parameters_without(slopes)
-    error, white_by_error = evaluate(problem, found.unknowns).error, np.asarray(problem.whitening)
-    count = np.sum(np.asarray(problem.segments.weight))
-    while substeps < most:
-        better = evaluate(replace(problem, substeps=2 * substeps), found.unknowns).error
-        white = (better - error) @ white_by_error.T
-        mean_square = float(np.max(np.sum(white**2, axis=(0, 1)) / count))
-        moved = 0.0 if columns is None else _standard_errors_moved(columns, white, _named(found))
-        if np.sqrt(mean_square) < tolerance and moved < shift:
-            break
-        substeps, error = 2 * substeps, better
-    return substeps
-
-
-def _named(found: Fit) -> Bool[np.ndarray, " parameters"]:
-    """Which parameters are no coefficients of something learned."""
-    learned = {e.name for e in found.model.effects if e.family == FAMILY}
-    return np.array([path.partition(".")[0] not in learned for path in found.free.paths], dtype=bool)
-
-
-def _standard_errors_moved(columns: np.ndarray, white: np.ndarray, which: Bool[np.ndarray, " parameters"]) -> float:
-    """How far a whitened output error would move some of the parameters, in standard errors of their joint estimate."""
-    rows = white.reshape(white.shape[0], -1)
-    slopes = columns[:, : rows.shape[1]].reshape(rows.size, -1)
-    gradient, information = slopes.T @ rows.ravel(), slopes.T @ slopes
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    moved, covariance = (inverse @ (scale * gradient))[which], inverse[np.ix_(which, which)]
-    return float(np.sqrt(max(0.0, moved @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ moved)))

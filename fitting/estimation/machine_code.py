@@ -165,14 +165,15 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns) -> Blocks:
     )
 
 
-def rows_by_machine_code(problem: Problem, unknowns: Unknowns) -> Float[np.ndarray, "segments rows"]:
-    """The rows of [`fitting.estimation.residual.residual`][] by the machine code that has derivatives, without
-    computing them."""
+def plain_residual_by_machine_code(
+    problem: Problem, unknowns: Unknowns
+) -> tuple[Float[np.ndarray, "segments rows"], Float[np.ndarray, "segments states"]]:
+    """[`fitting.estimation.residual.residual`][] by the machine code that has derivatives, without computing them."""
     kernel = problem.kernel
     assert kernel is not None
-    return np.asarray(
-        _march(kernel.jacobian, lanes_of(problem, unknowns, kernel), kernel.hidden, "jacobian", "rows").rows
-    )
+    lanes = lanes_of(problem, unknowns, kernel)
+    found = _march(kernel.jacobian, lanes, kernel.hidden, "jacobian", "rows")
+    return np.asarray(found.rows), np.asarray(_gap(lanes, found))
 
 
 def _march(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian") -> Marched:

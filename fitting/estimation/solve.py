@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.estimation.engines import linearise, rows_at
+from fitting.estimation.engines import linearise, residual_at
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt
 from fitting.estimation.machine_code import task
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
@@ -124,7 +124,7 @@ def _function(unknowns: Unknowns, seen: Products) -> tuple[None, Products]:
 
 def evaluate(problem: Problem, unknowns: Unknowns) -> LeftOver:
     """What is left over at the given unknowns."""
-    return _left_over(problem, rows_at(problem, unknowns))
+    return _left_over(problem, residual_at(problem, unknowns)[0])
 
 
 def _left_over(problem: Problem, rows: Float[Array | np.ndarray, "segments rows"]) -> LeftOver:

@@ -6,15 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import Fit, Start, Strategy, fit, needed_substeps
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.problem import Segmentation
+from fitting.estimation.solver_steps import needed_substeps
 
 _STEPS = 20
 # From a solution near by, which has not lost its way.
 _CONTINUED = Strategy(_STEPS, begin_anew_above=np.inf, retry_states=False)
-# By how many standard errors the solver's steps may move the parameters, and how many steps a sample may take.
-_SHIFT = 0.2
-_MOST_SUBSTEPS = 32
+# By how many standard errors the solver's steps may move the parameters, and how many steps a sample may take on the
+# way and in the end: dry friction that tells K to 1e-7 asks for 128 (`docs/uncertainty.md`).
+_SHIFT = 0.1
+_MOST_SUBSTEPS, _MOST_IN_THE_END = 32, 256
 # What the long fit may cost in the objective: 2 % of the error.
 _LOSS = 0.02
 
@@ -57,7 +59,8 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
 
 
 def refitted_on_all(found: Fit, selection: Fit) -> Fit:
-    """The same parameters fitted to the data that selected the model as well.
+    """The same parameters fitted to the data that selected the model as well, with steps as fine as their standard
+    errors ask for.
 
     Args:
         found: the fit to training data, over horizons of any length.
@@ -67,13 +70,14 @@ def refitted_on_all(found: Fit, selection: Fit) -> Fit:
         The fit to both; over short horizons where longer ones do not follow the logs any more.
     """
     horizons = dict.fromkeys((found.horizon, selection.horizon))
-    for fitted in (_on_both(found, selection, horizon) for horizon in horizons):
+    substeps = needed_substeps(found, shift=_SHIFT, most=_MOST_IN_THE_END)
+    for fitted in (_on_both(found, selection, horizon, substeps) for horizon in horizons):
         if np.isfinite(fitted.objective) and (follows(fitted) or not follows(found)):
             return fitted
     return found
 
 
-def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
+def _on_both(found: Fit, selection: Fit, horizon: int, substeps: int) -> Fit:
     states = np.concatenate([np.asarray(f.unknowns.states)[: f.pieces.sum()] for f in (found, selection)])
     # Parameters that a fit has not moved were held.
     held = all(float(found.model.get(p)) == float(found.problem.model.get(p)) for p in found.free.paths)
@@ -81,7 +85,7 @@ def _on_both(found: Fit, selection: Fit, horizon: int) -> Fit:
         found.model,
         (*found.stretches, *selection.stretches),
         found.free.paths,
-        replace(found.segmentation, horizon=horizon, count=len(states)),
+        replace(found.segmentation, horizon=horizon, substeps=substeps, count=len(states)),
         start=Start(found.covariance, jnp.asarray(states)),
         strategy=replace(_CONTINUED, hold_parameters=held),
     )

@@ -21,7 +21,6 @@ from fitting.first_order.motion import (
     motions,
     unit_pushes,
 )
-from fitting.first_order.surrogates import Scores, null_gains
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
 from hdjax.engine.pointwise import slopes_at_instants
@@ -198,27 +197,6 @@ def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[np.ndarray, "seg
         parts += [size[:, :-1], size[:, 1:]]
     forces = Forces(np.concatenate(lands, axis=-1), np.stack(parts, axis=2))
     return np.concatenate([look.answers.parameters, look.answers.to(forces)], axis=-1)
-
-
-def surrogate_gains(
-    looks: tuple[Look, Look],
-    acting: tuple[Acting, Acting],
-    sizes: tuple[Sizes, Sizes],
-    surrogates: tuple[np.ndarray, np.ndarray],
-) -> Float[np.ndarray, " draws"]:
-    """What forces gain on unseen data where there is nothing to find.
-
-    Args:
-        looks: at the data that are fitted, and at unseen data.
-        acting: what the forces are made of, likewise.
-        sizes: likewise.
-        surrogates: residuals of the same colour with random phases, by draw, segment and row.
-    """
-    fitted, unseen = (
-        Scores.of(_columns(look, unit, size), look.answers.weight, look.error, drawn)
-        for look, unit, size, drawn in zip(looks, acting, sizes, surrogates, strict=True)
-    )
-    return null_gains(fitted, unseen, len(looks[0].problem.free.paths))
 
 
 def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:

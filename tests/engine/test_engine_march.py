@@ -10,7 +10,7 @@ import pytest
 from test_engine_equations import models
 
 import rig
-from fitting.estimation.engines import linearise, residual_with_blocks, rows_at, simulate, with_engine
+from fitting.estimation.engines import linearise, residual_at, residual_with_blocks, simulate, with_engine
 from fitting.estimation.experiment import Experiment, Stretch, cut
 from fitting.estimation.free_parameters import fitted_paths, free_parameters
 from fitting.estimation.machine_code import _gap, lanes_of, task
@@ -298,7 +298,7 @@ def test_products_are_those_of_the_jacobian(name: str):
         full = linearise(ready, unknowns)
         found, rows = task(ready, unknowns).look(unknowns)
         np.testing.assert_allclose(rows, full.residual, rtol=0, atol=1e-13 * np.abs(full.residual).max())
-        np.testing.assert_array_equal(rows_at(ready, unknowns), full.residual)
+        np.testing.assert_array_equal(residual_at(ready, unknowns)[0], full.residual)
         products, wanted = np.asarray(found.products), np.asarray(Products.of(full).products)
         size = np.sqrt(np.einsum("spp->sp", wanted))
         bound = size[:, :, None] * size[:, None, :]
