@@ -1,7 +1,7 @@
 """The only least squares: parameters, initial states and noise covariance from segments of logs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
