@@ -102,7 +102,7 @@ assert proof.confirmed()
 inertias = np.geomspace(5e-5, 1e-3, 16)
 shares = np.array(
     [
-        [float(v.share(x)) for v, x in zip(study.variables, design, strict=True)]
+        [float(v.share(float(x))) for v, x in zip(study.variables, design, strict=True)]
         for design in ((s, n, j) for s in SIZES for n in RATIOS for j in inertias)
     ]
 )
