@@ -186,8 +186,9 @@ def fit(
     )
     moves = float(scales(stretches, model).x) * of_twist(model)[-1]
     shown = Shown.of(problem.model, moves)
-    # The scale of a single output changes nothing but the say of the hidden states' prior.
-    scale_matters = problem.segments.measured.shape[-1] > 1 or unknowns.states.shape[1] > len(model.motion_states)
+    # The scale of a single output changes nothing but what priors count: of parameters, and of hidden states.
+    priors = np.any(np.asarray(problem.free.precision) > 0) or unknowns.states.shape[1] > len(model.motion_states)
+    scale_matters = problem.segments.measured.shape[-1] > 1 or bool(priors)
     covariance = start.covariance
     if covariance is None:
         covariance = evaluate(problem, unknowns).covariance if scale_matters else np.array([[moves**2]])

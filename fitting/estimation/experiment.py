@@ -110,7 +110,8 @@ class Segments(eqx.Module):
         load_torque: coefficients of the load torque, or None.
         measured: outputs at the samples.
         weight: 1 for a sample whose outputs count, 0 for the others and for padding.
-        joined: whether a segment starts where the one before it ends.
+        goes_on: whether a segment's data go on where those of the one before it end.
+        joined: whether a segment's simulation goes on as well, where the one before it ends.
         halo: intervals before each segment's first sample.
         temperature: likewise of the drive's temperature, or None where a log lacks it.
     """
@@ -119,6 +120,7 @@ class Segments(eqx.Module):
     load_torque: PiecewisePolynomial | None
     measured: Float[Array, "segments samples outputs"]
     weight: Float[Array, "segments samples"]
+    goes_on: Bool[Array, " segments"]
     joined: Bool[Array, " segments"]
     halo: int = eqx.field(static=True)
     temperature: PiecewisePolynomial | None = None
@@ -335,6 +337,7 @@ def cut(
     warm = all(s.experiment.temperature is not None for s in stretches)
     parts = [_cut_one(s, length, pieces, halo, loaded=loaded, warm=warm) for s in stretches]
     found = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    goes_on = np.concatenate([_goes_on(*pair, length) for pair in zip((None, *stretches), stretches, strict=False)])
     missing = max(0, (segment_count(stretches, length) if count is None else count) - found[0].shape[0])
     filled = [np.concatenate([column, np.repeat(column[-1:], missing, axis=0)]) for column in found]
     knots, torque, load, warmth, measured, weight, joined = filled
@@ -346,10 +349,20 @@ def cut(
         load_torque=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(load)) if loaded else None,
         measured=jnp.asarray(measured),
         weight=jnp.asarray(weight),
+        goes_on=jnp.asarray(np.append(goes_on, np.zeros(missing, dtype=bool))),
         joined=jnp.asarray(joined),
         halo=halo,
         temperature=PiecewisePolynomial(own_knots[:, halo:], jnp.asarray(warmth)) if warm else None,
     )
+
+
+def _goes_on(before: Stretch | None, stretch: Stretch, length: int) -> Bool[np.ndarray, " segments"]:
+    """Whether each segment of a stretch goes on where the one before it ends; of the first one, behind a stretch of
+    whole segments."""
+    found = np.ones(-(-len(stretch) // length), dtype=bool)
+    ends = None if before is None or len(before) % length else (before.name, before.stop)
+    found[0] = ends == (stretch.name, stretch.start)
+    return found
 
 
 def _cut_one(

@@ -116,7 +116,7 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
     if around >= 2:
         before, previous = np.roll(knots, 1, axis=0), np.roll(measured, 1, axis=0)
         earlier = before[:, -1 - around : -1] - knots[:, :1]
-        goes_on = np.abs(before[:, -1] - knots[:, 0]) < 0.5 * step
+        goes_on = np.asarray(segments.goes_on)
         both = _value_and_rate(
             np.hstack([earlier, time[:, : around + 1]]),
             np.hstack([previous[:, -around:], measured[:, : around + 1]]),

@@ -46,7 +46,7 @@ class Along(eqx.Module):
         between: the motion at the nodes of each interval.
         pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
         carried: and what it adds to the state by the end of the interval, see [`carried`][].
-        goes_on: whether a segment goes on where the one before it ends in time, joined or not.
+        goes_on: whether a segment's data go on where those of the one before it end.
         firsts: the first segment of each stretch.
         ends: segment and knot where each stretch ends.
     """
@@ -81,7 +81,8 @@ def along(model: Model, followed: Followed, segments: Segments, stretches: Seque
     between = motions(model, followed.between, conditions)
     pushes = unit_pushes(model, followed.between, conditions)
     lands = {name: carried(followed, push) for name, push in pushes.items()}
-    return Along(model, followed, segments, at_knots, between, pushes, lands, continues(segments), firsts, ends)
+    goes_on = np.asarray(segments.goes_on)
+    return Along(model, followed, segments, at_knots, between, pushes, lands, goes_on, firsts, ends)
 
 
 def conditions_at_knots(segments: Segments) -> Conditions:
@@ -204,13 +205,6 @@ def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
     own = effect if isinstance(effect, type) else type(effect)
     kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
     return next((form for form, kind in zip(LEARNED_TORQUES, kinds, strict=True) if issubclass(own, kind)), None)
-
-
-def continues(segments: Segments) -> Bool[np.ndarray, " segments"]:
-    """Whether a segment goes on where the one before it ends in time, joined or not."""
-    knots = segments.knots
-    late = knots[1:, 0] - knots[:-1, -1]
-    return np.append(False, np.abs(late) < 0.5 * np.median(segments.width))
 
 
 def _at_knots(
