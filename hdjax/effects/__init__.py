@@ -28,6 +28,8 @@ from hdjax.effects.friction import (
     MotorFriction,
     StribeckLoadFriction,
     StribeckMotorFriction,
+    ViscousLoadFriction,
+    ViscousMotorFriction,
 )
 from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
 from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
@@ -46,6 +48,8 @@ from hdjax.effects.stiffness import QuadraticStiffness, QuinticStiffness, Smooth
 from hdjax.effects.thermal import ThermalDamping, ThermalMotorFriction, ThermalStiffness
 
 __all__ = [
+    "ViscousLoadFriction",
+    "ViscousMotorFriction",
     "ActuatorEffect",
     "BY_NAME",
     "Backlash",

@@ -15,6 +15,8 @@ from hdjax.effects.friction import (
     MotorFriction,
     StribeckLoadFriction,
     StribeckMotorFriction,
+    ViscousLoadFriction,
+    ViscousMotorFriction,
 )
 from hdjax.effects.hysteresis import BoucWen, Dahl, MaxwellSlip, SharpBoucWen
 from hdjax.effects.kinematic import KinematicError, KinematicHarmonic, KinematicSidebands
@@ -48,10 +50,12 @@ CATALOGUE: tuple[type[Effect], ...] = (
     CoulombFriction,
     LoadDependentFriction,
     MotorFriction,
+    ViscousMotorFriction,
     StribeckMotorFriction,
     DahlMotorFriction,
     LuGreMotorFriction,
     LoadFriction,
+    ViscousLoadFriction,
     StribeckLoadFriction,
     LuGreLoadFriction,
     KinematicError,

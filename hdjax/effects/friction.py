@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.dry import DryLoadFriction, DryMeshFriction, DryMotorFriction, load_rate, motor_rate
-from hdjax.effects.effect import Effect, Motion, Scales
+from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
 from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
@@ -64,6 +64,22 @@ class LoadDependentFriction(DryMeshFriction):
 
     def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         return self.T_c + self.share * jnp.abs(drive.stiffness * restoring(motion.x, drive.alpha))
+
+
+class ViscousMotorFriction(MotorSideEffect):
+    """Friction torque `b omega_m` against the motor."""
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "viscous_motor_friction"
+
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.b * motor_rate(motion)
 
 
 class MotorFriction(DryMotorFriction):
@@ -140,6 +156,22 @@ class StribeckMotorFriction(DryMotorFriction):
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
         return super().torque(motion, drive, state) - self.b * motor_rate(motion)
+
+
+class ViscousLoadFriction(LoadSideEffect):
+    """Friction torque `b omega_l` against the load."""
+
+    family: ClassVar[str] = "load_friction"
+    name: ClassVar[str] = "viscous_load_friction"
+
+    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        return (cls(),)
+
+    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
+        return -self.b * load_rate(motion)
 
 
 class LoadFriction(DryLoadFriction):
