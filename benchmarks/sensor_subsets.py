@@ -103,9 +103,10 @@ class Joint:
         found = np.zeros((self.torque.size, 5))
         for i, T in enumerate(self.torque.tolist()[:-1]):
             solver.set_f_params(T)
-            found[i + 1, 4] = solver.integrate((i + 1) * self.step - self.late)[1]
+            if self.late:
+                found[i + 1, 4] = solver.integrate((i + 1) * self.step - self.late)[1]
             found[i + 1, :4] = solver.integrate((i + 1) * self.step)
-        return found
+        return found if self.late else np.column_stack([found[:, :4], found[:, 1]])
 
 
 def drawn(kind: Kind, random: np.random.Generator) -> Joint:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -239,7 +240,8 @@ class TwoInertiaModel(Model):
         return sum(taken, jnp.zeros_like(self.drive.J_l))
 
     def outputs(self, state: State) -> Float[Array, " outputs"]:
-        theta_m, theta_l, omega_m, omega_l = (state[i] for i in range(4))
+        theta_m, omega_m = state[0], state[2]
+        theta_l, omega_l = self._load_as_read(state)
         for effect in self._of(SensorEffect):
             theta_m, theta_l = effect.reading(theta_m, theta_l, omega_m, omega_l)
         turn = theta_m / self.drive.N
@@ -253,6 +255,23 @@ class TwoInertiaModel(Model):
             JOINT_TORQUE: lambda: self._mesh_torque(self.motion(state), self._own_states(tuple(state))),
         }
         return jnp.stack([readings[name]() for name in self.measured])
+
+    def _load_as_read(self, state: State) -> tuple[Array, Array]:
+        """The load's angle and rate when its sensors are read: Taylor's series to the third order in the delay, as the
+        bare drive moves without a torque. What else moves the load counts to the first order."""
+        delays = [d for d in (effect.load_delay() for effect in self._of(SensorEffect)) if d is not None]
+        theta_l, omega_l = state[1], state[3]
+        if not delays:
+            return theta_l, omega_l
+        motion, ahead = self.motion(state), -sum(delays, jnp.zeros(()))
+        mobility = 1.0 / self._load_inertia + 1.0 / (self._motor_inertia * self.drive.N**2)
+        untwisting = -mobility * self.drive.mesh_torque(motion.x, motion.v)
+        torque, slope = jax.jvp(self.drive.mesh_torque, (motion.x, motion.v), (motion.v, untwisting))
+        acceleration, jerk = torque / self._load_inertia, slope / self._load_inertia
+        return (
+            theta_l + ahead * (omega_l + ahead * (acceleration / 2.0 + ahead * jerk / 6.0)),
+            omega_l + ahead * (acceleration + ahead * jerk / 2.0),
+        )
 
 
 class TwistModel(Model):

@@ -84,7 +84,8 @@ def regressors(
     lands, sizes = [seen.carried[name] for name in added], list(added.values())
     forces = Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))
     # A sensor of the joint torque reads what is added to it.
-    read = isinstance(stacked, MeshTorqueEffect | MeshGeometryEffect) and JOINT_TORQUE in seen.model.measured
+    in_the_mesh = isinstance(stacked, MeshTorqueEffect | MeshGeometryEffect)
+    read = isinstance(stacked, SensorEffect) or (in_the_mesh and JOINT_TORQUE in seen.model.measured)
     return Regressors(forces, _finite(_readings(seen, stacked, states)) if read else None), memory
 
 

@@ -255,6 +255,10 @@ class SensorEffect(Effect):
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         """What the motor's and the load's encoder read [rad] at the true angles [rad] and rates [rad/s]."""
 
+    def load_delay(self) -> Array | None:
+        """Time by which the load's sensors are read later than the motor's [s]; None where they are read together."""
+        return None
+
 
 class ActuatorEffect(Effect):
     """Changes the logged torque (or forcing) on its way to the drive."""

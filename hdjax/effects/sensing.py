@@ -5,9 +5,10 @@ from typing import ClassVar
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive
-from hdjax.effects.effect import Effect, Scales, SensorEffect
+from hdjax.effects.effect import ActuatorEffect, Effect, Scales, SensorEffect
 from hdjax.effects.ripple import amplitude_and_phase, ripple
 from hdjax.parameters import Scalar, parameter
+from hdjax.signals import PiecewisePolynomial
 
 SOURCE = "EFFECTS: 10 um on a disc of 25 to 50 mm are 40 to 80 arcsec"
 _PLAUSIBLE = (1.9e-4, 3.9e-4)
@@ -64,10 +65,9 @@ class LoadEncoderEccentricity(SensorEffect):
 
 
 class _EncoderDelay(SensorEffect):
-    """One encoder is read later than the other, by a filter or its way over a bus.
+    """One side's sensors are read later than the other's, by a filter or their way over a bus.
 
-    To first order in the delay, `theta(t - delay) = theta - delay theta'`: an oscillation at `w` is wrong by
-    `(w delay)^2 / 2` of itself. What both encoders are late by is an `input_delay`.
+    What both are late by is an `input_delay`.
     """
 
     family: ClassVar[str] = "sensor_delay"
@@ -82,24 +82,38 @@ class _EncoderDelay(SensorEffect):
         role="strength",
     )
 
+    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
+        return theta_m, theta_l
+
+
+class MotorEncoderDelay(_EncoderDelay, ActuatorEffect):
+    """The motor's sensors read `theta_m(t - delay)`.
+
+    The simulation's time is that of the motor's reading: the torque is as late, and the load is read ahead.
+    """
+
+    name: ClassVar[str] = "motor_encoder_delay"
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
+        # At exactly zero the delayed sample changes its interval, and the slope is taken on the wrong side.
+        return (cls(delay=1e-9 * scales.time_step),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        return logged.delayed(self.delay)
+
+    def load_delay(self) -> Array:
+        return -self.delay
+
+
+class LoadEncoderDelay(_EncoderDelay):
+    """The load's sensors read `theta_l(t - delay)`."""
+
+    name: ClassVar[str] = "load_encoder_delay"
+
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return (cls(),)
 
-
-class MotorEncoderDelay(_EncoderDelay):
-    """The motor's encoder reads `theta_m(t - delay)`, to first order in the delay."""
-
-    name: ClassVar[str] = "motor_encoder_delay"
-
-    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
-        return theta_m - self.delay * omega_m, theta_l
-
-
-class LoadEncoderDelay(_EncoderDelay):
-    """The load's encoder reads `theta_l(t - delay)`, to first order in the delay."""
-
-    name: ClassVar[str] = "load_encoder_delay"
-
-    def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
-        return theta_m, theta_l - self.delay * omega_l
+    def load_delay(self) -> Array:
+        return self.delay

@@ -1,8 +1,12 @@
 """An encoder that is read late: recovered from logs, beside stiffness and damping."""
 
+import dataclasses
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import rig
 from fitting.estimation.base_fit import base_fit
@@ -11,6 +15,7 @@ from fitting.estimation.experiment import Stretch, experiment_from_log
 from fitting.estimation.free_parameters import base_paths, effect_paths
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Drive, TwoInertiaModel
+from hdjax.effects import SensorEffect
 from hdjax.effects.sensing import LoadEncoderDelay, MotorEncoderDelay
 
 COUNT, FINER = 2000, 5
@@ -28,24 +33,42 @@ def late(side: int, steps: int) -> Stretch:
     return Stretch(experiment_from_log(log, hold="zero-order", N=rig.N), 0, COUNT)
 
 
-def test_a_late_encoder_is_recovered():
-    form, steps = LoadEncoderDelay, 2
-    stretch = late(1, steps)
+@pytest.mark.parametrize("form, side", [(MotorEncoderDelay, 0), (LoadEncoderDelay, 1)])
+def test_a_late_encoder_is_recovered(form: type[SensorEffect], side: int):
+    steps = 4
+    stretch = late(side, steps)
     base = base_fit(MODEL, (stretch,))
-    model = base.model.with_effects(form(delay=1e-5))
+    model = base.model.with_effects(form(delay=1e-5))  # pyright: ignore[reportCallIssue]
     paths = (*base_paths(base.model), *effect_paths(model.effects[0]))
-    found: Fit = fit(model, base.stretches, paths, base.segmentation)
+    segmentation = dataclasses.replace(base.segmentation, halo=2)
+    found: Fit = fit(model, base.stretches, paths, segmentation)
     assert found.objective < base.objective - 1.0
     estimates = uncertainty(found, torque_noise=False).estimates
-    delay = estimates[f"{form.name}.delay"]
-    # What is left of second order moves the delay by a share of (w d)^2 / 2, 0.4 % at the resonance.
-    assert delay.value == pytest.approx(steps * rig.STEP / FINER, rel=5e-3)
-    assert abs(estimates["K"].value - rig.K) < 4 * estimates["K"].std
+    delay = steps * rig.STEP / FINER
+    assert estimates[f"{form.name}.delay"].std < 1e-3 * delay
+    for path, true in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP, f"{form.name}.delay": delay}.items():
+        assert abs(estimates[path].value - true) < 4 * estimates[path].std
+
+
+def test_the_load_is_read_where_it_was():
+    """Against the drive's own motion, without a torque, backwards in time."""
+    drive = eqx.tree_at(lambda d: (d.K, d.B_sp), MODEL.drive, (jnp.asarray(rig.K), jnp.asarray(rig.B_SP)))
+    model = TwoInertiaModel(drive)
+    state, delay = jnp.asarray(np.array([1.0, 0.018, 3.0, -0.4])), 0.1 / float(drive.omega_0)
+    zero = jnp.zeros(())
+    earlier = solve_ivp(
+        lambda _, y: np.asarray(model.rates(jnp.asarray(y), zero, zero)), (0.0, -delay), np.asarray(state), rtol=1e-10
+    ).y[:, -1]
+    read = TwoInertiaModel(drive, (LoadEncoderDelay(delay=delay),), ("load_angle", "load_velocity"))
+    moved = np.abs(earlier - np.asarray(state))[[1, 3]]
+    # What is left of the rate, to the third order in the delay.
+    np.testing.assert_allclose(read.outputs(state), earlier[[1, 3]], rtol=0, atol=3e-3 * moved.max())
 
 
 def test_each_delay_moves_its_own_reading():
-    state = jnp.asarray(np.array([1.0, 0.02, 3.0, -0.4]))
-    drive = MODEL.drive
-    for form, moved in ((MotorEncoderDelay, (0.01 * 3.0 / rig.N,) * 2), (LoadEncoderDelay, (0.0, -0.01 * -0.4))):
-        change = TwoInertiaModel(drive).outputs(state) - TwoInertiaModel(drive, (form(delay=0.01),)).outputs(state)
-        np.testing.assert_allclose(change, moved, atol=1e-15)
+    """To first order: the motor's delay in the simulation's time, which is that of the motor's reading."""
+    state = jnp.asarray(np.array([1.0, 0.01, 3.0, -0.4]))
+    rest = TwoInertiaModel(MODEL.drive).outputs(state)
+    for form, moved in ((MotorEncoderDelay, (0.0, -1e-6 * -0.4)), (LoadEncoderDelay, (0.0, 1e-6 * -0.4))):
+        change = TwoInertiaModel(MODEL.drive, (form(delay=1e-6),)).outputs(state) - rest
+        np.testing.assert_allclose(change, moved, atol=1e-10)
