@@ -17,7 +17,7 @@ from fitting.estimation.estimate import Fit, segments_of_logs
 from fitting.estimation.linear_response import follow
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.uncertainty.input_noise import torque_pushes
-from hdjax import Model
+from hdjax import Model, TwoInertiaModel
 
 # Standard deviations, in units of what simulations leave, by which a segment's first state may be off.
 _FREE = 10.0
@@ -286,12 +286,17 @@ def _by_parameter(fit: Fit) -> Float[np.ndarray, "segments samples outputs param
 
 
 def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray) -> Float[np.ndarray, " states"]:
-    """By how much each state may be off where a segment begins."""
-    angles = len(model.motion_states) // 2
-    shown = np.abs(read[0, 0][:, :angles])
+    """By how much each state may be off where a segment begins: an angle by what its own output or its rate's shows; a
+    side that no output shows, by as much as the other one."""
+    angles, omega_0 = len(model.motion_states) // 2, float(model.drive.omega_0)
+    sides = np.array([float(model.drive.N), 1.0]) if isinstance(model, TwoInertiaModel) else np.ones(angles)
+    shown = np.abs(read[0, 0][:, : 2 * angles]).reshape(-1, 2, angles)
+    # Outputs that show angles; where there is none, rates.
+    shown = shown[:, 0] if shown[:, 0].any() else omega_0 * shown[:, 1]
     angle = _FREE * np.max(np.where(shown > 0, rms[:, None] / np.where(shown > 0, shown, 1.0), 0.0), axis=0)
+    angle = np.where(angle > 0, angle, sides * np.max(angle / sides))
     hidden = np.std(states.reshape(-1, states.shape[-1]), axis=0)[2 * angles :]
-    return np.concatenate([angle, angle * float(model.drive.omega_0), hidden])
+    return np.concatenate([angle, angle * omega_0, hidden])
 
 
 def _spread(count: int, most: int) -> np.ndarray:
