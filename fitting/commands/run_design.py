@@ -3,11 +3,10 @@
 import json
 from pathlib import Path
 
-from rich.console import Console
-
 from fitting.commands.design_file import read_design_file
 from fitting.commands.design_report import design_dict, design_text
 from fitting.commands.pictures import show_files
+from fitting.commands.spinner import spinning
 from fitting.errors import DataError
 from fitting.files import write_whole
 from hdjax.design import confirm, optimise
@@ -30,19 +29,18 @@ def design_file(spec: Path, out: Path, *, plot: bool) -> None:
     study, search = asked.study, asked.search
     # Beside many draws, designs side by side only wait for the slowest.
     lanes = max(1, min(search.starts, LANES, 64 // (1 if study.draws is None else len(study.draws.values))))
-    console = Console(stderr=True)
-    with console.status("compiling") as status:
+    with spinning("compiling") as say:
         try:
             found = optimise(
                 study,
                 search.starts,
                 seed=search.seed,
                 lanes=lanes,
-                progress=lambda count: status.update(f"searching: {count} designs appraised"),
+                progress=lambda count: say(f"searching: {count} designs appraised"),
             )
         except ValueError as error:
             raise DataError(f"{spec}: {error}; change the ranges in [variables]") from error
-        status.update("sweeping around the optimum")
+        say("sweeping around the optimum")
         proof = confirm(study, found.best, width=search.width, points=search.points, seed=search.seed, lanes=lanes)
     files: dict[Path, str | bytes] = {
         out / "design.json": json.dumps(design_dict(study, found, proof), indent=1, allow_nan=False) + "\n"

@@ -9,7 +9,7 @@ from fitting.api.verbs import close_loop, fit
 from fitting.commands.demo import write_demo_logs
 from fitting.commands.next_experiment import stated_limits
 from fitting.commands.options import ExperimentLimits
-from fitting.commands.spinner import Spinner
+from fitting.commands.spinner import spinning
 from fitting.errors import InputError
 from fitting.search_options import SearchOptions
 
@@ -34,7 +34,7 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
         _check_posterior()
     data = load(logs, drive)
     stated = None if limits is None else stated_limits(limits, data)
-    with Spinner() as progress:
+    with spinning() as progress:
         found = fit(data, draws=seed, progress=progress)
         if stated is not None:
             found = found.with_next_experiment(stated, progress=progress)
@@ -69,7 +69,7 @@ def close_loop_on_logs(
     """
     data = load(logs, drive, test=test)
     stated = None if limits is None else stated_limits(limits, data)
-    with Spinner() as progress:
+    with spinning() as progress:
         found = close_loop(data, search=search, progress=progress)
         if stated is not None:
             found = found.with_next_experiment(stated, progress=progress)
