@@ -22,6 +22,7 @@ def fit(
     *,
     drive: DriveFileOption,
     out: Path,
+    test: TestLogs = (),
     posterior: bool = False,
     seed: int = 0,
     next_experiment: bool = False,
@@ -56,6 +57,8 @@ def fit(
         raise InputError(f"--workers must be 0 or more, but is {fleet.workers}")
     if asked is not None and folder is not None:
         raise InputError(f"{logs[0]}: --next-experiment is for log files of one drive; name its logs")
+    if test and folder is not None:
+        raise InputError(f"{folder}: --test is for log files of one drive, but this is a folder; name its logs")
     if posterior and folder is not None:
         raise InputError(f"{folder}: --posterior is for log files of one drive, but this is a folder; name its logs")
     start_jax()
@@ -66,7 +69,7 @@ def fit(
         return
     from fitting.commands.run_fit import fit_logs
 
-    fit_logs(logs, drive, out, seed if posterior else None, asked)
+    fit_logs(logs, drive, out, seed if posterior else None, test=test, limits=asked)
 
 
 def close_loop(

@@ -16,7 +16,15 @@ from fitting.search_options import SearchOptions
 _NOTHING = "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
 
 
-def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits: ExperimentLimits | None) -> None:
+def fit_logs(
+    logs: list[Path],
+    drive: Path,
+    out: Path,
+    seed: int | None = None,
+    *,
+    test: Sequence[Path] = (),
+    limits: ExperimentLimits | None = None,
+) -> None:
     """Fit logs together, write the report, and show it.
 
     Args:
@@ -24,6 +32,7 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
         drive: drive file.
         out: folder of the report.
         seed: of draws from the posterior; None where none are asked for.
+        test: files of test data.
         limits: of the next experiment; None where none is asked for.
 
     Raises:
@@ -32,7 +41,7 @@ def fit_logs(logs: list[Path], drive: Path, out: Path, seed: int | None, limits:
     """
     if seed is not None:
         _check_posterior()
-    data = load(logs, drive)
+    data = load(logs, drive, test=test)
     stated = None if limits is None else stated_limits(limits, data)
     with spinning() as progress:
         found = fit(data, draws=seed, progress=progress)

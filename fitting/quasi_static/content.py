@@ -10,6 +10,7 @@ from fitting import formatting
 from fitting.quasi_static.facts import (
     ABOUT_SCALE,
     account,
+    beyond_fitted,
     few_stretches,
     framed,
     log_dicts,
@@ -22,6 +23,7 @@ from fitting.quasi_static.intervals import Known
 from fitting.quasi_static.preparation import MOVES, QuasiStaticData
 from fitting.quasi_static.stretches import stretches
 from fitting.quasi_static.torque_twist import SHAPES
+from fitting.quasi_static.unseen_logs import UnseenLogs
 
 # The least of the values that vendors' tables imply.
 _TYPICAL_ALPHA = 1.1e5
@@ -53,12 +55,13 @@ def plain_shape(shape: str) -> str:
     return "straight line" if shape == "linear" else shape
 
 
-def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
+def report_dict(data: QuasiStaticData, fit: QuasiStaticFit, unseen: UnseenLogs) -> dict[str, Any]:
     """The report as JSON has it: finite numbers and nulls only.
 
     Args:
         data: The logs that were fitted.
         fit: Of these logs.
+        unseen: Logs of test data.
 
     Returns:
         The keys of every fit's report; `shapes` has each shape's own figures besides.
@@ -73,7 +76,7 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         "rated_torque": rated,
         "torque_range": [float(np.min(blocks.torque)), float(np.max(blocks.torque))],
         "twist_range": float(np.ptp(blocks.twist)),
-        "before": account(parameters, fit.best.misfit, fit.held_out[fit.chosen]),
+        "before": account(parameters, fit.best.misfit, fit.held_out[fit.chosen], unseen.misfit(fit.best)),
         "after": no_account(),
         "alternatives": [
             {
@@ -88,10 +91,16 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit) -> dict[str, Any]:
         ],
         "shapes": shapes,
         "cannot_tell": [],
-        "logs": log_dicts(data, blocks.rows, blocks.reversals),
+        "logs": [log | {"test": 0} for log in log_dicts(data, blocks.rows, blocks.reversals)] + _test_logs(unseen),
     }
-    report = framed(data, content)
-    return report | {"summary": summary(report), "cannot_tell": _limits(report, data, fit)}
+    report = framed(dataclasses.replace(data, findings=data.findings | unseen.data.findings), content)
+    return report | {"summary": summary(report), "cannot_tell": _limits(report, data, fit, unseen)}
+
+
+def _test_logs(unseen: UnseenLogs) -> list[dict[str, Any]]:
+    blocks = unseen.blocks
+    logs = log_dicts(unseen.data, [one.rows[0] for one in blocks], [one.reversals[0] for one in blocks])
+    return [log | {"held_out": 0, "test": count} for log, count in zip(logs, unseen.rows, strict=True)]
 
 
 def summary(report: Mapping[str, Any]) -> str:
@@ -100,19 +109,23 @@ def summary(report: Mapping[str, Any]) -> str:
     names = [n for n in ("K", "K1", "K2", "K3") if n in known and known[n]["identifiable"]]
     validation = formatting.quantity(report["before"]["rmse"]["validation"], "rad")
     width = known["hysteresis_width"]
+    test = report["before"]["rmse"]["test"]
+    errs = f"it errs by {validation} rms"
+    if test is not None:
+        errs += f", on test data by {formatting.quantity(test, 'rad', like=report['before']['rmse']['validation'])}"
     loop = "The logs do not show a width of the loop"
     if width["value"] is not None and width["identifiable"]:
         loop = f"The loop is {_with_interval(width)} wide at zero torque"
     if not names:
         return (
             "The logs do not determine a stiffness: what the twist does beside the torque outweighs what the torque "
-            f"does to it. On stretches that a straight line has not seen it errs by {validation} rms."
+            f"does to it. On stretches that a straight line has not seen {errs}."
         )
     stiffness = formatting.words([f"{name} {_with_interval(known[name])}" for name in names])
     article = "" if shape.endswith("slopes") else "a "
     return (
         f"Torque and twist follow {article}{shape} with {stiffness}. {loop}. On stretches that "
-        f"the fit has not seen it errs by {validation} rms."
+        f"the fit has not seen {errs}."
     )
 
 
@@ -187,7 +200,7 @@ def _alpha_reason(fit: QuasiStaticFit, alpha: Known) -> str:
     return f"{reason}; alpha of 1.1e5, the least in vendors' tables, would need x above {needed}"
 
 
-def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFit) -> list[str]:
+def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFit, unseen: UnseenLogs) -> list[str]:
     known, best, motion = report["before"]["parameters"], fit.best, set(data.motion)
     reasons: dict[str, list[str]] = {}
     for name, one in known.items():
@@ -220,6 +233,7 @@ def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFi
             not best.curve.drifting,
             "A drift of the twist with time is taken as zero: it takes two full torque cycles to tell it apart.",
         ),
+        beyond_fitted(unseen.torque, fit.blocks.torque, fit.blocks.torque_noise),
         few_stretches(int(stretches(best.residual, fit.blocks.log)[-1]) + 1),
     ]
     return those_that_hold(notes)

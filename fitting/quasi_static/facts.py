@@ -45,7 +45,7 @@ def framed(data: QuasiStaticData, content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def log_dicts(data: QuasiStaticData, rows: Sequence[int], reversals: Sequence[int]) -> list[dict[str, Any]]:
-    """The logs; each of their rows is held out once.
+    """The logs that were fitted; each of their rows is held out once.
 
     Args:
         data: The logs.
@@ -115,4 +115,21 @@ def few_stretches(count: int) -> tuple[bool, str]:
     return count < FEW_STRETCHES, (
         f"What the curve leaves over is so correlated that the logs hold only {count} independent stretches: the "
         "intervals are wide, and rest on little. Record more torque cycles."
+    )
+
+
+def beyond_fitted(torque: np.ndarray, fitted: np.ndarray, error: float) -> tuple[bool, str]:
+    """What is said where test data lie at torques beyond those that were fitted.
+
+    Args:
+        torque: Of the test data [N m], (m,).
+        fitted: Of the fitted data [N m], (n,).
+        error: Of a torque [N m], rms; noisy torques scatter about the ends of the range.
+    """
+    margin = 2.0 * error
+    beyond = (torque < np.min(fitted) - margin) | (torque > np.max(fitted) + margin)
+    share = float(np.mean(beyond)) if len(beyond) else 0.0
+    return share > 0.0, (
+        f"{formatting.percent(share)} of the test data lie at torques beyond those that were fitted: there the "
+        "equation extrapolates."
     )

@@ -12,6 +12,7 @@ from fitting.quasi_static.facts import (
     ABOUT_SCALE,
     ARCMIN,
     account,
+    beyond_fitted,
     estimates,
     few_stretches,
     framed,
@@ -249,16 +250,6 @@ def _from_to(accounts: Mapping[str, Any], part: str) -> str:
     return f"{verb} from {formatting.quantity(start, 'rad')} to {formatting.quantity(end, 'rad', like=start)}"
 
 
-def _beyond(parts: Parted) -> float:
-    """Share of the test data at torques beyond those that were fitted."""
-    if not parts.tests:
-        return 0.0
-    torque, known = np.concatenate([one.points.torque[one.scored] for one in parts.tests]), parts.points.torque
-    # Points of noisy torques scatter about the ends of the range.
-    margin = 2.0 * parts.points.torque_error
-    return float(np.mean((torque < np.min(known) - margin) | (torque > np.max(known) + margin)))
-
-
 def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> list[str]:
     points, model = loop.held.points, loop.after.model
     parameters = dict(report["after"]["parameters"] or report["before"]["parameters"])
@@ -268,7 +259,7 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
     friction = parameters.get("hysteresis.friction", {"value": 0.0})["value"]
     slower = loop.decision == "model_sufficient" and loop.after.rmse > _NOISE * points.twist_noise
     error = formatting.quantity(float(abs(loop.before.model.coefficients[0])) * points.torque_error, "rad")
-    unseen = _beyond(parts)
+    unseen = np.concatenate([one.points.torque[one.scored] for one in parts.tests] or [points.torque[:0]])
     own = next((one.at_rest.own_stiffness for one in loop.findings if one.at_rest is not None), None)
     notes = [
         (vague, f"{not_identifiable(vague)}." if vague else ""),
@@ -294,11 +285,7 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
             "The logs are too short to set test data aside: no error is stated on data that no choice has seen. Name "
             "another log with --test.",
         ),
-        (
-            unseen > 0,
-            f"{formatting.percent(unseen)} of the test data lie at torques beyond those that were fitted: there the "
-            "equation extrapolates.",
-        ),
+        beyond_fitted(unseen, points.torque, points.torque_error),
         few_stretches(int(stretches(model.misfit, points.log, each=2)[-1]) + 1),
         (True, ABOUT_SCALE),
     ]

@@ -21,9 +21,8 @@ from fitting.quasi_static.form import START
 from fitting.quasi_static.points import Points, points_of
 from fitting.quasi_static.preparation import QuasiStaticData, believed, prepare
 from fitting.quasi_static.twist_model import TwistModel
+from fitting.quasi_static.unseen_logs import LEAD
 
-# Share of a log named as test data, at its beginning, that tells its zero.
-_LEAD = 0.2
 # Of two torque cycles.
 _REVERSALS = 4
 
@@ -87,7 +86,7 @@ def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ())
         data = prepare(logs, drive_file, at_rest=True)
         alone = [prepare([log], drive_file, at_rest=True) for log in test]
         whole = [points_of(one.logs, one.motion, ratio) for one in alone]
-        tests = tuple(Unseen.of(points, _LEAD * points.duration) for points in whole)
+        tests = tuple(Unseen.of(points, LEAD * points.duration) for points in whole)
         data = replace(data, findings=data.findings | {name: f for one in alone for name, f in one.findings.items()})
         return Parted(data, points_of(data.logs, data.motion, ratio), tests)
     try:

@@ -6,7 +6,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from fitting.errors import InputError
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.log import Log
 from fitting.quasi_static.content import report_dict
@@ -17,6 +16,7 @@ from fitting.quasi_static.plots import fit_pictures, loop_pictures
 from fitting.quasi_static.preparation import prepare
 from fitting.quasi_static.report import report_text, write_report
 from fitting.quasi_static.test_part import parted
+from fitting.quasi_static.unseen_logs import UnseenLogs
 from fitting.report.plots import Plot
 from fitting.search_options import SearchOptions
 
@@ -51,20 +51,14 @@ def fit_quasi_static_logs(
     Args:
         logs: Of kind "quasi-static", of one drive.
         drive_file: Of the drive.
-        test: Logs of test data, which are refused.
+        test: Logs of test data; where there are none, all rows are fitted, and held-out stretches tell an error.
         progress: Told what is being done.
-
-    Raises:
-        InputError: There are test logs.
     """
-    if test:
-        raise InputError(
-            f"{test[0].path}: `hdjax fit` takes no test data of quasi-static logs; leave --test out, or run close-loop"
-        )
     progress("fitting torque-twist curves")
     data = prepare(logs, drive_file)
+    unseen = UnseenLogs.of(test, drive_file)
     found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
-    return Told(report_dict(data, found), fit_pictures(found))
+    return Told(report_dict(data, found, unseen), fit_pictures(found))
 
 
 def close_quasi_static_loop(

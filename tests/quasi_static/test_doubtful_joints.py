@@ -18,6 +18,7 @@ from fitting.quasi_static.loop_content import loop_report
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import prepare
 from fitting.quasi_static.test_part import Parted
+from fitting.quasi_static.unseen_logs import UnseenLogs
 
 SOFT = 120.0
 
@@ -107,7 +108,7 @@ def test_what_is_not_determined_makes_no_headline_and_nothing_unphysical_is_foun
     log = replace(log, joint_torque=20.0 + sign * log.joint_torque)
     steady = prepare([log], drive_file(), at_rest=True)
     fit = fit_quasi_static(steady.logs, hysteresis=False)
-    report = report_dict(steady, fit)
+    report = report_dict(steady, fit, UnseenLogs.of([], drive_file()))
     assert not report["before"]["parameters"]["K"]["identifiable"]
     assert "do not determine a stiffness" in report["summary"] and "N m/rad" not in report["summary"]
     loop = close_loop(points_of(steady.logs, [motion], RATIO))
