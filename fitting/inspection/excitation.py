@@ -13,6 +13,8 @@ COHERENT = 0.9
 
 _POWER = (0.05, 0.95)  # of a torque, between these shares lies its band
 _SEGMENTS = 16
+# How many times a side that turns freely integrates the torque: what drifts would hide what follows.
+_ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1}
 _FEWEST = 256
 
 
@@ -57,8 +59,8 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
         answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
         if len(torque) >= _FEWEST and np.ptp(torque) > 0:
             band = _band(torque, rate)
-            answers = answer is not None and len(answer) >= _FEWEST and np.ptp(answer) > 0
-            coherent = _coherent(torque, answer, rate, band) if answer is not None and answers else None
+            if answer is not None and len(answer) >= _FEWEST and np.ptp(answer) > 0:
+                coherent = _coherent(torque, np.diff(answer, n=_ORDER.get(response or "", 0)), rate, band)
     spread = None if twist is None else float(np.ptp(twist))
     return Excitation(ranges, driver, response, band, coherent, spread)
 

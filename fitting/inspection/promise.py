@@ -61,6 +61,8 @@ def _of_motor_side(inspection: Inspection, moved: Excitation) -> Iterator[str]:
     side = "One side alone" if len(has) == 1 else "No twist"
     yield f"{side} ({' and '.join(has)} and torque): K, B_sp and inertias, where the torque reaches the resonance."
     yield "The motor side shows antiresonance and resonance, of which both inertias and K follow with the ratio."
+    if moved.band is not None:
+        yield f"Both must lie inside the band of the torque ({moved.band[0]:.3g} to {moved.band[1]:.3g} Hz)."
     yield "alpha and effects of the mesh show poorly: a second angle would tell them, so look for one in the log."
 
 

@@ -33,7 +33,7 @@ def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
         The findings of the reader, then those of the checks; refusals are among them.
     """
     checks = [_jitter(log), _excitation(log), _response(log), _channels(log, drive_file)]
-    if log.motor_angle is not None and log.load_angle is not None:
+    if log.kind == "drive" or (log.motor_angle is not None and log.load_angle is not None):
         checks += [_wrapped(log), mix_ups(log, drive_file)]
     # Numbers of any size may stand in a file; what overflows is no worse than what is merely wrong.
     with np.errstate(all="ignore"):
@@ -108,7 +108,7 @@ def _response(log: Log) -> Iterator[Finding]:
             name,
             "there is no response to fit, so check the column or record another log"
             if hopeless
-            else "unless that side was locked, the sensor is stuck and the dynamic error is wrong",
+            else "unless that side was locked, the sensor is stuck and what is fitted to it is wrong",
         )
 
 

@@ -28,18 +28,19 @@ def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     """What the signals of a drive log say against each other.
 
     Args:
-        log: A drive log. Outputs after `log.outputs_until` rows are not looked at.
+        log: A drive log, or one of both angles; a log of one side says nothing of the other. Outputs after
+            `log.outputs_until` rows are not looked at.
         drive_file: The drive that it was read with.
     """
-    assert log.motor_angle is not None
-    if len(log.motor_angle[: log.outputs_until]) < 4 * FEWEST:
+    if len(log.time[: log.outputs_until]) < 4 * FEWEST:
         return
-    found = list(_ratio(log, drive_file))
+    both = log.motor_angle is not None and log.load_angle is not None
+    found = list(_ratio(log, drive_file)) if both else []
     yield from found
     yield from _velocity(log, drive_file, "motor")
     yield from _velocity(log, drive_file, "load")
     # With a wrong ratio or side the sum of momenta says nothing new.
-    if not any(finding.severity == "refusal" for finding in found):
+    if both and not any(finding.severity == "refusal" for finding in found):
         yield from _momentum(log, drive_file)
 
 
@@ -139,7 +140,7 @@ def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
     """A logged velocity, integrated over the stamps, against the angle."""
     name, ratio = f"{side}_velocity", drive_file.reduction_ratio or 1.0
     angle, velocity = getattr(log, f"{side}_angle"), getattr(log, name)
-    if velocity is None or np.all(angle == angle[0]):
+    if velocity is None or angle is None or np.all(angle == angle[0]):
         return
     velocity = velocity[: log.outputs_until]
     known = np.isfinite(velocity)

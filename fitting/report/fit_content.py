@@ -9,8 +9,11 @@ from fitting.report.outputs import in_words
 from fitting.uncertainty.prediction_band import coverage
 from fitting.validation.frequency_response import (
     FrequencyResponse,
+    antiresonance_seen,
     coherent_band,
+    excites_antiresonance,
     excites_resonance,
+    is_blurred,
     resonance_seen,
     unexplained_band,
 )
@@ -133,6 +136,8 @@ def _response_dict(found: FrequencyResponse | None) -> dict[str, Any] | None:
     return {
         "resonance": found.resonance,
         "resonance_seen": resonance_seen(found),
+        "antiresonance": found.antiresonance,
+        "antiresonance_seen": antiresonance_seen(found),
         "excited": excites_resonance(found),
         "coherent_band": coherent_band(found),
         "unexplained_band": unexplained_band(found),
@@ -150,27 +155,34 @@ def _response_sentences(found: FrequencyResponse) -> list[str]:
         said.append(f"The {output} follows the {found.source} linearly from {_range(*band)} (coherence above 0.9).")
     else:
         said.append(f"Nowhere does the {output} follow the {found.source} linearly (coherence above 0.9).")
-    own, seen = _hertz(found.resonance), resonance_seen(found)
-    if not excites_resonance(found):
-        said.append(f"The log does not excite the model's resonance at {own}.")
-    elif seen is None:
-        said.append(f"The log reaches the model's resonance at {own}, but shows no clear peak there.")
-    elif abs(seen - found.resonance) <= max(_AGREES * found.resonance, found.resolution):
-        said.append(f"The resonance is seen at {_hertz(seen)}, where the model has it ({own}).")
-    else:
-        said.append(f"The resonance is seen at {_hertz(seen)}, but the model has it at {own}.")
+    own, seen = found.antiresonance, antiresonance_seen(found)
+    if own is not None:
+        said.append(_compared("antiresonance", "dip", own, seen, excites_antiresonance(found), found.resolution))
+    seen = resonance_seen(found)
+    said.append(_compared("resonance", "peak", found.resonance, seen, excites_resonance(found), found.resolution))
     lacking = unexplained_band(found)
     if lacking:
         said.append(
             f"From {_range(*lacking)} the {found.source} is strong and noise is small, but the coherence is low: "
             "nonlinearity, a disturbance, or an effect that the model lacks."
         )
-    if found.width < 2 * found.resolution:
+    if is_blurred(found, found.width):
         said.append(
             f"The lines lie {_hertz(found.resolution)} apart, too far for a resonance {_hertz(found.width)} wide: its "
             "peak looks lower than it is, and the coherence dips there."
         )
     return said
+
+
+def _compared(name: str, form: str, own: float, seen: float | None, excited: bool, resolution: float) -> str:
+    """A frequency of the model's beside what the log shows of it."""
+    if not excited:
+        return f"The log does not excite the model's {name} at {_hertz(own)}."
+    if seen is None:
+        return f"The log reaches the model's {name} at {_hertz(own)}, but shows no clear {form} there."
+    if abs(seen - own) <= max(_AGREES * own, resolution):
+        return f"The {name} is seen at {_hertz(seen)}, where the model has it ({_hertz(own)})."
+    return f"The {name} is seen at {_hertz(seen)}, but the model has it at {_hertz(own)}."
 
 
 def _range(low: float, high: float) -> str:

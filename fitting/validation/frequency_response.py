@@ -19,6 +19,7 @@ _AVERAGES = 8
 _SHORTEST, _LONGEST = 128, 1 << 15
 # How many times the drive as a whole integrates the torque into an output.
 _ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1, "load_velocity": 1}
+_OF_MOTOR = ("motor_angle", "motor_velocity")
 # Lines across the width of the resonance.
 _LINES = 8
 # Deviation of a sample from its place on the grid, as a share of the step, that is no matter.
@@ -30,6 +31,8 @@ HIGH_COHERENCE, LOW_COHERENCE = 0.9, 0.6
 _WORTH_A_WORD = 0.05
 # Above it there is no peak to see.
 _OVERDAMPED = 0.6
+# Lines to either side of a sharp peak that a Hann window mixes with it: its main lobe (Harris 1978).
+_LOBE = 2.0
 # Lines that a band may lack.
 _GAP = 3
 # Where a peak of the log counts as the model's, as a factor of frequency.
@@ -52,6 +55,8 @@ class FrequencyResponse(eqx.Module):
         source: what the input is called.
         output: what was measured, the model's principal output.
         order: how many times the drive as a whole integrates the torque into it.
+        antiresonance: frequency at which load and spring hold the motor still [Hz], where the output is the motor's
+            motion; else None.
     """
 
     frequency: Float[np.ndarray, " frequencies"]
@@ -66,6 +71,7 @@ class FrequencyResponse(eqx.Module):
     source: str = eqx.field(static=True)
     output: str = eqx.field(static=True, default="dynamic_error")
     order: int = eqx.field(static=True, default=0)
+    antiresonance: float | None = None
 
     @property
     def resolution(self) -> float:
@@ -126,6 +132,7 @@ def frequency_response(
         source="torque" if isinstance(model.drive, Drive) else "forcing",
         output=output,
         order=order,
+        antiresonance=_antiresonance(model, slope),
     )
 
 
@@ -157,6 +164,14 @@ def _mean_slope(model: Model, experiments: Sequence[Experiment]) -> float:
     x = np.concatenate([twist(Stretch(e, 0, len(e)), model) for e in experiments])
     hardening = max(1.0 + 3.0 * float(model.drive.alpha) * float(np.mean(x**2)), 0.0)
     return float(model.drive.omega_0) ** 2 * hardening
+
+
+def _antiresonance(model: Model, slope: float) -> float | None:
+    """Frequency at which the linearised load and spring hold the motor still [Hz]; None of another output."""
+    if model.measured[-1] not in _OF_MOTOR or not isinstance(model, TwoInertiaModel):
+        return None
+    drive = model.drive
+    return math.sqrt(slope * float(drive.K / drive.J_l)) / float(drive.omega_0) / (2 * math.pi)
 
 
 def _input_gain(model: Model) -> float:
@@ -206,20 +221,50 @@ def strong_lines(found: FrequencyResponse) -> np.ndarray:
 
 
 def excites_resonance(found: FrequencyResponse) -> bool:
-    """Whether the log holds the resonance: a line near it where the dynamic error follows the input."""
+    """Whether the log holds the resonance: a line near it where the output follows the input."""
     reach = max(found.width, 2.0 * found.resolution)
     near = np.abs(found.frequency - found.resonance) <= reach
     return bool(np.any(found.coherence[near] > LOW_COHERENCE))
 
 
+def excites_antiresonance(found: FrequencyResponse) -> bool:
+    """Whether the log holds the antiresonance: the motor follows the torque on both sides of it, though it hardly moves
+    there; not where the output has none."""
+    if found.antiresonance is None:
+        return False
+    octaves = np.log(found.frequency / found.antiresonance) / math.log(_NEAR)
+    coherent = octaves[found.coherence > HIGH_COHERENCE]
+    return bool(np.any(np.abs(coherent + 0.5) < 0.5) and np.any(np.abs(coherent - 0.5) < 0.5))
+
+
 def resonance_seen(found: FrequencyResponse) -> float | None:
     """Frequency of the measured peak [Hz] near the model's resonance; None where there is none to see."""
-    if not excites_resonance(found) or found.width > 2 * _OVERDAMPED * found.resonance:
+    return _extreme(found, found.resonance, found.width) if excites_resonance(found) else None
+
+
+def antiresonance_seen(found: FrequencyResponse) -> float | None:
+    """Frequency of the measured dip [Hz] near the model's antiresonance; None where there is none to see."""
+    if found.antiresonance is None or not excites_antiresonance(found):
+        return None
+    return _extreme(found, found.antiresonance, _antiresonance_width(found), dip=True)
+
+
+def _antiresonance_width(found: FrequencyResponse) -> float:
+    """Of the dip [Hz]: damping goes with the stiffness, as both act in the mesh."""
+    return found.width * ((found.antiresonance or 0.0) / found.resonance) ** 2
+
+
+def _extreme(found: FrequencyResponse, frequency: float, width: float, *, dip: bool = False) -> float | None:
+    """Frequency of the measured peak or dip [Hz] near one of the model's, which is so wide."""
+    if width > 2 * _OVERDAMPED * frequency:
         return None
     # A line beyond the excited ones is coherent by chance now and then; what holds the resonance is in one piece.
-    near = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / found.resonance)) < math.log(_NEAR))
-    band = min(_bands(near), key=lambda b: float(np.min(np.abs(found.frequency[b] - found.resonance))))
-    peak = int(band[np.argmax(np.abs(found.measured[band]) * found.frequency[band] ** found.order)])
+    near = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / frequency)) < math.log(_NEAR))
+    if not near.any():
+        return None
+    band = min(_bands(near), key=lambda b: float(np.min(np.abs(found.frequency[b] - frequency))))
+    size = np.abs(found.measured[band]) * found.frequency[band] ** found.order
+    peak = int(band[np.argmin(size) if dip else np.argmax(size)])
     return float(found.frequency[peak]) if band[0] < peak < band[-1] else None
 
 
@@ -233,9 +278,24 @@ def unexplained_band(found: FrequencyResponse) -> tuple[float, float] | None:
     where there are few such lines."""
     strong = strong_lines(found)
     lacking = strong & (found.coherence < LOW_COHERENCE) & (found.noise_coherence > HIGH_COHERENCE)
+    lacking &= ~_blurred(found)
     if np.sum(lacking) <= _WORTH_A_WORD * np.sum(strong):
         return None
     return _widest(found, lacking)
+
+
+def _blurred(found: FrequencyResponse) -> np.ndarray:
+    """Lines at which a peak or dip that the lines don't resolve lowers the coherence of any log."""
+    sharp = [(found.resonance, found.width)]
+    if found.antiresonance is not None:
+        sharp.append((found.antiresonance, _antiresonance_width(found)))
+    beside = [np.abs(found.frequency - f) <= _LOBE * found.resolution for f, width in sharp if is_blurred(found, width)]
+    return np.any([np.zeros(found.frequency.shape, dtype=bool), *beside], axis=0)
+
+
+def is_blurred(found: FrequencyResponse, width: float) -> bool:
+    """Whether lines lie too far apart for a peak or dip of this width [Hz]."""
+    return width < 2.0 * found.resolution
 
 
 def _widest(found: FrequencyResponse, chosen: np.ndarray) -> tuple[float, float] | None:

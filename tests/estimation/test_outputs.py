@@ -19,6 +19,7 @@ from fitting.estimation.problem import Segmentation
 from fitting.estimation.starting_values import starting_models
 from fitting.fit_drive import fit_only
 from fitting.report.content import report_dict
+from fitting.report.plots.gallery import fit_plots
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Drive, TwoInertiaModel
 from hdjax.drive import Prior
@@ -130,6 +131,16 @@ def test_reports_tell_each_output_in_its_unit():
         assert report["goodness"]["error_over_noise"][output.replace("_", " ")] == pytest.approx(1.0, rel=0.1)
     assert report["before"]["rmse"]["training"] == report["before"]["rmse_of_outputs"]["joint_torque"]["training"]
     assert "joint torque" in report["frequency_response"]["says"][0]
+
+
+def test_reports_of_the_motor_alone_tell_of_its_antiresonance():
+    stretches = stretches_of(JOINT, ("motor_angle",))
+    found = fit_only(model_of(stretches), {"zero-order": (stretches[0].experiment,)}, hold="zero-order")
+    response = report_dict(found)["frequency_response"]
+    assert response["antiresonance"] == pytest.approx(np.sqrt(JOINT.K / JOINT.J_l) / (2 * np.pi), rel=1e-3)
+    assert any("antiresonance" in sentence for sentence in response["says"])
+    (picture,) = (plot for plot in fit_plots(found, units={}) if plot.key == "frequency-response")
+    assert "antiresonance" in str(picture.figure["layout"]["annotations"])
 
 
 def test_a_joint_torque_is_that_of_the_mesh():

@@ -103,6 +103,16 @@ def test_excitation_and_promises_of_each_kind(motion: Motion):
         assert word in " ".join(told[name].told)
 
 
+def test_a_motor_that_turns_away_follows_its_torque(motion: Motion):
+    """The drift of a side that turns freely hides no response."""
+    columns = {"time": motion.time, "motor_torque": motion.motor_torque}
+    columns["motor_angle"] = motion.motor_angle + 300.0 * motion.time**2
+    found = fitting.inspect(columns)
+    (moved,) = found.excitations
+    assert moved.coherent is not None and moved.coherent[0] < 3.0
+    assert f"inside the band of the torque ({moved.band[0]:.3g} to" in " ".join(found.told)
+
+
 def test_the_same_excitation_twice_tells_no_less(motion: Motion):
     columns = SHAPES["symbols of papers"].columns(motion)
     once, twice = (fitting.inspect(logs).inspection.joint for logs in (columns, [columns, columns]))

@@ -277,6 +277,23 @@ def test_velocity_against_time_base(side: str, factor: float, severity: str | No
         only(findings, severity, f"{side}_velocity", word)
 
 
+@pytest.mark.parametrize(("factor", "severity"), [(1.0, None), (0.02, "warning"), (1e-3, "refusal")])
+def test_velocity_of_the_motor_alone_against_time_base(factor: float, severity: str | None) -> None:
+    log = drive_log()
+    motor, _ = angles(log)
+    alone = replace(log, load_angle=None, dynamic_error=None, motor_velocity=factor * np.gradient(motor, log.time))
+    findings = examine(alone, drive_file())
+    assert [finding.severity for finding in findings] == ([] if severity is None else [severity])
+
+
+def test_a_wrapped_angle_of_the_motor_alone_is_refused() -> None:
+    log = drive_log(swing=0.2)
+    motor, _ = angles(log)
+    wrapped = (motor + np.pi) % (2 * np.pi) - np.pi
+    (finding,) = examine(replace(log, motor_angle=wrapped, load_angle=None, dynamic_error=None), drive_file())
+    assert finding.severity == "refusal" and "wrapped" in finding.consequence
+
+
 def test_a_velocity_with_holes_over_a_gap() -> None:
     log = drive_log()
     motor, _ = angles(log)

@@ -10,13 +10,15 @@ import rig
 from fitting.estimation.experiment import Experiment, experiment_from_log
 from fitting.validation.frequency_response import (
     FrequencyResponse,
+    antiresonance_seen,
     coherent_band,
+    excites_antiresonance,
     excites_resonance,
     frequency_response,
     resonance_seen,
     unexplained_band,
 )
-from hdjax import Hold
+from hdjax import Drive, Hold, TwoInertiaModel
 
 MU, OMEGA_0, GAIN, STEP = 12.0, 200.0, 50.0, 1e-3
 F_0 = OMEGA_0 / (2 * np.pi)
@@ -194,3 +196,64 @@ def test_a_drive_is_excited_by_its_motor_torque():
     truth = 1 / (rig.N * rig.J_M) / (c * rig.K - omega**2)
     # The hold and the damping matter by (omega step)^2 and by zeta^2.
     assert abs(found.model[0]) == pytest.approx(truth, rel=1e-4)
+
+
+def motor_alone(torque: np.ndarray, *, B_sp: float = 0.4, noise: float = 1e-4) -> tuple[Experiment, TwoInertiaModel]:
+    """A log of the motor's angle of a linear drive, exact from sample to sample, and its model."""
+    N, J_m, J_l, K = 50.0, 4e-5, 0.2, 300.0
+    mesh = np.array([K / N, -K, B_sp / N, -B_sp])  # of the motor's and the load's angle, and of their rates
+    rates = np.zeros((5, 5))
+    rates[:2, 2:4] = np.eye(2)
+    rates[2, :4], rates[2, 4], rates[3, :4] = -mesh / N / J_m, 1.0 / J_m, mesh / J_l
+    whole = expm(rates * STEP)
+    across, pushed = whole[:4, :4], whole[:4, 4]
+    states = np.zeros((torque.size, 4))
+    for k in range(torque.size - 1):
+        states[k + 1] = across @ states[k] + pushed * torque[k]
+    angle = states[:, 0] + noise * np.random.default_rng(8).normal(size=torque.size)
+    log = rig.log_of_angles(angle, angle, torque, ratio=N, step=STEP, name="motor")
+    log = dataclasses.replace(log, load_angle=None, dynamic_error=None)
+    model = TwoInertiaModel(Drive(N=N, J_m=J_m, J_l=J_l, K=K, B_sp=B_sp), measured=("motor_angle",))
+    return experiment_from_log(log, hold="zero-order", N=N), model
+
+
+ANTIRESONANCE = np.sqrt(300.0 / 0.2) / (2 * np.pi)
+RESONANCE = ANTIRESONANCE * np.sqrt(1.0 + 0.2 / (50.0**2 * 4e-5))
+
+
+def test_the_motor_alone_shows_antiresonance_and_resonance():
+    experiment, model = motor_alone(rig.multisine(COUNT, STEP, rms=0.05, low=0.5, high=40.0, seed=1))
+    found = frequency_response(model, [experiment], hold="zero-order", noise=1e-4)
+    assert found is not None and found.output == "motor_angle"
+    assert found.antiresonance == pytest.approx(ANTIRESONANCE) and found.resonance == pytest.approx(RESONANCE)
+    assert antiresonance_seen(found) == pytest.approx(ANTIRESONANCE, abs=2 * found.resolution)
+    assert resonance_seen(found) == pytest.approx(RESONANCE, abs=2 * found.resolution)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.5, 0.6 * ANTIRESONANCE), (1.3 * ANTIRESONANCE, 40.0)])
+def test_a_torque_on_one_side_of_the_antiresonance_does_not_show_it(low: float, high: float):
+    experiment, model = motor_alone(rig.multisine(COUNT, STEP, rms=0.05, low=low, high=high, seed=2), noise=1e-3)
+    found = frequency_response(model, [experiment], hold="zero-order", noise=1e-3)
+    assert found is not None and coherent_band(found) is not None
+    assert not excites_antiresonance(found) and antiresonance_seen(found) is None
+
+
+@pytest.mark.parametrize("measured", ["load_velocity", "joint_torque", "dynamic_error"])
+def test_what_does_not_see_the_motor_has_no_antiresonance(measured: str):
+    experiment = rig.drive_experiment(8000, noise=0.0)
+    outputs = ("motor_turn", "dynamic_error") if measured == "dynamic_error" else ("motor_angle", measured)
+    model = dataclasses.replace(rig.drive_model(alpha=0.0), measured=outputs)
+    experiment = dataclasses.replace(experiment, outputs=outputs)
+    found = frequency_response(model, [experiment], hold="zero-order", noise=1e-9)
+    assert found is not None and found.antiresonance is None and not excites_antiresonance(found)
+
+
+def test_dips_and_peaks_that_the_lines_do_not_resolve_are_nothing_unexplained():
+    """A short log of little damping: leakage of the window lowers the coherence there."""
+    torque = rig.multisine(8000, STEP, rms=0.05, low=0.5, high=30.0, seed=3)
+    experiment, model = motor_alone(torque, B_sp=0.02)
+    found = frequency_response(model, [experiment], hold="zero-order", noise=1e-4)
+    assert found is not None and found.width < found.resolution
+    beside = np.abs(found.frequency - RESONANCE) < 2 * found.resolution
+    assert np.min(found.coherence[beside]) < 0.6
+    assert unexplained_band(found) is None

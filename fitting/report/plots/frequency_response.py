@@ -40,6 +40,10 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
     magnitudes = factor * np.abs(found.model[(found.frequency >= low) & (found.frequency <= high)])
     forcing = pretty_unit(units.get("forcing", "N m"))
     per = f"({forcing})" if " " in forcing or "/" in forcing else forcing
+    marks = [("natural frequency", found.resonance, "center")]
+    if found.antiresonance is not None:
+        # The two may lie close together.
+        marks = [("antiresonance", found.antiresonance, "right"), (*marks[0][:2], "left")]
     layout = {
         "xaxis": axis("frequency [Hz]", anchor="y3", **axis_scale(True, low, high))
         | {"range": [float(np.log10(low)), float(np.log10(high))]},
@@ -48,8 +52,8 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
         | {"range": [float(np.log10(np.min(magnitudes) / 3)), float(np.log10(np.max(magnitudes) * 3))]},
         "yaxis2": axis("phase [°]", domain=[0.3, 0.54], range=[-285, 105], tickvals=[-270, -180, -90, 0, 90]),
         "yaxis3": axis("coherence", domain=[0, 0.24], range=[0, 1.05]),
-        "shapes": [vertical_line(x=found.resonance)],
-        "annotations": [note("natural frequency", x=float(np.log10(found.resonance)))],
+        "shapes": [vertical_line(x=x) for _, x, _ in marks],
+        "annotations": [note(name, x=float(np.log10(x))) | {"xanchor": side} for name, x, side in marks],
     }
     output = in_words(found.output)
     return Plot(
@@ -74,7 +78,7 @@ def _shown(found: FrequencyResponse) -> np.ndarray:
 def _view(found: FrequencyResponse) -> tuple[float, float]:
     """Frequencies of the first view: what the input excites and the resonance, with some room."""
     excited = found.frequency[strong_lines(found)]
-    low = min(float(excited[0]), found.resonance) / _AROUND
+    low = min(float(excited[0]), found.antiresonance or found.resonance) / _AROUND
     high = max(float(excited[-1]), found.resonance) * _AROUND
     return max(low, float(found.frequency[0])), min(high, float(found.frequency[-1]))
 
