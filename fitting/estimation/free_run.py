@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.estimation.driven_load import twist
 from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch, cut
 from fitting.estimation.free_parameters import FreeParameters, free_parameters
 from fitting.estimation.problem import Segmentation, suggested_substeps
+from fitting.estimation.reach import Quantity, reach
 from fitting.estimation.residual import Problem, Unknowns
 from hdjax import Model, TwoInertiaModel
 
@@ -49,7 +49,7 @@ class FreeRun(eqx.Module):
         beside: the other outputs, predicted and measured, by their names in the log.
         weight: 1 for a sample whose measurement counts, 0 for the others; None where all count.
         output: name of the principal output.
-        largest_twist: [rad], measured, or what the model makes of what was measured.
+        reach: largest twist, speed and torque of the stretch, as in [`fitting.estimation.reach`][].
     """
 
     name: str = eqx.field(static=True)
@@ -59,7 +59,7 @@ class FreeRun(eqx.Module):
     beside: dict[str, Pair] | None = None
     weight: Float[np.ndarray, " n"] | None = None
     output: str = eqx.field(static=True, default="dynamic_error")
-    largest_twist: float = 0.0
+    reach: dict[Quantity, float] = eqx.field(default_factory=dict)
 
     @property
     def outputs(self) -> dict[str, Pair]:
@@ -150,7 +150,7 @@ def free_run(
                 beside=pairs,
                 weight=stretch.weight,
                 output=principal,
-                largest_twist=float(np.max(np.abs(twist(stretch, model)))),
+                reach=reach(stretch, model),
             )
         )
     return tuple(runs)

@@ -25,6 +25,8 @@ from fitting.report.steps import steps
 from fitting.report.summary import summary
 from fitting.report.unexplained import unexplained
 from fitting.report.unknown import unknown_dict
+from fitting.validation.extrapolation import extrapolations
+from hdjax import TwoInertiaModel
 
 SCHEMA = "hdjax-report/2"
 
@@ -74,6 +76,7 @@ def report_dict(
         },
         "before": account_dict(outcome.before, units, x_max, start=start),
         "after": after | {"effects": [effect_dict(f, outcome, units) for f in outcome.findings]},
+        "extrapolation": _extrapolation(outcome, units),
         "identifiability": identifiability_dict(outcome.after.identifiability, units),
         "steps": steps(outcome),
         "alternatives": alternatives(outcome),
@@ -100,6 +103,22 @@ def report_dict(
     report["meaning"] = [] if is_loop else meaning(report)
     report["cannot_tell"] = limits(report)
     return with_old_names(report)
+
+
+def _extrapolation(outcome: Outcome, units: Mapping[str, str]) -> list[dict[str, Any]]:
+    """In what test data go beyond the fitted data."""
+    twist, forcing = units["dynamic_error"], units["forcing"]
+    told = {
+        "twist": ("dynamic error", twist),
+        "speed": ("rate of the dynamic error", f"{twist}/s"),
+        "torque": ("forcing", forcing),
+    }
+    if isinstance(outcome.stored.model, TwoInertiaModel):
+        told = {"twist": ("twist", twist), "speed": ("motor speed", "rad/s"), "torque": ("torque", forcing)}
+    return [
+        {"quantity": told[one.quantity][0], "unit": told[one.quantity][1], "fitted": one.fitted, "test": one.test}
+        for one in extrapolations(outcome.after)
+    ]
 
 
 def _circumstances(outcome: Outcome) -> dict[str, Any]:

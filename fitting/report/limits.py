@@ -181,4 +181,4 @@ def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def largest_twist(outcome: Outcome) -> float:
     """The largest dynamic error on training data."""
-    return max(run.largest_twist for run in outcome.before.training)
+    return max(run.reach["twist"] for run in outcome.before.training)

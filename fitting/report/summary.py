@@ -16,7 +16,11 @@ _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight",
 
 
 def summary(report: Mapping[str, Any]) -> str:
-    """The decision in plain words."""
+    """The decision in plain words, and whether test data ask more of the model than was fitted."""
+    return _decision(report) + _extrapolating(report)
+
+
+def _decision(report: Mapping[str, Any]) -> str:
     _, unit, noise = principal(report)
     on = report["judged_on"]
     before, after = (report[stage]["rmse"][on] for stage in ("before", "after"))
@@ -65,6 +69,18 @@ def summary(report: Mapping[str, Any]) -> str:
         f"depends most on the {left['depends_on']} (which accounts for "
         f"{formatting.percent(left['explained_share'])} of it)."
     )
+
+
+def _extrapolating(report: Mapping[str, Any]) -> str:
+    """How far test data go beyond what was fitted; empty where they don't."""
+    beyond = [
+        f"{one['quantity']} up to {formatting.quantity(one['test'], one['unit'])} (fitted up to "
+        f"{formatting.quantity(one['fitted'], one['unit'], like=one['test'])})"
+        for one in report["extrapolation"]
+    ]
+    if not beyond:
+        return ""
+    return f" Test data go beyond what was fitted, so that the model extrapolates: {formatting.words(beyond)}."
 
 
 def _remembering(report: Mapping[str, Any]) -> str:

@@ -46,7 +46,7 @@ def write_logs(folder: Path, scrambled: bool, offset: float = 0.0) -> tuple[Path
 
 def without_test(found: dict) -> dict:
     """A report without what tells of test data, of the health of logs, and of the time that it took."""
-    kept = {k: v for k, v in found.items() if k not in ("health", "seconds", "summary")}
+    kept = {k: v for k, v in found.items() if k not in ("health", "seconds", "summary", "extrapolation")}
     for stage in ("before", "after"):
         for parts in (kept[stage]["rmse"], kept[stage]["rmse_motor_angle"], *kept[stage]["rmse_of_outputs"].values()):
             for part in ("test", "validation"):

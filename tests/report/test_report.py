@@ -423,6 +423,20 @@ def test_a_diverged_fit_has_a_report_too(fitted: FitOnly, tmp_path: Path):
     assert "diverged" in write_page(tmp_path, broken)
 
 
+@pytest.mark.parametrize("kind", ["fitted", "loop"])
+def test_a_speed_beyond_those_fitted_is_told(kind: str, request: pytest.FixtureRequest, tmp_path: Path):
+    outcome = request.getfixturevalue(kind)
+    side = "account" if kind == "fitted" else "after"
+    assert report_dict(outcome)["extrapolation"] == []
+    runs = [run.reach["speed"] for run in (*getattr(outcome, side).training, *getattr(outcome, side).selection)]
+    far = eqx.tree_at(lambda o: getattr(o, side).test[0].reach["speed"], outcome, 2.0 * max(runs))
+    found = report_dict(far)
+    expected = {"quantity": "motor speed", "unit": "rad/s", "fitted": max(runs), "test": 2.0 * max(runs)}
+    assert found["extrapolation"] == [pytest.approx(expected)]
+    assert "the model extrapolates: motor speed up to" in report_text(found).replace("\n      ", " ")
+    assert "the model extrapolates: motor speed up to" in write_page(tmp_path, far)
+
+
 def test_text_of_a_fit_is_aligned(fitted: FitOnly):
     found = report_dict(fitted, health=HEALTH)
     text = report_text(found)
