@@ -47,10 +47,7 @@ def fit_logs(
         found = fit(data, draws=seed, progress=progress)
         if stated is not None:
             found = found.with_next_experiment(stated, progress=progress)
-    nothing = (
-        "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
-    )
-    _show(found, out, *([nothing] if stated is not None and found.report["next_experiment"] is None else []))
+    _show(found, out, *([_NOTHING] if stated is not None and found.report["next_experiment"] is None else []))
 
 
 def close_loop_on_logs(
