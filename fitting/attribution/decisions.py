@@ -104,7 +104,7 @@ def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival
         The candidate, and the names of those that gain as much.
     """
     most = max(r.long_gain for r in rivals)
-    least = most - max(rules.least_gain, rules.same_gain * most)
+    least = most - max(rules.least_gain, rules.same_gain * abs(most))
     close = [r for r in rivals if r.long_gain >= least]
     first = min(close, key=lambda r: (not r.plausible, r.parameters, r.states, -r.gain))
     return first, tuple(r.name for r in close)

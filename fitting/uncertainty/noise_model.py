@@ -33,6 +33,8 @@ _LAGS = 20
 # Where the search for the sensors' noise begins: nine tenths of what short pieces tell (log odds); halves with and
 # without memory, one of five samples.
 _MOST_OF_IT, _HALF, _FIVE_SAMPLES = 2.2, np.log(0.5), 1.5
+# Share of that variance below which it does not fall: rounding would leave the filter's variances negative.
+_LEAST_OF_IT = 1e-6
 # Step of its differences, the slope of the likelihood at which it ends [nats a sample], and iterations at most: where
 # noise is what is left, it ends after ten.
 _STEP, _FLAT, _ITERATIONS = 1e-4, 1e-4, 15
@@ -153,11 +155,11 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
 
     def white(unknowns: np.ndarray) -> SensorNoise:
         nothing = np.zeros_like(unknowns)
-        return SensorNoise(known.combined, expit(unknowns), nothing, nothing)
+        return SensorNoise(known.combined, np.maximum(expit(unknowns), _LEAST_OF_IT), nothing, nothing)
 
     def with_memory(unknowns: np.ndarray) -> SensorNoise:
         fast, slow, odds = np.split(unknowns, 3, axis=-1)
-        return SensorNoise(known.combined, np.exp(fast), np.exp(slow), expit(odds))
+        return SensorNoise(known.combined, np.maximum(np.exp(fast), _LEAST_OF_IT), np.exp(slow), expit(odds))
 
     shares, sensors = _likeliest(steps, _first_shares(steps, known), white, np.full(count, _MOST_OF_IT))
     found = _judged(steps, shares, sensors)

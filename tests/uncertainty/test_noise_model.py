@@ -41,7 +41,13 @@ TWIST = float(np.hypot(SIZES[0] / rig.N, SIZES[1]))
 
 
 def noisy_experiment(
-    *, seed: int = 0, count: int = COUNT, std: float = STD, correlation: float | None = None, **physics: Any
+    *,
+    seed: int = 0,
+    count: int = COUNT,
+    std: float = STD,
+    correlation: float | None = None,
+    load: bool = True,
+    **physics: Any,
 ) -> Experiment:
     """A log whose torque was logged with noise, and where asked for whose encoders' noise has a memory."""
     acting = rig.drive_torque(count, seed=seed)
@@ -50,7 +56,8 @@ def noisy_experiment(
         motion[:, :2] += slow_noise(correlation, count) * SIZES
     log = rig.drive_log(motion, acting, seed=seed, noise=1.0 if correlation is None else 0.0)
     logged = acting + std * np.random.default_rng(seed + 7).normal(size=count)
-    return experiment_from_log(replace(log, motor_torque=logged), hold="zero-order", N=rig.N)
+    seen = replace(log, motor_torque=logged) if load else replace(log, motor_torque=logged, load_angle=None)
+    return experiment_from_log(seen, hold="zero-order", N=rig.N)
 
 
 def slow_noise(correlation: float, count: int) -> Float[np.ndarray, "samples encoders"]:
@@ -61,7 +68,7 @@ def slow_noise(correlation: float, count: int) -> Float[np.ndarray, "samples enc
 
 
 def fitted(experiment: Experiment) -> Fit:
-    model = rig.drive_model()
+    model = replace(rig.drive_model(), measured=experiment.outputs)
     return fit(model, whole([experiment]), base_paths(model), Segmentation(128))
 
 
@@ -81,6 +88,18 @@ def test_the_noise_is_that_of_the_log(noisy: Fit):
     assert found.size == pytest.approx(1.0, abs=0.05)
     assert found.predictable < 0.02 and found.sensors.memory(rig.STEP) is None
     assert noise_of_torque(found) == found.std
+
+
+def test_the_noise_is_known_from_the_motor_alone():
+    """The first state of the load, which no sensor shows, is free in each segment."""
+    found = left(fitted(noisy_experiment(load=False)))
+    assert is_noise(found) and found.sensors.memory(rig.STEP) is None
+    assert noise_of_torque(found) == pytest.approx(STD, rel=0.1)
+
+
+def test_noise_said_to_be_far_too_large_is_found_out(noisy: Fit):
+    found = noise_model(noisy, 1e5 * OUTPUTS, predictable=RULES.innovations)
+    assert found.std == pytest.approx(STD, rel=0.1) and np.isfinite(found.likelihood)
 
 
 @pytest.mark.parametrize("correlation, std", [(0.8, 0.0), (0.98, 0.0), (0.8, STD), (0.98, STD)])
