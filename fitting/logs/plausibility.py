@@ -28,8 +28,8 @@ def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     """Contradictions between the signals of a drive log.
 
     Args:
-        log: A drive log, or one of both angles; a log of one side says nothing of the other. Outputs after
-            `log.outputs_until` rows are not looked at.
+        log: A drive log, or one of both angles; a log of one side has no contradictions with the other. Outputs
+            after `log.outputs_until` rows are not used.
         drive_file: The drive that it was read with.
     """
     if len(log.time[: log.outputs_until]) < 4 * FEWEST:
@@ -91,7 +91,7 @@ def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
             "refusal",
             f"the load angle moves {abs(slope):.4g} times as far as the motor angle",
             where,
-            "the motor and load columns seem exchanged, so swap them in [columns]",
+            "the motor and load columns seem swapped, so exchange them in [columns]",
         )
         return
     if slope < 0:

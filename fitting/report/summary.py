@@ -16,7 +16,7 @@ _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight",
 
 
 def summary(report: Mapping[str, Any]) -> str:
-    """The decision in plain words, and whether test data ask more of the model than was fitted."""
+    """The decision in a few sentences, and the extrapolation of test data."""
     return _decision(report) + _extrapolating(report)
 
 
@@ -71,7 +71,7 @@ def _decision(report: Mapping[str, Any]) -> str:
 
 
 def _extrapolating(report: Mapping[str, Any]) -> str:
-    """How far test data go beyond what was fitted; empty where they don't."""
+    """A sentence on test data beyond the fitted range; empty without any."""
     beyond = [
         f"{one['quantity']} up to {formatting.quantity(one['test'], one['unit'])} (fitted up to "
         f"{formatting.quantity(one['fitted'], one['unit'], like=one['test'])})"
