@@ -6,7 +6,7 @@
     loop = fitting.close_loop(data)
     prediction = fitting.predict("report/model.json", other)
 
-The first use of a name loads JAX, which takes a second or two.
+The first use of a name imports JAX, which takes a second or two.
 """
 
 from importlib import import_module
@@ -63,7 +63,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # A command line answers `--help` without JAX.
+    # The command line shows `--help` without JAX.
     if name == "__version__":
         return import_module("importlib.metadata").version("hdjax")
     if name not in _HOME:

@@ -1,8 +1,8 @@
-"""Many logs, each of a drive of its own: one table of fits, whatever becomes of the single log.
+"""Fits of many logs of different drives, into one table.
 
-Logs are fitted side by side, in threads or on a cluster; logs of similar length share compiled programs. Each finished
-fit is kept in a file named after what it was made from, so that a run that was cut off goes on where it stopped, and a
-log that has changed since is fitted anew.
+Logs are fitted in parallel, in threads or on a cluster; logs of similar length share compiled programs. Each fit is
+stored in a file named by a hash of its inputs, so that an interrupted run is resumed, and a changed log is fitted
+again.
 """
 
 import hashlib
@@ -33,20 +33,20 @@ from hdjax.engine import one_thread
 
 State = Literal["fitted", "refused", "failed"]
 Row = dict[str, Any]
-# A drive file beside a log goes before the one that is given for all.
+# A drive file beside a log takes precedence over the common one.
 _OWN_DRIVE = "drive.toml"
 _FINISHED = "finished"
 
 
 def find_logs(folder: Path, *, apart_from: Path | None = None) -> tuple[Path, ...]:
-    """The log files below a folder, in order of their names; hidden files and folders are left out.
+    """The log files below a folder, in order of their names, without hidden files and folders.
 
     Args:
-        folder: where to look.
-        apart_from: a folder whose files are no logs: that of the results.
+        folder: to search.
+        apart_from: the folder of the results, which is skipped.
 
     Raises:
-        InputError: where there is none.
+        InputError: there is none.
     """
     found = []
     for path in sorted(folder.rglob("*")):
@@ -69,23 +69,23 @@ def fit_fleet(
     scheduler: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> pl.DataFrame:
-    """Fit the base model to each log below a folder on its own, and write `fleet.parquet`.
+    """Fit the base model to each log below a folder separately, and write `fleet.parquet`.
 
     Args:
-        folder: holds the logs.
-        drive: drive file of the logs; a `drive.toml` beside a log goes before it.
-        out: folder for the table and for what is needed to go on after an interruption.
+        folder: of the logs.
+        drive: drive file of the logs; a `drive.toml` beside a log takes precedence.
+        out: folder for the table and for files to resume an interrupted run.
         workers: processes of a cluster on this machine; 0 for threads of this process, one for each core.
-        scheduler: address of a Dask scheduler whose workers do it, in place of `workers`; logs and `out` must be
-            visible to them under the same paths.
-        progress: told how many of how many are done.
+        scheduler: address of a Dask scheduler, in place of `workers`; logs and `out` must have the same paths for its
+            workers.
+        progress: receives the counts of done and total.
 
     Returns:
-        A row for each log: what became of it, and for each parameter its value, standard error, 95 % interval and
-        what that is from, whether the log tells the parameter, and if not, why.
+        A row for each log: outcome, and for each parameter value, standard error, 95 % interval and its origin,
+        identifiability, and the reason if not identifiable.
 
     Raises:
-        InputError: where there are no logs, or no cluster.
+        InputError: there are no logs, or no cluster.
     """
     logs = find_logs(folder, apart_from=out)
     given = folder.absolute(), drive.absolute(), out.absolute()
@@ -109,7 +109,7 @@ def fit_fleet(
 
 
 def _in_threads(logs: Sequence[Path], given: tuple[Path, Path, Path]) -> Iterator[tuple[Path, Row]]:
-    # The first one alone: what it compiles serves the others.
+    # The first one alone: the others reuse its compiled programs.
     yield logs[0], _finished_row(*given, logs[0])
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         waiting = {pool.submit(_finished_row, *given, log): log for log in logs[1:]}
@@ -122,7 +122,7 @@ def _in_threads(logs: Sequence[Path], given: tuple[Path, Path, Path]) -> Iterato
 
 
 def _finished_row(folder: Path, drive: Path, out: Path, log: Path) -> Row:
-    """The row of a log, from an earlier run where it is the same log, drive file and program."""
+    """The row of a log, from an earlier run with the same log, drive file and program."""
     own = log.parent / _OWN_DRIVE
     drive = own if own.is_file() else drive
     name = str(log.relative_to(folder))
@@ -135,7 +135,7 @@ def _finished_row(folder: Path, drive: Path, out: Path, log: Path) -> Row:
         try:
             return json.loads(kept.read_text(encoding="utf-8")) | {"log": name, "drive": str(drive)}
         except ValueError:
-            # Spoilt from outside: made again below.
+            # Corrupt file: computed again below.
             pass
     row = _fit_one(log, name, drive)
     write_whole({kept: json.dumps(row, allow_nan=False)})
@@ -146,13 +146,13 @@ def _fit_one(log: Path, name: str, drive: Path) -> Row:
     begin = time.perf_counter()
     try:
         rig = read_rig([log], drive, other_holds=False)
-        # Fits run side by side, so each keeps to one device.
+        # Fits run in parallel, so each uses one device.
         with jax.default_device(jax.local_devices()[0]), one_thread():
             fitted = fit_only(rig.model, rig.experiments, test=rig.test, hold=rig.hold)
     except (InputError, DataError, SimulationError) as error:
         return _row(name, drive, "refused", str(error), seconds=time.perf_counter() - begin)
-    except Exception as error:  # one bad log never stops the others
-        reason = f"{log}: the fit broke off ({type(error).__name__}: {error}); please report this with the log"
+    except Exception as error:  # a failing log must not stop the others
+        reason = f"{log}: the fit failed ({type(error).__name__}: {error}); please report this with the log"
         return _row(name, drive, "failed", reason, seconds=time.perf_counter() - begin)
     return _row(name, drive, "fitted", "", seconds=time.perf_counter() - begin, **_figures(rig, fitted))
 
@@ -164,7 +164,7 @@ def _row(name: str, drive: Path, state: State, message: str, **figures: object) 
 
 
 def _figures(rig: Rig, fitted: FitOnly) -> Row:
-    """What the table tells of a fit."""
+    """Columns of the table for a fit."""
     log, account, goodness = rig.logs[0], fitted.account, fitted.goodness
     found: Row = {
         "kind": log.kind,
@@ -182,10 +182,10 @@ def _figures(rig: Rig, fitted: FitOnly) -> Row:
 
 
 def parameter_columns(account: Account, units: Mapping[str, str]) -> Row:
-    """What the table tells of each parameter.
+    """Columns of the table for each parameter.
 
     Args:
-        account: the fitted model's.
+        account: of the fitted model.
         units: of `dynamic_error` and, in a reduced log, of `forcing`.
     """
     found: Row = {}
@@ -205,7 +205,7 @@ def parameter_columns(account: Account, units: Mapping[str, str]) -> Row:
 
 
 def fleet_text(table: pl.DataFrame, names: Sequence[str] = ("K", "alpha", "B_sp", "mu", "omega_0", "gain")) -> str:
-    """What a terminal shows of a fleet: how the logs ended, the spread of each parameter, and every refusal."""
+    """Text of a fleet for a terminal: outcome of the logs, spread of each parameter, and every refusal."""
     counts = {state: int((table["state"] == state).sum()) for state in ("fitted", "refused", "failed")}
     lines = [f"{len(table)} logs: " + ", ".join(f"{n} {state}" for state, n in counts.items() if n)]
     shown = [n for n in names if n in table.columns and table[n].count()]

@@ -1,4 +1,4 @@
-"""Where the time went."""
+"""Timing of stages."""
 
 import time
 
@@ -11,7 +11,7 @@ class Clock:
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
-        """Note that a stage is over."""
+        """Record the time of a finished stage."""
         now = time.perf_counter()
         self.laps[name] = now - self._last
         self._last = now

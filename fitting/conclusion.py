@@ -1,4 +1,4 @@
-"""The conclusion: which model is trusted in the end, and what the data say of it."""
+"""The conclusion: the accepted model and the decision."""
 
 from dataclasses import replace
 
@@ -25,18 +25,18 @@ from hdjax import Hold
 
 
 class Conclusion(eqx.Module):
-    """What the data say in the end.
+    """The final decision and its evidence.
 
     Attributes:
-        outcome: the same in a word.
-        seen: what that rests on.
-        trusted: the model whose names are trusted.
-        unknown: what was learned beside them, or in the place of all.
-        fitted: the final model on training data, over horizons as long as it follows.
+        outcome: the decision.
+        seen: the evidence.
+        trusted: the model with the accepted names.
+        unknown: the term learned beside them, or in place of all.
+        fitted: the final model on training data, over the longest horizons that follow the logs.
         runs: its free runs along the selection data.
-        runs_at_first: those of the base model.
+        runs_at_first: free runs of the base model.
         noise: covariance of the measurement noise of the outputs.
-        left: noise of the sensors, with a memory, and of the torque, where what is left was taken for it.
+        left: noise of sensors and torque, where that explains the residual.
     """
 
     outcome: Outcome = eqx.field(static=True)
@@ -56,13 +56,13 @@ class Conclusion(eqx.Module):
 
 
 def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: MeasurementNoise) -> Conclusion:
-    """Ask of the trusted model what is still open, and conclude.
+    """Gather the remaining evidence for the accepted model, and decide.
 
     Args:
         base: the model without effects.
-        challenge: of the names that were found.
-        study: the data, and how they are cut.
-        noise: of the measured outputs, as far as fits were asked for it.
+        challenge: of the named effects.
+        study: the data and their segmentation.
+        noise: of the measured outputs, where it was estimated.
     """
     trusted, unknown = challenge.trusted, challenge.unknown
     covariance = noise.and_beside((trusted if unknown is None else unknown.trial).training).covariance
@@ -72,7 +72,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
         covariance = jnp.asarray(left.sensors.covariance)
     outcome, _ = conclude(seen)
     if outcome == "effect_found" and max(seen.excess) < RULES.excess:
-        # What the names leave is hardly more than noise.
+        # The residual with the names is hardly more than noise.
         unknown, seen = None, replace(seen, learned=False)
 
     def along_selection(fitted: Fit, hold: Hold) -> tuple[FreeRun, ...]:
@@ -88,7 +88,7 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
         seen = replace(seen, surprise=beyond)
         outcome, _ = conclude(seen)
         if outcome == "unexplained":
-            # What follows over long times may be learned in the place of names that do not.
+            # A learned term that follows long stretches may replace names that do not.
             instead = learn_supported(base, study)
             other = None if instead is None else long_fit(instead.trial.training)
             if instead is not None and other is not None:

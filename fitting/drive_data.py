@@ -1,4 +1,4 @@
-"""A drive file and its logs made ready: the base model, and the logs under each assumption about the torque."""
+"""Preparation of a drive file and its logs: the base model, and the logs under each hold of the torque."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,8 +20,8 @@ from hdjax import HOLDS, Drive, Hold, Model, ReducedDrive, ReducedModel, TwoIner
 from hdjax.drive import Prior
 
 WHY_NOT_QUASI_STATIC = (
-    "a quasi-static log holds nothing of the resonance, so that there is no motion to simulate; `hdjax fit` finds its "
-    "stiffness and hysteresis, and for the rest record a drive log with motor torque"
+    "a quasi-static log has no dynamics to simulate; `hdjax fit` finds its stiffness and hysteresis. For the rest, "
+    "record a drive log with motor torque"
 )
 
 
@@ -30,13 +30,12 @@ class Rig(eqx.Module):
 
     Attributes:
         name: of the drive.
-        model: base model; its stiffness and damping are placeholders until they are fitted.
-        hold: what the drive file says of the torque between samples, or None.
-        experiments: the logs' stretches between gaps, without test data, under each hold, or under the one stated
-            alone.
-        test: likewise of the test data.
+        model: base model; its stiffness and damping are placeholders.
+        hold: inter-sample behaviour of the torque in the drive file, or None.
+        experiments: the logs' stretches between gaps, without test data, under each hold, or the stated one only.
+        test: the same of the test data.
         logs: as fitted, without test data.
-        findings: what the health gate saw, by log.
+        findings: of the health check, by log.
         error_unit: unit of the dynamic error.
     """
 
@@ -53,17 +52,17 @@ class Rig(eqx.Module):
 def read_rig(
     log_paths: Sequence[Path], drive_path: Path, *, test: Sequence[Path] = (), other_holds: bool = True
 ) -> Rig:
-    """Read a drive file and logs, and refuse what can't be fitted.
+    """Read a drive file and logs, and refuse those that can't be fitted.
 
     Args:
         log_paths: of one drive.
         drive_path: its drive file.
-        test: logs of the same drive that are test data; where none is given, the end of each log is.
-        other_holds: whether the torque is wanted under other holds as well, where the drive file states one.
+        test: logs of the same drive that are test data; if none is given, the end of each log is.
+        other_holds: whether to include other holds where the drive file states one.
 
     Raises:
-        InputError: for a bad file, or logs of different kinds.
-        DataError: for logs that can't support a fit.
+        InputError: bad file, or logs of different kinds.
+        DataError: the logs can't support a fit.
     """
     drive_file = read_drive_file(drive_path)
     fitted, tested = read_logs([(p, None) for p in log_paths], drive_file, test=[(p, None) for p in test])
@@ -73,7 +72,7 @@ def read_rig(
 def rig_of(
     logs: tuple[Log, ...], drive_file: DriveFile, *, test: tuple[Log, ...] = (), other_holds: bool = True
 ) -> Rig:
-    """[`read_rig`][] for logs that have been read."""
+    """[`read_rig`][] for logs already read."""
     if logs[0].kind == "quasi-static":
         raise InputError(f"{logs[0].path}: {WHY_NOT_QUASI_STATIC}")
     stated = drive_file.torque_hold
@@ -87,7 +86,7 @@ def rig_of(
         findings[log.name] = examine(log, drive_file)
     fitted = tuple(known for known, _ in parts)
     tests = [whole_test_log(log, drive_file) for log in test] or [end for _, end in parts if end is not None]
-    # The end of a log goes on by its clock.
+    # The end of a log keeps its clock.
     starts = {log.name: float(log.time[0]) for log in (*fitted, *test)}
     return Rig(
         name=drive_file.name,
@@ -105,13 +104,13 @@ def rig_of(
 
 
 Source = tuple[Path, Any]
-"""A log: its path and None, or what messages call it and its table in memory."""
+"""A log: its path and None, or a name for messages and its table in memory."""
 
 
 def read_logs(
     logs: Sequence[Source], drive_file: DriveFile, *, test: Sequence[Source] = (), outputs_until: int | None = None
 ) -> tuple[tuple[Log, ...], tuple[Log, ...]]:
-    """Logs as they were recorded, and those that are test data; all of one kind, each with a name of its own.
+    """Raw logs to fit, and those of test data; all of one kind, with unique names.
 
     Args:
         logs: to be fitted.
@@ -120,7 +119,7 @@ def read_logs(
         outputs_until: see [`fitting.logs.log.read_log`][].
 
     Raises:
-        InputError: They are of several kinds, or a log is to be fitted and to be test data.
+        InputError: They are of several kinds, or a log is both fitted and test data.
     """
     fitted, tested = ({path.resolve() for path, table in own if table is None} for own in (logs, test))
     if fitted & tested:
@@ -131,7 +130,7 @@ def read_logs(
 
 
 def together(logs: Sequence[Log]) -> tuple[Log, ...]:
-    """Logs of one kind, each with a name of its own.
+    """Logs of one kind, with unique names.
 
     Raises:
         InputError: They are of several kinds.
@@ -139,24 +138,25 @@ def together(logs: Sequence[Log]) -> tuple[Log, ...]:
     kinds = sorted({log.kind for log in logs})
     if len(kinds) > 1:
         raise InputError(
-            f"{logs[0].path} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them apart"
+            f"{logs[0].path} and the other logs: {' and '.join(kinds)} logs can't be fitted together; run them "
+            "separately"
         )
     return _with_own_names(logs)
 
 
 def ready_log(path: Path, drive_file: DriveFile, *, outputs_until: int | None = None) -> Log:
-    """A log that was read, its wrong samples masked, and its dynamic error zeroed; arguments as in
-    [`fitting.logs.log.read_log`][]. The fit of a quasi-static log finds its zero itself."""
+    """Read a log, mask invalid samples, and zero its dynamic error; arguments as in [`fitting.logs.log.read_log`][].
+    The fit of a quasi-static log estimates its zero."""
     return ready(read_log(path, drive_file, outputs_until=outputs_until), drive_file)
 
 
 def ready(log: Log, drive_file: DriveFile) -> Log:
-    """A log as it was read, with its wrong samples masked and its dynamic error zeroed."""
+    """The log with invalid samples masked and its dynamic error zeroed."""
     return log if log.kind == "quasi-static" else zeroed(masked(log), drive_file)
 
 
 def base_model(drive_file: DriveFile, log: Log) -> Model:
-    """The model without effects that suits a log; stiffness and damping are placeholders."""
+    """The model without effects for a log; stiffness and damping are placeholders."""
     if log.kind == "reduced":
         return ReducedModel(ReducedDrive(mu=1.0, omega_0=1.0))
     known = {"J_m": drive_file.motor_inertia or 1.0, "J_l": drive_file.load_inertia or 1.0, "k_T": 1.0}
@@ -172,7 +172,7 @@ def experiments(log: Log, drive_file: DriveFile, hold: Hold) -> tuple[Experiment
 
 
 def _with_own_names(logs: Sequence[Log]) -> tuple[Log, ...]:
-    """Logs of the same name in several folders are told apart by their folder, and then by their number."""
+    """Logs of the same name are distinguished by their folder, and then by a number."""
     named: list[Log] = []
     for log in logs:
         alike = sum(log.path.stem == other.path.stem for other in logs) > 1

@@ -1,4 +1,4 @@
-"""The two ways in which a request to `fitting` is refused."""
+"""Errors for bad input and insufficient data."""
 
 
 class InputError(ValueError):
@@ -14,7 +14,7 @@ class InputError(ValueError):
 class DataError(ValueError):
     """Data that are well formed but cannot support the request; exit code 1.
 
-    The message is one sentence that names the file, what was seen, and the remedy.
+    The message is one sentence that names the file, the observation, and the remedy.
     """
 
     def __init__(self, message: object):
@@ -22,5 +22,5 @@ class DataError(ValueError):
 
 
 def _one_line(message: object) -> str:
-    """Names in logs and drive files may hold line ends and control characters; a message may not."""
+    """Replace line ends and control characters, which names in logs and drive files may contain."""
     return "".join(c if c.isprintable() else " " for c in " ".join(str(message).split()))

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and what may stand in them."""
+"""Atomic writing of files, and content for JSON."""
 
 import math
 import os
@@ -11,12 +11,12 @@ import numpy as np
 
 
 def write_whole(contents: Mapping[Path, str | bytes]) -> None:
-    """Write several files so that either all of them are whole or none was touched.
+    """Write several files so that either all are complete or none is changed.
 
-    Each is written beside its destination under a temporary name first; only when all are complete are they renamed.
+    Each is first written to a temporary file beside its destination; all are renamed when complete.
 
     Args:
-        contents: text or bytes by path; missing folders are made.
+        contents: text or bytes by path; missing folders are created.
     """
     waiting: list[tuple[str, Path]] = []
     try:
@@ -26,7 +26,7 @@ def write_whole(contents: Mapping[Path, str | bytes]) -> None:
             waiting.append((name, path))
             with os.fdopen(handle, "wb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
-            # mkstemp makes files that only the owner reads; a report is an ordinary file.
+            # mkstemp creates files that only the owner can read; a report is an ordinary file.
             os.chmod(name, 0o644)
         while waiting:
             name, path = waiting[0]
@@ -38,7 +38,7 @@ def write_whole(contents: Mapping[Path, str | bytes]) -> None:
 
 
 def finite(value: Any) -> Any:
-    """The same structure with None, null in JSON, in place of what is no finite number."""
+    """The same structure with None (null in JSON) in place of numbers that are not finite."""
     if isinstance(value, Mapping):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

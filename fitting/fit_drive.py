@@ -1,4 +1,4 @@
-"""A fit without a search for effects, with all that can be said of it."""
+"""A fit without a search for effects, with all its diagnostics."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from fitting.attribution.selection_round import Round
 from fitting.clock import Clock
-from fitting.estimation.base_fit import base_fit, is_held, told_by_load
+from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.free_parameters import with_priors
@@ -31,25 +31,25 @@ from hdjax import Hold, Model, TwoInertiaModel
 
 
 class FitOnly(eqx.Module):
-    """A fitted drive; stands in for a [`Loop`][] in reports.
+    """A fitted drive; takes the place of a [`Loop`][] in reports.
 
     Attributes:
-        account: the fitted model's.
-        start: the model that the fit started from.
+        account: of the fitted model.
+        start: the starting model.
         noise: covariance of the measurement noise of the outputs.
-        hold: what the torque does between samples, as used.
-        residual: diagnostics of what the model leaves over.
-        tests: of the same.
+        hold: inter-sample behaviour of the torque, as used.
+        residual: diagnostics of the residual.
+        tests: of the residual.
         goodness: figures of merit.
-        frequency_response: of the logs and of the model; None where the logs are too short for it.
-        bands: how well the free runs are known, along test data where there are any.
-        posterior: draws, where they were asked for.
-        seconds: where the time went.
-        by_load: whether K, alpha and B_sp are those of the load's own equation, see
-            [`fitting.estimation.motor_driven`][], since the motion does not follow from the torque.
-        by_friction: whether all parameters are those of a fit beside friction of the motor, see
-            [`fitting.estimation.beside_friction`][], for the same reason; the load was not seen.
-        assumed: where by load, what the load's equation was given of the inertia of which nothing was known.
+        frequency_response: of the logs and of the model; None where the logs are too short.
+        bands: prediction bands of the free runs, along test data where there are any.
+        posterior: draws, if requested.
+        seconds: time by stage.
+        by_load: whether K, alpha and B_sp are those of the load's equation, see [`fitting.estimation.motor_driven`][],
+            since the torque does not explain the motion.
+        by_friction: whether all parameters are those of a fit with friction of the motor, see
+            [`fitting.estimation.beside_friction`][], for the same reason, if the load was not measured.
+        assumed: value of an unknown inertia in the load's equation, if `by_load`.
     """
 
     account: Account
@@ -78,12 +78,12 @@ class FitOnly(eqx.Module):
 
     @property
     def before(self) -> Account:
-        """The one account that there is."""
+        """The account."""
         return self.account
 
     @property
     def after(self) -> Account:
-        """Likewise."""
+        """The account, as there is no second model."""
         return self.account
 
 
@@ -96,19 +96,19 @@ def fit_only(
     seed: int | None = None,
     progress: Progress = silent,
 ) -> FitOnly:
-    """Fit the base model to the logs of one drive and account for it; arguments as in [`fitting.loop.close_loop`][].
+    """Fit the base model to the logs of one drive, with all diagnostics; arguments as in [`fitting.loop.close_loop`][].
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
-        experiments: the same logs under each assumption about the torque between samples.
-        test: likewise of data that only the final figures look at.
-        hold: the assumption that the user states; where None, the one that suits the model best.
-        seed: of draws from the posterior; where None, none are made.
-        progress: told what is being done.
+        experiments: the same logs under each hold of the torque.
+        test: the same of test data, which only the final figures use.
+        hold: the stated hold; the best one if None.
+        seed: of draws from the posterior; None for no draws.
+        progress: receives messages.
 
     Raises:
-        DataError: where no oscillator fits the data.
-        ImportError: where draws are asked for and blackjax is not installed.
+        DataError: no oscillator fits the data.
+        ImportError: draws are requested and blackjax is not installed.
     """
     clock = Clock()
     progress("fitting the base model")
@@ -118,13 +118,13 @@ def fit_only(
     noise = measurement_noise(base).covariance
     clock.lap("measurement noise")
     progress("final fit over long horizons")
-    told_by = told_by_load(base)
-    by_friction = told_by is not None and not sees_twist(base.stretches)
-    base, assumed = (base, {}) if told_by is None or by_friction else _without_priors(base)
+    fixed_by = fit_behind_fixed_values(base)
+    by_friction = fixed_by is not None and not sees_twist(base.stretches)
+    base, assumed = (base, {}) if fixed_by is None or by_friction else _without_priors(base)
     found = base if is_held(base) else long_fit(base, must_explain=True)
     clock.lap("final fit")
     progress("free runs")
-    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True, told_by=told_by)
+    result = account(found, found.stretches, tests, noise=noise, halo=0, profiles=True, std_from=fixed_by)
     seen = found.stretches if not tests else tests
     bands = prediction_bands(found, result.uncertainty, seen, noise=noise, runs=result.judged)
     clock.lap("free runs and standard errors")
@@ -151,7 +151,7 @@ def fit_only(
         bands=bands,
         posterior=draws,
         seconds=clock.laps,
-        by_load=told_by is not None and not by_friction,
+        by_load=fixed_by is not None and not by_friction,
         by_friction=by_friction,
         assumed=assumed,
     )
@@ -163,8 +163,8 @@ def _base(
     test: Mapping[Hold, tuple[Experiment, ...]],
     hold: Hold | None,
 ) -> tuple[Hold, Fit, Mapping[Hold, tuple[Experiment, ...]], Mapping[Hold, tuple[Experiment, ...]]]:
-    """The base fit under the stated hold, or under the one that suits it best; and the data with the sample intervals
-    that it makes of those which rounded stamps leave open."""
+    """The base fit under the stated or the best hold; and the data with refined values of uncertain sample
+    intervals."""
     holds: list[Hold] = list(experiments) if hold is None else [hold]
     fits = {h: base_fit(model, whole(experiments[h])) for h in holds}
     hold = min(holds, key=lambda h: fits[h].objective)
@@ -176,8 +176,8 @@ def _base(
 
 
 def _without_priors(base: Fit) -> tuple[Fit, dict[str, float]]:
-    """A base fit whose motion does not follow from the torque, with inertias and torque constant held, which then don't
-    either; and what the load's equation was given of an inertia of which nothing was known."""
+    """A base fit whose torque does not explain the motion, with inertias and torque constant fixed, since they are not
+    identifiable then; and the value of an unknown inertia in the load's equation."""
     if not isinstance(base.model, TwoInertiaModel) or not base.model.drive.priors:
         return base, {}
     unknown = [p.path for p in base.model.drive.priors if np.isinf(p.tolerance) and p.path == "J_l"]

@@ -1,4 +1,4 @@
-"""Numbers and units as a reader wants them: sensible digits, prefixes, superscripts. SI stays inside."""
+"""Formatting of numbers and units: significant digits, prefixes, superscripts."""
 
 import math
 import re
@@ -7,35 +7,35 @@ from typing import Literal
 
 Place = Literal["drive", "mesh", "actuator"]
 Ends = Sequence[float | None]
-"""Lower and upper end of an interval; None where there is none."""
+"""Lower and upper end of an interval; None for an open end."""
 
 _MINUS, _NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
 _SUPERSCRIPT = str.maketrans("0123456789-n", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ⁿ")
 _LEAST_CHANCE = 1e-9
-# A prefix is put before these only; `m(N m/rad)` would be a puzzle.
+# Units that take a prefix; `m(N m/rad)` would be unclear.
 _PREFIXED = ("rad", "rad/s", "s", "m", "m/s", "V", "V/s", "A", "N", "N m", "Hz")
 _PREFIXES = {0: "", -3: "m", -6: "µ", -9: "n", -12: "p"}
 
 
 def pretty_unit(unit: str) -> str:
-    """A unit with superscripts; nothing for a pure number."""
+    """A unit with superscripts; empty for a pure number."""
     return "" if unit == "1" else superscripts(unit)
 
 
 def superscripts(text: str) -> str:
-    """Text whose whole powers are raised."""
+    """Text with integer powers as superscripts."""
     return re.sub(r"\^(-?[0-9n]+)(?![0-9.])", lambda m: m.group(1).translate(_SUPERSCRIPT), text)
 
 
 def scaled_unit(magnitude: float, unit: str) -> tuple[float, str]:
-    """The factor and unit in which numbers of about this magnitude read well.
+    """The factor and prefixed unit for numbers of about this magnitude.
 
     Args:
         magnitude: a typical or the largest absolute value, in `unit`.
         unit: SI unit.
 
     Returns:
-        What to multiply by, and the unit thereafter: `(1e6, "µrad")` for 3e-5 rad.
+        The factor, and the resulting unit: `(1e6, "µrad")` for 3e-5 rad.
     """
     if unit not in _PREFIXED or not math.isfinite(magnitude) or magnitude <= 0:
         return 1.0, pretty_unit(unit)
@@ -44,17 +44,17 @@ def scaled_unit(magnitude: float, unit: str) -> tuple[float, str]:
 
 
 def axis_label(name: str, unit: str) -> str:
-    """An axis label, with the unit in brackets where there is one."""
+    """An axis label, with the unit in brackets if any."""
     return f"{name} [{unit}]" if unit else name
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number to so many significant digits; an em dash where there is none."""
+    """A number to so many significant digits; an em dash for None."""
     if value is None or not math.isfinite(value):
         return "—"
     if value == 0:
         return "0"
-    # As rounded: 9.996e-4 is 0.00100, not 10.00 x 10^-4.
+    # After rounding: 9.996e-4 is 0.00100, not 10.00 x 10^-4.
     power = int(f"{value:.{digits - 1}e}".partition("e")[2])
     if -4 < power < 6:
         return _fixed(value, digits - 1 - power)
@@ -62,18 +62,18 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def plain(value: float | None, digits: int = 4) -> str:
-    """A number in plain characters, as programs write it; n/a where there is none."""
+    """A number in ASCII; n/a for None."""
     return "n/a" if value is None else f"{value:.{digits}g}"
 
 
 def quantity(value: float | None, unit: str, *, digits: int = 3, like: float | None = None) -> str:
-    """A number with its unit, prefixed where that reads well: `quantity(1.05e-6, "rad")` is "1.05 µrad".
+    """A number with its unit, prefixed if suitable: `quantity(1.05e-6, "rad")` is "1.05 µrad".
 
     Args:
-        value: in `unit`; None where it is not known.
+        value: in `unit`; None if unknown.
         unit: SI unit.
         digits: significant digits.
-        like: a number beside which this one is read, which chooses the prefix.
+        like: a number for comparison, which determines the prefix.
     """
     if value is None or not math.isfinite(value):
         return "—"
@@ -82,21 +82,21 @@ def quantity(value: float | None, unit: str, *, digits: int = 3, like: float | N
 
 
 def measured(value: float | None, std: float | None, unit: str) -> str:
-    """A value with its standard error, both to the digits that the error leaves: "17 432 ± 12 N m/rad"."""
+    """A value with its standard error, both to the digits justified by the error: "17 432 ± 12 N m/rad"."""
     if std is None or not math.isfinite(std) or std <= 0:
         return quantity(value, unit, digits=4)
     return _together((value,), std, unit, "{0} ± {1}")
 
 
 def interval(ends: Ends, std: float | None, unit: str) -> str:
-    """An interval, to the digits that the standard error leaves."""
+    """An interval, to the digits justified by the standard error."""
     if std is None or not math.isfinite(std) or std <= 0:
         return f"{quantity(ends[0], unit)} to {quantity(ends[1], unit)}"
     return _span(ends, std, unit)
 
 
 def in_factor(value: float | None, std: float | None, factor: float) -> str:
-    """[`measured`][] for a column whose head states the unit: "17 432 ± 12" in units of `1 / factor`."""
+    """[`measured`][] for a column whose header states the unit: "17 432 ± 12" in units of `1 / factor`."""
     if value is None or not math.isfinite(value):
         return "—"
     if std is None or not math.isfinite(std) or std <= 0:
@@ -105,7 +105,7 @@ def in_factor(value: float | None, std: float | None, factor: float) -> str:
 
 
 def interval_in_factor(ends: Ends, std: float | None, factor: float) -> str:
-    """[`interval`][] for a column whose head states the unit."""
+    """[`interval`][] for a column whose header states the unit."""
     if std is None or not math.isfinite(std) or std <= 0:
         return "—"
     return _span(ends, std, "1", factor)
@@ -117,7 +117,7 @@ def _span(ends: Ends, std: float, unit: str, factor: float | None = None) -> str
 
 
 def open_interval(ends: Ends) -> str:
-    """A pattern for the known ends of an interval: "{0} to {1}", or which one is missing."""
+    """A pattern for the known ends of an interval: "{0} to {1}", or a statement of the open end."""
     low, high = (e is not None for e in ends)
     if low and high:
         return "{0} to {1}"
@@ -125,7 +125,7 @@ def open_interval(ends: Ends) -> str:
 
 
 def value_in_factor(value: float | None, std: float | None, factor: float) -> str:
-    """A value alone for such a column, to the digits that the standard error leaves."""
+    """A value without error for such a column, to the digits justified by the standard error."""
     if value is None or std is None or not math.isfinite(std) or std <= 0:
         return number(None if value is None else factor * value, 4)
     return _together((value,), std, "1", "{0}", factor)
@@ -137,7 +137,7 @@ def percent(share: float | None) -> str:
         return "—"
     value = 100.0 * share
     if 99.0 < value < 100.0:
-        # So many decimals that the nines end.
+        # Enough decimals to show a digit other than nine.
         decimals = min(max(math.ceil(-math.log10(100.0 - value)), 0), 4)
         value = math.floor(value * 10**decimals) / 10**decimals
         return f"{_fixed(value, decimals)} %"
@@ -145,14 +145,14 @@ def percent(share: float | None) -> str:
 
 
 def smaller(share: float | None) -> str:
-    """How an error that is less by a share stands beside the other."""
+    """Comparison of an error that is smaller by a share."""
     if share is not None and share < 0:
         return f"{percent(-share)} larger"
     return f"{percent(share)} smaller"
 
 
 def p_value(chance: float | None) -> str:
-    """A p-value; below a billionth only that."""
+    """A p-value; below a billionth only that bound."""
     if chance is not None and chance < _LEAST_CHANCE:
         return "< 1e-9"
     return plain(chance, 2)
@@ -164,14 +164,14 @@ def words(names: list[str]) -> str:
 
 
 def in_log_units(unit: str, *, response: str, forcing: str, place: Place = "mesh") -> str:
-    """The unit of a parameter of a reduced drive, whose response and forcing have units of their own.
+    """The unit of a parameter of a reduced drive, whose response and forcing have arbitrary units.
 
     Args:
-        unit: as the parameter states it, for a drive in SI or with `[x]` and `[u]`.
+        unit: in the parameter's metadata, in SI or with `[x]` and `[u]`.
         response: unit of the dynamic error.
         forcing: unit of the forcing.
-        place: where it acts. In the mesh a twist stands for the response and a torque for its acceleration; at the
-            actuator a torque stands for the forcing; the drive's own radian is an angle.
+        place: where it acts. In the mesh a twist corresponds to the response and a torque to its acceleration; at the
+            actuator a torque corresponds to the forcing; a radian of the drive is an angle.
     """
     if "^-n" in unit:
         return unit.replace("rad", response)
@@ -224,7 +224,7 @@ def _spell(powers: dict[str, int]) -> str:
 
 
 def _fixed(value: float, decimals: int) -> str:
-    """Fixed point with a real minus sign and grouped thousands."""
+    """Fixed point with a typographic minus sign and grouped thousands."""
     rounded = round(value, decimals)
     text = f"{rounded:,.{max(decimals, 0)}f}"
     if abs(rounded) < 10_000:

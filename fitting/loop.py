@@ -1,4 +1,4 @@
-"""The whole story: fit, look at what is left over, find the effect behind it, put it inside the equations, refit."""
+"""The closed loop: fit, attribute the residual to an effect, add it to the equations, refit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from fitting.attribution.case_evidence import CaseEvidence
 from fitting.attribution.decisions import decide
 from fitting.attribution.effect_evidence import evidence
 from fitting.attribution.effect_search import Search, base_trial, refitted_without, search_effects
-from fitting.attribution.log_alignment import put_back, put_back_as, with_clocks_set
+from fitting.attribution.log_alignment import clock_shifts, with_clock_shifts, with_clocks_set
 from fitting.attribution.selection_round import Round
 from fitting.attribution.study import Study
 from fitting.attribution.support import noise_of_torque
@@ -44,23 +44,22 @@ def close_loop(
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
-        experiments: the same logs under each assumption about the torque between samples. The end of each selects the
-            model.
-        test: likewise of data that only the final figures look at; where there are none, no figures are claimed.
-        hold: the assumption that the user states; where None, the one that suits the base model best.
-        catalogue: forms to look for.
-        search: how they are searched for.
-        progress: told what is being done.
+        experiments: the same logs under each hold of the torque. The end of each is selection data.
+        test: the same of test data, which only the final figures use; without them there are no test figures.
+        hold: the stated hold; the best one for the base model if None.
+        catalogue: candidate forms.
+        search: settings of the search.
+        progress: receives messages.
 
     Returns:
         The outcome.
 
     Raises:
-        DataError: where no oscillator fits the data.
+        DataError: no oscillator fits the data.
     """
     need_double_precision()
     clock = Clock()
-    progress("finding starting values")
+    progress("computing starting values")
     base, read = base_trial(model, {h: split(e) for h, e in experiments.items()}, hold)
     factors = refined_intervals(base.training)
     if factors:
@@ -71,7 +70,7 @@ def close_loop(
     clock.lap("base fit")
     base, study = with_clocks_set(base, read)
     fitted = study.data[base.hold][0]
-    late = put_back(read.data[base.hold][0], fitted)
+    late = clock_shifts(read.data[base.hold][0], fitted)
     clock.lap("clocks")
     found = search_effects(base, study, max_effects=search.max_effects, catalogue=catalogue)
     clock.lap("attribution")
@@ -80,13 +79,13 @@ def close_loop(
     end = draw_conclusion(base, challenge, study, noise=found.noise)
     clock.lap("final fit")
     progress("free runs")
-    tests = put_back_as(late, {h: whole(e) for h, e in (test or {}).items()}, fitted)
+    tests = with_clock_shifts(late, {h: whole(e) for h, e in (test or {}).items()}, fitted)
     return _Closed(base, study, found, challenge, end).told(tests, late, clock)
 
 
 @dataclass(frozen=True)
 class _Closed:
-    """What each stage has come to."""
+    """Results of the stages."""
 
     base: Trial
     study: Study
@@ -95,7 +94,7 @@ class _Closed:
     end: Conclusion
 
     def told(self, tests: Mapping[Hold, tuple[Stretch, ...]], late: tuple[float, ...], clock: Clock) -> Loop:
-        """All that can be said of it."""
+        """The outcome with all diagnostics."""
         end, found, base, final = self.end, self.found, self.base, self.end.final
         case = CaseEvidence(tuple(this.evidence for this in found.rounds), self.challenge.seen, end.seen)
         before, after = self._accounts(tests)
@@ -133,7 +132,7 @@ class _Closed:
         )
 
     def _accounts(self, tests: Mapping[Hold, tuple[Stretch, ...]]) -> tuple[Account, Account]:
-        """The base model's and the final model's, each fitted to the data that selected it as well; the same where
+        """Accounts of the base model and the final model, each refitted to training and selection data; equal where
         nothing was found."""
         end = self.end
 
@@ -148,7 +147,7 @@ class _Closed:
         return accounted(self.base, self.base.training, end.runs_at_first), after
 
     def _findings(self, after: Account) -> tuple[Finding, ...]:
-        """The trusted effects with their final values, largest gain first; what was learned comes last."""
+        """The accepted effects with their final values, largest gain first; a learned term comes last."""
         end = self.end
         by_name = rms_error(end.runs) if end.unknown is None else self._rmse(end.trusted)
         rmse_without = {name: self._rmse(trial) for name, trial in self._without().items()}
@@ -160,7 +159,7 @@ class _Closed:
         return (*findings, Finding(effect, effect.name, effect.family, gain, end.unknown.p_value))
 
     def _without(self) -> dict[str, Trial]:
-        """The trusted model without each of its effects."""
+        """The accepted model without each of its effects."""
         base, named, trusted, without = self.base, self.found.named, self.end.trusted, self.found.without
         if trusted is named:
             return without
@@ -171,7 +170,7 @@ class _Closed:
         return {name: refitted_without([name], trusted, base, self.study) for name in kept}
 
     def _rmse(self, trial: Trial) -> float:
-        """Of a model's free runs along selection data."""
+        """Rms error of a model's free runs along selection data."""
         if trial is self.base:
             return rms_error(self.end.runs_at_first)
         stretches, halo = self.study.data[trial.hold][1], self.study.setting.halo
@@ -184,10 +183,10 @@ def _named_findings(
     """The accepted effects with their final values.
 
     Args:
-        rounds: every look at the catalogue.
+        rounds: of the search.
         final: the final model.
         rmse: error of its free runs on selection data.
-        rmse_without: likewise without each effect; those that were not kept are not in it.
+        rmse_without: the same without each effect that was kept.
     """
     effects = {e.name: e for e in final.effects}
     found = [

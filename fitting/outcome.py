@@ -1,4 +1,4 @@
-"""What closing the loop comes to."""
+"""Outcome of the closed loop."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -18,15 +18,15 @@ from hdjax.effects import Effect
 
 
 class Finding(eqx.Module):
-    """An effect that the data support.
+    """An accepted effect.
 
     Attributes:
-        effect: with fitted values; None where the finding is another hold of the torque.
+        effect: with fitted values; None for another hold of the torque.
         name: its form.
         family: its family.
-        gain: share of the free-run error on selection data that it removes, against the same model without it; of what
-            has a name, in the model before anything is learned beside it.
-        p_value: chance that the best of the catalogue would gain as much on noise.
+        gain: share of the free-run error on selection data that it removes, relative to the same model without it; for
+            named effects, without learned terms.
+        p_value: under the null distribution of the catalogue's best on noise.
     """
 
     effect: Effect | None
@@ -40,34 +40,34 @@ class Loop(eqx.Module):
     """The outcome of closing the loop.
 
     Attributes:
-        decision: what the data say.
-        checks: the rules as they were applied.
-        before: the base model's account.
-        after: the final model's account; the same where nothing was found.
-        findings: supported effects, largest gain first; what was learned comes last.
-        rounds: every look at the catalogue.
-        dropped: effects that a later one made superfluous.
-        doubted: effects that were found, but that a learned torque contradicts.
-        unknown: what was learned, where the catalogue does not explain what is missing, or not all of it.
-        case: what the decision rests on.
-        evidence: what each effect of the final model does, and what the data say of it.
+        decision: the conclusion.
+        checks: the applied rules.
+        before: account of the base model.
+        after: account of the final model; equal to `before` where nothing was found.
+        findings: accepted effects, largest gain first; a learned term comes last.
+        rounds: of the search.
+        dropped: accepted effects that a later one made superfluous.
+        doubted: effects that a learned torque contradicts.
+        unknown: learned term, where the catalogue does not explain all that is missing.
+        case: evidence for the decision.
+        evidence: contribution of each effect of the final model, and its estimate from the data.
         noise: covariance of the measurement noise of the outputs.
-        noise_memory: for how long [s] what is left over remembers itself, where it was taken for noise of the sensors
-            with a memory; None elsewhere.
-        torque_noise: standard deviation of the noise of a sample of the logged torque [N m], where that is what is
-            left; None elsewhere.
-        left: what short segments of the selection data leave of each output under the final model, over the
+        noise_memory: correlation time [s] of the residual, where it is attributed to coloured sensor noise; None
+            otherwise.
+        torque_noise: standard deviation of the noise of a torque sample [N m], where that explains the residual; None
+            otherwise.
+        left: residual of each output over short segments of the selection data with the final model, over the
             measurement noise.
-        residual_before: diagnostics of what the base model leaves over.
-        residual_after: likewise of the final model.
-        hold: what the torque does between samples, as used.
-        setting: how the logs were cut.
+        residual_before: diagnostics of the base model's residual.
+        residual_after: diagnostics of the final model's residual.
+        hold: inter-sample behaviour of the torque, as used.
+        setting: segmentation of the logs.
         after_substeps: solver steps in a sample interval of the final model.
         stretches: training and selection stretches.
-        surprise: how much farther off than they promised free runs of selection stretches are where effects were found
-            that do not explain them, and nothing was learned that does better; None elsewhere.
-        put_back: by how much the clock of each log was put back [s], so that a line is in phase.
-        seconds: where the time went.
+        surprise: error of free runs along selection stretches over their bands, where accepted effects do not explain
+            it and no learned term is better; None otherwise.
+        put_back: time offset subtracted from each log's clock [s], so that a line is in phase.
+        seconds: time by stage.
     """
 
     decision: Outcome = eqx.field(static=True)
@@ -102,6 +102,6 @@ class Loop(eqx.Module):
 
     @property
     def times_noise(self) -> float:
-        """What short segments of the selection data leave under the final model, over the measurement noise; of the
-        output where it is largest. Noise of the torque does not count."""
+        """Largest residual of an output over short segments of the selection data with the final model, over the
+        measurement noise. Torque noise does not count."""
         return 1.0 if self.torque_noise is not None else max(self.left)

@@ -1,4 +1,4 @@
-"""Who is told what is being done."""
+"""Progress messages."""
 
 from collections.abc import Callable
 
@@ -6,4 +6,4 @@ Progress = Callable[[str], None]
 
 
 def silent(message: str) -> None:
-    """Tell nobody."""
+    """Discard messages."""

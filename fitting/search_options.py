@@ -1,17 +1,16 @@
-"""How effects are searched for. Apart, so that a command line has it without loading JAX."""
+"""Settings of the search for effects. Separate, so that the command line needs no import of JAX."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How effects are searched for.
+    """Settings of the search for effects.
 
     Attributes:
-        max_effects: Effects to add at most.
-        seed: Of the surrogates behind the p-values.
-        thorough: Refit every form of the catalogue in each round, in place of those that a first-order look finds
-            likely (minutes).
+        max_effects: Most effects to add.
+        seed: Of the surrogates for p-values.
+        thorough: Refit every form of the catalogue in each round, not only those that screening finds likely (minutes).
     """
 
     max_effects: int = 3

@@ -1,4 +1,4 @@
-"""A fitted model on disk: `model.json`, what `hdjax predict` reads."""
+"""A fitted model on disk: `model.json`, as read by `hdjax predict`."""
 
 import itertools
 import json
@@ -33,17 +33,17 @@ from hdjax.parameters import as_scalar, own_parameters, own_value
 SCHEMA = "hdjax-model/1"
 
 _MOST_FUNCTIONS = 1000
-# What learned functions have beside their coefficients.
+# Data of learned functions in addition to their coefficients.
 _SHAPES: dict[type[Learned], str] = {LearnedFriction: "transition", LearnedPeriodic: "omega"}
 _WITH_PARAMETERS: dict[str, type[Effect]] = {**BY_NAME, **{form.name: form for form in LEARNED_WITH_MEMORY}}
 
 
 class StoredModel(eqx.Module):
-    """A model and what a free run needs beside it.
+    """A model with the settings of its free runs.
 
     Attributes:
         model: with fitted values.
-        hold: what the torque does between samples.
+        hold: inter-sample behaviour of the torque.
         substeps: solver steps in a sample interval.
         halo: intervals of torque before the start, for delays.
         noise: covariance of the measurement noise of the outputs.
@@ -59,8 +59,8 @@ class StoredModel(eqx.Module):
         """Simulate the drive under a sampled torque, from rest.
 
         Args:
-            torque: of the motor [N m], or the forcing of a reduced model; held between samples as in the logs.
-            times: stamps of the samples [s], rising; the motion is saved there.
+            torque: of the motor [N m], or the forcing of a reduced model; with the inter-sample behaviour of the logs.
+            times: stamps of the samples [s], rising; the motion is returned there.
         """
         forcing = sampled(np.asarray(times), np.asarray(torque), hold=self.hold)
         return simulate(self.model, forcing, jnp.asarray(times))
@@ -88,7 +88,7 @@ def read_model(path: str | Path) -> StoredModel:
     """Read a model.
 
     Raises:
-        InputError: where the file is missing or is not a model of this program.
+        InputError: the file is missing or not a model of this program.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -108,7 +108,7 @@ def _values(module: eqx.Module) -> dict[str, float]:
 
 
 def _prior(prior: Prior) -> dict[str, Any]:
-    """What was known of a parameter beforehand, as the file has it; no tolerance where that was nothing."""
+    """A parameter's prior in the file; no tolerance for a free one."""
     return {
         "path": prior.path,
         "value": prior.value,
@@ -124,7 +124,7 @@ def _priors(content: Any) -> tuple[Prior, ...]:
 
 
 def _learned_content(effect: Effect) -> dict[str, Any]:
-    """What a learned function has beside its coefficients."""
+    """Data of a learned function in addition to its coefficients."""
     if not isinstance(effect, Learned):
         return {}
     axes = [_axis_content(a) for a in effect.axes]
@@ -183,7 +183,7 @@ def _effect(content: Any) -> Effect:
 
 
 def _parts(axis: Axis) -> tuple[Axis, ...]:
-    """An axis and what is beside its sign."""
+    """An axis and its part beside the sign."""
     return (axis,) if not isinstance(axis, SignAxis) or axis.beside is None else (axis, *_parts(axis.beside))
 
 

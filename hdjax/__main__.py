@@ -3,6 +3,6 @@
 import sys
 from importlib.metadata import entry_points
 
-# By its name: the command line belongs to `fitting`, which this package does not import.
+# Loaded by name: the command line belongs to `fitting`, which this package does not import.
 (script,) = entry_points(group="console_scripts", name="hdjax")
 sys.exit(script.load()())

@@ -1,4 +1,4 @@
-"""Independent tasks on processes of this machine or of many, by Dask. A task that dies with its worker is redone."""
+"""Independent tasks on processes of this machine or of many, by Dask. A task whose worker fails is repeated."""
 
 import contextlib
 import pickle
@@ -11,25 +11,25 @@ from hdjax.extra import required
 
 _RETRIES = 3
 _EVERYWHERE = ("jax_enable_x64",)
-# What makes sense on this machine alone.
+# Arguments that apply to this machine only.
 _HERE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
 def on_cluster(
     function: Callable[..., Any], items: Sequence[Any], given: tuple, *, workers: int, scheduler: str | None
 ) -> Iterator[tuple[Any, Any]]:
-    """Call `function(*given, item)` for every item on a cluster; gives each item with its result, as they come.
+    """Call `function(*given, item)` for every item on a cluster; yields each item with its result when finished.
 
     Args:
-        function: a function of a module, whose tasks may be done more than once.
-        items: what differs between the tasks.
-        given: what they share.
-        workers: processes of a cluster on this machine, where there is no scheduler.
+        function: a function at module level, whose tasks may run more than once.
+        items: one argument per task.
+        given: common arguments.
+        workers: processes of a cluster on this machine, without a scheduler.
         scheduler: address of a cluster's scheduler. Its workers have this project installed.
 
     Raises:
-        ImportError: where Dask is not installed.
-        ValueError: where no scheduler answers.
+        ImportError: Dask is not installed.
+        ValueError: no scheduler answers.
     """
     distributed = required("distributed")
     names = _EVERYWHERE if scheduler else (*_EVERYWHERE, *_HERE)
@@ -52,7 +52,7 @@ def on_cluster(
             raise ValueError(f"no Dask scheduler answers at {address}") from error
         # Bytes: a worker must know the precision before it makes arrays of them.
         shared = client.scatter((pickle.dumps((function, given)), settings), broadcast=True)
-        # What is done is remembered by whoever keeps it, not by the scheduler: a later run must ask anew.
+        # The caller stores results, not the scheduler: a later run must compute again.
         futures = client.map(_on_worker, items, given=shared, pure=False, retries=_RETRIES)
         of = dict(zip((future.key for future in futures), items, strict=True))
         for future in distributed.as_completed(futures):
@@ -60,7 +60,7 @@ def on_cluster(
 
 
 def _on_worker(item: Any, given: tuple[bytes, dict[str, Any]]) -> Any:
-    """A worker's process is the task's own: JAX's settings are those of whoever asked."""
+    """Run a task in a worker's process, with the caller's JAX settings."""
     task, settings = given
     for name, value in settings.items():
         jax.config.update(name, value)

@@ -1,7 +1,7 @@
-"""Feedforward compensation of the dynamic error: the torque and the motor angle that a periodic error asks for.
+"""Feedforward compensation of a periodic dynamic error: torque and motor angle.
 
-The equations are solved backwards along one motor revolution: the motion that is wanted is prescribed, what the other
-coordinate must then do follows from the load's equation by harmonic balance, and the motor's equation gives the torque.
+The equations are inverted along one motor revolution: the desired motion is prescribed, the other coordinate follows
+from the load's equation by harmonic balance, and the motor's equation gives the torque.
 """
 
 from typing import Any, ClassVar, Literal
@@ -26,14 +26,14 @@ _SOLVED = 1e-9
 
 
 class Feedforward(eqx.Module):
-    """What the motor must do so that an error vanishes at constant speed.
+    """Motor angle and torque for which an error vanishes at constant speed.
 
     Attributes:
         speed: mean motor rate [rad/s].
         correction: of the motor angle, around `speed * t` [rad, motor side].
         torque: motor torque along that motion [N m].
-        dynamic_error: what is left of x = theta_m/N - theta_l [rad].
-        output_error: what is left of the load's distance from its mean rotation [rad].
+        dynamic_error: remaining x = theta_m/N - theta_l [rad].
+        output_error: remaining deviation of the load from its mean rotation [rad].
         converged: whether the equations were solved.
     """
 
@@ -64,32 +64,34 @@ def feedforward(
     Args:
         model: the drive with its kinematic error and other effects without memory.
         speed: mean motor rate [rad/s].
-        target: `"dynamic_error"`: x stands still, motor and load swing together. `"output"`: the load turns
+        target: `"dynamic_error"`: x is constant, motor and load oscillate together. `"output"`: the load turns
             uniformly, and the motor moves against the kinematic error.
         load_torque: constant torque on the load along +theta_l [N m].
         harmonics: of the motor revolution to keep.
         samples: of a revolution at which forces are evaluated; above twice the harmonics.
 
     Raises:
-        ValueError: where an effect has memory or turns with the output.
+        ValueError: an effect has memory or depends on the output angle.
     """
     for effect in model.effects:
         if effect.states or isinstance(effect, LoadSideEffect):
-            raise ValueError(f"`{effect.name}` has memory or turns with the output: no period of a motor revolution")
+            raise ValueError(
+                f"`{effect.name}` has memory or depends on the output angle: no period of a motor revolution"
+            )
     if samples <= 2 * harmonics:
         raise ValueError(f"`samples` must be above {2 * harmonics}, but is {samples}")
     speed, load_torque = as_scalar(speed), as_scalar(load_torque)
     drive = model.drive
 
     def motion(unknowns: Array, speed: Array) -> tuple[FourierSeries, FourierSeries]:
-        """x and the load's swing: the mean of x, then the cosines and sines of the coordinate that is not held."""
+        """x and the load's oscillation: the mean of x, then the cosines and sines of the free coordinate."""
         free = FourierSeries(speed, jnp.zeros(()), unknowns[1 : harmonics + 1], unknowns[harmonics + 1 :])
         held = FourierSeries(speed, jnp.zeros(()), jnp.zeros(harmonics), jnp.zeros(harmonics))
         x, swing = (held, free) if target == "dynamic_error" else (free, held)
         return FourierSeries(speed, unknowns[0], x.cosine, x.sine), swing
 
     def torques(model: TwoInertiaModel, x: FourierSeries, swing: FourierSeries, load_torque: Array) -> Array:
-        """By sample: what the load lacks, and what the motor must give [N m]."""
+        """By sample: residual torque on the load, and motor torque [N m]."""
         drive = model.drive
         t = jnp.arange(float(samples)) * (2 * np.pi / samples) / x.omega
         rates = [(s, s.derivative(), s.derivative().derivative()) for s in (x, swing)]
@@ -151,7 +153,7 @@ class MotorServo(MotorSideEffect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        """None: a servo is known to whoever closed the loop."""
+        """None: a servo is not a candidate effect."""
         return ()
 
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
@@ -159,11 +161,11 @@ class MotorServo(MotorSideEffect):
 
 
 class ServoTorque(eqx.Module):
-    """The part of a servo's motor torque that is a function of time: what the command asks for, and the feedforward.
+    """The part of a servo's motor torque that is a function of time: command and feedforward.
 
     Attributes:
         servo: its gains.
-        speed: mean motor rate that is commanded [rad/s].
+        speed: commanded mean motor rate [rad/s].
         correction: of the commanded motor angle, around `speed * t` [rad].
         feedforward: torque added to the servo's [N m].
     """
@@ -189,18 +191,18 @@ def run_at_speed(
     use: tuple[Literal["torque", "motor_angle"], ...] = ("torque", "motor_angle"),
     load_torque: ArrayLike = 0.0,
 ) -> Trajectory:
-    """Simulate a drive whose motor a servo turns at constant speed, with or without feedforward.
+    """Simulate a drive with a servo at constant speed, with or without feedforward.
 
-    The drive starts as if it had rotated rigidly; drop the transient before you compare.
+    The drive starts in rigid rotation; discard the transient before comparing.
 
     Args:
         plant: the true drive.
-        speed: motor rate that is commanded [rad/s].
-        times: where to save [s].
+        speed: commanded motor rate [rad/s].
+        times: of the saved states [s].
         servo: the motor's position servo.
         correction: from [`feedforward`][], of a model that may differ from the plant; none where not given.
-        use: whether the servo is given the corrected motor angle, the torque, or both. The torque alone helps where
-            the servo is soft (it holds against the motion that is wanted), the angle alone where it is stiff.
+        use: whether to use the corrected motor angle, the torque, or both. The torque alone suits a soft servo (which
+            opposes the desired motion), the angle alone a stiff one.
         load_torque: constant torque on the load along +theta_l [N m].
     """
     speed = as_scalar(speed)

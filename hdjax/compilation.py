@@ -1,4 +1,4 @@
-"""Programs of JAX that are compiled in a way of their own."""
+"""JAX programs with special compiler options."""
 
 import functools
 from collections.abc import Callable
@@ -15,17 +15,17 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _Tree = TypeVar("_Tree")
 
-# Programs are made for multiples of so many lanes.
+# Programs are compiled for multiples of this number of lanes.
 _LANES = 32
-# Compiling well takes longer than what it saves where there is little work.
+# Options for fast compilation, since optimisation takes longer than it saves for little work.
 _SMALL: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 def jit_with(
     function: Callable[_Arguments, _Result], compiler_options: dict[str, Any]
 ) -> Callable[_Arguments, _Result]:
-    """`eqx.filter_jit` with options of the compiler for processors; without them inside another program, which has
-    options of its own, and on other devices, whose compiler does not know them."""
+    """`eqx.filter_jit` with compiler options for CPUs; without them inside another program, which has its own, and on
+    other devices, which do not support them."""
     options: Any = {"compiler_options": compiler_options}
     outside, inside = eqx.filter_jit(function, **options), eqx.filter_jit(function)
 
@@ -37,28 +37,27 @@ def jit_with(
 
 
 def jit_small(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`eqx.filter_jit` for programs of so little work that they are rather compiled in no time than well."""
+    """`eqx.filter_jit` for programs of little work, compiled fast instead of optimised."""
     return jit_with(function, _SMALL)
 
 
 def is_traced(*trees: Any) -> bool:
-    """Whether trees are looked at from inside a program of JAX."""
+    """Whether trees contain tracers of a JAX program."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def library_of(*arrays: Any) -> Any:
-    """What to calculate with: JAX inside its programs; outside it would compile one for each operation and shape, so
-    there numpy."""
+    """The array library: JAX under tracing; numpy outside, where JAX would compile each operation and shape."""
     return jnp if any(isinstance(array, Tracer) for array in arrays) else np
 
 
 def some_at_a_time(program: Callable[..., Any], *arrays: Array | np.ndarray, most: int = _LANES) -> Any:
-    """What a program of JAX makes of lanes, so many at a time that data of all sizes share few programs.
+    """Apply a JAX program to lanes in batches of few sizes, so that data of all sizes share few compilations.
 
     Args:
         program: from arrays whose first axis is one of lanes to a tree of such arrays.
         arrays: of all lanes.
-        most: lanes at a time; of a program that is called often, calls cost more than programs.
+        most: lanes per batch; for a frequently called program, calls cost more than compilations.
     """
     count = len(arrays[0])
     if count <= _LANES:
@@ -70,5 +69,5 @@ def some_at_a_time(program: Callable[..., Any], *arrays: Array | np.ndarray, mos
 
 
 def on_host(tree: _Tree) -> _Tree:
-    """The same with numpy's arrays, outside programs of JAX."""
+    """The same with numpy arrays, outside JAX programs."""
     return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)

@@ -1,4 +1,4 @@
-"""The drive's own parameters: two inertias on a nonlinear, damped mesh, and what follows from them."""
+"""Parameters of a drive (two inertias and a nonlinear, damped mesh), and derived quantities."""
 
 from typing import NamedTuple
 
@@ -12,12 +12,12 @@ SEED = "seed document, Table 1"
 
 
 class Prior(NamedTuple):
-    """What is known beforehand of a parameter that is not known for sure.
+    """Prior of a parameter.
 
     Attributes:
         path: its symbol.
-        value: the likeliest [SI].
-        tolerance: standard deviation of its logarithm; infinite where nothing is known.
+        value: the most likely one [SI].
+        tolerance: standard deviation of its logarithm; infinite for a free parameter.
     """
 
     path: str
@@ -60,7 +60,7 @@ class Drive(eqx.Module):
 
     @property
     def stiffness(self) -> Scalar:
-        """What multiplies `f(x)` in the mesh torque: K [N m/rad]."""
+        """Factor of `f(x)` in the mesh torque: K [N m/rad]."""
         return self.K
 
     def mesh_torque(self, x: Array, v: Array) -> Array:
@@ -75,14 +75,14 @@ class Drive(eqx.Module):
         return self.k_T * T_m / (self.N * self.J_m) - T_l / self.J_l
 
     def reduced(self) -> "ReducedDrive":
-        """The single equation of the dynamic error that this drive obeys, forced by the motor torque."""
+        """The equation of this drive's dynamic error, forced by the motor torque."""
         return ReducedDrive(mu=self.mu, omega_0=self.omega_0, alpha=self.alpha, gain=self.k_T / (self.N * self.J_m))
 
 
 class ReducedDrive(eqx.Module):
     """The dynamic error's own equation, `x'' + mu x' + omega_0^2 (x + alpha x^3) = gain u(t)`.
 
-    Stands for a drive (or any Duffing oscillator) known only by a forcing `u` and a response `x`, in any units.
+    Represents a drive (or any Duffing oscillator) with a forcing `u` and a response `x`, in any units.
     """
 
     mu: Scalar = parameter(unit="1/s", doc="damping of the dynamic error", source="DESIGN eq. 2.1")
@@ -92,16 +92,16 @@ class ReducedDrive(eqx.Module):
 
     @property
     def c(self) -> float:
-        """What a unit of mesh torque takes off x'': one, since the torque is counted by that."""
+        """Deceleration of x by a unit of mesh torque: one, by definition of the torque."""
         return 1.0
 
     @property
     def stiffness(self) -> Scalar:
-        """What multiplies `f(x)`: omega_0^2 [1/s^2]."""
+        """Factor of `f(x)`: omega_0^2 [1/s^2]."""
         return self.omega_0**2
 
     def mesh_torque(self, x: Array, v: Array) -> Array:
-        """Restoring and damping acceleration [x/s^2], the reduced equation's stand-in for the mesh torque."""
+        """Restoring and damping acceleration [x/s^2], which takes the place of the mesh torque."""
         return self.stiffness * restoring(x, self.alpha) + self.mu * v
 
 

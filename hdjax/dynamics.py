@@ -30,7 +30,7 @@ from hdjax.signals import PiecewisePolynomial
 State = Float[Array, " states"]
 
 BOTH_ANGLES = ("motor_turn", "dynamic_error")
-"""What is seen of a drive with an encoder on either side."""
+"""Outputs of a drive with an encoder on either side."""
 
 JOINT_TORQUE = "joint_torque"
 OUTPUTS = {
@@ -42,7 +42,7 @@ OUTPUTS = {
     "load_velocity": "rad/s",
     JOINT_TORQUE: "N m",
 }
-"""What sensors may read, with its unit. `motor_turn` is theta_m/N, all else as DESIGN names it."""
+"""Possible outputs of sensors, with their units. `motor_turn` is theta_m/N, all else as DESIGN names it."""
 _Kind = TypeVar("_Kind", bound=Effect)
 
 
@@ -56,25 +56,25 @@ class Model(eqx.Module):
 
     @abc.abstractmethod
     def motion(self, state: State | Sequence[Array], conditions: Conditions = Conditions()) -> Motion:
-        """The motion that a state means, as the mesh sees it."""
+        """The motion of a state, at the mesh."""
 
     @abc.abstractmethod
     def component_rates(
         self, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions = Conditions()
     ) -> list[Array]:
-        """[`rates`][] of a state that is kept as separate numbers, which is how a vectorised program is fastest."""
+        """[`rates`][] of a state given as separate numbers, which is fastest in a vectorised program."""
 
     def rates(self, state: State, torque: Array, load_torque: Array, conditions: Conditions = Conditions()) -> State:
         """Time derivative of the state.
 
         Args:
             state: see `state_names`.
-            torque: motor torque [N m] that acts (or the forcing of a reduced drive).
+            torque: motor torque [N m] after actuator effects (or the forcing of a reduced drive).
             load_torque: torque on the load along +theta_l [N m]; ignored by a reduced drive.
-            conditions: time and temperature, for effects that ask for them.
+            conditions: time and temperature, for effects that need them.
 
         Raises:
-            ValueError: where an effect asks for what `conditions` lack.
+            ValueError: an effect needs a condition that is missing.
         """
         return jnp.stack(self.component_rates(tuple(state), torque, load_torque, conditions))
 
@@ -89,12 +89,11 @@ class Model(eqx.Module):
 
     @abc.abstractmethod
     def outputs(self, state: State) -> Float[Array, " outputs"]:
-        """What the sensors read: the quantities that `measured` names, of `OUTPUTS`; the last one is the principal
-        output, by which a fit is judged."""
+        """Outputs of the sensors: the quantities `measured`, of `OUTPUTS`; the last one is the principal output."""
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the state's entries; an effect's own states carry its name."""
+        """Names of the state's entries; hidden states contain their effect's name."""
         own = tuple(f"{e.name}.{s}" for e in self.effects for s in e.states)
         return self.motion_states + own
 
@@ -103,12 +102,12 @@ class Model(eqx.Module):
         return self.settled(jnp.asarray(np.zeros(len(self.motion_states))))
 
     def settled(self, motion_state: Float[Array, " motion_states"]) -> State:
-        """The state of a drive that has long moved like this: the effects' own states have followed."""
+        """The state with hidden states in steady state with the motion."""
         motion = self.motion(motion_state)
         return jnp.concatenate([motion_state, *(e.initial_state(motion) for e in self.effects if e.states)])
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
-        """The torque that acts, from the torque that was logged."""
+        """The torque after actuator effects, from the logged torque."""
         for effect in self._of(ActuatorEffect):
             logged = effect.actuate(logged)
         return logged
@@ -139,7 +138,7 @@ class Model(eqx.Module):
         return self._at(path)
 
     def _at(self, path: str) -> Any:
-        """What stands at a dotted path, which `eqx.tree_at` fills with placeholders."""
+        """The leaf at a dotted path, for `eqx.tree_at`, which inserts placeholders."""
         if "." not in path:
             return getattr(self.drive, path)
         name, field = path.split(".")
@@ -155,7 +154,7 @@ class Model(eqx.Module):
         return tuple(e for e in self.effects if isinstance(e, kind))
 
     def _own_states(self, state: Sequence[Array]) -> dict[str, Array]:
-        """Each effect's own states by its name."""
+        """Hidden states of each effect, by name."""
         start = len(self.motion_states)
         found = {}
         for effect in self.effects:
@@ -172,7 +171,7 @@ class Model(eqx.Module):
         return tau
 
     def _with_own_rates(self, motion: Motion, rates: list[Array], own: dict[str, Array]) -> list[Array]:
-        """The state's rate: the motion's, then those of the effects' own states."""
+        """The state's rate: that of the motion, then of the hidden states."""
         return rates + [r for e in self.effects if e.states for r in e.state_rates(motion, own[e.name])]
 
 
@@ -227,12 +226,12 @@ class TwoInertiaModel(Model):
 
     @property
     def _motor_inertia(self) -> Array:
-        """What the motor's own rate has of the drive's J_m."""
+        """The part of J_m that moves with the motor's rate."""
         return self.drive.J_m - self._inertia_taken(MotorSideEffect)
 
     @property
     def _load_inertia(self) -> Array:
-        """What the load's own rate has of the drive's J_l."""
+        """The part of J_l that moves with the load's rate."""
         return self.drive.J_l - self._inertia_taken(LoadSideEffect)
 
     def _inertia_taken(self, kind: type[ShaftEffect]) -> Array:
@@ -311,7 +310,7 @@ class ReducedModel(TwistModel):
 
 
 class MotorDrivenModel(TwistModel):
-    """The load behind the mesh where the motor's motion is given, whatever moves the motor.
+    """The load behind the mesh for a given motion of the motor.
 
         x'' = theta_m''/N - (tau + T_l)/J_l
 

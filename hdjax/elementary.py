@@ -1,6 +1,6 @@
 """Elementary functions in plain arithmetic, which XLA vectorises on a processor.
 
-Its own call a library lane by lane, which would be most of the time of a simulation.
+XLA's own functions call a library lane by lane, which would dominate the time of a simulation.
 """
 
 import functools
@@ -32,7 +32,7 @@ def cosine_and_sine(angle: Values) -> tuple[Values, Values]:
     return _by_arithmetic(angle)
 
 
-# Traced once for all that call it.
+# Traced once for all callers.
 @jax.jit
 def _by_arithmetic(angle: Values) -> tuple[Values, Values]:
     turns = jnp.round(angle * (2.0 / math.pi))

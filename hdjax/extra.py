@@ -1,4 +1,4 @@
-"""Libraries that only some users need, loaded where they are asked for."""
+"""Optional libraries, imported on demand."""
 
 import importlib
 from typing import Any
@@ -8,7 +8,7 @@ def required(name: str) -> Any:
     """A library of the extra `sweep`.
 
     Raises:
-        ImportError: where it is absent.
+        ImportError: it is not installed.
     """
     try:
         return importlib.import_module(name)

@@ -71,7 +71,7 @@ def random_phase_multisine(
         key: source of the phases.
 
     Raises:
-        ValueError: where no line falls between the two frequencies.
+        ValueError: no line is between the two frequencies.
     """
     line = 2 * jnp.pi / period
     first, last = int(jnp.ceil(omega_min / line)), int(jnp.floor(omega_max / line))

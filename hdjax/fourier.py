@@ -12,8 +12,8 @@ from hdjax.parameters import as_scalar
 class FourierSeries(eqx.Module):
     """`mean + sum_k cosine[k-1] cos(k omega t) + sine[k-1] sin(k omega t)`, k = 1 ... harmonics.
 
-    A torque or forcing where it is called with a time, and the steady-state series `sum_k B_k cos(k omega t + psi_k)`
-    of a response. Leading axes of `mean`, `cosine` and `sine` are coordinates.
+    A torque or forcing as a function of time, and the steady-state series `sum_k B_k cos(k omega t + psi_k)` of a
+    response. Leading axes of `mean`, `cosine` and `sine` are coordinates.
 
     Attributes:
         omega: fundamental angular frequency [rad/s].
@@ -61,18 +61,19 @@ class FourierSeries(eqx.Module):
         def of_one(mean: Array, cosine: Array, sine: Array) -> Array:
             wave = FourierSeries(1.0, mean, cosine, sine)
             samples = wave.values(8 * (self.harmonics + 1))
-            # From every sample: of two tops alike, the higher may lie further from its nearest sample.
+            # From every sample: of two similar maxima, the higher may be further from its nearest sample.
             t = jnp.arange(float(samples.size)) * (2 * jnp.pi / samples.size)
             slope = wave.derivative()
             curvature = slope.derivative()
-            # A top lies within a step of some sample. Where the bend vanishes Newton would leap to where a phase has
-            # no digits left, and the harmonics would no longer belong together.
+            # A maximum is within a step of a sample. With vanishing curvature Newton's method would diverge, and phases
+            # would lose all digits.
             step = 2 * jnp.pi / samples.size
             for _ in range(3):
                 bend = curvature(t)
                 leap = jnp.where(bend == 0.0, 0.0, slope(t) / jnp.where(bend == 0.0, 1.0, bend))
                 t = t - jnp.clip(leap, -step, step)
-            # The slope is zero there: how the instant moves does not matter. Newton may leave a flat top for a dip.
+            # The slope is zero there, so the instant's derivative does not matter. Newton's method may move from a flat
+            # maximum to a minimum.
             tops = jnp.concatenate([wave(jax.lax.stop_gradient(t)), samples])
             return jnp.max(jnp.abs(tops))
 
@@ -80,7 +81,7 @@ class FourierSeries(eqx.Module):
         return jax.vmap(of_one)(*flat).reshape(self.mean.shape)
 
     def padded(self, harmonics: int) -> "FourierSeries":
-        """The same function with zeros for the harmonics above, or cut after `harmonics`."""
+        """The same function, padded with zeros or truncated to `harmonics`."""
         missing = max(0, harmonics - self.harmonics)
         pad = [(0, 0)] * (self.cosine.ndim - 1) + [(0, missing)]
         cosine, sine = (jnp.pad(c, pad)[..., :harmonics] for c in (self.cosine, self.sine))

@@ -1,4 +1,4 @@
-"""Programs of many lanes: compiled for wide vectors, and shared among the devices of this machine."""
+"""Programs of many lanes: compiled for wide vectors, and distributed over the devices of this machine."""
 
 import functools
 from collections.abc import Callable
@@ -15,15 +15,15 @@ from hdjax.compilation import jit_small, jit_with
 _Tree = TypeVar("_Tree")
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
-# A Runge-Kutta step's stages then fit into the registers of a processor that has such: twice as fast.
+# The stages of a Runge-Kutta step then fit into wide registers: twice as fast.
 _WIDE: dict[str, Any] = {"xla_cpu_prefer_vector_width": 512}
-# With fewer lanes to each device, what the devices tell each other would take longer than what they save.
+# With fewer lanes per device, communication would take longer than it saves.
 _LEAST_LANES = 8
 
 
 def jit_lanes(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`eqx.filter_jit` for programs whose lanes [`hdjax.simulate.march`][] moves, compiled for wide vectors and shared
-    by the devices that hold their arrays."""
+    """`eqx.filter_jit` for programs with lanes of [`hdjax.simulate.march`][], compiled for wide vectors and distributed
+    over the devices of their arrays."""
     return _on_devices(function, jit_with(function, _WIDE))
 
 
@@ -44,8 +44,7 @@ def _on_devices(
 
 
 def _together(tree: _Tree) -> _Tree:
-    """The same arrays, all on the devices that share the lanes: where one of them was left behind, the program would
-    be compiled again."""
+    """The same arrays, all on the devices that share the lanes; otherwise the program would be compiled again."""
     mesh = next((a.sharding.mesh for a in jax.tree.leaves(tree) if _is_shared(a)), None)
     if mesh is None:
         return tree
@@ -62,12 +61,12 @@ def _is_shared(leaf: Any) -> bool:
 
 
 def on_one_device(tree: _Tree) -> _Tree:
-    """The same arrays for what is too little work to be shared."""
+    """The same arrays on one device, for little work."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)) if _is_shared(leaf) else leaf, tree)
 
 
 def placed_like(tree: _Tree, like: _Tree) -> _Tree:
-    """The same arrays, each where another tree has its own."""
+    """The same arrays, placed like those of another tree."""
 
     def placed(leaf: Any, other: Any) -> Any:
         return jax.device_put(np.asarray(leaf), other.sharding) if _is_shared(other) else leaf
@@ -76,14 +75,14 @@ def placed_like(tree: _Tree, like: _Tree) -> _Tree:
 
 
 def spread(tree: _Tree, lanes: int) -> _Tree:
-    """Share the lanes of arrays among the devices of this process; every other array is on each of them.
+    """Distribute the lanes of arrays over the devices of this process; other arrays are replicated.
 
-    Compiled programs follow where their arrays are. Everything stays where it is on one device, where the lanes are
-    few or can't be shared evenly, and where `jax.default_device` names a device.
+    Compiled programs follow their arrays. Nothing is distributed on a single device, for few lanes or an uneven number,
+    or if `jax.default_device` names a device.
 
     Args:
-        tree: arrays whose first axis is `lanes` long carry one lane a row.
-        lanes: how many there are.
+        tree: arrays with a first axis of length `lanes` have one lane per row.
+        lanes: their number.
     """
     if jax.config.jax_default_device is not None:  # pyright: ignore[reportAttributeAccessIssue]
         return tree
@@ -96,6 +95,6 @@ def spread(tree: _Tree, lanes: int) -> _Tree:
     shared, everywhere = NamedSharding(mesh, PartitionSpec("lanes")), NamedSharding(mesh, PartitionSpec())
     arrays, rest = eqx.partition(tree, eqx.is_array)
     places = jax.tree.map(lambda a: shared if a.ndim and a.shape[0] == lanes else everywhere, arrays)
-    # By way of the host: JAX would compile a program for each shape that it cuts.
+    # Via the host: JAX would compile a program for each shape of slices.
     hosts = jax.tree.map(np.asarray, arrays)
     return eqx.combine(jax.device_put(hosts, places), rest)

@@ -21,19 +21,19 @@ class Noise(eqx.Module):
 
     @abc.abstractmethod
     def start(self, key: PRNGKeyArray) -> Float[Array, " own"]:
-        """The noise's own states at the start, drawn from their stationary law."""
+        """The noise's states at the start, drawn from their stationary distribution."""
 
     @abc.abstractmethod
     def torques(self, own: Float[Array, " own"]) -> Float[Array, "2"]:
-        """The part of the torques that the own states hold [N m]."""
+        """The part of the torques given by the noise's states [N m]."""
 
     @abc.abstractmethod
     def rates(self, own: Float[Array, " own"]) -> Float[Array, " own"]:
-        """Time derivative of the own states without the random part."""
+        """Time derivative of the noise's states without the random part."""
 
     @abc.abstractmethod
     def diffusion(self, acceleration: Float[Array, "states 2"]) -> Float[Array, "all 2"]:
-        """What a unit of white noise on each channel does to the model's states and to the own states.
+        """Diffusion matrix: influence of unit white noise on each channel on the model's states and the noise's states.
 
         Args:
             acceleration: rate of the model's states per unit of torque on each channel.
@@ -41,7 +41,7 @@ class Noise(eqx.Module):
 
 
 class WhiteNoise(Noise):
-    """Torques without memory, `<w(t) w(t')> = S delta(t - t')`.
+    """White torque noise, `<w(t) w(t')> = S delta(t - t')`.
 
     S is the two-sided spectral density per hertz: a one-sided density, as most analysers show, is 2 S, and a
     two-sided one per rad/s is `S/(2 pi)`. Independent samples of variance `sigma^2`, each held for h, have
@@ -79,7 +79,8 @@ class WhiteNoise(Noise):
 
 
 class ColouredNoise(Noise):
-    """Torques that remember (Ornstein-Uhlenbeck), `<w(t) w(t')> = rms^2 exp(-|t - t'|/correlation_time)`.
+    """Exponentially correlated torque noise (Ornstein-Uhlenbeck), `<w(t) w(t')> = rms^2 exp(-|t -
+    t'|/correlation_time)`.
 
     White noise of intensity `2 rms^2 correlation_time` through a first-order lag; the torques are two more states.
     For a reduced drive the forcing's unit takes the place of N m.
@@ -97,7 +98,7 @@ class ColouredNoise(Noise):
 
     @property
     def white(self) -> WhiteNoise:
-        """What the noise is to a drive much slower than `correlation_time`."""
+        """Equivalent white noise for a drive much slower than `correlation_time`."""
         twice = 2.0 * self.correlation_time
         return WhiteNoise(intensity=twice * self.rms**2, load_intensity=twice * self.load_rms**2)
 
@@ -130,13 +131,13 @@ def _refuse_negative(name: str, value: Array) -> None:
 
 
 def root(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root whose slope at zero is zero, as without noise there is nothing to follow; no NaN below."""
+    """Square root with zero slope at zero and below, to avoid NaN without noise."""
     positive = x > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def _error_gains(drive: Drive | ReducedDrive) -> tuple[Array, Array]:
-    """What a unit of torque on motor and load adds to the forcing of the dynamic error, but for the sign."""
+    """Magnitude of the forcing of the dynamic error per unit of torque on motor and load."""
     if isinstance(drive, ReducedDrive):
         return drive.gain, jnp.zeros_like(drive.gain)
     return drive.k_T / (drive.N * drive.J_m), 1.0 / drive.J_l

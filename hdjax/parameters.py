@@ -1,4 +1,4 @@
-"""Physical parameters: fields that carry their unit, bounds and source, and have one dotted path everywhere."""
+"""Physical parameters: fields with unit, bounds and source, and one dotted path everywhere."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
-    # Numbers go in and arrays come out (a converter stands between), which a type checker can't follow.
+    # A converter turns numbers into arrays, which a type checker can't follow.
     Scalar = Any
 else:
     Scalar = Float[Array, ""]
@@ -21,16 +21,16 @@ Role = Literal["base", "strength", "shape"]
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
-    """What is known of a parameter apart from its value.
+    """Metadata of a parameter.
 
     Attributes:
         unit: SI unit as text, for instance `"N m/rad"`.
-        doc: one line that says what it is.
+        doc: its meaning in one line.
         source: paper, table or equation behind its law or magnitude; `"assumed"` where there is none.
-        bounds: open interval of values that make physical sense.
-        plausible: magnitudes that real drives show, lowest and highest; evidence for a reader, no bound of a fit.
-        role: `"base"` for the drive itself, `"strength"` for a parameter whose zero removes the effect,
-            `"shape"` for one that only shapes an effect that is there.
+        bounds: open interval of physical values.
+        plausible: range of magnitudes of real drives, for information; not a bound of a fit.
+        role: `"base"` for the drive itself, `"strength"` for a parameter whose zero removes the effect, `"shape"` for
+            other parameters of an effect.
     """
 
     unit: str
@@ -41,18 +41,18 @@ class ParameterInfo:
     role: Role
 
     def implausibly_large(self, value: float) -> bool:
-        """Whether the value's magnitude is above what real drives show. (A small one only is weak.)"""
+        """Whether the value's magnitude exceeds that of real drives. (A small value is a weak effect.)"""
         return abs(value) > self.plausible[1]
 
     @property
     def positive(self) -> bool:
-        """Whether only values above zero make sense."""
+        """Whether only positive values are physical."""
         return self.bounds[0] == 0.0
 
 
 def as_scalar(value: Any) -> Array:
     """Turn a number into a floating-point scalar array of JAX's default precision."""
-    # Arrays that are one stay as they are; from numbers by way of numpy, since JAX would compile a program for them.
+    # Suitable arrays are unchanged; numbers are converted by numpy, since JAX would compile a program.
     if isinstance(value, jax.Array) and value.dtype == np.dtype(jnp.result_type(float)):
         return value
     return jnp.asarray(np.asarray(value) if isinstance(value, float | int) else value, dtype=float)
@@ -76,13 +76,13 @@ def parameter(
     """Declare a field of an equinox module as a physical parameter.
 
     Args:
-        default: value where the user gives none.
+        default: default value.
         unit: SI unit as text.
-        doc: one line that says what it is.
-        source: where the law or the magnitude comes from.
-        bounds: open interval of sensible values; a lower bound of 0 makes the fitter work on its logarithm.
+        doc: its meaning in one line.
+        source: of the law or the magnitude.
+        bounds: open interval of physical values; with a lower bound of 0 the logarithm is fitted.
         role: see [`ParameterInfo`][].
-        several: whether the field holds any number of such parameters, which are then called `field_0`, `field_1`, ...
+        several: whether the field has any number of such parameters, named `field_0`, `field_1`, ... ...
 
     Returns:
         A dataclass field.

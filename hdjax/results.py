@@ -1,4 +1,4 @@
-"""Every way a simulation can end, each with its cause and its mend."""
+"""All endings of a simulation, with cause and remedy."""
 
 import enum
 
@@ -14,7 +14,7 @@ class Ending(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """What happened and what to do about it."""
+        """Cause and remedy."""
         return _MESSAGES[self]
 
 

@@ -1,9 +1,8 @@
-"""What dry friction does during one step of an explicit solver: rates slide on, come to rest and stay there, or turn
-back.
+"""Dry friction during one step of an explicit solver: sliding, stopping and sticking, or reversal.
 
-The friction's mean over the step comes from the step's start, where all else is taken to accelerate evenly through it
-(compare the time stepping of Moreau 1988, in which the friction of a step is what its end demands). What that leaves of
-a rate that should rest, the next step takes off.
+The friction's mean over the step is computed at the step's start, with all other accelerations constant (compare the
+time stepping of Moreau 1988, where it is determined by the step's end). A remaining rate that should be zero is removed
+by the next step.
 """
 
 import dataclasses
@@ -20,16 +19,17 @@ from hdjax.effects import Conditions, DryFriction, Rubbing
 from hdjax.elementary import exponential
 from hdjax.where import where
 
-# A straight line from -1 to 1 over so many corners leaves as much of the sign away as a hyperbolic tangent does.
+# Width of a linear ramp from -1 to 1, in corner rates, with the same integral deviation from the sign as a hyperbolic
+# tangent.
 _RAMP = 2.0 * math.log(2.0)
-# Where friction holds several rates, their signs are found one after the other, so many times.
+# Number of sweeps over the signs of several rates, found one after the other.
 _SWEEPS = 2
 
 
 def over_step(
     model: Model, state: Sequence[Array], torque: Array, load_torque: Array, conditions: Conditions, step: Array
 ) -> dict[str, Rubbing] | None:
-    """How dry friction acts in a drive during one step from here; None where it has none.
+    """Dry friction of a drive during one step from a state; None without any.
 
     Args:
         model: the equations.
@@ -37,12 +37,12 @@ def over_step(
         torque: likewise, as for [`hdjax.dynamics.Model.rates`][].
         load_torque: likewise.
         conditions: likewise.
-        step: how long it is [s].
+        step: its length [s].
     """
     dry = [effect for effect in model.effects if isinstance(effect, DryFriction)]
     if not dry:
         return None
-    # What is learned on the motor may depend on the torque that comes in there.
+    # A learned term on the motor may depend on the incoming torque.
     motion = model.motion(state, dataclasses.replace(conditions, T_m=torque))
     names = sorted({effect.opposes for effect in dry})
     against = [[effect for effect in dry if effect.opposes == name] for name in names]
@@ -56,7 +56,7 @@ def over_step(
     def rubbing(signs: Sequence[Array], turns: Sequence[Array]) -> dict[str, Rubbing]:
         return {n: Rubbing(sign, turn) for n, sign, turn in zip(names, signs, turns, strict=True)}
 
-    # What the rates would do without the friction: what they do with any, and that taken back.
+    # Rates without friction: computed with some friction, which is then subtracted.
     some = rubbing([jnp.zeros_like(level) for level in levels], own)
     slopes = model.component_rates(state, torque, load_torque, dataclasses.replace(conditions, rubbing=some))
     rates, accelerations = jax.jvp(
@@ -68,8 +68,8 @@ def over_step(
         step * acceleration + _total(move * torque for move, torque in zip(row, taken, strict=True))
         for acceleration, row in zip(accelerations, moved, strict=True)
     ]
-    # A rate that crosses its corner within a part of a step, too fast for the stages to see, takes the mean as well.
-    # Friction that drives has none.
+    # A rate that crosses zero within a fraction of a step, unresolved by the stages, also uses the mean. Friction with
+    # a negative coefficient has none.
     turns = [where(r > 0.0, jnp.hypot(r, change), r) for r, change in zip(own, changes, strict=True)]
     return rubbing(mean_signs(rates, changes, reaches, corners), turns)
 
@@ -85,9 +85,9 @@ def mean_signs(
     Args:
         rates: at the step's start [rad/s].
         changes: of each rate in the step, without the friction [rad/s].
-        reaches: by how much the friction against each rate (second index) lowers each rate (first index) in a step in
-            which it slides forwards [rad/s].
-        corners: rate over which each sign turns [rad/s].
+        reaches: decrease of each rate (first index) by the friction against each rate (second index) in a step of
+            forward sliding [rad/s].
+        corners: rate over which each sign reverses [rad/s].
     """
     signs = [jnp.zeros_like(rate) for rate in rates]
     each = range(len(signs))
@@ -99,14 +99,14 @@ def mean_signs(
 
 
 def _mean_sign(rate: Array, change: Array, reach: Array, corner: Array) -> Array:
-    """Of one rate, from its end, which has a closed form where the sign rises in a straight line, the ramp.
+    """The mean sign of one rate, from its end, which has a closed form for a linear ramp.
 
     In units of the step the rate obeys `rate' = change - reach clip(rate / ramp, -1, 1)`: a straight line outside the
     ramp, an exponential inside.
     """
     way = where(rate >= 0.0, 1.0, -1.0)
     rate, change = way * rate, way * change
-    # Where the friction does next to nothing, so does its sign.
+    # Where the friction is negligible, so is its sign.
     reach = jnp.maximum(reach, 1e-9 * (rate + jnp.abs(change)) + 1e-15)
     ramp = jnp.hypot(_RAMP * corner, 1e-3 * reach)
 

@@ -1,4 +1,4 @@
-"""Sampled signals between their samples: one polynomial per interval, whatever the hold."""
+"""Inter-sample behaviour of sampled signals: one polynomial per interval for every hold."""
 
 from collections.abc import Callable
 from typing import Literal, get_args
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hdjax.where import where
 
 DEGREE = 5
-"""Degree of the polynomial of an interval; 5 lets value, slope and curvature match at both of its ends."""
+"""Degree of the polynomial of an interval; 5 matches value, slope and curvature at both ends."""
 
 Hold = Literal["zero-order", "linear", "cubic", "band-limited"]
 """Inter-sample behaviour of a sampled input: constant, straight, a cubic spline, or a windowed sinc."""
@@ -45,12 +45,12 @@ class PiecewisePolynomial(eqx.Module):
     def delayed(self, delay: Array) -> "PiecewisePolynomial":
         """The signal `self(t - delay)` on the same knots.
 
-        A jump that the delay moves into the inside of an interval can't be kept by one polynomial. Each interval
-        gets the quintic with the same moments up to the fifth (the L2 projection), so that a smooth system sees
-        the same impulse, and the result is differentiable in the delay.
+        A jump that the delay moves inside an interval can't be represented by one polynomial. Each interval gets the
+        quintic with the same moments up to the fifth (the L2 projection). So a smooth system receives the same impulse,
+        and the result is differentiable by the delay.
 
         Args:
-            delay: how much later the signal arrives [s].
+            delay: of the signal [s].
         """
         start = self.knots[:-1] - delay
         width = jnp.diff(self.knots)
@@ -76,9 +76,9 @@ class PiecewisePolynomial(eqx.Module):
         return PiecewisePolynomial(self.knots, _powers(legendre, width))
 
     def lagged(self, lag: Array) -> "PiecewisePolynomial":
-        """The signal y of `lag y' + y = self`, settled at the first knot, on the same knots.
+        """The signal y of `lag y' + y = self`, in steady state at the first knot, on the same knots.
 
-        On each interval y is a polynomial and a decaying exponential; for the latter stands the quintic with the
+        On each interval y is a polynomial and a decaying exponential; the latter is replaced by the quintic with the
         same moments, see [`delayed`][].
 
         Args:
@@ -141,7 +141,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 _FINE_NODES, _FINE_WEIGHTS = np.polynomial.legendre.leggauss(16)
 _FAST = 12.0
 _NORMS = 2.0 * np.arange(DEGREE + 1) + 1.0
-# An interval that a delay has moved can lie on two pieces, or on three where the stamps jitter (by up to a third).
+# A delayed interval may overlap two pieces, or three with jittering stamps (by up to a third).
 _PIECES = 3
 # Rows: Legendre polynomials on [0, 1] in powers of the fraction of the interval.
 _LEGENDRE_TO_POWERS = np.array(
@@ -169,15 +169,15 @@ def sampled(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], *, h
     Args:
         time: sample stamps [s], rising.
         values: the samples.
-        hold: what the signal does between samples. `"zero-order"`: keeps the sample until the next one (a digital
-            drive's torque command); `"linear"`; `"cubic"`: a cubic spline; `"band-limited"`: the smooth signal
-            without content above half the sampling rate (anti-aliased analogue measurements), from a windowed sinc.
+        hold: inter-sample behaviour. `"zero-order"`: keeps the sample until the next one (a digital drive's torque
+            command); `"linear"`; `"cubic"`: a cubic spline; `"band-limited"`: the smooth signal without content above
+            half the sampling rate (anti-aliased analogue measurements), from a windowed sinc.
 
     Returns:
         The signal on `n` intervals; the last one has the median width.
 
     Raises:
-        ValueError: for an unknown hold.
+        ValueError: unknown hold.
     """
     if hold not in HOLDS:
         raise ValueError(f"`hold` must be one of {HOLDS}, but is {hold!r}")
@@ -206,7 +206,7 @@ def _linear(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _cubic(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
-    # Loaded here, and not by every command that has no use for it.
+    # Imported here: most commands do not need it.
     from scipy.interpolate import CubicSpline
 
     coefficients = np.zeros((values.size, DEGREE + 1))
@@ -225,7 +225,7 @@ def _band_limited(knots: np.ndarray, values: np.ndarray) -> np.ndarray:
     sign = np.where(n % 2 == 0, 1.0, -1.0)
     slope_filter = np.where(n == 0, 0.0, sign / away) * window
     curvature_filter = np.where(n == 0, -(np.pi**2) / 3, -2.0 * sign / away**2) * window
-    # A constant has no curvature: the window's truncation must not give it one.
+    # Corrects the window's truncation, so that a constant has no curvature.
     curvature_filter[reach] -= curvature_filter.sum()
     # Odd reflection keeps value and slope continuous where the record ends.
     extended = np.pad(values, reach, mode="reflect", reflect_type="odd")

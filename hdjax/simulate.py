@@ -1,7 +1,7 @@
 """Simulation of the equations of motion: by diffrax, and by a march in fixed steps for fits.
 
-Other integrators serve one purpose each: machine code for fits and sweeps (`hdjax.engine`), steady motions
-(`hdjax.response`), many lanes (`hdjax.sweep`) and random torque (`hdjax.stochastic`).
+Other integrators are specialised: machine code for fits and sweeps (`hdjax.engine`), steady motions (`hdjax.response`),
+many lanes (`hdjax.sweep`) and random torque (`hdjax.stochastic`).
 """
 
 import functools
@@ -30,7 +30,7 @@ class Trajectory(eqx.Module):
     Attributes:
         time: where the states were saved [s].
         states: states by row; names in `Model.state_names`.
-        outputs: what the encoders read, see `Model.outputs`.
+        outputs: of the sensors, see `Model.outputs`.
         ending: an [`Ending`][] as an integer.
     """
 
@@ -74,7 +74,7 @@ def simulate(
     Args:
         model: the equations.
         forcing: motor torque [N m] (or a reduced drive's forcing) as a function of time. Sampled signals come from
-            [`hdjax.sampled`][]; the solver is told where they jump.
+            [`hdjax.sampled`][]; the solver resolves their jumps.
         times: where to save [s], rising; the first is the start.
         initial_state: state at `times[0]`; at rest where not given.
 
@@ -87,17 +87,17 @@ def simulate(
         step_size: a fixed step [s]; adaptive where not given.
         rtol: relative tolerance of adaptive steps.
         atol: absolute tolerance of adaptive steps.
-        max_steps: where to give up.
+        max_steps: largest number of steps.
         adjoint: how to differentiate: diffrax's default is reverse mode, `diffrax.ForwardMode()` is forward.
         progress_meter: silent where not given; `diffrax.TqdmProgressMeter()` or `TextProgressMeter()` show progress.
-        throw: whether a simulation that did not reach its end raises. With False each lane of a vmap keeps its own
-            ending, and its states are finite up to where it failed.
+        throw: whether a simulation that did not reach its end raises an error. With False each lane of a vmap keeps its
+            ending, and its states are finite until it failed.
 
     Returns:
         The trajectory.
 
     Raises:
-        ValueError: where an effect acts on the logged torque, but the forcing is not a sampled signal.
+        ValueError: an effect acts on the logged torque, but the forcing is not a sampled signal.
         SimulationError: with the [`Ending`][] that names cause and mend.
     """
     require_sampled(model, forcing)
@@ -131,7 +131,7 @@ def require_sampled(model: Model, forcing: Callable[[Array], Array]) -> None:
 
 
 def raise_failure(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, if it reached its end; inside a transformation nothing is known yet."""
+    """The trajectory, if it reached its end; inside a transformation it is not checked."""
     if not isinstance(trajectory.ending, Tracer):
         worst = int(np.max(trajectory.ending))
         if worst != Ending.successful:
@@ -211,22 +211,22 @@ def march(
     intervals: Int[Array, ""] | None = None,
     temperature: PiecewisePolynomial | None = None,
 ) -> tuple[Float[Array, "n states"], State]:
-    """The lean path of the fit: fixed steps of an explicit Runge-Kutta solver from sample to sample.
+    """Simulate for a fit, by fixed steps of an explicit Runge-Kutta solver from sample to sample.
 
     Agrees with [`simulate`][] to the order of the solver; dry friction that turns within less than a step is taken over
-    the step (see [`hdjax.rubbing`][]). It steps by the solver's own tableau inside one scan, so that segments,
-    sensitivities and candidates are lanes of one program; it costs nothing per sample but the arithmetic. A signal's
-    polynomial belongs to one sample interval, so no step crosses a jump.
+    the step (see [`hdjax.rubbing`][]). It uses the solver's tableau inside one scan, so that segments, sensitivities
+    and candidates are lanes of one program, without overhead per sample. A signal's polynomial belongs to one sample
+    interval, so no step crosses a jump.
 
     Args:
         model: the equations.
-        torque: the torque that acts (after `Model.actuate`); its knots are the samples, and tell effects the time.
+        torque: torque after `Model.actuate`; its knots are the samples, and supply the time.
         load_torque: likewise on the load; zero where None.
         initial_state: state at the first knot.
         solver: an explicit Runge-Kutta solver of diffrax; its tableau is used.
         substeps: steps in each sample interval. An array is data, so that one compiled program serves any number.
-        intervals: in how many of the intervals, from the first on, the drive moves; in the others it stays where it is,
-            at next to no cost. Data, as `substeps`; all of them where None.
+        intervals: number of simulated intervals, from the first on; in the others the state is constant, at little
+            cost. Data, as `substeps`; all where None.
         temperature: of the drive [K] on the same knots; None where no effect depends on it.
 
     Returns:
@@ -248,7 +248,7 @@ def march(
             conditions = Conditions(knot + s, None if warmth is None else polynomial(warmth, s), rubbing)
             return polynomial(coefficients, s), load, conditions
 
-        # Compiled once and called by every stage: it would be traced again for each.
+        # Compiled once and called by every stage, to avoid repeated tracing.
         @jax.jit
         def rates_within(y, s, rubbing):
             return model.component_rates(y, *around(s, rubbing))
@@ -268,7 +268,7 @@ def march(
     load_coefficients, warmth = (None if s is None else s.coefficients for s in (load_torque, temperature))
     width = jnp.diff(torque.knots)
     inputs = (jnp.arange(width.size), torque.coefficients, load_coefficients, warmth, torque.knots[:-1], width)
-    # The state travels as separate numbers: under vmap each is one contiguous row of lanes.
+    # The state is carried as separate numbers: under vmap each is one contiguous row of lanes.
     end, states = jax.lax.scan(interval, tuple(initial_state), inputs)
     return jnp.stack(states, axis=-1), jnp.stack(end)
 

@@ -1,4 +1,4 @@
-"""The laws that a drive's motion under random torque obeys in the long run."""
+"""Stationary distributions of a drive's motion under random torque."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from hdjax.where import where
 
 
 class StationaryVariance(eqx.Module):
-    """Variances of a motion that noise and damping have brought into balance.
+    """Variances of a stationary motion under noise.
 
     Attributes:
         x: variance of the dynamic error [rad^2].
@@ -27,7 +27,7 @@ class StationaryVariance(eqx.Module):
 def stationary_density(
     drive: Drive | ReducedDrive, S: ArrayLike, x: Float[ArrayLike, "*shape"], v: Float[ArrayLike, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Probability density of dynamic error and rate under white noise, in the long run.
+    """Stationary probability density of dynamic error and rate under white noise.
 
         p(x, v) ~ exp(-2 mu H/S)        H = v^2/2 + omega_0^2 (x^2/2 + alpha x^4/4)
 
@@ -53,7 +53,7 @@ def stationary_density(
     """
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
     gibbs = _gibbs(drive, S, noiseless=False)
-    # Far out the density is zero long before its exponents overflow.
+    # Far out the density is zero before its exponents overflow.
     u = jnp.clip(x / (gibbs.sigma * jnp.sqrt(gibbs.harmonic)), -1e3, 1e3)
     rate = jnp.clip(v / (gibbs.sigma * gibbs.omega_0), -1e3, 1e3)
     nodes, width = _nodes()
@@ -63,7 +63,7 @@ def stationary_density(
 
 
 def stationary_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> StationaryVariance:
-    """Variances of dynamic error and rate under white noise, in the long run, exactly.
+    """Exact stationary variances of dynamic error and rate under white noise.
 
     For alpha = 0 they are `S/(2 mu omega_0^2)` and `S/(2 mu)`. Differentiable with respect to drive and S.
 
@@ -86,7 +86,7 @@ def stationary_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> Stationary
 
 
 def linearised_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> StationaryVariance:
-    """Variances under white noise by statistical linearisation: a Gaussian motion on the stiffness it sees on average.
+    """Variances under white noise by statistical linearisation: a Gaussian motion with the mean stiffness.
 
     The stiffness is `omega_0^2 (1 + 3 alpha <x^2>)`. The variance of v is exact; that of x is so for small
     `alpha <x^2>` and falls short by up to 15 % where the cubic term is all.
@@ -110,7 +110,7 @@ def linearised_variance(drive: Drive | ReducedDrive, S: ArrayLike) -> Stationary
 
 
 def coloured_variance(drive: Drive | ReducedDrive, rms: ArrayLike, correlation_time: ArrayLike) -> StationaryVariance:
-    """Variances under coloured noise of the drive's linear part, in the long run.
+    """Stationary variances of the drive's linear part under coloured noise.
 
     The Lyapunov equation of (x, v, w) gives, with `t_c` the correlation time,
 
@@ -125,7 +125,7 @@ def coloured_variance(drive: Drive | ReducedDrive, rms: ArrayLike, correlation_t
 
     Raises:
         ValueError: for an alpha that is not zero, or without damping or stiffness. Inside a transformation, which knows
-            no values, alpha is not looked at, and the variances are infinite without damping or stiffness.
+            no values, alpha is not checked, and the variances are infinite without damping or stiffness.
     """
     if not isinstance(drive.alpha, Tracer) and drive.alpha != 0.0:
         raise ValueError(f"`drive.alpha` must be zero for a closed form, but is {drive.alpha}")

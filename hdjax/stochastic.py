@@ -1,4 +1,4 @@
-"""Drives under random torque, simulated."""
+"""Simulation of drives under random torque."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -23,14 +23,13 @@ _AdditiveCoeffs: Any = type(dfx.ShARK.tableau.coeffs_w)
 
 
 class AdditiveRK4(dfx.AbstractSRK, dfx.AbstractStratonovichSolver):
-    """The classical fourth-order Runge-Kutta method, made stochastic for additive noise.
+    """The classical fourth-order Runge-Kutta method, extended to additive noise.
 
-    A lightly damped drive needs it. The energy that noise feeds in leaves at the small rate mu, so a solver's own
-    gain or loss of energy must be smaller still. With `z = omega_0 h`, a step h of diffrax's two-stage ShARK and SRA1
-    raises the energy at the rate `omega_0 z^3/4` (above mu for a damping ratio of 5e-4 and z = 0.16, where a stationary
-    motion then grows for ever); RK4 lowers it at `omega_0 z^5/72`. diffrax's Langevin solvers (ALIGN,
-    ShOULD, QUICSORT) assume a damping `gamma v` and a force of x alone: no forcing in time, no friction or hidden state
-    of an effect, no coloured noise.
+    A lightly damped drive needs it. The energy of the noise is dissipated at the small rate mu, so a solver's energy
+    error must be smaller. With `z = omega_0 h`, a step h of diffrax's two-stage ShARK and SRA1 raises the energy at the
+    rate `omega_0 z^3/4` (above mu for a damping ratio of 5e-4 and z = 0.16, where a stationary motion then grows for
+    ever); RK4 lowers it at `omega_0 z^5/72`. diffrax's Langevin solvers (ALIGN, ShOULD, QUICSORT) assume a damping
+    `gamma v` and a force of x alone: no forcing in time, no friction or hidden state of an effect, no coloured noise.
 
     Stage i evaluates the drift at `y + h sum_j a_ij f_j + g (u_i W + H)`, W and H being the step's increment and
     space-time Levy area, with `u = (0, 1/2 + s, 1/2 - s, 1)` and `s^2 = 1/8`. That makes
@@ -107,7 +106,7 @@ def simulate_noisy(
 ) -> Trajectory:
     """Simulate a drive under a torque that is partly random.
 
-    Many motions come from `jax.vmap` over keys. The same key and steps give the same motion.
+    Use `jax.vmap` over keys for many motions. The same key and steps give the same motion.
 
     Args:
         model: the equations, with all effects.
@@ -171,7 +170,7 @@ def _simulate_noisy(
 ) -> Trajectory:
     torque = model.actuate(forcing) if isinstance(forcing, PiecewisePolynomial) else forcing
     start_key, path_key = jax.random.split(key)
-    # Torque enters the accelerations linearly and whatever the state, so any state shows how.
+    # Torque enters the accelerations linearly and independently of the state, so any state will do.
     acceleration = jax.jacfwd(lambda u: model.rates(model.rest(), u[0], u[1], Conditions(time=times[0])))(jnp.zeros(2))
     fractions = jnp.arange(substeps, dtype=times.dtype) / substeps
     steps = times[:-1, None] + jnp.diff(times)[:, None] * fractions[None, :]

@@ -1,4 +1,4 @@
-"""Stiffness and damping of a mesh that warms up."""
+"""Temperature dependence of mesh stiffness and damping."""
 
 from typing import TypeVar
 
@@ -102,11 +102,11 @@ class ResonanceDrift(eqx.Module):
 def resonance_drift(
     drive: _Drive, law: TemperatureLaw, temperatures: Float[ArrayLike, " n"], *, forcing: ArrayLike
 ) -> ResonanceDrift:
-    """How the resonance of a drive moves with temperature.
+    """Change of a drive's resonance with temperature.
 
     Args:
         drive: the drive at the law's reference temperature.
-        law: what changes.
+        law: of stiffness and damping.
         temperatures: T [K].
         forcing: amplitude A of the harmonic forcing of the dynamic error [rad/s^2], see [`Drive.error_forcing`][].
 
@@ -118,7 +118,7 @@ def resonance_drift(
     """
     temperatures = jnp.asarray(temperatures, dtype=float)
     if not isinstance(temperatures, Tracer):
-        for temperature in (temperatures.min(), temperatures.max()):  # the law is linear: its ends tell
+        for temperature in (temperatures.min(), temperatures.max()):  # the law is linear: checking its ends suffices
             law.stiffness_factor(temperature)
 
     def resonance(temperature):

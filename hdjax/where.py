@@ -1,4 +1,4 @@
-"""A choice between two arrays whose type a checker can follow."""
+"""A choice between two arrays, typed for checkers."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike

@@ -1,1 +1,1 @@
-"""What `fitting` offers: logs in, results out."""
+"""Public interface of `fitting`: from logs to results."""

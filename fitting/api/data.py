@@ -22,10 +22,10 @@ class Data:
     """The logs of one drive.
 
     Attributes:
-        drive: The drive, as its file describes it.
-        logs: To be fitted; where there is no test log, the end of each is test data.
+        drive: Content of the drive file.
+        logs: To be fitted; without test logs, the end of each is test data.
         test: Logs that are test data as a whole.
-        tables: What was given in the place of files, by the path that stands for it.
+        tables: Tables in memory in place of files, by the path used for them in messages.
         outputs_until: Rows in which the outputs are known; None for all.
     """
 
@@ -37,7 +37,7 @@ class Data:
 
     @property
     def kind(self) -> str:
-        """Of the logs: "drive", "reduced" or "quasi-static"."""
+        """Kind of the logs: "drive", "reduced" or "quasi-static"."""
         return self.logs[0].kind
 
     def with_test(self, names: str | Iterable[str]) -> "Data":
@@ -47,7 +47,7 @@ class Data:
             names: Of the logs, or of their files.
 
         Raises:
-            InputError: There is no such log, or none would be left.
+            InputError: There is no such log, or none would remain for the fit.
         """
         wanted = {names} if isinstance(names, str) else set(names)
         chosen = [log for log in self.logs if {log.name, log.path.name, str(log.path)} & wanted]
@@ -61,11 +61,11 @@ class Data:
         return replace(self, logs=rest, test=(*self.test, *chosen))
 
     def rig(self, *, other_holds: bool = True) -> Rig:
-        """The logs made ready to be fitted; arguments as in `fitting.drive_data.rig_of`."""
+        """The prepared logs; arguments as in `fitting.drive_data.rig_of`."""
         return rig_of(self.logs, self.drive, test=self.test, other_holds=other_holds)
 
     def ready(self, log: Log, *, outputs_until: int | None = None) -> Log:
-        """A log masked and zeroed, by outputs that are known so far; see `fitting.logs.log.read_log`."""
+        """A log, masked and zeroed by outputs known so far; see `fitting.logs.log.read_log`."""
         table = self.tables.get(log.path)
         if outputs_until != self.outputs_until:
             log = replace(read_log(log.path, self.drive, outputs_until=outputs_until, table=table), name=log.name)
@@ -73,7 +73,7 @@ class Data:
 
     @property
     def table(self) -> "pl.DataFrame":
-        """One row a log."""
+        """One row per log."""
         import polars as pl
 
         both = [(log, part) for part, logs in (("fitted", self.logs), ("test", self.test)) for log in logs]
@@ -108,9 +108,9 @@ def load(
         logs: A path, a table in memory (a frame of pandas or polars, a dataset of xarray, or arrays by name), or
             several of these.
         drive: A drive file, or its tables [drive], [signals] and [columns] by name.
-        test: Logs of the same drive that are test data, likewise; where none is given, the end of each log is.
-        outputs_until: Rows in which angles or dynamic error must be known; 50 suffice for a prediction. None asks for
-            what a fit needs.
+        test: Logs of the same drive that are test data, likewise; if none is given, the end of each log is.
+        outputs_until: Rows in which angles or dynamic error must be known; 50 suffice for a prediction. None for the
+            requirements of a fit.
 
     Raises:
         InputError: A file can't be read, lacks a column, is named twice, or the logs are of several kinds.
@@ -127,11 +127,11 @@ def load(
 
 
 def sources(logs: Any, *, first: int = 1) -> list[Source]:
-    """The path of each log and None, or what messages call it and its table in memory.
+    """The path of each log and None, or a name for messages and the table in memory.
 
     Args:
         logs: A path, a table in memory, or several of these.
-        first: The number of the first, by which tables are called.
+        first: The number of the first, used in the names of tables.
     """
     several = [logs] if isinstance(logs, str | PathLike) or _is_table(logs) else list(logs)
     return [
@@ -147,5 +147,5 @@ def _drive(drive: str | PathLike[str] | Mapping[str, Any] | DriveFile) -> DriveF
 
 
 def _is_table(source: Any) -> bool:
-    """Whether something is a table in memory: it has columns (pandas, polars), variables (xarray), or is a mapping."""
+    """Whether an object is a table in memory: it has columns (pandas, polars), variables (xarray), or is a mapping."""
     return hasattr(source, "columns") or hasattr(source, "variables") or isinstance(source, Mapping)

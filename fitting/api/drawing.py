@@ -1,4 +1,4 @@
-"""The report's pictures on axes of matplotlib."""
+"""The report's plots on axes of matplotlib."""
 
 from typing import Any
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from fitting.report.plots import Plot
 
-# Dots of a screen, in which pictures state their height.
+# Resolution of a screen, since plots state their height in pixels.
 _DOTS_PER_INCH = 80.0
 _DASHES = {"dot": ":", "dash": "--", "dashdot": "-."}
 _MARKERS = {"circle": "o", "square": "s", "diamond": "D", "cross": "P", "x": "x"}
 
 
 def draw(plot: Plot, axes: Any = None) -> Any:
-    """Draw a picture.
+    """Draw a plot.
 
     Args:
-        plot: The picture.
-        axes: One axes of matplotlib for each pair of axes of the picture, from the top; made where not given.
+        plot: The plot.
+        axes: One axes of matplotlib for each pair of axes of the plot, from the top; created where not given.
 
     Returns:
-        The axes, or an array of them where the picture has several.
+        The axes, or an array of them where the plot has several.
     """
     import matplotlib.pyplot as plt
 
@@ -75,7 +75,7 @@ def _trace(place: Any, trace: dict[str, Any]) -> None:
 
 
 def _bars(place: Any, trace: dict[str, Any], number: int, count: int) -> None:
-    """One of several groups of bars, side by side."""
+    """One of several groups of adjacent bars."""
     flat = trace.get("orientation") == "h"
     lengths, names = (trace["x"], trace["y"]) if flat else (trace["y"], trace["x"])
     lengths = [np.nan if v is None else v for v in lengths]
@@ -91,7 +91,7 @@ def _bars(place: Any, trace: dict[str, Any], number: int, count: int) -> None:
 
 
 def _of_matplotlib(color: Any) -> Any:
-    """A colour, where plotly writes its parts in brackets."""
+    """A matplotlib colour from plotly's rgba notation."""
     if isinstance(color, str) and color.startswith("rgb"):
         parts = [float(part) for part in color[color.index("(") + 1 : -1].split(",")]
         return (*(part / 255.0 for part in parts[:3]), *parts[3:])
@@ -99,7 +99,7 @@ def _of_matplotlib(color: Any) -> Any:
 
 
 def _look(place: Any, layout: dict[str, Any], pair: tuple[str, str]) -> None:
-    """Labels, scales and ranges as the picture has them."""
+    """Labels, scales and ranges of the plot."""
     for letter, name in zip("xy", pair, strict=True):
         own = layout.get(f"{letter}axis{name[1:]}", {})
         getattr(place, f"set_{letter}label")(own.get("title", {}).get("text", ""))

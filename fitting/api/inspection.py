@@ -1,4 +1,4 @@
-"""A look at logs that nobody has described."""
+"""Inspection of logs without a drive file."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -24,13 +24,13 @@ from fitting.logs.findings import Finding
 
 @dataclass(frozen=True, eq=False)
 class InspectionResult:
-    """What logs seem to hold, and what a fit could tell from them.
+    """Guessed content of logs, and what a fit of them could determine.
 
     Attributes:
         inspection: Columns, signals, units and signs as guessed, with reasons.
-        findings: What the health gate saw, by log.
-        excitations: How each log moves the drive.
-        told: What a fit can and can't tell, in sentences.
+        findings: Of the health check, by log.
+        excitations: Excitation and response of each log.
+        told: Sentences on what a fit can and can't determine.
     """
 
     inspection: Inspection
@@ -40,21 +40,21 @@ class InspectionResult:
 
     @property
     def columns(self) -> pl.DataFrame:
-        """One row a column that was recognised or could be something: signal, unit, sign, confidence, reasons."""
+        """One row per column that is or may be a signal: signal, unit, sign, confidence, reasons."""
         return pl.DataFrame(column_rows(self.inspection), schema=dict.fromkeys(HEAD, pl.String), orient="row")
 
     @property
     def drive(self) -> dict[str, Any]:
-        """The tables of a drive file as far as they are known, as [`fitting.load`][] takes them."""
+        """The known tables of a drive file, in the form of [`fitting.load`][]."""
         return drive_tables(self.inspection)
 
     @property
     def unknown(self) -> dict[str, str]:
-        """What must be filled in before a fit, by its place in the drive file, and why."""
+        """Values that must be filled in before a fit, by their place in the drive file, with the reason."""
         return unknowns(self.inspection)
 
     def drive_file(self) -> str:
-        """The text of a drive file: each guess with its reason, and lines to fill in for what is not known."""
+        """The text of a drive file: each guess with its reason, and lines to fill in for unknown values."""
         return drive_file_text(self.inspection, "`hdjax init`")
 
     def save(self, path: str | PathLike[str], *, force: bool = False) -> Path:
@@ -62,13 +62,13 @@ class InspectionResult:
 
         Args:
             path: Of the file.
-            force: Whether a file that is there already may be overwritten.
+            force: Whether an existing file may be overwritten.
 
         Raises:
-            InputError: There is a file already.
+            InputError: The file exists already.
         """
         if Path(path).exists() and not force:
-            raise InputError(f"{path}: there is a file already; give another name, or overwrite it with force")
+            raise InputError(f"{path}: the file exists already; give another name, or overwrite it with force")
         write_whole({Path(path): self.drive_file()})
         return Path(path)
 
@@ -77,13 +77,13 @@ class InspectionResult:
 
         Args:
             log: Number of the log.
-            axes: Of matplotlib, one for each signal; made where not given.
+            axes: Of matplotlib, one for each signal; created where not given.
         """
         import matplotlib.pyplot as plt
 
         signals = list(self.inspection.joint.signals)
         if not signals:
-            raise ValueError("no column was recognised, so that there is nothing to draw")
+            raise ValueError("no column was recognised, so that there is nothing to plot")
         if axes is None:
             height = 1.6 * len(signals) + 0.8
             axes = plt.subplots(len(signals), 1, sharex=True, squeeze=False, figsize=(8.0, height))[1][:, 0]
@@ -94,11 +94,11 @@ class InspectionResult:
         return axes
 
     def summary(self) -> str:
-        """All that was found, in a page of text."""
+        """The whole inspection as text."""
         return inspection_text(self.inspection, self.findings, self.excitations, self.told)
 
     def to_dict(self) -> dict[str, Any]:
-        """The same for programs, as JSON can hold it."""
+        """The inspection as JSON content."""
         joint, time = self.inspection.joint, self.inspection.time
         return finite(
             {
@@ -129,12 +129,12 @@ class InspectionResult:
 
 
 def inspect(logs: Any, *, joint: str | int | None = None) -> InspectionResult:
-    """Look at logs of one drive or robot without a drive file.
+    """Inspect logs of one drive or robot without a drive file.
 
     Args:
         logs: A path, a table in memory (a frame of pandas or polars, a dataset of xarray, or arrays by name), or
             several of these with the same columns.
-        joint: Label of the robot's joint that matters, as in "q[3]"; where None, the one that moves the most.
+        joint: Label of the robot's joint, as in "q[3]"; if None, the one that moves the most.
 
     Raises:
         InputError: A file can't be read, the logs have different columns, or there is no such joint.
@@ -146,7 +146,7 @@ def inspect(logs: Any, *, joint: str | int | None = None) -> InspectionResult:
 
 
 def inspected(tables: Sequence[Table], *, joint: str | None = None) -> InspectionResult:
-    """[`inspect`][] for logs whose columns have been read."""
+    """[`inspect`][] for logs with columns already read."""
     found = inspect_tables(tables, joint=joint)
     with np.errstate(all="ignore"):
         moved = tuple(excitation(found, k) for k in range(len(tables)))

@@ -1,4 +1,4 @@
-"""Free runs of identified models along logs, and models side by side."""
+"""Free runs of identified models along logs, and comparison of models."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,13 +28,13 @@ AnyModel = str | PathLike[str] | StoredModel | Result
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A model's free run along a log, which started it and then gave nothing but its inputs.
+    """A model's free run along a log.
 
     Attributes:
-        run: Predicted and measured.
-        rows: Of the run that stand in the log.
-        zero: What was taken off the measured dynamic error, and is a part of the predicted one.
-        findings: What was seen in the log.
+        run: Predicted and measured outputs.
+        rows: Of the run that are rows of the log.
+        zero: Offset that was subtracted from the measured dynamic error; the predicted one includes it.
+        findings: On the log.
     """
 
     run: FreeRun
@@ -44,7 +44,7 @@ class Prediction:
 
     @property
     def table(self) -> pl.DataFrame:
-        """Time [s] and predicted outputs [SI, or a reduced log's unit], the principal one first, one row a sample."""
+        """Time [s] and predicted outputs [SI, or a reduced log's unit], the principal one first, one row per sample."""
         zeros = {"dynamic_error": self.zero}
         found = {name: (predicted + zeros.get(name, 0.0)) for name, (predicted, _) in self.run.outputs.items()}
         return pl.DataFrame({"time": self.run.time[self.rows]} | {name: v[self.rows] for name, v in found.items()})
@@ -55,7 +55,7 @@ class Prediction:
         return Path(path)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw measured and predicted principal output on axes of matplotlib; made where not given."""
+        """Draw measured and predicted principal output on axes of matplotlib; created where not given."""
         return _drawn({"predicted": self.run}, axes)
 
     def summary(self) -> str:
@@ -68,11 +68,11 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Models side by side on the same logs.
+    """Comparison of models on the same logs.
 
     Attributes:
-        runs: Free runs by model, one a log.
-        noise: Rms measurement noise of the principal output that each model knows of.
+        runs: Free runs by model, one per log.
+        noise: Rms measurement noise of the principal output stored with each model.
     """
 
     runs: dict[str, tuple[FreeRun, ...]]
@@ -80,7 +80,7 @@ class Comparison:
 
     @property
     def table(self) -> pl.DataFrame:
-        """One row a model and log: rms error, fit in percent, and the error over the noise."""
+        """One row per model and log: rms error, fit in percent, and the error over the noise."""
         rows = [
             [name, run.name, run.rmse, fit_percent([run]), run.rmse / self.noise[name]]
             for name, runs in self.runs.items()
@@ -90,7 +90,7 @@ class Comparison:
         return pl.DataFrame(rows, schema=columns, orient="row")
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the first log and each model's prediction on axes of matplotlib; made where not given."""
+        """Draw the first log and each model's prediction on axes of matplotlib; created where not given."""
         return _drawn({name: runs[0] for name, runs in self.runs.items()}, axes)
 
     def summary(self) -> str:
@@ -104,7 +104,7 @@ class Comparison:
 def predict(model: AnyModel, data: Data) -> Prediction:
     """Run a model freely along a log.
 
-    The log's outputs are used in the first 50 samples only, which give the initial state.
+    The log's outputs are used in the first 50 samples only, for the initial state.
 
     Args:
         model: A `model.json` of a report, a result, or its model.
@@ -112,7 +112,7 @@ def predict(model: AnyModel, data: Data) -> Prediction:
 
     Raises:
         InputError: The log does not suit the model.
-        DataError: The log can't be used, or the model runs away.
+        DataError: The log can't be used, or the simulation diverges.
     """
     if len(data.logs) != 1:
         raise InputError(f"a prediction follows one log, but there are {len(data.logs)}; load it alone")
@@ -120,7 +120,7 @@ def predict(model: AnyModel, data: Data) -> Prediction:
     log = data.ready(data.logs[0], outputs_until=WINDOW)
     (run,), rows = _runs(stored, name, data, log)
     if not np.isfinite(run.predicted).all():
-        raise DataError(f"{log.path}: the model's free run leaves the numbers; check the torque column's unit and sign")
+        raise DataError(f"{log.path}: the model's free run diverges; check the torque column's unit and sign")
     return Prediction(run, rows, log.zero, log.findings)
 
 
@@ -129,7 +129,7 @@ def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
 
     Args:
         models: Each as in [`predict`][], by name.
-        data: The logs; what was used to fit a model tells little of it.
+        data: The logs; preferably not those that a model was fitted to.
 
     Raises:
         InputError: A log does not suit a model.
@@ -144,7 +144,7 @@ def compare(models: Mapping[str, AnyModel], data: Data) -> Comparison:
 
 
 def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:
-    """The measured principal output of one log, and what models predict of it."""
+    """The measured principal output of one log, and models' predictions of it."""
     import matplotlib.pyplot as plt
 
     place = plt.subplots()[1] if axes is None else axes
@@ -158,7 +158,7 @@ def _drawn(runs: Mapping[str, FreeRun], axes: Any) -> Any:
 
 
 def _stored(model: AnyModel) -> tuple[StoredModel, str]:
-    """A model, and what messages call it."""
+    """A model, and its name in messages."""
     if isinstance(model, StoredModel):
         return model, "the model"
     if isinstance(model, Result):
@@ -173,7 +173,7 @@ def _runs(stored: StoredModel, name: str, data: Data, log: Log) -> tuple[tuple[F
         raise InputError(f"{log.path}: {WHY_NOT_QUASI_STATIC}")
     if (log.kind == "drive") != isinstance(stored.model, TwoInertiaModel):
         raise InputError(
-            f"{log.path}: a {log.kind} log, but {name} is a model of the other kind; give a log like those fitted"
+            f"{log.path}: a {log.kind} log, but {name} is a model of another kind; give a log of the fitted kind"
         )
     needed, seen = as_logged(stored.model)[0], log.outputs
     if stored.model.measured != fitted_outputs(log):

@@ -1,4 +1,4 @@
-"""Results of the verbs: tables, a summary, pictures, a report on disk."""
+"""Results of fits and loops: tables, a summary, plots, a report on disk."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,28 +17,28 @@ from fitting.report.plots import Plot
 from fitting.stored_model import StoredModel
 
 if TYPE_CHECKING:
-    # Few fits are asked for a table.
+    # Imported on demand: few results are used as tables.
     import polars as pl
 
 _COLUMNS = ("value", "std", "low", "high", "unit", "identifiable", "flag")
 
 
 class Told(Protocol):
-    """What is told of an outcome: a [`fitting.report.Report`][], or that of quasi-static logs."""
+    """The report of an outcome: a [`fitting.report.Report`][], or that of quasi-static logs."""
 
     @property
     def content(self) -> dict[str, Any]:
-        """What `report.json` holds."""
+        """The content of `report.json`."""
         ...
 
     @property
     def pictures(self) -> Sequence[Plot]:
-        """Of the page, in its order."""
+        """Plots in the order of the page."""
         ...
 
     @property
     def text(self) -> str:
-        """For a terminal."""
+        """Text for a terminal."""
         ...
 
     def write(self, folder: str | PathLike[str]) -> Any:
@@ -48,11 +48,11 @@ class Told(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result:
-    """What a verb found.
+    """Result of a fit or a loop.
 
     Attributes:
-        told: What is told of the outcome.
-        rig: The logs as they were fitted; None for quasi-static ones.
+        told: The report.
+        rig: The logs as fitted; None for quasi-static ones.
     """
 
     told: Told
@@ -60,12 +60,12 @@ class Result:
 
     @property
     def report(self) -> dict[str, Any]:
-        """What `report.json` holds."""
+        """The content of `report.json`."""
         return self.told.content
 
     @property
     def model(self) -> StoredModel | None:
-        """The identified model; None for quasi-static logs, which show no motion."""
+        """The identified model; None for quasi-static logs, which have no dynamics."""
         return self.told.outcome.stored if isinstance(self.told, Report) else None
 
     @property
@@ -82,25 +82,25 @@ class Result:
 
     @property
     def plots(self) -> tuple[str, ...]:
-        """Names of the pictures that [`plot`][] draws."""
+        """Names of the plots for [`plot`][]."""
         return tuple(plot.key for plot in self.told.pictures)
 
     def summary(self) -> str:
-        """What was found, in a page of text."""
+        """The result as text."""
         return self.told.text
 
     def plot(self, name: str = "prediction", axes: Any = None) -> Any:
-        """Draw one of the pictures of the report on axes of matplotlib.
+        """Draw one of the plots of the report on axes of matplotlib.
 
         Args:
-            name: One of `plots`, or how it begins.
-            axes: To draw on, one for each pair of axes that the picture has; made where not given.
+            name: One of `plots`, or its beginning.
+            axes: To draw on, one for each pair of axes of the plot; created where not given.
 
         Returns:
             The axes, or an array of them.
 
         Raises:
-            ValueError: There is no such picture.
+            ValueError: There is no such plot.
         """
         found = next((plot for plot in self.told.pictures if plot.key.startswith(name)), None)
         if found is None:
@@ -113,24 +113,24 @@ class Result:
         return Path(folder)
 
     def with_next_experiment(self, limits: Mapping[str, float] | None = None, *, progress: Progress = silent) -> Self:
-        """Look for the motor torque of an experiment that would tell more: explanations that are tied apart, or after a
-        fit alpha.
+        """Search for the motor torque of a next experiment, which separates tied explanations, or after a fit
+        determines alpha.
 
         Args:
-            limits: Any of `torque` [N m], `speed` [rad/s], `travel` [rad], `twist` [rad] and `duration` [s]; what the
-                logs have reached where not given.
-            progress: Told what is being done.
+            limits: Any of `torque` [N m], `speed` [rad/s], `travel` [rad], `twist` [rad] and `duration` [s]; those
+                reached in the logs where not given.
+            progress: Receives messages.
 
         Returns:
-            The same with the experiment in its report; without one where nothing is open, or no torque keeps the
+            The same with the experiment in its report; without one where none is needed, or no torque respects the
             limits.
 
         Raises:
             InputError: The logs are quasi-static.
         """
         if not isinstance(self.told, Report) or self.rig is None:
-            raise InputError(f"there is no next experiment to look for: {WHY_NOT_QUASI_STATIC}")
-        # Loaded here: few are asked for an experiment.
+            raise InputError(f"there is no next experiment: {WHY_NOT_QUASI_STATIC}")
+        # Imported here: few results need an experiment.
         from fitting.next_experiment.proposal import experiment_for_alpha, experiment_for_ties
 
         outcome = self.told.outcome
@@ -141,7 +141,7 @@ class Result:
         return replace(self, told=Report.of_rig(outcome, self.rig, next_experiment=proposed))
 
     def to_dict(self) -> dict[str, Any]:
-        """What `report.json` holds."""
+        """The content of `report.json`."""
         return self.report
 
     def __str__(self) -> str:
@@ -162,7 +162,7 @@ class FitResult(Result):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopResult(Result):
-    """A closed loop: what was missing, and the model with it."""
+    """A closed loop: the accepted effects, and the model with them."""
 
     @property
     def decision(self) -> str:
@@ -171,7 +171,7 @@ class LoopResult(Result):
 
     @property
     def effects(self) -> "pl.DataFrame":
-        """The effects that were found: family, form, gain and p-value, largest gain first."""
+        """The accepted effects: family, form, gain and p-value, largest gain first."""
         import polars as pl
 
         keys = ("family", "name", "gain", "p_value")
@@ -181,7 +181,7 @@ class LoopResult(Result):
 
     @property
     def effect_parameters(self) -> "pl.DataFrame":
-        """The parameters of all effects, as `parameters` has them."""
+        """The parameters of all effects, as in `parameters`."""
         known: dict[str, Any] = {}
         for effect in self.report["after"]["effects"]:
             known |= effect.get("parameters") or {}
@@ -189,7 +189,7 @@ class LoopResult(Result):
 
     @property
     def rules(self) -> "pl.DataFrame":
-        """Why this decision: each rule with its statistic, its threshold and its outcome."""
+        """Reasons of the decision: each rule with statistic, threshold and outcome."""
         import polars as pl
 
         return pl.DataFrame(self.report.get("rules") or [])

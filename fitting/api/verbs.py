@@ -1,4 +1,4 @@
-"""Fit a drive, close the loop on it: one verb, one result."""
+"""Functions `fit` and `close_loop`."""
 
 from collections.abc import Iterable
 
@@ -16,18 +16,18 @@ def fit(data: Data, *, draws: int | None = None, progress: Progress = silent) ->
 
     Args:
         data: Logs of one drive, from [`fitting.load`][].
-        draws: Seed of draws from the posterior; where None, none are made.
-        progress: Told what is being done.
+        draws: Seed of draws from the posterior; None for no draws.
+        progress: Receives messages.
 
     Raises:
         DataError: The logs can't support a fit.
-        ImportError: Draws are asked for and blackjax is not installed.
+        ImportError: Draws are requested and blackjax is not installed.
         ValueError: JAX computes in single precision.
     """
     need_double_precision()
     if data.kind == "quasi-static":
-        # Loaded here, as what follows: each takes long, and most logs need one of them.
-        from fitting.quasi_static.told import fit_quasi_static_logs
+        # Imported here, like the others: each import takes long, and most logs need one of them.
+        from fitting.quasi_static.results import fit_quasi_static_logs
 
         return FitResult(fit_quasi_static_logs(data.logs, data.drive, test=data.test, progress=progress))
     rig = data.rig(other_holds=False)
@@ -42,13 +42,13 @@ def close_loop(
     search: SearchOptions = SearchOptions(),
     progress: Progress = silent,
 ) -> LoopResult:
-    """Fit the base model, find what it lacks, put that inside the equations, and refit.
+    """Fit the base model, find the effects that it lacks, add them to the equations, and refit.
 
     Args:
         data: Logs of one drive, from [`fitting.load`][].
-        test: Names of those logs that are test data; where none is named or was loaded as such, the end of each log is.
-        search: How effects are searched for.
-        progress: Told what is being done.
+        test: Names of logs that are test data; if none is named or was loaded as such, the end of each log is.
+        search: Settings of the search for effects.
+        progress: Receives messages.
 
     Raises:
         InputError: There is no such log.
@@ -60,7 +60,7 @@ def close_loop(
     if named:
         data = data.with_test(named)
     if data.kind == "quasi-static":
-        from fitting.quasi_static.told import close_quasi_static_loop
+        from fitting.quasi_static.results import close_quasi_static_loop
 
         told = close_quasi_static_loop(data.logs, data.drive, test=data.test, search=search, progress=progress)
         return LoopResult(told)

@@ -1,1 +1,1 @@
-"""Which effect explains what a model leaves over: candidates inside the equations, scores, decisions."""
+"""Attribution of a residual to effects: candidates, scores and decisions."""

@@ -1,4 +1,4 @@
-"""A model on trial: fitted to the training stretches, judged on those it has not seen."""
+"""Fits of candidate models to training data, and their evaluation on held-out data."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,26 +20,25 @@ from fitting.estimation.whole_log_fit import follows, over_whole_stretches, with
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
-# Iterations of a trial at most: a form that needs more than this has no clear minimum.
+# Most iterations of a candidate's fit: a form that needs more has no clear minimum.
 _TRIAL_STEPS = 25
-# From a fit of the same model.
+# Iterations from a fit of the same model.
 _CONTINUED = Strategy(_TRIAL_STEPS, begin_anew_above=np.inf, retry_states=False)
-# What tells a good start from a poor one.
+# Iterations that rank the starts.
 _FIRST_STEPS = replace(_CONTINUED, max_steps=12, give_up_above=-np.inf)
-# What a first pass may fall short of because of what effects remember: it must have come so far towards what it is to
-# reach.
+# Share of the required gain that a first pass must reach; hidden states may converge later.
 _MOST_OF_THE_WAY = 2.0 / 3.0
 
 
 class Trial(eqx.Module):
-    """A model fitted to the training stretches, and what it does on the held-out ones.
+    """A model fitted to training data and evaluated on held-out data.
 
     Attributes:
         model: with fitted values.
         training: the fit.
-        held_out: the same parameters on unseen stretches; only initial states are fitted there.
-        hold: what the torque does between samples.
-        lasting: the share of its gain that lasts over whole stretches.
+        held_out: fit to held-out data with the same parameters; only initial states are free.
+        hold: inter-sample behaviour of the torque.
+        lasting: share of its gain that persists in free runs along whole stretches.
     """
 
     model: Model
@@ -49,21 +48,20 @@ class Trial(eqx.Module):
     lasting: float = eqx.field(static=True, default=1.0)
 
     def gain_over(self, before: "Trial") -> float:
-        """Decrease of the held-out objective; of a model with memory, what of it lasts."""
+        """Decrease of the held-out objective; of a model with memory, the part that persists over whole stretches."""
         return (before.held_out.objective - self.held_out.objective) * self.lasting
 
 
 def attempt(
     model: Model, study: Study, hold: Hold, *, start: Trial | None = None, hold_parameters: bool = False
 ) -> Trial:
-    """Fit a model and look at it on held-out data.
+    """Fit a model and evaluate it on held-out data.
 
     Args:
         model: equations and starting values.
-        study: the data, and how they are cut.
-        hold: what the torque does between samples.
-        start: a trial near by, whose error covariance weighs the outputs at the start, and whose initial states it
-            starts from.
+        study: the data and their segmentation.
+        hold: inter-sample behaviour of the torque.
+        start: a similar trial, which supplies the initial error covariance and initial states.
         hold_parameters: see [`fitting.estimation.estimate.Strategy`][].
     """
     near = None if start is None else start.training
@@ -71,12 +69,12 @@ def attempt(
     return _judged(trained(model, study, hold, near, strategy).with_all_free(), study, hold)
 
 
-def gone_on(trial: Trial, study: Study) -> Trial:
-    """A trial after another pass of its fit; the same where that gains nothing.
+def continued(trial: Trial, study: Study) -> Trial:
+    """A trial after a further pass of its fit; unchanged where that gains nothing.
 
     Args:
-        trial: as it stands.
-        study: the data, and how they are cut.
+        trial: the current one.
+        study: the data and their segmentation.
     """
     training = trained(trial.model, study, trial.hold, trial.training, _CONTINUED)
     if training.objective > trial.training.objective - LEAST_PROGRESS:
@@ -87,18 +85,17 @@ def gone_on(trial: Trial, study: Study) -> Trial:
 def challenge(
     models: Sequence[Model], study: Study, hold: Hold, *, champion: Trial, give_up_above: float = np.inf
 ) -> Trial | None:
-    """The best fit of several starts, if it explains the training data at least as well as the model that it is to
-    replace.
+    """The best fit of several starts, if it explains the training data at least as well as the current model.
 
     Args:
-        models: one and the same model at several starting values.
-        study: the data, and how they are cut.
-        hold: what the torque does between samples.
-        champion: the model to replace.
-        give_up_above: a lower objective that it must reach.
+        models: the same model at several starting values.
+        study: the data and their segmentation.
+        hold: inter-sample behaviour of the torque.
+        champion: the current model.
+        give_up_above: an objective that it must reach.
     """
     first = first_pass(models, study, hold, champion=champion)
-    return to_the_end(first, study, hold, champion=champion, give_up_above=give_up_above)
+    return completed(first, study, hold, champion=champion, give_up_above=give_up_above)
 
 
 def first_pass(
@@ -109,14 +106,14 @@ def first_pass(
     champion: Trial,
     own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Fit:
-    """The first pass of a challenger, from the best of its starts as a few iterations from each tell it.
+    """The first pass of a challenger, from the best start after a few iterations from each.
 
     Args:
-        models: one and the same model at several starting values.
-        study: the data, and how they are cut.
-        hold: what the torque does between samples.
-        champion: the model to replace.
-        own_states: where the own states of the first model's last effect start, in each segment.
+        models: the same model at several starting values.
+        study: the data and their segmentation.
+        hold: inter-sample behaviour of the torque.
+        champion: the current model.
+        own_states: hidden initial states of the first model's last effect, by segment.
     """
     study = study.for_rivals()
     best, near = models[0], champion.training
@@ -132,8 +129,8 @@ def first_pass(
     return trained(best, study, hold, near, strategy, own_states=own_states)
 
 
-def to_the_end(first: Fit, study: Study, hold: Hold, *, champion: Trial, give_up_above: float = np.inf) -> Trial | None:
-    """A challenger followed from its first pass to the end, as far as it is worth it; arguments as in
+def completed(first: Fit, study: Study, hold: Hold, *, champion: Trial, give_up_above: float = np.inf) -> Trial | None:
+    """The completed fit of a challenger after its first pass, or None where it is given up; arguments as in
     [`challenge`][]."""
     to_judge, study = study, study.for_rivals()
     before = champion.training.objective
@@ -144,12 +141,12 @@ def to_the_end(first: Fit, study: Study, hold: Hold, *, champion: Trial, give_up
     if first.objective > limit:
         return None
     study = study.fine_enough(first)
-    # A segment that lost its way while the parameters were far off would now hold them there.
+    # A segment that diverged while the parameters were far off would now keep them there.
     strategy = replace(_CONTINUED, retry_states=True, give_up_above=limit)
     best = trained(first.model, study, hold, first, strategy)
     if best.objective > limit:
         return None
-    # Where a corner is sharper than the steps resolve, a fit rounds it until they do.
+    # Where the solver steps do not resolve a sharp nonlinearity, a fit smooths it until they do.
     finer = study.fine_enough(best)
     if finer is not study:
         best = trained(best.model, finer, hold, best, strategy)
@@ -165,16 +162,15 @@ def trained(
     *,
     own_states: Float[np.ndarray, "segments own"] | None = None,
 ) -> Fit:
-    """A fit that starts with the covariance of one near by, and from its states as far as the model has the same.
+    """A fit that starts with the covariance of a similar one, and from its states where the model has them.
 
     Args:
         model: equations and starting values.
-        study: the data, how they are cut, and how little progress ends a fit.
-        hold: what the torque does between samples.
-        near: the fit near by, if there is one.
-        strategy: how the fit is iterated, for the rest.
-        own_states: where the last effect's own states start, in each segment; as if they had long moved like this where
-            not given.
+        study: the data, their segmentation, and the least progress of a fit.
+        hold: inter-sample behaviour of the torque.
+        near: the similar fit, if any.
+        strategy: further settings of the iteration.
+        own_states: hidden initial states of the last effect, by segment; in steady state where not given.
     """
     start = Start()
     if near is not None:
@@ -188,8 +184,8 @@ def trained(
 
 
 def _strategy_beside(near: Fit | None, model: Model) -> Strategy:
-    """How a model is fitted that starts from a fit near by: begun anew where it has other states, and in any case where
-    there is none."""
+    """Settings of a fit that starts from a similar one. The first pass is repeated where states differ, or without a
+    similar fit."""
     if near is None:
         return Strategy(_TRIAL_STEPS)
     if near.model.state_names == model.state_names:
@@ -213,16 +209,16 @@ def _judged(training: Fit, study: Study, hold: Hold) -> Trial:
 
 
 def _may_remember_better(found: Fit) -> bool:
-    """Whether an effect with memory leaves more than noise."""
+    """Whether an effect with memory leaves a residual above the noise."""
     return any(e.states for e in found.model.effects) and not leaves_white_noise(found)
 
 
 def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
-    """The share of an effect's gain that lasts over whole held-out stretches; all of it for an effect without memory,
+    """Share of an effect's gain that persists over whole held-out stretches. It is one for an effect without memory,
     and where neither model follows the drive for so long.
 
-    Hidden states are fitted to each short segment, where they can stand for what something else leaves there: an
-    offset, say. Over a whole stretch they have to follow from the motion.
+    On short segments, fitted hidden initial states can compensate other errors, such as an offset. Over a whole stretch
+    hidden states follow from the motion.
     """
     short = before.held_out.objective - trial.held_out.objective
     if not effect.states or short <= 0.0:
@@ -234,9 +230,9 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
 
 
 def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[float] | None:
-    """What trials gain over the model before them in free runs along whole held-out stretches: logs of the ratios of
-    the errors. None where free runs tell nothing: the model before runs away, or neither it nor one of the trials
-    follows the drive for long.
+    """Gains of trials over the preceding model in free runs along whole held-out stretches: logarithms of error ratios.
+    None where free runs are inconclusive: the preceding model diverges, or neither it nor a trial follows the drive for
+    long.
     """
     old = _free_runs(before, study)
     before_long = rms_error(old)
@@ -248,7 +244,7 @@ def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[flo
 
 
 def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
-    """Of the held-out stretches."""
+    """Free runs of the held-out stretches."""
     return free_run(
         trial.model,
         study.data[trial.hold][1],
@@ -264,7 +260,7 @@ def halo_for(training: Sequence[Stretch], *, longest_delay: float = 1e-2) -> int
 
     Args:
         training: training stretches.
-        longest_delay: how far back a delayed or lagging torque may reach [s].
+        longest_delay: of a delayed or lagging torque [s].
     """
     step = training[0].experiment.time_step
     return int(np.clip(np.ceil(longest_delay / step) + 1, 4, 64))

@@ -1,11 +1,11 @@
-"""A lead of the first look, or another hold of the torque, put inside the equations and refitted."""
+"""Refits with an effect from screening inside the equations, or with another hold of the torque."""
 
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Trial, challenge, first_pass, lasting_share, to_the_end, trained
+from fitting.attribution.candidate_fit import Trial, challenge, completed, first_pass, lasting_share, trained
 from fitting.attribution.rules import RULES
 from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
@@ -15,26 +15,25 @@ from hdjax import Hold
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
 
-# Iterations after which another hold of the torque must explain more: it moves the motion so little that the first
-# one finds the way.
+# Iterations after which another hold of the torque must explain more: it changes the motion so little that few suffice.
 _HOLD_STEPS = Strategy(3, reweigh=False, begin_anew_above=np.inf, retry_states=False)
 
 
 def try_lead(before: Trial, lead: Lead, study: Study, give_up_above: float) -> Trial | None:
-    """Refit with the effect, from the first-order estimate, from what is typical, and from what the model's own
-    parameters may stand for; None where it does not come as far as it is to.
+    """Refit with the effect, from several starts: the first-order estimate, typical values, and values that replace a
+    part of the model's parameters. None where the required objective is not reached.
 
     Args:
         before: the current model.
-        lead: what is put inside it.
+        lead: the effect.
         study: the data, and how they are cut.
         give_up_above: the training objective that it must reach.
     """
-    return go_on(before, lead, begin(before, lead, study), study, give_up_above)
+    return complete_refit(before, lead, begin(before, lead, study), study, give_up_above)
 
 
 def begin(before: Trial, lead: Lead, study: Study) -> Fit:
-    """The first pass of such a refit; arguments as in [`try_lead`][]."""
+    """The first pass of a refit; arguments as in [`try_lead`][]."""
     model = before.model
     known = model.parameters()
     moved = {}
@@ -53,15 +52,15 @@ def begin(before: Trial, lead: Lead, study: Study) -> Fit:
     return first_pass(starts, study, before.hold, champion=before, own_states=lead.own_states)
 
 
-def go_on(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_above: float) -> Trial | None:
-    """The rest of it, as far as it is worth it, from where its first pass has begun; arguments as in [`try_lead`][]."""
-    trial = to_the_end(begun, study, before.hold, champion=before, give_up_above=give_up_above)
+def complete_refit(before: Trial, lead: Lead, begun: Fit, study: Study, give_up_above: float) -> Trial | None:
+    """The completed refit after its first pass, or None where it is given up; arguments as in [`try_lead`][]."""
+    trial = completed(begun, study, before.hold, champion=before, give_up_above=give_up_above)
     return None if trial is None else replace(trial, lasting=lasting_share(lead.effect, before, trial))
 
 
 def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
-    """Refit under another hold. It acts on the same motion, so that a few steps from the present fit tell whether it
-    is worth more.
+    """Refit with another hold. The motion hardly changes, so that a few steps from the current fit show whether more
+    are worthwhile.
 
     Args:
         before: the current model.
@@ -75,7 +74,7 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:
-    """The effect with every positive strength off zero, where its logarithm can move."""
+    """The effect with every positive strength above zero, so that its logarithm exists."""
     for name, info in own_parameters(effect):
         if info.role == "strength" and info.positive:
             value = float(getattr(effect, name))

@@ -1,4 +1,4 @@
-"""The evidence on which a case is decided, and how reports store it.
+"""Evidence for the decisions on a case, as reports store it.
 
 Nothing here fits, simulates or decides.
 """
@@ -15,17 +15,17 @@ Question = Literal["instead", "beside"]
 
 @dataclass(frozen=True)
 class EffectEvidence:
-    """What the data say of the best candidate of a round.
+    """Evidence for the best candidate of a round.
 
     Attributes:
         name: of the form.
         gain: decrease of the objective on selection data.
-        p_value: chance that the best of the catalogue gains as much where nothing is missing.
-        removed: what it removes of the error, over what the effects before it have removed (rms).
-        imperfection: what the laws of the effects before it may get wrong, likewise.
-        strength_errors: standard errors by which its best known strength differs from zero.
-        over_noise: log likelihood by which it betters noise; infinite where that is no explanation.
-        at_bounds: how many of its parameters ended at a bound.
+        p_value: chance that the best form gains as much where nothing is missing.
+        removed: error that it removes, over the error that preceding effects have removed (rms).
+        imperfection: error that the laws of preceding effects may cause, likewise.
+        strength_errors: standard errors by which its most significant strength differs from zero.
+        over_noise: log likelihood ratio against noise; infinite where noise does not explain the residual.
+        at_bounds: number of its parameters that ended at a bound.
     """
 
     name: str
@@ -40,17 +40,17 @@ class EffectEvidence:
 
 @dataclass(frozen=True)
 class Rival:
-    """A candidate among those that can't be told from the best one.
+    """A candidate that competes with the best one.
 
     Attributes:
         name: of the form.
         gain: over short segments.
-        long_gain: in free runs along whole stretches; over short segments where these tell nothing.
-        tied: whether it can't be told from the best one over short segments.
+        long_gain: in free runs along whole stretches; over short segments where these are inconclusive.
+        tied: whether it is tied with the best one over short segments.
         parameters: number of free parameters.
-        states: likewise of states.
+        states: number of states.
         plausible: whether no parameter is larger than real drives show.
-        remembers: whether it has states that the model before it has not.
+        remembers: whether it adds states to the preceding model.
     """
 
     name: str
@@ -65,11 +65,11 @@ class Rival:
 
 @dataclass(frozen=True)
 class RoundEvidence:
-    """What one look at the catalogue rests on.
+    """Evidence of one round of the search.
 
     Attributes:
-        asked: what the data say of the candidate that leads, and of those before it that they do not support.
-        behind: of each candidate that was refitted, how far it is behind the best one, block by block.
+        asked: evidence for the leading candidate, and for better ones that the data do not support.
+        behind: score difference of the best candidate and each refitted one, block by block.
         rivals: those that competed over whole stretches.
     """
 
@@ -80,15 +80,14 @@ class RoundEvidence:
 
 @dataclass(frozen=True)
 class ModelEvidence:
-    """A fitted model as the final decision sees it.
+    """Evidence on a fitted model for the final decision.
 
     Attributes:
         training: objective on training data: half the log-determinant of the error's covariance.
         selection: likewise on selection data.
         parameters: number of free parameters.
-        excess: what short segments of the selection data leave of each output, over the measurement noise.
-        white: whether training data leave nothing of the dynamic error that its colour betrays, and of no output more
-            than the noise.
+        excess: residual of each output over short segments of the selection data, over the measurement noise.
+        white: whether the training residual of the dynamic error is white, and that of each output is within the noise.
     """
 
     training: float
@@ -100,12 +99,12 @@ class ModelEvidence:
 
 @dataclass(frozen=True)
 class NoiseEvidence:
-    """What a Kalman filter with noise of sensors and torque leaves.
+    """Innovations of a Kalman filter with noise of sensors and torque.
 
     Attributes:
         share: the noise of the torque over its rms.
-        predictable: share of the innovations' variance that earlier ones predict.
-        size: rms of the innovations in units of what the filter expects, of the output where it is largest.
+        predictable: share of the innovations' variance that is predictable from earlier ones.
+        size: rms of the innovations over its expected value, of the output where it is largest.
     """
 
     share: float
@@ -115,23 +114,23 @@ class NoiseEvidence:
 
 @dataclass(frozen=True)
 class ChallengeEvidence:
-    """What is known when a learned term challenges names.
+    """Evidence where a learned term challenges named effects.
 
     Attributes:
         base: the model without effects.
-        named: the model with those that were found; the base model where there are none.
-        names: how many there are.
-        noise: the objective that nothing but measurement noise makes.
-        imperfect: whether all that is left is what the laws of the names may get wrong.
-        beside: the named model with a learned term beside them; None where none is supported or it was not asked.
-        instead: the base model with a learned term in their place; likewise.
-        asked: what was learned, or could not be.
-        come_out: share of the term in their place that the names make up.
-        shown: whether every name still has a strength that is told from zero beside the learned term.
-        one_shape: whether a name is one shape of the function that was learned both beside it and in its place.
-        left: what the names leave as noise; None where they leave no more than white measurement noise.
-        longer_worse: log of the rms error of free runs with the term in their place, over that with the names; zero
-            where free runs tell nothing.
+        named: the model with the named effects; the base model where there are none.
+        names: number of named effects.
+        noise: objective of pure measurement noise.
+        imperfect: whether inexact laws of the named effects may explain the residual.
+        beside: the named model with a learned term as well; None where none is supported or none was fitted.
+        instead: the base model with a learned term in place of named effects; likewise.
+        asked: the learned terms that were tried.
+        come_out: share of the replacing term that the named effects reproduce.
+        shown: whether every named effect keeps a significantly nonzero strength beside the learned term.
+        one_shape: whether a named effect is one shape of the function that was learned both beside it and in its place.
+        left: noise evidence of the named model; None where its residual is white measurement noise.
+        longer_worse: log of the rms error of free runs with the replacing term, over that with the named effects; zero
+            where free runs are inconclusive.
     """
 
     base: ModelEvidence
@@ -150,25 +149,26 @@ class ChallengeEvidence:
 
     @property
     def enough(self) -> bool:
-        """Whether the names leave nothing that could be learned."""
+        """Whether the named effects leave nothing to be learned."""
         return self.named.white or self.imperfect
 
     def answered(self, question: Question, found: ModelEvidence | None, **changes: Any) -> "ChallengeEvidence":
-        """The same with one more answer."""
+        """The same with the result of one more learned term."""
         return replace(self, asked=(*self.asked, question), **{question: found}, **changes)
 
 
 @dataclass(frozen=True)
 class FinalEvidence:
-    """What the last decision rests on.
+    """Evidence for the final decision.
 
     Attributes:
-        names: of the effects that are trusted.
-        learned: whether a term was learned beside them, or in the place of all.
-        excess: what short segments of the selection data leave of each output under the names alone, over the noise.
-        excess_at_first: likewise under the base model.
-        noise_explains: whether what is left is noise of the sensors, with a memory, and of the torque.
-        surprise: by how much free runs are farther off than they promised; None where that is not asked.
+        names: of the accepted effects.
+        learned: whether a term was learned beside them or in place of all.
+        excess: residual of each output over short segments of the selection data, with the named effects alone, over
+            the noise.
+        excess_at_first: likewise of the base model.
+        noise_explains: whether coloured noise of sensors and torque explains the residual.
+        surprise: free-run error over its prediction band; None where that is not checked.
     """
 
     names: tuple[str, ...]
@@ -181,12 +181,12 @@ class FinalEvidence:
 
 @dataclass(frozen=True)
 class CaseEvidence:
-    """All that the decision on one case rests on.
+    """Evidence for all decisions on one case.
 
     Attributes:
-        rounds: every look at the catalogue.
-        challenge: of the names that were found.
-        final: what the last decision rests on.
+        rounds: of the search.
+        challenge: of the named effects.
+        final: evidence for the final decision.
     """
 
     rounds: tuple[RoundEvidence, ...]
@@ -194,7 +194,7 @@ class CaseEvidence:
     final: FinalEvidence
 
 
-# What JSON has no number for.
+# Fields that may be infinite, for which JSON has no number.
 _UNBOUNDED = (
     "removed",
     "strength_errors",
@@ -209,7 +209,7 @@ _UNBOUNDED = (
 
 
 def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
-    """The evidence of a case.
+    """The stored evidence of a case.
 
     Args:
         stored: `evidence` of its report.json.

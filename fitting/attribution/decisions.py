@@ -1,7 +1,6 @@
-"""Every decision of the loop: what the rules make of the evidence.
+"""Decisions of the loop: the rules applied to the evidence.
 
-Nothing here fits, simulates or reads: the same evidence and the same rules give the same decision, so that stored
-evidence can be decided anew under other rules.
+Pure functions without fits or simulations: stored evidence can be decided again under other rules.
 """
 
 from collections.abc import Sequence
@@ -28,14 +27,14 @@ Outcome = Literal["effect_found", "model_sufficient", "unexplained"]
 
 @dataclass(frozen=True)
 class Check:
-    """A rule as it was applied.
+    """Result of applying a rule.
 
     Attributes:
         rule: its name in [`DecisionRules`][].
-        about: what it was asked of.
-        statistic: what the data say.
-        threshold: what the rule compares it with.
-        holds: whether it is met.
+        about: what was tested.
+        statistic: value from the data.
+        threshold: value that it is compared with.
+        holds: whether the rule is met.
     """
 
     rule: str
@@ -49,7 +48,7 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
     """Whether the data support an effect: all checks must hold.
 
     Args:
-        seen: what they say.
+        seen: the evidence for it.
         rules: the thresholds.
     """
     least, errors, chance = rules.least_gain, rules.strength_errors, rules.significance
@@ -65,11 +64,11 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
 
 
 def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = RULES) -> Check:
-    """Whether a candidate can't be told from the best one: paired differences over blocks, one-sided.
+    """Whether a candidate is tied with the best one: one-sided test of paired differences over blocks.
 
     Args:
         name: of the candidate.
-        behind: log predictive density of the best one less that of the candidate, block by block.
+        behind: log predictive density of the best one minus that of the candidate, block by block.
         rules: the thresholds.
     """
     count = behind.size
@@ -82,8 +81,8 @@ def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = 
 
 
 def compete(best: Rival, others: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, ...]:
-    """Those that compete over whole stretches, the best one included: what is tied with it, and all where it has a
-    memory, whose states short segments leave free.
+    """The candidates that compete over whole stretches: the best one and its ties; all where the best one has memory,
+    whose states are free on short segments.
 
     Args:
         best: the candidate with the largest gain over short segments.
@@ -94,14 +93,14 @@ def compete(best: Rival, others: Sequence[Rival], rules: DecisionRules = RULES) 
 
 
 def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival, tuple[str, ...]]:
-    """Which candidate is taken: of those that gain as much over whole stretches the simplest, a plausible one first.
+    """The chosen candidate: of those with equal gain over whole stretches the simplest, plausible ones first.
 
     Args:
-        rivals: those that compete.
+        rivals: the competing candidates.
         rules: the thresholds.
 
     Returns:
-        The candidate, and the names of those that gain as much.
+        The candidate, and the names of those with equal gain.
     """
     most = max(r.long_gain for r in rivals)
     least = most - max(rules.least_gain, rules.same_gain * abs(most))
@@ -111,10 +110,10 @@ def leader(rivals: Sequence[Rival], rules: DecisionRules = RULES) -> tuple[Rival
 
 
 def only_noise(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
-    """Whether what a model leaves is noise of sensors and torque: all checks must hold.
+    """Whether noise of sensors and torque explains a residual: all checks must hold.
 
     Args:
-        seen: what the filter leaves.
+        seen: the innovations of the filter.
         rules: the thresholds.
     """
     about = f"noise of the sensors, and of the torque by {100 * seen.share:.2g} % of its rms"
@@ -125,10 +124,10 @@ def only_noise(seen: NoiseEvidence, rules: DecisionRules = RULES) -> tuple[Check
 
 
 def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Question | None:
-    """What must be learned next before names can be trusted; None where enough is known.
+    """The learned term needed next to accept or reject named effects; None where none is.
 
     Args:
-        seen: what is known.
+        seen: the evidence so far.
         rules: the thresholds.
     """
     enough = seen.enough
@@ -138,7 +137,7 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
     if seen.names and not enough and not little and "instead" not in seen.asked:
         return "instead"
     if seen.instead is not None and seen.instead.white and seen.come_out < rules.come_out:
-        # Nothing beside the names could be better.
+        # No further term could improve the named model.
         return None
     if not enough and "beside" not in seen.asked:
         return "beside"
@@ -149,14 +148,13 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
 
 
 def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[Check, ...]:
-    """Whether names can be trusted: one check that holds is enough.
+    """Whether named effects are accepted: one check that holds is enough.
 
-    A learned term in the place of a name is free to be anything. The name is doubtful where that term predicts
-    selection data as well as one beside the name. It must also differ from the named effect, or do better by far with
-    fewer parameters.
+    Named effects are rejected where a learned term in their place predicts selection data as well as one beside them.
+    It must also differ from the named effects, or predict far better with fewer parameters.
 
     Args:
-        seen: all that was asked.
+        seen: the evidence.
         rules: the thresholds.
     """
     if seen.instead is None:
@@ -173,19 +171,19 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
     simpler = (by_far and fewer > 0) or (seen.one_shape and fewer >= 0)
     if beside is not None and _adds_little(seen, rules):
         added = seen.named.selection - beside.selection
-        return (Check("little", "what a learned term adds to the names", added, rules.little, True),)
+        return (Check("little", "gain of a learned term beside the names", added, rules.little, True),)
     return (
         Check("little", "a learned term in their place predicts as well", better_by, -rules.least_gain, not as_good),
         Check(
             "come_out",
-            "a learned term in their place comes out as the names",
+            "share of a learned term in their place that the names reproduce",
             seen.come_out,
             rules.come_out,
             come_out and not simpler,
         ),
         Check(
             "lasting",
-            "free runs with the learned term, against the names",
+            "free runs with the learned term in their place",
             seen.longer_worse,
             rules.lasting,
             seen.longer_worse > rules.lasting,
@@ -194,13 +192,13 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
 
 
 def _leaves_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
-    """Whether not even a term that left nothing but noise would be better than the names by far."""
+    """Whether a term that left only noise would gain little over the names."""
     return seen.named.selection - seen.noise < rules.little * (seen.base.selection - seen.noise)
 
 
 def _adds_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
-    """Whether a term beside the names adds next to nothing, on training and on selection data: either may show motions
-    that the other does not."""
+    """Whether a term beside the names gains little, on training and on selection data; motions of the two may
+    differ."""
     if seen.beside is None:
         return False
     pairs = [
@@ -211,7 +209,7 @@ def _adds_little(seen: ChallengeEvidence, rules: DecisionRules) -> bool:
 
 
 def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome, tuple[Check, ...]]:
-    """What the data say in the end, and the checks that led there.
+    """The conclusion, and the checks that led to it.
 
     Args:
         seen: the evidence.
@@ -220,33 +218,35 @@ def conclude(seen: FinalEvidence, rules: DecisionRules = RULES) -> tuple[Outcome
     left, first = np.array(seen.excess), np.array(seen.excess_at_first)
     if not seen.names:
         most = float(np.max(left))
-        check = Check("excess", "what the model leaves over", most, rules.excess, most < rules.excess)
+        check = Check("excess", "residual over the noise", most, rules.excess, most < rules.excess)
         enough = not seen.learned and (check.holds or seen.noise_explains)
         return "model_sufficient" if enough else "unexplained", (check,)
     output = int(np.argmax(first))
     share = float(1.0 - (left[output] ** 2 - 1.0) / max(first[output] ** 2 - 1.0, 1e-12))
-    about = "what the named effects leave over"
+    about = "residual with the named effects over the noise"
     checks = [
         Check("excess", about, float(left[output]), rules.excess, bool(left[output] < rules.excess)),
-        Check("explained", "what they remove", share, rules.explained, share >= rules.explained),
+        Check("explained", "variance that they remove", share, rules.explained, share >= rules.explained),
     ]
     found = any(check.holds for check in checks) or (seen.noise_explains and not seen.learned)
     if found and seen.surprise is not None:
         as_promised = seen.surprise <= rules.surprise
-        checks.append(Check("surprise", "free runs over their bands", seen.surprise, rules.surprise, as_promised))
+        checks.append(
+            Check("surprise", "error of free runs over their bands", seen.surprise, rules.surprise, as_promised)
+        )
         found = as_promised
     return "effect_found" if found else "unexplained", tuple(checks)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the rules make of the evidence.
+    """A conclusion under given rules.
 
     Attributes:
-        outcome: what the data say.
-        names: of the effects that are trusted.
-        checks: every rule as it was applied.
-        lacking: what these rules would have asked for and the evidence does not hold; None where it holds all.
+        outcome: the conclusion.
+        names: of the accepted effects.
+        checks: every applied rule.
+        lacking: evidence that these rules need but that was not gathered; None where it is complete.
     """
 
     outcome: Outcome
@@ -259,8 +259,8 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
     """Decide a case.
 
     Args:
-        evidence: all that is known of it.
-        rules: the thresholds; other ones than those by which it was gathered may ask for more than it holds.
+        evidence: of the case.
+        rules: the thresholds; if they differ from those of the loop, evidence may be missing.
     """
     checks: list[Check] = []
     lacking: list[str] = []
@@ -285,6 +285,6 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
         stand = names_stand(evidence.challenge, rules)
         checks += stand
         if any(check.holds for check in stand) != bool(names):
-            lacking.append("the final model where names are trusted otherwise")
+            lacking.append("the final model with other names")
     outcome, last_checks = conclude(evidence.final, rules)
     return Decision(outcome, names, (*checks, *last_checks), lacking[0] if lacking else None)

@@ -1,4 +1,4 @@
-"""What an effect does along the fitted motion, and what the data say that it does where no law is assumed."""
+"""Torque of an effect along the fitted motion, from its law and as estimated from the data without a law."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.estimate import Fit
 from fitting.estimation.projection import solved
-from fitting.first_order.gains import Acting, Look, look_along, products
+from fitting.first_order.gains import Acting, LinearisedFit, linearise_along, products
 from fitting.first_order.motion import place_of
 from hdjax import Drive, Model
 from hdjax.effects import (
@@ -22,26 +22,26 @@ from hdjax.effects.learned import Learned, LearnedTorque
 from hdjax.effects.learned_axes import ANGLES
 from hdjax.engine.pointwise import at_instants
 
-# Values of the variable at which the data are asked, in each direction.
+# Values of the variable at which the torque is estimated, in each direction.
 _PLACES = 14
-# This part of the samples, on each side, tells what the effect does at one of them.
+# Share of the samples, on each side, that the effect is averaged over at each value.
 _NEARBY = 500
-# Instants of the motion that are drawn.
+# Instants of the motion that are plotted.
 _INSTANTS = 1500
 
 
 class Evidence(eqx.Module):
-    """What one effect does, against the quantity that shows it best.
+    """The torque or error of one effect over the variable that shows it best.
 
     Attributes:
         effect: its name.
         quantity: "torque" [N m], or "error" [rad] of the gear or an encoder.
-        variable: what it is drawn against; angles within one turn.
+        variable: the abscissa; angles within one turn.
         at: the variable at instants of the motion.
-        does: what the effect does at these instants.
-        places: where the data were asked, one row for each direction of the motion; none for errors.
-        told: the torque that the data call for there, with everything else as fitted.
-        std: its standard error, as if the residual were white.
+        does: torque or error of the effect at these instants.
+        places: values of the variable for the estimate, one row for each direction of the motion; none for errors.
+        told: torque estimated from the data there, with all parameters as fitted.
+        std: standard error of `told`, for a white residual.
     """
 
     effect: str = eqx.field(static=True)
@@ -55,7 +55,7 @@ class Evidence(eqx.Module):
 
 
 def evidence(fit: Fit) -> tuple[Evidence, ...]:
-    """The evidence of each effect that one quantity of the motion shows.
+    """The evidence of each effect that depends mainly on one variable.
 
     Args:
         fit: of the model with the effects.
@@ -63,16 +63,16 @@ def evidence(fit: Fit) -> tuple[Evidence, ...]:
     drawn = [e for e in fit.model.effects if e.drawn_against is not None and not isinstance(e, Learned)]
     if not drawn:
         return ()
-    look = look_along(fit)
+    look = linearise_along(fit)
     return tuple(found for found in (_evidence(look, effect) for effect in drawn) if found is not None)
 
 
-def _evidence(look: Look, effect: Effect) -> Evidence | None:
+def _evidence(look: LinearisedFit, effect: Effect) -> Evidence | None:
     assert effect.drawn_against is not None
     value = np.array(getattr(look.motion, effect.drawn_against))
     does = at_instants(_done, (look.followed.states, 2), ((effect.name, look.model), 0), (look.motion, 2))
     weight = np.asarray(look.problem.segments.weight)
-    # The last knot of a segment is the first one of the next.
+    # The last knot of a segment is the first one of the next segment.
     kept = (np.pad(weight, ((0, 0), (0, 1))) > 0) & np.isfinite(value) & np.isfinite(does)
     if effect.drawn_against in ANGLES and np.ptp(value[kept]) > 2 * np.pi:
         value = np.mod(value, 2 * np.pi)
@@ -90,7 +90,7 @@ def _evidence(look: Look, effect: Effect) -> Evidence | None:
 
 
 def _directions(effect: Effect, motion: Motion) -> np.ndarray:
-    """The sign of what an effect with memory, or of sliding, may differ by; zero where it can't."""
+    """The sign of the rate by which an effect with memory or sliding may differ; zero for other effects."""
     v = np.asarray(motion.v)
     memory_of_twist = bool(effect.states) and effect.drawn_against == "x"
     slides = effect.family == "position_dependent_friction"
@@ -101,7 +101,7 @@ def _directions(effect: Effect, motion: Motion) -> np.ndarray:
 
 
 def _done(state: Array, named: tuple[str, Model], motion: Motion) -> Array:
-    """What the effect of a name does at an instant: its torque, or its error."""
+    """Torque or error of a named effect at an instant."""
     name, model = named
     effect = model.effect(name)
     names = model.state_names
@@ -118,15 +118,15 @@ def _done(state: Array, named: tuple[str, Model], motion: Motion) -> Array:
 
 
 def _told(
-    look: Look,
+    look: LinearisedFit,
     form: type[LearnedTorque],
     value: Float[np.ndarray, "segments knots"],
     does: Float[np.ndarray, "segments knots"],
     kept: np.ndarray,
     direction: Float[np.ndarray, "segments knots"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares for a torque that is added to the effect's: a broken line through as many places, for each
-    direction, with everything else as fitted."""
+    """Least-squares estimate of the torque as a piecewise linear function with nodes at `places`, for each direction,
+    with all parameters as fitted."""
     signs = np.unique(direction[kept])
     places, hats, middle = [], [], []
     for sign in signs:
@@ -138,7 +138,7 @@ def _told(
         hats.append(_hats(value, nodes) * there[..., None])
     found = products(look, Acting((look.pushes[form.name],)), (np.concatenate(hats, axis=-1),))
     own = slice(len(look.problem.free.paths), None)
-    # The error is whitened: an equal sum over the outputs is the likelihood.
+    # The error is whitened: the plain sum over outputs is the likelihood.
     gram = np.einsum("siipq->pq", found.gram[..., own, own])
     gradient = np.einsum("siip->p", found.gradient[..., own])
     added = solved(gram, gradient[:, None])[:, 0]
@@ -148,7 +148,7 @@ def _told(
 
 
 def _nearby(value: np.ndarray, does: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """What the effect does at each node, on average over the samples that come closest."""
+    """The effect at each node, averaged over the nearest samples."""
     order = np.argsort(value)
     middle = np.searchsorted(value[order], nodes)
     reach = max(1, value.size // _NEARBY)
@@ -156,8 +156,8 @@ def _nearby(value: np.ndarray, does: np.ndarray, nodes: np.ndarray) -> np.ndarra
 
 
 def _hats(value: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Broken lines that are one at one node and zero at the others; constant beyond the ends. None for a missing
-    node."""
+    """Piecewise linear functions that are one at one node and zero at the others; constant beyond the ends. Zero for a
+    missing node."""
     there = np.isfinite(nodes)
     unit = np.eye(int(there.sum()))
     known = np.stack([np.interp(value, nodes[there], row) for row in unit], axis=-1)

@@ -1,4 +1,4 @@
-"""The search for effects: add the best one, refit, look again; then drop what a later one has made superfluous."""
+"""Stepwise search for effects: add the best one, refit, repeat; then drop those that later ones make superfluous."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
-from fitting.attribution.candidate_fit import Trial, attempt, gone_on, halo_for
+from fitting.attribution.candidate_fit import Trial, attempt, continued, halo_for
 from fitting.attribution.rules import RULES
 from fitting.attribution.selection_round import Round, look
 from fitting.attribution.study import Data, Setting, Study
@@ -19,19 +19,19 @@ from fitting.uncertainty.measurement_noise import MeasurementNoise, measurement_
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
-# Share of segments in which the base model may run away.
+# Largest share of segments in which the base model may diverge.
 _MOST_LOST = 0.5
 
 
 class Search(eqx.Module):
-    """What was found.
+    """Result of the search for effects.
 
     Attributes:
-        named: the model with the effects that were found.
-        rounds: every look at the catalogue.
-        dropped: names of what was found, and was superfluous beside what came later.
-        without: the model without each of what was kept.
-        noise: of the measured outputs, as far as fits were asked for it.
+        named: the model with the accepted effects.
+        rounds: of the search.
+        dropped: names of accepted effects that later ones made superfluous.
+        without: the model without each of the kept effects.
+        noise: of the measured outputs, where it was estimated.
     """
 
     named: Trial
@@ -42,16 +42,15 @@ class Search(eqx.Module):
 
 
 def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Study]:
-    """The base model fitted under the stated hold, or under the one that suits it best, and a study of the data
-    without the samples that its fit does not believe.
+    """The base model fitted under the stated or the best hold, and a study of the data without its outliers.
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
         data: the stretches.
-        hold: what the torque does between samples, where the user states it.
+        hold: inter-sample behaviour of the torque, where the user states it.
 
     Raises:
-        DataError: where no oscillator fits the data.
+        DataError: no oscillator fits the data.
     """
     first = hold if hold is not None else next(iter(data))
     training = data[first][0]
@@ -66,20 +65,20 @@ def base_trial(model: Model, data: Data, hold: Hold | None) -> tuple[Trial, Stud
         chosen = attempt(chosen.model, finer, chosen.hold, start=chosen, hold_parameters=is_held(best))
     if np.mean(lost(chosen.training)) > _MOST_LOST:
         raise DataError(
-            "no stiffness and damping let the simulated drive follow the logs: it runs away; check the inertias in the "
-            "drive file, and unit, sign and side of the torque column"
+            "the simulated drive diverges for every stiffness and damping; check the inertias in the drive file, and "
+            "unit, sign and side of the torque column"
         )
     return chosen, finer
 
 
 def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Sequence[type[Effect]]) -> Search:
-    """Look for effects until the data support no further one.
+    """Add effects until the data support no further one.
 
     Args:
         base: the model without effects.
-        study: the data, and how they are cut.
+        study: the data and their segmentation.
         max_effects: effects to add at most.
-        catalogue: forms to look for.
+        catalogue: candidate forms.
     """
     current, rounds, noise = base, [], measurement_noise(base.training)
     while len(rounds) < max_effects:
@@ -94,8 +93,8 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
             break
         assert this.winner.trial is not None
         study = study.with_substeps(this.winner.trial.training.substeps)
-        # What a trial has not quite reached the next look would take for a further effect.
-        current = gone_on(this.winner.trial, study)
+        # Continue the fit: a remainder that has not converged would be taken for a further effect.
+        current = continued(this.winner.trial, study)
         study.progress(f"found {this.winner.name}")
     dropped = _holds_given_up(rounds, base.hold, current.hold)
     current, superfluous, without = _without_superfluous(current, base, study)
@@ -109,8 +108,8 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
 
 
 def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Trial, list[str], dict[str, Trial]]:
-    """The model without effects that selection data hardly miss beside later ones, their names, and the model without
-    each of the others but the last."""
+    """The model without superfluous effects, their names, and the model without each of the others but the last. An
+    effect is superfluous if its removal hardly changes the error on selection data."""
     dropped, without = [], {}
     for name in [e.name for e in current.model.effects][:-1]:
         poorer = refitted_without([name], current, base, study)
@@ -123,7 +122,7 @@ def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Tri
 
 
 def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[str]:
-    """Findings of another hold of the torque that a later one has taken back."""
+    """Accepted holds of the torque that a later one replaces."""
     holds = [
         this for this in rounds if this.accepted and this.winner.trial and this.winner.trial.hold != this.before.hold
     ]
@@ -131,13 +130,13 @@ def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[st
 
 
 def refitted_without(names: Collection[str], current: Trial, base: Trial, study: Study) -> Trial:
-    """The model refitted without some of what was found, by as many solver steps.
+    """The model refitted without some of its effects, with the same solver steps.
 
     Args:
-        names: of effects; any other one is that of another hold of the torque, which is taken back.
+        names: of effects; any other name is that of a hold, which is reverted.
         current: the model.
         base: the model without effects.
-        study: the data, and how they are cut.
+        study: the data and their segmentation.
     """
     model, effects = current.model, {e.name for e in current.model.effects}
     for name in effects.intersection(names):

@@ -1,4 +1,4 @@
-"""Every threshold that decides something, with its meaning, its unit and its source."""
+"""Thresholds of all decisions, with meaning, unit and source."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -13,140 +13,143 @@ _UNDECLARED = "study of undeclared effects, `docs/evaluation_history.md`"
 
 @dataclass(frozen=True)
 class DecisionRules:
-    """Every threshold that decides something; `docs/rules.md` is made of the fields."""
+    """Thresholds of all decisions; `docs/rules.md` is generated from the fields."""
 
     significance: float = _rule(
         0.01,
         "1",
-        "largest chance that the best of the catalogue gains as much where nothing is missing",
-        "convention; at 0.01 at most one false alarm in a hundred looks",
+        "largest p-value of the best form's gain",
+        "convention; at 0.01 at most one false alarm in a hundred searches",
     )
     least_gain: float = _rule(
         1e-3,
         "log of rms error",
         "smallest decrease of the error that counts: a tenth of a percent",
-        "an imperfection of the solver counts for as much",
+        "solver errors may cause as much",
     )
     tie_level: float = _rule(
         0.05,
         "1",
-        "chance at which a candidate counts as worse than the best one, by a paired t test over blocks",
+        "p-value below which a candidate is worse than the best one, by a paired t test over blocks",
         "convention",
     )
     same_gain: float = _rule(
-        0.02, "share of the best gain", "gains over whole stretches that differ by less are the same", _UNDECLARED
+        0.02, "share of the best gain", "gains over whole stretches that differ by less are equal", _UNDECLARED
     )
     strength_errors: float = _rule(
         3.9,
         "standard errors",
-        "by which a strength must differ from zero",
-        "one percent of chance over a hundred forms and shapes (Bonferroni)",
+        "least distance of a strength from zero",
+        "p-value of one percent over a hundred forms and shapes (Bonferroni)",
     )
     at_bounds: float = _rule(
         0.0,
         "parameters",
-        "of an effect that may have ended at a bound: beyond it the law makes no sense, so that it names nothing",
+        "largest number of an effect's parameters at a bound: beyond its bounds a law is not physical",
         "bounds are in the code of each effect",
     )
     excess: float = _rule(
-        1.5, "times the noise", "a residual larger than this is not noise", "the noise is known to a few per cent"
+        1.5, "times the noise", "largest residual that counts as noise", "the noise is estimated to a few per cent"
     )
     explained: float = _rule(
         0.99,
         "share of variance",
-        "of the error beyond noise that found effects must remove to be the explanation",
+        "of the error beyond noise that effects must remove to explain it",
         "a tenth of the error; 0.9986 on Silverbox, and 0.99 changes none of 40 cases of the study (seed 95)",
     )
     quasi_static_explained: float = _rule(
         0.9,
         "share of variance",
-        "likewise of quasi-static logs, whose laws err by more",
+        "likewise of quasi-static logs, whose laws are less exact",
         "0.96 for the hysteresis of a measured joint (`docs/quasi_static.md`)",
     )
     little: float = _rule(
         0.05,
         "share of the gain",
-        "what a learned term adds to names, or names leave beyond noise, is little below this share of their gain",
+        "below which a learned term's further gain, or the names' error beyond noise, is negligible",
         _UNDECLARED,
     )
     come_out: float = _rule(
         0.75,
         "share of mean square",
-        "of a learned term that named effects must make up for it to have come out as them",
+        "of a learned term that named effects must reproduce to count as equal to it",
         _UNDECLARED,
     )
     lasting: float = _rule(
         0.1,
         "log of rms error",
-        "by which free runs of a learned term may be worse than those of the names that it would replace",
-        "a lag in the place of creep left 40 times as much (study, seed 95)",
+        "largest excess of a learned term's free-run error over that of the names that it replaces",
+        "a lag in place of creep had 40 times the error (study, seed 95)",
     )
-    many: float = _rule(3.0, "names", "so many names may be the terms of one function", _UNDECLARED)
+    many: float = _rule(3.0, "names", "least number of names that may be the terms of one function", _UNDECLARED)
     noise_gain: float = _rule(
         5.0,
         "nats",
-        "log likelihood by which an effect, or noise of the torque, must better noise that would explain as much",
+        "least log likelihood ratio of an effect, or of torque noise, against a noise model without it",
         "the best of fifty forms gains 4 by chance",
     )
     innovations: float = _rule(
         0.03,
         "share of variance",
-        "of a Kalman filter's innovations that earlier ones may predict where all that is left is noise",
+        "largest predictable part of a Kalman filter's innovations where only noise is left",
         "below 0.01 under noise, above 0.06 where an effect is missing (`tests/uncertainty/test_noise_model.py`)",
     )
     free_run_explained: float = _rule(
         0.9,
         "share of variance",
-        "of the free runs' error beyond noise that effects must remove for their bands not to be asked",
-        "laws are not exact, and bands know nothing of that",
+        "of the free runs' error beyond noise: if effects remove more, prediction bands are not checked",
+        "laws are not exact, and bands do not include their error",
     )
     surprise: float = _rule(
         1.25,
         "times the band",
-        "free runs that are farther off than this are not what the model promised",
+        "largest error of free runs that agrees with the prediction band",
         "a right model stays within 1.2 (`tests/validation/test_free_run_check.py`)",
     )
 
     line_errors: float = _rule(
-        5.0, "standard errors", "by which a spectral line is in a log", "one in 2e6 by chance, over some thousand lines"
+        5.0,
+        "standard errors",
+        "least amplitude of a spectral line that is present in a log",
+        "p-value 5e-7, over some thousand lines",
     )
     line_share: float = _rule(
         0.25,
         "share of squares",
-        "of what is left that a line must explain for the clocks of several logs to be set by it",
-        "lines that a multisine leaves behind explain less each (`tests/attribution/test_log_alignment.py`)",
+        "of the residual that a line must explain to align the clocks of several logs",
+        "residual lines of a multisine explain less each (`tests/attribution/test_log_alignment.py`)",
     )
     line_in_phase: float = _rule(
         0.9,
         "share of amplitude",
-        "that a line of one phase keeps of what it has with a phase of each log's own where clocks are right",
+        "amplitude of a line with one common phase over that with a phase per log, where clocks are aligned",
         "phases within 0.45 rad",
     )
     coefficient: float = _rule(
         0.005,
         "log of rms error",
-        "that a further coefficient of a learned function must gain on parts of the training data left out",
+        "least cross-validated gain of a further coefficient of a learned function",
         "assumed: half a percent of the error",
     )
     variable: float = _rule(
-        0.03, "log of rms error", "that a second variable of a learned function must gain", "assumed: three percent"
+        0.03, "log of rms error", "least gain of a second variable of a learned function", "assumed: three percent"
     )
     quasi_static_imperfection: float = _rule(
         0.05,
         "share of rms",
-        "of what effects of quasi-static logs have removed that their laws may get wrong",
+        "error of quasi-static effects' laws, relative to what they have removed",
         "laws of hysteresis and stiffness are good to some hundredths (`docs/quasi_static.md`)",
     )
     wander: float = _rule(
         20.0,
         "times the noise",
-        "by which a residual of quasi-static logs may wander and still be coloured noise",
-        "an encoder's noise correlated by 0.98 from row to row would be nine times",
+        "largest low-frequency residual of quasi-static logs that counts as coloured noise",
+        "encoder noise with a correlation of 0.98 from row to row gives nine times",
     )
 
 
 RULES = DecisionRules()
-"""The rules as they are."""
+"""The default rules."""
 
 
 def rules_table(rules: DecisionRules = RULES) -> list[dict[str, Any]]:

@@ -5,19 +5,19 @@ from jaxtyping import Float
 
 from fitting.attribution.candidate_fit import Trial
 
-# Blocks at most: so long that what one leaves over hardly knows of the next.
+# Most blocks: each is long enough for residuals of neighbouring blocks to be nearly uncorrelated.
 _MOST_BLOCKS = 40
 
 
 def block_scores(trial: Trial, whitening: Float[np.ndarray, "outputs outputs"]) -> Float[np.ndarray, " blocks"]:
     """Log predictive density of each block, up to a constant.
 
-    The density is a multivariate t with as many degrees of freedom as the block has numbers: the noise's variance may
-    be off by a few times in a block, so that no block decides alone.
+    The density is a multivariate t with as many degrees of freedom as the block has values. So the noise variance of a
+    block may differ by a few times, and no block decides alone.
 
     Args:
         trial: the candidate.
-        whitening: of the noise, the same for all candidates that are compared.
+        whitening: of the noise, the same for all compared candidates.
     """
     white = np.asarray(trial.held_out.error) @ np.asarray(whitening).T
     weight = np.asarray(trial.held_out.problem.segments.weight).sum(axis=1)

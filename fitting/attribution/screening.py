@@ -1,9 +1,8 @@
-"""A first look at the whole catalogue: what would each effect explain, to first order?
+"""Screening: first-order gain of each effect of the catalogue.
 
-At zero strength an effect changes nothing, but the derivative of the simulated outputs with respect to its strength is
-there: the answer of the present model to a small force along its own motion. Least squares on those derivatives gives
-each effect's strength and gain to first order (a score test), on held-out data too. The same linear algebra applied to
-surrogates of the residual gives the law of the best gain where there is nothing to find.
+The derivative of the simulated outputs by an effect's strength at zero is the model's response to a small force along
+its motion. Least squares with these regressors gives each effect's strength and gain to first order (a score test),
+also on held-out data. Applied to surrogates of the residual, it gives the null distribution of the best gain.
 """
 
 import math
@@ -21,26 +20,25 @@ from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.scales import scales
 from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import follows
-from fitting.first_order.linearised_fit import Answered, Sight, batches, follow_on, sight
+from fitting.first_order.linearised_fit import Answered, FittedMotion, batches, fitted_motion, follow_on
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 
-# What an effect would do along a motion that is off by more than this share is off by as much; the measured motion then
-# takes its place.
+# Relative error of the motion above which effects are evaluated along the measured motion instead.
 _NEAR = 0.1
 
 
 class Lead(eqx.Module):
-    """One form of an effect, as the first look sees it.
+    """One form of an effect with its first-order estimates.
 
     Attributes:
-        effect: the form at the strengths that suit best to first order.
-        drive_changes: change of the parameters that were free already, by path.
+        effect: the form with first-order estimates of its strengths.
+        drive_changes: change of the other free parameters, by path.
         gain: decrease of the objective on held-out data, to first order.
-        own_states: where the effect's own states start in each training segment, driven by the present model's motion;
-            None for an effect without.
+        own_states: hidden initial states in each training segment, driven by the current model's motion; None for an
+            effect without.
     """
 
     effect: Effect
@@ -49,23 +47,23 @@ class Lead(eqx.Module):
     own_states: Float[np.ndarray, "segments own"] | None = None
 
 
-# What a look at the catalogue says of a form; of quasi-static logs likewise.
+# Type of a form's screening result, also of quasi-static logs.
 LeadT = TypeVar("LeadT", default=Lead)
 
 
 class Screen(eqx.Module, Generic[LeadT]):
-    """The first look at the whole catalogue.
+    """Result of screening the catalogue.
 
     Attributes:
         leads: best first.
-        null_gains: the best gain over the catalogue in each of the surrogates.
+        null_gains: best gain over the catalogue for each surrogate.
     """
 
     leads: tuple[LeadT, ...]
     null_gains: Float[np.ndarray, " draws"]
 
     def p_value(self, gain: float) -> float:
-        """How often chance alone makes the best of the catalogue at least this good."""
+        """p-value of a gain under the null distribution of the catalogue's best."""
         return (1 + int(np.sum(self.null_gains >= gain))) / (1 + self.null_gains.size)
 
 
@@ -76,12 +74,12 @@ def screen(
     catalogue: Sequence[type[Effect]] = CATALOGUE,
     seed: int = 0,
 ) -> Screen:
-    """Look at every form that the current model lacks.
+    """Screen every form that the current model lacks.
 
     Args:
         training: fit of the current model.
         held_out: the same model's parameters on held-out stretches (states fitted, parameters held).
-        catalogue: forms to look at.
+        catalogue: candidate forms.
         seed: of the surrogates.
     """
     model = training.model
@@ -91,16 +89,16 @@ def screen(
     found = applicable(forms, lines, has_motor=isinstance(model, TwoInertiaModel))
     proposals = tuple(effect for effects in found.values() for effect in effects)
     strays = not follows(training, share=_NEAR)
-    # Held parameters stay: the motion of a model that strays tells nothing of them where no sensor sees the twist.
+    # Fixed parameters stay fixed: without a sensor of the twist, a motion that deviates has no information about them.
     stay = strays and _was_held(training) and not sees_twist(training.stretches)
     free_now = () if stay else training.free.paths
     skipped = len(training.free.paths) - len(free_now)
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
-    sights = sight(training, seed, measured=strays), sight(held_out, seed + 1, measured=strays)
+    fitted_motions = fitted_motion(training, seed, measured=strays), fitted_motion(held_out, seed + 1, measured=strays)
     known = len(free_now)
-    for batch in batches(sights, proposals, follow_on(training, held_out)):
-        scores = [_scores(*pair) for pair in zip(sights, batch.answers, strict=True)]
+    for batch in batches(fitted_motions, proposals, follow_on(training, held_out)):
+        scores = [_scores(*pair) for pair in zip(fitted_motions, batch.answers, strict=True)]
         for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
             fitted, unseen = (score.columns([*range(known), *(skipped + known + c for c in own)]) for score in scores)
             columns = list(range(known, known + len(own)))
@@ -120,27 +118,27 @@ def screen(
 
 
 def _was_held(fit: Fit) -> bool:
-    """Whether the parameters of a fit were held: it has not moved them, but for rounding."""
+    """Whether a fit's parameters were fixed: unchanged except for rounding."""
     return all(
         math.isclose(float(fit.model.get(p)), float(fit.problem.model.get(p)), rel_tol=1e-12) for p in fit.free.paths
     )
 
 
 def _filled_up(states: np.ndarray, fit: Fit) -> np.ndarray:
-    """One row for each of a fit's segments; those without data are like the last one that has some."""
+    """One row for each of a fit's segments; those without data repeat the last one with data."""
     return np.pad(states, ((0, len(fit.unknowns.states) - len(states)), (0, 0)), mode="edge")
 
 
-def _scores(sight: Sight, answered: Answered) -> Scores:
-    columns = np.concatenate([sight.answers.parameters, answered], axis=-1)
-    return Scores.of(columns, sight.answers.weight, sight.residual, sight.surrogates)
+def _scores(fitted_motion: FittedMotion, answered: Answered) -> Scores:
+    columns = np.concatenate([fitted_motion.answers.parameters, answered], axis=-1)
+    return Scores.of(columns, fitted_motion.answers.weight, fitted_motion.residual, fitted_motion.surrogates)
 
 
 def _linear_gain(fitted: Scores, unseen: Scores, known: int, positive: list[int]) -> tuple[dict[int, float], float]:
-    """Least-squares step of the columns, and what it gains on unseen data beyond refitting those that were free
-    already, the first ones.
+    """Least-squares step of the columns, and its gain on held-out data relative to refitting the free parameters (the
+    first columns).
 
-    A strength that can't be negative is left at zero where it would be.
+    A strength that can't be negative is zero where its estimate is.
     """
     kept, against = list(range(known, len(fitted.gram))), fitted.gradient[:, None]
     while True:

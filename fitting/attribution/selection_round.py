@@ -1,4 +1,4 @@
-"""Which effect explains what the model leaves over: trials inside the equations, judged on data they have not seen."""
+"""One round of the search: candidates are refitted inside the equations and compared on held-out data."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ import numpy as np
 from typing_extensions import TypeVar
 
 from fitting.attribution.candidate_fit import Trial, long_gains
-from fitting.attribution.candidate_refit import begin, go_on, try_hold
+from fitting.attribution.candidate_refit import begin, complete_refit, try_hold
 from fitting.attribution.case_evidence import EffectEvidence, Rival, RoundEvidence
 from fitting.attribution.decisions import compete, leader, support, tie
 from fitting.attribution.rules import RULES
@@ -29,31 +29,31 @@ from fitting.estimation.scales import scales
 from fitting.uncertainty.identifiability import parameters_at_bounds
 from hdjax.effects import Effect
 
-# Work in proportion: what is tied with the best gains as much but for this share; so it must in its first pass to be
-# worth another.
+# A candidate needs this share of the best gain after its first pass to be refitted further; ties have nearly the same
+# gain.
 _NEAR_TIE = 0.1
-# A family of which one form gains this share of what the best of all does may have one that does better.
+# Further forms of a family are refitted if one of its forms has this share of the best gain.
 _MAY_DO_BETTER = 0.75
-# A rival that explains less than this share of what the best one so far does, in its first pass, is given up.
+# A rival with less than this share of the best gain after its first pass is dropped.
 _HOPELESS = 0.3
 
 
-# A fitted model, and one where a competitor may not have been refitted; quasi-static logs have fits of their own.
+# Types of a fitted model, and of one that may be missing; quasi-static logs have other fits.
 Fitted = TypeVar("Fitted", default=Trial)
 Refitted = TypeVar("Refitted", default=Trial | None)
 
 
 class Verdict(eqx.Module, Generic[Refitted]):
-    """One competitor of a round.
+    """Result of one candidate of a round.
 
     Attributes:
         name: the form.
         family: its family.
-        trial: the refitted model, or None where it was not worth a refit.
-        gain: decrease of the held-out objective (first-order estimate where there was no refit); of an effect with
-            memory, what of it lasts over whole stretches.
-        p_value: of that gain against the best of the catalogue on noise.
-        separable: whether held-out data tell it from the round's winner.
+        trial: the refitted model, or None without a refit.
+        gain: decrease of the held-out objective (first-order estimate without a refit); of an effect with memory, the
+            part that persists over whole stretches.
+        p_value: of that gain under the null distribution of the catalogue's best.
+        separable: whether held-out data distinguish it from the winner.
     """
 
     name: str = eqx.field(static=True)
@@ -65,14 +65,14 @@ class Verdict(eqx.Module, Generic[Refitted]):
 
 
 class Round(eqx.Module, Generic[Fitted, Refitted]):
-    """One look at the catalogue under one model.
+    """One round of the search.
 
     Attributes:
-        before: the model that was looked at.
-        screen: first-order look and the law of chance.
-        verdicts: all competitors, best first.
+        before: the current model.
+        screen: first-order gains and their null distribution.
+        verdicts: all candidates, best first.
         accepted: whether the best one is supported.
-        evidence: what that rests on.
+        evidence: for that decision.
     """
 
     before: Fitted
@@ -83,12 +83,12 @@ class Round(eqx.Module, Generic[Fitted, Refitted]):
 
     @property
     def winner(self) -> Verdict[Refitted]:
-        """The best competitor."""
+        """The best candidate."""
         return self.verdicts[0]
 
 
 def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
-    """What the data say of a competitor; another hold has no strength to tell from zero."""
+    """The evidence for a candidate; another hold has no strength to test."""
     trial = verdict.trial
     assert trial is not None
     own = {verdict.name} & {e.name for e in trial.model.effects}
@@ -106,15 +106,15 @@ def _evidence(verdict: Verdict, standing: Standing) -> EffectEvidence:
 
 
 def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]]) -> Round:
-    """Look for the effect that explains most of what a model leaves over.
+    """Find the effect that explains most of a model's residual.
 
     Args:
         standing: the current model.
-        study: the data, of which every hold competes with the present one, and whether all forms are refitted.
-        catalogue: forms to consider.
+        study: the data under every hold to compare, and whether all forms are refitted.
+        catalogue: candidate forms.
     """
     before = standing.before
-    study.progress("looking through the catalogue")
+    study.progress("screening the catalogue")
     screened = screen(before.training, before.held_out, catalogue=catalogue, seed=study.seed)
     refits = _Refits(before, study)
     refits.of_all(screened) if study.setting.thorough else refits.in_proportion(screened)
@@ -137,18 +137,18 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
 
 
 class _Refits:
-    """Forms that are put inside the equations and refitted, one after the other."""
+    """Refits of forms inside the equations, one after the other."""
 
     def __init__(self, before: Trial, study: Study) -> None:
         self.before, self.study = before, study
         self.done: dict[str, Trial] = {}
 
     def of_all(self, screened: Screen) -> None:
-        """Every form, to the end."""
+        """Refit every form completely."""
         self._refit(screened.leads, self.study, 0.0)
 
     def in_proportion(self, screened: Screen) -> None:
-        """The likeliest form of each family, and further forms near the best one."""
+        """Refit the most likely form of each family, and further forms near the best one."""
         before = self.before
         worth = worth_a_refit(screened, least=0.25 * RULES.least_gain)
         swing = scales(before.training.stretches, before.model)
@@ -172,20 +172,20 @@ class _Refits:
         for lead in leads:
             study.progress(f"refitting with {lead.effect.name}")
             begun.append((lead, begin(self.before, lead, study)))
-        # The one that has come farthest goes on first: beside it most others need not.
+        # The best one after its first pass is completed first; most others need not be.
         for lead, found in sorted(begun, key=lambda pair: pair[1].objective):
             best = min((t.training.objective for t in self.done.values()), default=np.inf)
             limit = _on_the_way(self.before, best, share)
-            trial = go_on(self.before, lead, found, study, limit)
+            trial = complete_refit(self.before, lead, found, study, limit)
             if trial is not None and np.isfinite(trial.held_out.objective):
                 self.done[lead.effect.name] = trial
 
     def _beside(self, best: Trial, leads: Sequence[Lead]) -> None:
-        # What is to come near it in its first pass needs its steps.
+        # Comparable first passes need its number of solver steps.
         self._refit(leads, self.study.with_substeps(best.training.substeps), 1.0 - _NEAR_TIE)
 
     def forms(self, screened: Screen) -> list[Verdict]:
-        """All forms; a first-order gain stands for those that were not refitted."""
+        """Results of all forms, with the first-order gain of those that were not refitted."""
         found = []
         for lead in screened.leads:
             trial = self.done.get(lead.effect.name)
@@ -195,7 +195,7 @@ class _Refits:
         return found
 
     def holds(self, screened: Screen) -> list[Verdict]:
-        """Other assumptions about the torque between samples."""
+        """Refit with other holds of the torque."""
         found = []
         for hold in self.study.data:
             if hold == self.before.hold:
@@ -210,8 +210,8 @@ class _Refits:
 def _supported_first(
     verdicts: list[Verdict], ask: Callable[[Verdict], EffectEvidence]
 ) -> tuple[list[Verdict], tuple[EffectEvidence, ...], bool]:
-    """The list from its first supported competitor on, the unsupported ones behind it, unchanged where none is; what
-    the data say of each that was asked; and whether there is one."""
+    """The list with unsupported leaders moved behind the first supported candidate (unchanged where none is); the
+    evidence for each tested one; and whether one is supported."""
     asked = []
     for i, verdict in enumerate(verdicts):
         if verdict.trial is None:
@@ -220,13 +220,13 @@ def _supported_first(
         if all(check.holds for check in support(asked[-1])):
             return [verdict, *verdicts[:i], *verdicts[i + 1 :]], tuple(asked), True
         if verdict.gain <= RULES.least_gain or verdict.p_value > RULES.significance:
-            # Those behind it gain less.
+            # The following ones gain less.
             break
     return verdicts, tuple(asked), False
 
 
 def _on_the_way(before: Trial, best: float, share: float) -> float:
-    """The training objective of what gains a share of what the best one does; infinite where there is none yet."""
+    """The training objective at a share of the best gain; infinite where there is no refit yet."""
     return before.training.objective - share * (before.training.objective - best) if np.isfinite(best) else np.inf
 
 
@@ -235,8 +235,8 @@ def _reaches(trial: Trial | None, objective: float) -> bool:
 
 
 def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], dict[str, tuple[float, ...]]]:
-    """The competitors, those marked whose error on selection data can't be told from the best one's; and how far each
-    that was refitted is behind it, block by block."""
+    """The candidates, with ties of the best one marked; and the score difference of each refitted one, block by
+    block."""
     best = verdicts[0].trial if verdicts else None
     if best is None:
         return verdicts, {}
@@ -249,10 +249,9 @@ def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], dict[str, tuple[
 
 
 def _simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tuple[list[Verdict], tuple[Rival, ...]]:
-    """The competitors with the one first that is taken where several can't be told apart, and what those are like.
+    """The candidates with the chosen one of several ties first, and the evidence of the ties.
 
-    Over short segments what adds up slowly is hidden, and what an effect remembers starts where it suits; whole
-    stretches tell.
+    Short segments hide slow errors, and leave hidden states free; so free runs along whole stretches decide.
     """
     refitted = [v for v in verdicts if v.trial is not None]
     best, *others = (_rival(v, before) for v in refitted)
@@ -265,7 +264,7 @@ def _simplest_first(verdicts: list[Verdict], before: Trial, study: Study) -> tup
     rivals = tuple(replace(_rival(v, before), long_gain=g) for v, g in zip(competing, gains, strict=True))
     first, close = leader(rivals)
     if not first.tied:
-        # Whole stretches have told it from one that only short segments preferred.
+        # Whole stretches distinguish it from one that only short segments preferred.
         apart = [v.name not in close if v.name in near else v.separable for v in verdicts]
         verdicts = [eqx.tree_at(lambda v: v.separable, v, a) for v, a in zip(verdicts, apart, strict=True)]
     return sorted(verdicts, key=lambda v: v.name != first.name), rivals

@@ -1,4 +1,4 @@
-"""Which forms are put inside the equations and refitted, from the first look alone."""
+"""Choice of the forms to refit, from screening alone."""
 
 from collections.abc import Sequence
 
@@ -7,32 +7,32 @@ from fitting.estimation.free_parameters import effect_paths
 from hdjax.effects import CATALOGUE
 
 NEARLY = 0.95
-"""A form with fewer parameters goes first where it explains at least this share of what its family's best one does."""
-# A form that to first order does no better than chance does in this share of cases is not refitted.
+"""A form with fewer parameters goes first where it has at least this share of its family's best gain."""
+# A form whose first-order gain has a p-value above this is not refitted.
 _WORTH_A_REFIT = 0.2
-# Nor is one that explains less than this share of what the best one does: where stiffness is far off, as with backlash,
-# the first look misses the gain of the right form by a factor of ten.
+# Nor is one with less than this share of the best gain. Where the stiffness is far off, as with backlash, screening may
+# underestimate the right form's gain by a factor of ten.
 _SHARE_OF_BEST = 0.05
-# First-order gains that differ by less than this share are the same.
+# First-order gains that differ by less than this share are equal.
 _THE_SAME = 1e-6
-# Families whose likeliest form is refitted inside the equations in each round.
+# Number of families whose most likely form is refitted in each round.
 _FAMILIES = 5
-# Each state of a form's own is followed, and its start fitted, in each segment: one with several goes first in its
-# family only where no other explains at least this share of what it does.
+# Hidden states are simulated, and their initial values fitted, in each segment. So a form with several goes first in
+# its family only where no other has this share of its gain.
 _FEWER_STATES = 0.25
-# Further forms of the best one's family, and of each that comes near it, that compete there.
+# Number of further forms that are refitted of the best one's family, and of each close one.
 _FORMS = 3
-# Beside an effect that leaves nothing but noise, others can at best be tied with it: those that to first order explain
-# at least this share of what it does,
+# If an effect leaves only noise, others can at best be tied with it: those with at least this share of its first-order
+# gain,
 _POSSIBLE_TIE = 0.5
 
 
 def worth_a_refit(screened: Screen, *, least: float) -> list[Lead]:
-    """Leads that may be more than chance and explain a share of what the best one does, best first.
+    """Forms with a plausible p-value and a share of the best gain, best first.
 
     Args:
-        screened: the first look.
-        least: gain that none may fall below.
+        screened: the result of screening.
+        least: smallest gain.
     """
     if screened.leads:
         least = max(least, _SHARE_OF_BEST * screened.leads[0].gain)
@@ -40,11 +40,11 @@ def worth_a_refit(screened: Screen, *, least: float) -> list[Lead]:
 
 
 def first_of_each_family(leads: Sequence[Lead], suspects: Sequence[Lead] = ()) -> list[Lead]:
-    """The likeliest form of each family, likeliest first; the simplest of those that explain nearly as much.
+    """The most likely form of each family, best first; the simplest of those with nearly the same gain.
 
     Args:
-        leads: what is worth a refit, best first.
-        suspects: what else may be behind the model's own parameters; of these families one form is always there.
+        leads: forms to refit, best first.
+        suspects: forms that base parameters may imitate; one of each of their families is always included.
     """
     families: dict[str, list[Lead]] = {}
     for lead in leads:
@@ -57,15 +57,15 @@ def first_of_each_family(leads: Sequence[Lead], suspects: Sequence[Lead] = ()) -
 
 
 def _likeliest(forms: Sequence[Lead]) -> Lead:
-    """The form of a family, best first, that goes first."""
+    """The form of a family that is refitted first."""
     lean = [a for a in forms if len(a.effect.states) < 2 and a.gain >= _FEWER_STATES * forms[0].gain]
     near = lean or list(forms)
     return _simplest([a for a in near if a.gain >= NEARLY * near[0].gain])
 
 
 def _simplest(leads: Sequence[Lead]) -> Lead:
-    """The one with the fewest parameters and states of its own; of those that to first order are one and the same
-    (backlash with and without damping in the gap) the one that the catalogue lists first."""
+    """The form with the fewest parameters and hidden states; of those that are equal to first order (backlash with and
+    without damping in the gap) the first of the catalogue."""
     best = max(leads, key=lambda lead: lead.gain)
 
     def order(lead: Lead) -> tuple[int, int, int]:
@@ -77,8 +77,8 @@ def _simplest(leads: Sequence[Lead]) -> Lead:
 
 
 def possible_ties(leads: Sequence[Lead], first: Sequence[Lead]) -> list[Lead]:
-    """What may explain as much as the first of all, which leaves nothing but noise: other families, and forms of its
-    own one that to first order explain more."""
+    """Possible ties of the best form, which leaves only noise: other families, and forms of its family with a larger
+    first-order gain."""
     leader = first[0]
     others = [lead for lead in first[1:] if lead.gain >= _POSSIBLE_TIE * leader.gain]
     forms = [a for a in leads if a.effect.family == leader.effect.family and a.gain > leader.gain and a is not leader]

@@ -1,4 +1,4 @@
-"""What a loop works on: training and selection data, how they are cut, the seed of its surrogates, who is told."""
+"""Data and settings of a loop: training and selection data, segmentation, seed of the surrogates, progress."""
 
 from dataclasses import dataclass, replace
 
@@ -12,20 +12,20 @@ from fitting.estimation.solver_steps import needed_substeps
 from fitting.progress import Progress, silent
 from hdjax import Hold
 
-# A few steps that together lower the objective by less than half of this are not worth another; nor by less than half
-# of the latter while a model is but one of several.
+# Least decrease of the objective, times two, over a few steps for an iteration to go on; the second one applies while
+# several candidates compete.
 LEAST_PROGRESS, _LEAST_OF_A_RIVAL = 0.1 * RULES.least_gain, RULES.least_gain
 
 Data = dict[Hold, tuple[tuple[Stretch, ...], tuple[Stretch, ...]]]
-"""Training and held-out stretches for each assumption about the torque between samples."""
+"""Training and held-out stretches for each hold of the torque."""
 
 
 class Setting(eqx.Module):
-    """How the data are cut and simulated; the same for all trials, so that they share programs.
+    """Segmentation and iteration settings; the same for all trials, so that they share programs.
 
     Attributes:
-        segmentation: into segments, and how finely these are simulated.
-        least_progress: share of the sum of squares that a few steps of a fit must take off it.
+        segmentation: segment lengths and solver steps.
+        least_progress: least relative decrease of the sum of squares over a few steps of a fit.
         thorough: whether all forms of the catalogue are refitted in each round.
     """
 
@@ -41,13 +41,13 @@ class Setting(eqx.Module):
 
 @dataclass(frozen=True)
 class Study:
-    """What a loop works on.
+    """Data and settings of a loop.
 
     Attributes:
-        data: the stretches; every hold that is here may be tried.
-        setting: how they are cut.
-        seed: of the surrogates behind the p-values.
-        progress: told what is being done.
+        data: the stretches, for every hold that may be tried.
+        setting: segmentation and iteration.
+        seed: of the surrogates for p-values.
+        progress: receives messages.
     """
 
     data: Data
@@ -56,16 +56,16 @@ class Study:
     progress: Progress = silent
 
     def with_substeps(self, count: int) -> "Study":
-        """The same, with so many solver steps in a sample interval."""
+        """The same with a given number of solver steps per sample interval."""
         segmentation = replace(self.setting.segmentation, substeps=count)
         return replace(self, setting=replace(self.setting, segmentation=segmentation))
 
     def for_rivals(self) -> "Study":
-        """The same, with no more patience than one of several models needs."""
+        """The same with the least progress for one of several models."""
         least = max(self.setting.least_progress, _LEAST_OF_A_RIVAL)
         return replace(self, setting=replace(self.setting, least_progress=least))
 
     def fine_enough(self, found: Fit) -> "Study":
-        """The same, with as many solver steps as the fitted motion needs; itself where these are enough."""
+        """The same with as many solver steps as the fitted motion needs."""
         substeps = needed_substeps(found)
         return self.with_substeps(substeps) if substeps > (self.setting.segmentation.substeps or 0) else self

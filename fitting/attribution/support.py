@@ -1,4 +1,4 @@
-"""What the data say of an effect that was refitted: its strength, what it removes, whether its values are plausible."""
+"""Evidence for a refitted effect: significance of its strength, removed error, plausibility of its values."""
 
 from collections.abc import Collection
 from functools import cached_property
@@ -22,15 +22,14 @@ from hdjax.parameters import own_parameters
 
 
 def strength_errors(fit: Fit, names: Collection[str]) -> dict[str, float]:
-    """By how many standard errors the best known strength of each effect differs from zero, of those that its name
-    speaks of.
+    """Largest distance from zero, in standard errors, of each effect's strengths that its name refers to.
 
-    With the effect's shape as fitted: where a strength is zero, its shape means nothing, and along a valley of shapes
-    that explain the same (a creep's stiffness over its time) the strength may well be open.
+    The shape is fixed as fitted: at zero strength it is undefined, and strength may be confounded with shape (a creep's
+    stiffness with its time).
 
     Args:
         fit: of the model.
-        names: of effects to ask for.
+        names: of the effects.
     """
     if not names:
         return {}
@@ -38,9 +37,8 @@ def strength_errors(fit: Fit, names: Collection[str]) -> dict[str, float]:
     return {name: _strength_errors(found, fit.model.effect(name)) for name in names}
 
 
-def told_from_zero(fit: Fit, names: Collection[str], rules: DecisionRules = RULES) -> set[str]:
-    """Those effects of a model of which the fit tells at least one strength from zero; arguments as in
-    [`strength_errors`][]."""
+def nonzero_effects(fit: Fit, names: Collection[str], rules: DecisionRules = RULES) -> set[str]:
+    """Effects with at least one significantly nonzero strength; arguments as in [`strength_errors`][]."""
     return {name for name, errors in strength_errors(fit, names).items() if errors > rules.strength_errors}
 
 
@@ -56,7 +54,8 @@ def _strength_errors(found: Uncertainty, effect: Effect) -> float:
 
 
 def _errors_of(estimate: Estimate, part: float, effect: Effect) -> float:
-    """Of one strength, where only a part of its error is left; of a positive one those of its logarithm."""
+    """Distance of one strength from zero in standard errors, without the error due to its shape; for a positive one by
+    its logarithm."""
     upper = estimate.ci95[1]
     if dict(own_parameters(effect))[estimate.path.split(".")[1]].positive:
         size, error = 1.0, part * float(np.log(max(upper / estimate.value, 1.0)))
@@ -66,22 +65,22 @@ def _errors_of(estimate: Estimate, part: float, effect: Effect) -> float:
 
 
 def imperfection(before: Trial) -> float:
-    """Share (rms) of what a model's effects have removed that they may get wrong themselves."""
+    """Possible rms error of the effects' laws, as a share of what they have removed."""
     return max((effect.imperfection for effect in before.model.effects), default=0.0)
 
 
 def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> tuple[bool, MeasurementNoise]:
-    """Whether nothing is left beyond the measurement noise but what a model's effects may get wrong themselves, so
-    that no further effect could remove more.
+    """Whether measurement noise and inexact laws of a model's effects may explain its residual, so that no further
+    effect could remove more.
 
     Args:
         before: the model.
         base: the model without effects.
-        noise: as far as fits have been asked for it.
+        noise: of the measured outputs, where it was estimated.
 
     Returns:
-        Whether it is so, and the noise, for which the model has been asked as well where it mattered: it may see less
-        of it than the base model.
+        Whether it is so, and the noise, which is estimated with this model as well where needed: it may be smaller than
+        with the base model.
     """
     small = imperfection(before)
     if _share(before, base, np.diag(np.asarray(noise.covariance))) > small:
@@ -91,17 +90,17 @@ def leaves_imperfection(before: Trial, base: Trial, noise: MeasurementNoise) -> 
 
 
 def noise_evidence(left: NoiseModel) -> NoiseEvidence:
-    """The same as decisions see it."""
+    """Noise evidence for the decisions."""
     return NoiseEvidence(left.share, left.predictable, left.size)
 
 
 def is_noise(left: NoiseModel | None) -> bool:
-    """Whether what a model leaves may all be noise."""
+    """Whether noise may explain a model's whole residual."""
     return left is not None and all(check.holds for check in only_noise(noise_evidence(left)))
 
 
 def noise_of_torque(left: NoiseModel | None) -> float | None:
-    """Standard deviation of the torque's noise [N m]; None where the sensors' noise alone explains as much."""
+    """Standard deviation of the torque noise [N m]; None where sensor noise alone explains as much."""
     return left.std if left is not None and left.likelihood - left.without > RULES.noise_gain else None
 
 
@@ -110,7 +109,7 @@ def _noise_of(trial: Trial, outputs: Float[np.ndarray, "outputs outputs"]) -> No
 
 
 class Standing:
-    """A model with effects, and what a further one has to better.
+    """The current model, which a further effect must improve.
 
     Attributes:
         before: the current model.
@@ -123,13 +122,13 @@ class Standing:
 
     @cached_property
     def left(self) -> NoiseModel:
-        """What the current model leaves as noise of the sensors, with a memory, and of the torque."""
+        """Fitted noise model of the current model: coloured sensor noise and torque noise."""
         return _noise_of(self.before, np.asarray(self.noise.covariance))
 
     def over_noise(self, trial: Trial) -> float:
-        """Log likelihood [nats] by which a model betters the current one, where each has a noise model of its own, less
-        what its further parameters would gain on noise (Schwarz 1978). Infinite where noise is no explanation of what
-        the current model leaves.
+        """Log likelihood ratio [nats] of a model against the current one, each with its own noise model, minus the
+        penalty of its further parameters (Schwarz 1978). Infinite where noise does not explain the current model's
+        residual.
 
         Args:
             trial: the model.
@@ -143,17 +142,17 @@ class Standing:
 
 
 def share_of_removed(trial: Trial, before: Trial, base: Trial) -> float:
-    """What a further effect removes of the error on selection data, over what the effects before it have removed (rms),
-    of the output of which it is the most; infinite for the first one.
+    """Error that a further effect removes on selection data, over that removed by preceding effects (rms), of the
+    output where it is largest; infinite for the first effect.
 
-    What a form gets wrong is a share of what it does to each output: friction may turn the motor thousands of times
-    farther than its encoder's noise, and the twist only a little.
+    The error of an inexact law is a share of its influence on each output. Friction may move the motor by thousands of
+    times the encoder's noise, and the twist only a little.
     """
     return _share(before, base, _mean_squares(trial))
 
 
 def _share(before: Trial, base: Trial, left: Float[np.ndarray, " outputs"]) -> float:
-    """What it would take off the error if so little (mean squares) were left, as in [`share_of_removed`][]."""
+    """The ratio for given remaining mean squares, as in [`share_of_removed`][]."""
     then, first = _mean_squares(before), _mean_squares(base)
     better = first > then
     if before is base or not np.any(better):
@@ -162,12 +161,13 @@ def _share(before: Trial, base: Trial, left: Float[np.ndarray, " outputs"]) -> f
 
 
 def _mean_squares(trial: Trial) -> Float[np.ndarray, " outputs"]:
-    """Of each output's error on selection data."""
+    """Mean square of each output's error on selection data."""
     return np.diag(np.asarray(trial.held_out.covariance))
 
 
 def is_plausible(trial: Trial, name: str) -> bool:
-    """Whether no parameter of an effect is larger than real drives show; a reduced log's units are its own."""
+    """Whether all parameters of an effect are within the range of real drives. Always true for a reduced log, whose
+    units are arbitrary."""
     if isinstance(trial.model, ReducedModel):
         return True
     own = [known for path, known in trial.model.parameters().items() if path.startswith(f"{name}.")]

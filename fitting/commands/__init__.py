@@ -1,5 +1,5 @@
 """The commands of `hdjax`.
 
-`fit`, `motion`, `response` and `studies` state what a user may type, and import nothing that takes long. Each calls a
-module `run_*`, which does the work, once the arguments are known to be good.
+`fit`, `motion`, `response` and `studies` define arguments, without slow imports. Each calls a module `run_*` for the
+work, after checking the arguments.
 """

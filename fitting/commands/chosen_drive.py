@@ -1,4 +1,4 @@
-"""The drive that a command without a log works on."""
+"""The drive of a command without a log."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ def read_drive(options: DriveOptions) -> tuple[Drive | ReducedDrive, tuple[Effec
     """The drive, and the effects of its model.
 
     Raises:
-        InputError: for an unknown preset, a bad model or number, or a drive without damping.
+        InputError: unknown preset, bad model or number, or a drive without damping.
     """
     if options.preset not in PRESETS:
         raise InputError(f"--preset must be one of {', '.join(PRESETS)}, but is {options.preset}")

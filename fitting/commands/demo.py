@@ -1,4 +1,4 @@
-"""The embedded sample: a simulated drive whose logs hide an effect that nobody declared."""
+"""The demo: logs of a simulated drive with an effect that is not declared."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ NOISE = 1e-6
 
 _RATE = 2000.0
 _DRIVE_FILE = """\
-# The demo's drive: what its maker would tell you. Not told: a kinematic error of two cycles per motor revolution.
+# The demo's drive, as stated by its maker. Not stated: a kinematic error of two cycles per motor revolution.
 [drive]
 name = "demo"
 reduction_ratio = 50
@@ -36,7 +36,7 @@ def write_demo_logs(folder: Path, *, seconds: float = 5.0, seed: int = 0) -> tup
     """Simulate the demo's drive and write its logs and drive file.
 
     Args:
-        folder: where to write; it must exist.
+        folder: for the files; it must exist.
         seconds: length of each log.
         seed: of torque and noise.
 
@@ -51,7 +51,7 @@ def write_demo_logs(folder: Path, *, seconds: float = 5.0, seed: int = 0) -> tup
         multisine = random_phase_multisine(
             rms=rms, omega_min=2 * np.pi * 2.0, omega_max=2 * np.pi * 120.0, period=seconds, key=key
         )
-        # A slow swing turns the motor through many revolutions; fast lines pass the resonance.
+        # A slow oscillation turns the motor through many revolutions; fast lines excite the resonance.
         swing = 0.15 * np.sin(2 * np.pi * time / seconds * 2)
         torque = np.asarray(jax.vmap(multisine)(jnp.asarray(time))) + swing
         motion = simulate(model, sampled(time, torque, hold="zero-order"), time, rtol=1e-9, atol=1e-12)

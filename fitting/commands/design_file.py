@@ -1,4 +1,4 @@
-"""The design file: which drive, what may be chosen, what is to be small, what must be kept, what is not known."""
+"""The design file: drive, variables, objective, limits and uncertainty."""
 
 import dataclasses
 from pathlib import Path
@@ -20,7 +20,7 @@ _ROBUST = ("report", "spread", "hold", "draws", "criterion", "share", "seed")
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """How the optimum is searched for and confirmed; see [`hdjax.design.optimise`][] and [`hdjax.design.confirm`][]."""
+    """Settings of the search and its confirmation; see [`hdjax.design.optimise`][] and [`hdjax.design.confirm`][]."""
 
     starts: int = 8
     seed: int = 0
@@ -30,11 +30,11 @@ class Search:
 
 @dataclasses.dataclass(frozen=True)
 class DesignFile:
-    """What a design file asks for.
+    """Content of a design file.
 
     Attributes:
         study: the study.
-        search: how.
+        search: its settings.
     """
 
     study: Study
@@ -45,8 +45,8 @@ def read_design_file(path: Path) -> DesignFile:
     """Read a design file.
 
     Raises:
-        InputError: where it is missing or can't be understood; names the section and the key.
-        DataError: where draws are asked of a report whose log does not tell a parameter.
+        InputError: it is missing or not understood; names section and key.
+        DataError: draws are requested from a report whose log does not determine a parameter.
     """
     file = Sections(path, _SECTIONS)
     try:
@@ -120,19 +120,19 @@ def _variables(file: Sections) -> tuple[Variable, ...]:
         spacing = file.one_of(where, "spacing", table.get("spacing", "linear"), SPACINGS)
         found.append(Variable(name, low, high, spacing))
     if not found:
-        raise file.refuse('[variables] must name what may be chosen, such as "B_sp" = { from = 0.1, to = 10.0 }')
+        raise file.refuse('[variables] must name the design variables, such as "B_sp" = { from = 0.1, to = 10.0 }')
     return tuple(found)
 
 
 def _tables(file: Sections, section: str) -> list[tuple[str, dict[str, Any]]]:
     found = [(label, file.table(f"{section}.{label}", value)) for label, value in file.section(section).items()]
     if section == "objective" and not found:
-        raise file.refuse("[objective] must name what is to be small, such as [objective.peak_error]")
+        raise file.refuse("[objective] must name what to minimise, such as [objective.peak_error]")
     return found
 
 
 def _measure(file: Sections, section: str, label: str, table: dict[str, Any], beside: tuple[str, ...]) -> Measure:
-    """The measure that a table names, or is named for, with its numbers."""
+    """The measure that a table names, or that its name states, with its arguments."""
     where = f"{section}.{label}"
     name = table.get("measure", label)
     if name not in MEASURES:
@@ -146,7 +146,7 @@ def _measure(file: Sections, section: str, label: str, table: dict[str, Any], be
 
 
 def _argument(file: Sections, where: str, key: str, value: object, default: object) -> Any:
-    """A measure's number, count or switch: of the kind that its default is."""
+    """A measure's number, count or switch, of the type of its default."""
     if isinstance(default, bool):
         if not isinstance(value, bool):
             raise file.refuse(f"[{where}] {key} must be true or false, but is {value!r}")

@@ -1,4 +1,4 @@
-"""The picture of a design study: the sweep around the optimum, and the draws at it. Nothing is computed here."""
+"""Plot of a design study: the sweep around the optimum, and the draws at it."""
 
 from io import BytesIO
 
@@ -10,12 +10,12 @@ from fitting.formatting import pretty_unit
 from hdjax.design import Confirmation, Optimised, Study
 from hdjax.design.robustness import exact_worst_share
 
-# Okabe and Ito's colours, which colour-blind readers tell apart, also in grey print.
+# Okabe and Ito's colours, which colour-blind readers can distinguish, also in grey print.
 _LINE, _MARK = "#0072B2", "#D55E00"
 
 
 def summary(study: Study, found: Optimised, proof: Confirmation) -> bytes:
-    """The picture as a PNG."""
+    """The plot as a PNG."""
     count, best = len(study.variables), found.best
     panels = 1 if count == 2 and proof.shape else count
     drawn = study.draws is not None
@@ -31,7 +31,7 @@ def summary(study: Study, found: Optimised, proof: Confirmation) -> bytes:
     figure.suptitle(
         "Design study: the optimum and the sweep around it"
         if best.feasible
-        else "Design study: no design keeps all limits",
+        else "Design study: no design meets all limits",
         fontsize=11,
     )
     buffer = BytesIO()
@@ -51,14 +51,14 @@ def _label(study: Study, i: int) -> str:
 
 
 def _map(axes: Axes, study: Study, found: Optimised, proof: Confirmation, figure: Figure) -> None:
-    """Objective over two variables, designs that break a limit in grey."""
+    """Objective over two variables, designs that violate a limit in grey."""
     x, y = (_values(study, proof.shares, i).reshape(proof.shape) for i in (0, 1))
     kept = np.where(proof.feasible, proof.objective, np.nan).reshape(proof.shape)
     axes.set_facecolor("#dddddd")
     drawn = axes.pcolormesh(x, y, kept, cmap="viridis", shading="nearest")
     figure.colorbar(drawn, ax=axes, label="objective")
     if not proof.feasible.all():
-        axes.plot([], [], "s", color="#dddddd", label="breaks a limit")
+        axes.plot([], [], "s", color="#dddddd", label="violates a limit")
     _ends(axes, study, found, x, y)
     _scales(axes, study, 0, 1)
     axes.legend(frameon=True, fontsize=8, loc="best")
@@ -102,12 +102,12 @@ def _scales(axes: Axes, study: Study, i: int, j: int | None) -> None:
 
 
 def _wide(study: Study, i: int, limits: tuple[float, float]) -> bool:
-    """Whether a logarithmic scale has a power of ten to mark."""
+    """Whether a logarithmic scale contains a power of ten."""
     return study.variables[i].spacing == "log" and bool(limits[0] > 0.0 and limits[1] > 10.0 * limits[0])
 
 
 def _draws(axes: Axes, study: Study, draws: dict[str, np.ndarray]) -> None:
-    """Distribution of the objective over the draws, with what the criterion makes of it."""
+    """Distribution of the objective over the draws, with the criterion."""
     objective = sum(float(t.weight) * draws[t.label] for t in study.terms if t.label in draws)
     if not isinstance(objective, np.ndarray):
         return

@@ -1,4 +1,4 @@
-"""What a design study found, for programs (JSON) and for a terminal."""
+"""Result of a design study, for programs (JSON) and for a terminal."""
 
 import math
 from typing import Any
@@ -14,7 +14,7 @@ SCHEMA = "hdjax-design/1"
 
 
 def design_dict(study: Study, found: Optimised, proof: Confirmation) -> dict[str, Any]:
-    """The result as JSON has it: finite numbers and nulls only."""
+    """The result as JSON content: finite numbers and nulls only."""
     parts = (*study.terms, *study.limits)
     return finite(
         {
@@ -59,8 +59,8 @@ def _end_dict(study: Study, end: Optimum) -> dict[str, Any]:
 
 
 def _worst(study: Study, label: str, draws: np.ndarray) -> float:
-    """The mean of a measure's worst share: its largest values, or its smallest where it must be at least something, or
-    is made large."""
+    """The mean of a measure's worst share: its largest values, or its smallest where it has a lower bound or is
+    maximised."""
     least = {limit.label: limit.least for limit in study.limits}
     made_large = {term.label: float(term.weight) < 0.0 for term in study.terms}
     if least.get(label, made_large.get(label, False)):
@@ -69,15 +69,15 @@ def _worst(study: Study, label: str, draws: np.ndarray) -> float:
 
 
 def design_text(study: Study, found: Optimised, proof: Confirmation) -> str:
-    """The result as a terminal shows it."""
+    """The result as text for a terminal."""
     best, known = found.best, study.case.parameters()
-    lines = ["Best design" if best.feasible else "No design keeps all limits; the one that misses them least"]
+    lines = ["Best design" if best.feasible else "No design meets all limits; the one with the smallest violation"]
     for path, value in best.values.items():
         unit = known[path][1].unit if path in known else "1"
         held = ""
         if path in best.at_bound:
             price = best.bound_multipliers[path]
-            held = f"  at its {best.at_bound[path]} bound; one unit beyond is worth {price:.4g} of the objective"
+            held = f"  at its {best.at_bound[path]} bound, worth {price:.4g} of the objective per unit"
         lines.append(f"  {path} = {_quantity(value, unit)}{held}")
     lines.append(f"Objective {best.objective:.6g}{_criterion(study)}")
     for part in (*study.terms, *study.limits):
@@ -88,7 +88,9 @@ def design_text(study: Study, found: Optimised, proof: Confirmation) -> str:
     if study.draws is not None:
         both = sorted(set(study.draws.paths) & set(best.values))
         if both:
-            lines.append(f"{', '.join(both)}: drawn and chosen; the chosen value holds in every draw.")
+            lines.append(
+                f"{', '.join(both)}: both uncertain and a design variable; the chosen value is used in every draw."
+            )
     return "\n".join(lines)
 
 
@@ -108,7 +110,7 @@ def _measure_line(study: Study, part: Any, best: Optimum) -> str:
         side = "at least" if part.least else "at most"
         line += f"; must be {side} {_quantity(float(part.bound), unit)}"
         if part.label in best.multipliers:
-            line += f", which holds the design: one unit more is worth {best.multipliers[part.label]:.4g}"
+            line += f", an active limit, worth {best.multipliers[part.label]:.4g} of the objective per unit"
         if best.excess[part.label] > 1e-6:
             line += f", MISSED by {100 * best.excess[part.label]:.3g} %"
     return line
@@ -119,15 +121,15 @@ def _starts_line(found: Optimised) -> str:
     same = sum(abs(e.objective - best) <= 1e-4 * (abs(best) or 1.0) and e.feasible for e in found.ends)
     names = [e.outcome.name for e in found.ends]
     told = ", ".join(f"{names.count(n)} {n}" for n in dict.fromkeys(names))
-    return f"{len(found.ends)} starts: {told}; {same} came to this objective."
+    return f"{len(found.ends)} starts: {told}; {same} reached this objective."
 
 
 def _verdict(best: Optimum, proof: Confirmation) -> list[str]:
     if not best.feasible:
-        return [f"Of {proof.objective.size} designs around it {int(proof.feasible.sum())} keep all limits."]
-    agrees = f"gradients differ from differences by {proof.gradient_error:.1e} of themselves"
+        return [f"Of {proof.objective.size} designs around it {int(proof.feasible.sum())} meet all limits."]
+    agrees = f"gradients differ from difference quotients by {proof.gradient_error:.1e}, relative"
     if not math.isfinite(proof.best_objective):
-        return [f"No design of the sweep around it keeps all limits; {agrees}."]
+        return [f"No design of the sweep around it meets all limits; {agrees}."]
     if proof.confirmed():
         return [f"Confirmed: none of {proof.objective.size} designs around it is better; {agrees}."]
     better = ", ".join(f"{p} = {v:.6g}" for p, v in proof.best.items())

@@ -31,9 +31,9 @@ def fit(
 ) -> None:
     """Fit stiffness, cubic coefficient and damping, and report how well the logs determine them.
 
-    Several logs are of one drive and are fitted together. Of a folder each log is fitted on its own, into one table; a
-    run that was cut off goes on where it stopped. Quasi-static logs (twist and joint torque) give stiffness, knees,
-    hysteresis and lost motion instead.
+    Several logs of one drive are fitted together. The logs of a folder are fitted separately, into one table; an
+    interrupted run is resumed. Quasi-static logs (twist and joint torque) give stiffness, knees, hysteresis and lost
+    motion instead.
 
     Parameters
     ----------
@@ -41,12 +41,12 @@ def fit(
         Folder for report.html, report.json and, but for quasi-static logs, model.json; of a folder of logs for
         fleet.parquet.
     posterior
-        Draw from the posterior as well (minutes), and write the draws to posterior.parquet. Needs the extra
+        Also draw from the posterior (minutes), and write the draws to posterior.parquet. Needs the extra
         `posterior`.
     seed
         Of the draws.
     next_experiment
-        Where alpha is not identifiable, look for the motor torque that would tell it within limits (up to a minute),
+        If alpha is not identifiable, search for a motor torque within limits that determines it (up to a minute),
         and write it to next_experiment.csv.
     """
     asked = wanted(limits, next_experiment)
@@ -83,19 +83,19 @@ def close_loop(
     next_experiment: bool = False,
     limits: ExperimentLimits = ExperimentLimits(),
 ) -> None:
-    """Fit, find the effect that the model lacks, put it inside the equations, refit, and compare on test data.
+    """Fit, find the effect that the model lacks, add it to the equations, refit, and compare on test data.
 
-    The last fifth of each log is test data, unless other logs are: nothing but the final figures looks at them.
+    The last fifth of each log is test data, unless test logs are named; only the final figures use it.
 
-    Quasi-static logs (twist and joint torque) are explained without inertia: the equation is the torque-twist line.
+    Quasi-static logs (twist and joint torque) are fitted without inertia: the base equation is the torque-twist line.
 
     Parameters
     ----------
     out
         Folder for report.html, report.json and, but for quasi-static logs, model.json.
     next_experiment
-        Where explanations are tied, look for the motor torque that would tell them apart within limits (minutes), and
-        write it to next_experiment.csv.
+        If explanations are tied, search for a motor torque within limits that separates them (minutes), and write
+        it to next_experiment.csv.
     """
     if search.max_effects < 0:
         raise InputError(f"--max-effects must be 0 or more, but is {search.max_effects}")
@@ -107,7 +107,7 @@ def close_loop(
 
 
 def demo(*, out: Path = Path("hdjax-demo"), seed: int = 0) -> None:
-    """Simulate a drive with an effect that nobody declared, close the loop on its logs, and say where the report is.
+    """Simulate a drive with an undeclared effect, close the loop on its logs, and print the path of the report.
 
     Parameters
     ----------

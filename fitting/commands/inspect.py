@@ -1,4 +1,4 @@
-"""The commands for logs that nobody has described: `hdjax inspect | init`."""
+"""The commands for logs without a drive file: `hdjax inspect | init`."""
 
 from pathlib import Path
 
@@ -7,14 +7,14 @@ from fitting.errors import InputError
 
 
 def inspect(logs: AnyLogs, /, *, joint: str | None = None) -> None:
-    """Look at logs without a drive file: columns, guessed signals and units with reasons, sampling, health, excitation.
+    """Inspect logs without a drive file: columns, guessed signals and units with reasons, sampling, health, excitation.
 
-    Says what a fit of such logs could tell, and what the drive file will need. Where nothing can be told, it says so.
+    States what a fit of such logs could determine, and what the drive file will need.
 
     Parameters
     ----------
     joint
-        Of a robot's log: the joint to look at, as in q[3]; the one that moves the most where not given.
+        Joint of a robot's log, as in q[3]; the one that moves the most where not given.
     """
     from fitting.commands.run_inspect import show_logs
 
@@ -29,14 +29,14 @@ def init(logs: AnyLogs, /, *, out: Path, joint: str | None = None, force: bool =
     out
         Drive file (TOML).
     joint
-        Of a robot's log: the joint to describe, as in q[3]; the one that moves the most where not given.
+        Joint of a robot's log, as in q[3]; the one that moves the most where not given.
     force
-        Overwrite a file that is there already.
+        Overwrite an existing file.
     """
     if out.is_dir():
         raise InputError(f"--out must be a file, but {out} is a folder; give the drive file's own name")
     if out.exists() and not force:
-        raise InputError(f"--out: there is a file {out} already; give another name, or --force to overwrite it")
+        raise InputError(f"--out: {out} exists already; give another name, or --force to overwrite it")
     from fitting.commands.run_inspect import write_drive_file
 
     write_drive_file(logs, out, joint)

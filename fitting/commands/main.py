@@ -17,7 +17,7 @@ from fitting.errors import DataError, InputError
 
 
 def _version() -> str:
-    # Loaded here: it takes a quarter of the time of all else that `--help` needs, and only `--version` asks for it.
+    # Imported here: it takes a quarter of the other import time of `--help`, and only `--version` needs it.
     from importlib.metadata import version
 
     return version("hdjax")
@@ -50,8 +50,8 @@ app.register_install_completion_command(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 the data can't support the request, 2 bad usage or bad input."""
-    # Libraries and compiled programs leave millions of small objects that stay. Python would go through them again and
-    # again, and once more at the end, which takes as long as loading jax.
+    # Libraries and compiled programs create millions of permanent small objects. Garbage collection over them, repeated
+    # and at exit, would take as long as importing jax.
     gc.set_threshold(500_000)
     atexit.register(gc.freeze)
     try:
@@ -62,14 +62,14 @@ def main(arguments: list[str] | None = None) -> None:
     except DataError as error:
         _fail(error, 1)
     except RuntimeError as error:
-        # Loaded here: the simulator takes long to load, and where it has failed it is loaded already.
+        # Imported here: the simulator takes long to import, and is imported already where it has failed.
         from hdjax import SimulationError
 
         if not isinstance(error, SimulationError):
             raise
         _fail(error, 1)
     except BrokenPipeError:
-        # Who reads along, as `head` does, has seen enough; the files are written before anything is printed.
+        # The reader of the pipe, such as `head`, has closed it; files are written before anything is printed.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}; check the path and its permissions", 2)

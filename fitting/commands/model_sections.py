@@ -10,11 +10,11 @@ from hdjax import PRESETS, Model, TwoInertiaModel
 from hdjax.effects import BY_NAME
 
 SOURCES = ("preset", "model")
-"""Keys of `[drive]` that are no parameters."""
+"""Keys of `[drive]` that are not parameters."""
 
 
 def stated_model(file: Sections) -> Model:
-    """The model that `[drive]` starts from: a `model.json` of a report, or a preset."""
+    """The base of `[drive]`: a `model.json` of a report, or a preset."""
     drive = file.section("drive")
     if "model" in drive:
         return read_model(file.path.parent / str(drive["model"])).model
@@ -22,11 +22,11 @@ def stated_model(file: Sections) -> Model:
 
 
 def with_stated_effects(file: Sections, model: Model) -> Model:
-    """The model with the effects that `[effects]` names."""
+    """The model with the effects of `[effects]`."""
     for name, values in file.section("effects").items():
         where = f"effects.{name}"
         if name not in BY_NAME:
-            raise file.refuse(f"[{where}] is no effect; there are {', '.join(BY_NAME)}")
+            raise file.refuse(f"[{where}] is not an effect; known are {', '.join(BY_NAME)}")
         table = file.table(where, values)
         fields = {f.name: f for f in dataclasses.fields(BY_NAME[name]) if "parameter" in f.metadata}
         numbers = file.numbers(where, table, fields)
@@ -36,6 +36,6 @@ def with_stated_effects(file: Sections, model: Model) -> Model:
 
 
 def stated_range(file: Sections, section: str, table: Mapping[str, Any]) -> tuple[float, float]:
-    """Both ends of a range."""
+    """Lower and upper end of a range."""
     file.needs(section, table, ("from", "to"))
     return file.number(section, "from", table["from"]), file.number(section, "to", table["to"])

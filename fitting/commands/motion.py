@@ -19,8 +19,8 @@ def predict(model: Path, log: Path, /, *, drive: DriveFileOption, out: Path) -> 
     log
         The log that supplies torque and time stamps.
     out
-        CSV file with the columns time and each output that the model was fitted to, the principal one first
-        (dynamic_error where it can be formed).
+        CSV file with the columns time and each fitted output of the model, the principal one first (dynamic_error
+        where available).
     """
     start_jax()
     from fitting.commands.run_predict import write_prediction

@@ -1,4 +1,4 @@
-"""What logs allow the next experiment to be, as stated on the command line."""
+"""Limits of the next experiment, as stated on the command line."""
 
 import numpy as np
 
@@ -11,14 +11,14 @@ _FEWEST_SAMPLES = 200
 
 
 def stated_limits(options: ExperimentLimits, data: Data) -> dict[str, float]:
-    """The limits that the user states, by their names in [`fitting.next_experiment.excitation.Limits`][].
+    """The stated limits, by their names in [`fitting.next_experiment.excitation.Limits`][].
 
     Args:
-        options: as given.
+        options: of the command line.
         data: the logs.
 
     Raises:
-        InputError: where a limit makes no sense, or the logs hold nothing of the resonance.
+        InputError: a limit is not valid, or the logs are quasi-static.
     """
     log = data.logs[0]
     if data.kind == "quasi-static":
@@ -36,7 +36,7 @@ def stated_limits(options: ExperimentLimits, data: Data) -> dict[str, float]:
         if value is not None and data.kind == "reduced" and name in ("speed", "travel"):
             raise InputError(f"{option} is for drives, but a reduced log has no motor; leave it out")
     if options.duration is not None:
-        # Loaded here: few fits look for a next experiment.
+        # Imported here: few fits search for a next experiment.
         from fitting.next_experiment.proposal import MOST_SAMPLES
 
         step = float(np.median(np.diff(log.time)))

@@ -1,4 +1,4 @@
-"""Options that several commands share, and checks of them."""
+"""Common options of commands, and their checks."""
 
 import math
 import os
@@ -26,12 +26,12 @@ DriveFileOption = Annotated[Path, Parameter(help="Drive file (TOML): ratio, iner
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ExperimentLimits:
-    """Limits of the next experiment; what the logs have reached where not given."""
+    """Limits of the next experiment; those reached in the logs where not given."""
 
     largest_torque: Annotated[float | None, Parameter(help="Of the next experiment: torque [N m], or forcing.")] = None
     largest_speed: Annotated[float | None, Parameter(help="Of the next experiment: motor speed [rad/s].")] = None
     largest_travel: Annotated[
-        float | None, Parameter(help="Of the next experiment: how far the output may turn from its start [rad].")
+        float | None, Parameter(help="Of the next experiment: largest angle of the output from its start [rad].")
     ] = None
     largest_twist: Annotated[
         float | None, Parameter(help="Of the next experiment: dynamic error [rad]; none where not given.")
@@ -42,7 +42,7 @@ class ExperimentLimits:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class DriveOptions:
-    """Which drive a command works on.
+    """The drive of a command.
 
     Attributes:
         preset: Name of a drive with published parameters.
@@ -62,7 +62,7 @@ class DriveOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class FleetOptions:
-    """Who fits the logs of a folder.
+    """Workers that fit the logs of a folder.
 
     Attributes:
         workers: Of a folder: processes on this machine that share its logs; threads where 0.
@@ -76,7 +76,7 @@ class FleetOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ForcingOptions:
-    """A motor torque, and how it is sampled.
+    """A motor torque and its sampling.
 
     Attributes:
         forcing: Shape of the motor torque.
@@ -96,10 +96,10 @@ class ForcingOptions:
 
 
 def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits | None:
-    """The limits where a next experiment is wanted, None where not.
+    """The limits if a next experiment is requested, else None.
 
     Raises:
-        InputError: where limits are stated for an experiment that nobody wants.
+        InputError: limits are stated, but no experiment is requested.
     """
     if next_experiment:
         return options
@@ -112,20 +112,20 @@ def wanted(options: ExperimentLimits, next_experiment: bool) -> ExperimentLimits
 
 
 def require_number(name: str, value: float, *, positive: bool = True) -> None:
-    """Refuse what is no number, or not above zero.
+    """Refuse NaN, infinity, or a number that is not positive.
 
     Raises:
-        InputError: that names the option.
+        InputError: names the option.
     """
     if not math.isfinite(value) or (positive and value <= 0.0):
         raise InputError(f"{name} must be a {'positive ' if positive else ''}number, but is {value:g}")
 
 
 def require_folder(path: Path | None) -> None:
-    """Refuse a folder that can't be written to, before minutes of work are done for it. Nothing is made.
+    """Refuse a folder that can't be written to, before the computation. Nothing is created.
 
     Raises:
-        InputError: where it, or the place in which it would be made, is no folder or is not open for writing.
+        InputError: it, or its parent, is not a folder or not writable.
     """
     if path is None:
         return

@@ -1,4 +1,4 @@
-"""Drives that a fit can't tell apart: draws of the fitted parameters, from the folder of its report."""
+"""Draws of the fitted parameters, from the folder of a report."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -20,19 +20,19 @@ from hdjax.design import Draws
 def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), seed: int = 0) -> Draws:
     """Draws of a fitted drive's parameters.
 
-    Those of `hdjax fit --posterior` where the folder has them, evenly thinned; else of the normal law of its standard
-    errors and correlations, in the logarithm of what is positive. Correlations below 0.1, which a report leaves out,
-    count as none.
+    Those of `hdjax fit --posterior` where available, evenly thinned. Else from the normal distribution with the
+    report's standard errors and correlations, in the logarithm of positive parameters. Correlations below 0.1, which a
+    report omits, count as zero.
 
     Args:
         folder: of a report of `hdjax fit` or `hdjax close-loop`.
-        count: how many draws.
-        hold: parameters that keep their fitted value.
-        seed: of the normal law.
+        count: number of draws.
+        hold: fixed parameters.
+        seed: of the normal distribution.
 
     Raises:
-        InputError: where the folder holds no such report.
-        DataError: where the log does not tell a parameter, so that its draws would mean nothing.
+        InputError: the folder has no such report.
+        DataError: the log does not determine a parameter, so that its draws have no meaning.
     """
     model = fitted_model(folder)
     try:
@@ -45,11 +45,11 @@ def drawn_from_report(folder: Path, count: int, *, hold: Collection[str] = (), s
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder}: no report.json of `hdjax fit` ({error}); give the folder of a report") from error
     if not spreads:
-        raise InputError(f"{folder}: all parameters are held, so that nothing is drawn; hold fewer")
+        raise InputError(f"{folder}: all parameters are held, so that there is nothing to draw; hold fewer")
     for path, (_, std, identifiable) in spreads.items():
         if not (identifiable and np.isfinite(std)):
             raise DataError(
-                f"{folder}: its log does not tell {path}, so that draws of it would mean nothing; "
+                f"{folder}: its log does not determine {path}, so that draws of it have no meaning; "
                 f'add hold = ["{path}"] to [robust]'
             )
     paths = tuple(spreads)
@@ -70,7 +70,7 @@ def fitted_model(folder: Path) -> TwoInertiaModel:
     """The model of a report.
 
     Raises:
-        InputError: where there is none, or it is a reduced one.
+        InputError: there is none, or it is a reduced one.
     """
     model = read_model(folder / "model.json").model
     if not isinstance(model, TwoInertiaModel):
@@ -94,10 +94,10 @@ def _normal(
     count: int,
     seed: int,
 ) -> np.ndarray:
-    """Draws of a normal law that fill it evenly."""
+    """Quasi-random draws of a normal distribution."""
     values, stds = (np.array(column) for column in zip(*((v, s) for v, s, _ in spreads.values()), strict=True))
     eigenvalues, vectors = np.linalg.eigh(correlation)
-    # What was left out of the correlations may have taken them out of the cone.
+    # Without the omitted correlations, the matrix may not be positive definite.
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     standard = qmc.MultivariateNormalQMC(np.zeros(values.size), engine=qmc.LatinHypercube(values.size, rng=seed))
     z = standard.random(count) @ root.T
@@ -111,7 +111,7 @@ def spread_around(values: Mapping[str, float], spreads: Mapping[str, float], cou
     Args:
         values: by path, other than zero.
         spreads: relative standard deviation by path.
-        count: how many draws.
+        count: number of draws.
         seed: of the draws.
     """
     told = {path: (values[path], abs(values[path]) * spread, True) for path, spread in spreads.items()}

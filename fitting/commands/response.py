@@ -1,4 +1,4 @@
-"""The commands that need no log: `hdjax amplitudes | seed-tables | speeds`."""
+"""The commands without a log: `hdjax amplitudes | seed-tables | speeds`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +20,7 @@ def amplitudes(
 ) -> None:
     """Check the analytic amplitudes of the dynamic error against harmonic balance and time integration.
 
-    Takes a few seconds; the pictures of --out take half a minute, most of it compilation.
+    Takes a few seconds; the plots of --out take half a minute, most of it compilation.
 
     Parameters
     ----------
@@ -47,7 +47,8 @@ def amplitudes(
 
 
 def seed_tables() -> None:
-    """Recompute the seed document's Tables 1 to 4 and its figure beside what is printed, cell by cell."""
+    """Recompute the seed document's Tables 1 to 4 and its figure, and compare them with the printed values, cell by
+    cell."""
     start_jax()
     from hdjax.response.seed_fit import best_fit_of_table_2
     from hdjax.response.seed_tables import as_text
@@ -65,18 +66,18 @@ def speeds(
     limit: float | None = None,
     out: Path | None = None,
 ) -> None:
-    """Say which motor speeds to avoid: where the kinematic error's cycles meet the drive's natural frequency.
+    """Find the motor speeds to avoid, at which the kinematic error excites the drive's natural frequency.
 
     Parameters
     ----------
     kinematic_error
-        Amplitude of two error cycles per motor revolution [rad], where the model has no kinematic error of its own.
+        Amplitude of two error cycles per motor revolution [rad], where the model has no kinematic error.
     slowest
         Lowest motor speed [rpm].
     fastest
         Highest motor speed [rpm].
     limit
-        Largest swing of the dynamic error that is allowed [rad]; three times the kinematic error where not given.
+        Largest allowed amplitude of the dynamic error [rad]; three times the kinematic error where not given.
     out
         Folder for speeds.json and speeds.png; none where not given.
     """

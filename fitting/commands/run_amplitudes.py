@@ -1,4 +1,4 @@
-"""What `hdjax amplitudes` does."""
+"""Implementation of `hdjax amplitudes`."""
 
 import json
 from pathlib import Path
@@ -26,15 +26,15 @@ def show_amplitudes(
     """Check the analytic amplitudes, write them, and show them.
 
     Args:
-        drive: which one.
+        drive: its options.
         motor_torque: amplitude [N m].
-        load_torque: likewise.
-        omega: frequencies [rad/s]; five of its own where None.
+        load_torque: amplitude [N m].
+        omega: frequencies [rad/s]; five default ones where None.
         out: folder, or None.
 
     Raises:
-        InputError: for a bad drive, or torques that cancel.
-        DataError: where there is nothing to draw.
+        InputError: bad drive, or torques that cancel.
+        DataError: there is nothing to plot.
     """
     made, _ = read_drive(drive)
     if isinstance(made, Drive):
@@ -111,7 +111,7 @@ def _amplitude_pictures(drive: Drive | ReducedDrive, A: float) -> dict[str, Any]
     branches = from_both_ends(model, harmonic_series(1.0, A), 0.2 * omega_0, 2.5 * omega_0)
     steady = [b for b in branches if bool(jnp.any(b.valid & b.stable))]
     if not steady:
-        raise DataError("no steady motion was found to draw; give a smaller --motor-torque, or leave --out away")
+        raise DataError("no steady motion was found to plot; give a smaller --motor-torque, or omit --out")
     largest = max(float(jnp.max(b.amplitude, where=b.valid, initial=0.0)) for b in branches)
     peaks = [p for p in map(peak, branches) if bool(p.converged) and 0.2 < float(p.value) / omega_0 < 2.5]
     omegas = np.linspace(0.6, 2.5, 600) * omega_0

@@ -1,4 +1,4 @@
-"""What `hdjax design` does."""
+"""Implementation of `hdjax design`."""
 
 import json
 from pathlib import Path
@@ -14,20 +14,20 @@ from hdjax.design.study import LANES
 
 
 def design_file(spec: Path, out: Path, *, plot: bool) -> None:
-    """Find the design that a design file asks for, write it, and show it.
+    """Find the optimum of a design file, write it, and print it.
 
     Args:
         spec: design file.
         out: folder.
-        plot: whether it is drawn.
+        plot: whether it is plotted.
 
     Raises:
-        InputError: for a bad file.
-        DataError: where no design keeps the limits.
+        InputError: bad file.
+        DataError: no design meets the limits.
     """
     asked = read_design_file(spec)
     study, search = asked.study, asked.search
-    # Beside many draws, designs side by side only wait for the slowest.
+    # With many draws, parallel designs would only wait for the slowest.
     lanes = max(1, min(search.starts, LANES, 64 // (1 if study.draws is None else len(study.draws.values))))
     with spinning("compiling") as say:
         try:
@@ -36,7 +36,7 @@ def design_file(spec: Path, out: Path, *, plot: bool) -> None:
                 search.starts,
                 seed=search.seed,
                 lanes=lanes,
-                progress=lambda count: say(f"searching: {count} designs appraised"),
+                progress=lambda count: say(f"searching: {count} designs evaluated"),
             )
         except ValueError as error:
             raise DataError(f"{spec}: {error}; change the ranges in [variables]") from error
@@ -53,4 +53,4 @@ def design_file(spec: Path, out: Path, *, plot: bool) -> None:
     print(design_text(study, found, proof))
     show_files(files)
     if not found.best.feasible:
-        raise DataError(f"{spec}: no design that was found keeps all limits; widen [variables] or loosen [limits]")
+        raise DataError(f"{spec}: no design that was found meets all limits; widen [variables] or loosen [limits]")

@@ -1,4 +1,4 @@
-"""What `hdjax fit`, `hdjax close-loop` and `hdjax demo` do with the logs of one drive."""
+"""Implementation of `hdjax fit`, `hdjax close-loop` and `hdjax demo` for the logs of one drive."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from fitting.commands.spinner import spinning
 from fitting.errors import InputError
 from fitting.search_options import SearchOptions
 
-_NOTHING = "No next experiment: either alpha is known from these logs, or no command was found that keeps the limits."
+_NOTHING = "No next experiment: either these logs determine alpha, or no command within the limits was found."
 
 
 def fit_logs(
@@ -25,19 +25,19 @@ def fit_logs(
     test: Sequence[Path] = (),
     limits: ExperimentLimits | None = None,
 ) -> None:
-    """Fit logs together, write the report, and show it.
+    """Fit logs together, write the report, and print it.
 
     Args:
         logs: files.
         drive: drive file.
         out: folder of the report.
-        seed: of draws from the posterior; None where none are asked for.
+        seed: of draws from the posterior; None for no draws.
         test: files of test data.
-        limits: of the next experiment; None where none is asked for.
+        limits: of the next experiment; None for no experiment.
 
     Raises:
-        InputError: for bad files, or draws without the extra that makes them.
-        DataError: where the logs can't support a fit.
+        InputError: bad files, or draws without the required extra.
+        DataError: the logs can't support a fit.
     """
     if seed is not None:
         _check_posterior()
@@ -59,19 +59,19 @@ def close_loop_on_logs(
     test: Sequence[Path] = (),
     limits: ExperimentLimits | None = None,
 ) -> None:
-    """Close the loop on logs of one drive, write the report, and show it.
+    """Close the loop on logs of one drive, write the report, and print it.
 
     Args:
         logs: files.
         drive: drive file.
         out: folder of the report.
-        search: how effects are searched for.
+        search: settings of the search for effects.
         test: files of test data.
-        limits: of the next experiment; None where none is asked for.
+        limits: of the next experiment; None for no experiment.
 
     Raises:
-        InputError: for bad files.
-        DataError: where the logs can't support a fit.
+        InputError: bad files.
+        DataError: the logs can't support a fit.
     """
     data = load(logs, drive, test=test)
     stated = None if limits is None else stated_limits(limits, data)
@@ -83,7 +83,7 @@ def close_loop_on_logs(
 
 
 def demonstrate(out: Path, seed: int) -> None:
-    """Simulate a drive with an effect that nobody declared, and close the loop on its logs.
+    """Simulate a drive with an undeclared effect, and close the loop on its logs.
 
     Args:
         out: folder for the logs and the report.

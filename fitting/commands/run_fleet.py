@@ -1,4 +1,4 @@
-"""What `hdjax fit` does with a folder of logs."""
+"""Implementation of `hdjax fit` for a folder of logs."""
 
 from pathlib import Path
 
@@ -10,17 +10,17 @@ from fitting.logs.drive_file import read_drive_file
 
 
 def fit_folder(folders: list[Path], drive: Path, out: Path, fleet: FleetOptions) -> None:
-    """Fit each log of a folder on its own, into one table, and show it.
+    """Fit each log of a folder separately, into one table, and print it.
 
     Args:
-        folders: one.
+        folders: exactly one.
         drive: drive file.
         out: folder of the table.
-        fleet: who does it.
+        fleet: the workers.
 
     Raises:
-        InputError: for several folders, or a bad drive file.
-        DataError: where no log could be fitted.
+        InputError: several folders, or a bad drive file.
+        DataError: no log could be fitted.
     """
     if len(folders) > 1:
         raise InputError(f"{folders[0]} and others: give one folder of logs, or log files of one drive")
@@ -37,4 +37,4 @@ def fit_folder(folders: list[Path], drive: Path, out: Path, fleet: FleetOptions)
     print(fleet_text(table))
     print(f"Table: {out / 'fleet.parquet'}")
     if not (table["state"] == "fitted").any():
-        raise DataError(f"{folders[0]}: none of its {len(table)} logs could be fitted; the reasons stand above")
+        raise DataError(f"{folders[0]}: none of its {len(table)} logs could be fitted; see the reasons above")

@@ -1,4 +1,4 @@
-"""What `hdjax inspect` and `hdjax init` do."""
+"""Implementation of `hdjax inspect` and `hdjax init`."""
 
 import shlex
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ from fitting.logs.read_table import LOG_SUFFIXES, format_suffix
 
 
 def show_logs(logs: Iterable[Path], joint: str | None) -> None:
-    """Print what logs seem to hold, those with the same columns together.
+    """Print inspections of logs, those with the same columns together.
 
     Args:
         logs: files, and folders of them.
@@ -26,7 +26,7 @@ def show_logs(logs: Iterable[Path], joint: str | None) -> None:
 
 
 def write_drive_file(logs: Iterable[Path], out: Path, joint: str | None) -> None:
-    """Write a drive file from logs of one drive, and say what must be filled in.
+    """Write a drive file from logs of one drive, and print what must be filled in.
 
     Args:
         logs: files, and folders of them.
@@ -54,7 +54,7 @@ def _tables(logs: Iterable[Path]) -> list[Table]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """The logs of a folder, by their names."""
+    """The logs of a folder, in order of their names."""
     found = [p for p in sorted(folder.iterdir()) if p.is_file() and format_suffix(p) in LOG_SUFFIXES]
     if not found:
         raise InputError(f"{folder}: the folder has no log; give one with {', '.join(LOG_SUFFIXES)} files")

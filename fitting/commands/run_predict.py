@@ -1,4 +1,4 @@
-"""What `hdjax predict` does."""
+"""Implementation of `hdjax predict`."""
 
 import sys
 from pathlib import Path
@@ -18,8 +18,8 @@ def write_prediction(model: Path, log: Path, drive: Path, out: Path) -> None:
         out: CSV file.
 
     Raises:
-        InputError: for bad files, or a log that does not suit the model.
-        DataError: where the log can't be used, or the model runs away.
+        InputError: bad files, or a log that does not suit the model.
+        DataError: the log can't be used, or the simulation diverges.
     """
     found = predict(model, load(log, drive, outputs_until=WINDOW))
     found.save(out)

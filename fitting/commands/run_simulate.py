@@ -1,4 +1,4 @@
-"""What `hdjax simulate` does."""
+"""Implementation of `hdjax simulate`."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,14 +20,14 @@ def write_simulation(
 
     Args:
         out: CSV file.
-        torque: of the motor, held from sample to sample.
+        torque: of the motor, with zero-order hold.
         model: model.json of a report, or None for a preset.
         preset: name of a drive.
         noise: rms of each angle [rad at the output].
         seed: of phases and noise.
 
     Raises:
-        InputError: for an unknown preset, a bad model, or a band without a line.
+        InputError: unknown preset, bad model, or a band without a line.
     """
     if preset not in PRESETS:
         raise InputError(f"--preset must be one of {', '.join(PRESETS)}, but is {preset}")

@@ -1,4 +1,4 @@
-"""What `hdjax speeds` does."""
+"""Implementation of `hdjax speeds`."""
 
 import json
 import math
@@ -31,19 +31,19 @@ def show_speeds(
     limit: float | None,
     out: Path | None,
 ) -> None:
-    """Find the motor speeds to avoid, write them, and show them.
+    """Find the motor speeds to avoid, write them, and print them.
 
     Args:
-        drive: which one.
+        drive: its options.
         kinematic_error: amplitude [rad] where the model has none.
         slowest: motor speed [rpm].
-        fastest: likewise.
-        limit: swing of the dynamic error [rad], or None.
+        fastest: motor speed [rpm].
+        limit: amplitude of the dynamic error [rad], or None.
         out: folder, or None.
 
     Raises:
-        InputError: for a bad drive, or speeds beyond all resonances.
-        DataError: where the response can't be followed.
+        InputError: bad drive, or speeds beyond all resonances.
+        DataError: the response can't be computed by continuation.
     """
     made, effects = read_drive(drive)
     if not isinstance(made, Drive):
@@ -85,19 +85,21 @@ def show_speeds(
     for c in critical_speeds(made, orders):
         if slowest <= c.speed * _RPM <= fastest:
             print(f"  {c.speed * _RPM:8.1f} rpm  {c.kind} resonance of {_cycles(c.order)}")
-    print(f"Speeds to avoid (swing of the dynamic error above {limit:.3g} rad):" if bands else "No speed to avoid.")
+    print(f"Speeds to avoid (amplitude of the dynamic error above {limit:.3g} rad):" if bands else "No speed to avoid.")
     for b in bands:
         print(
             f"  {b.start * _RPM:.1f} to {b.end * _RPM:.1f} rpm, up to {b.amplitude:.3g} rad at "
             f"{b.speed_at_peak * _RPM:.1f} rpm, mostly {_cycles(b.order)}"
         )
     if both is not None:
-        print(f"From {both[0]:.1f} to {both[1]:.1f} rpm two motions exist; a drive keeps the one that it comes with.")
+        print(
+            f"From {both[0]:.1f} to {both[1]:.1f} rpm two motions exist; which one occurs depends on the initial state."
+        )
     show_files(files)
 
 
 def _rows(bands: Sequence[SpeedBand]) -> list[dict[str, float]]:
-    """The bands as JSON has them."""
+    """The bands as JSON content."""
     return [
         {
             "start_rpm": b.start * _RPM,

@@ -1,4 +1,4 @@
-"""What `hdjax sweep` does."""
+"""Implementation of `hdjax sweep`."""
 
 import shutil
 from pathlib import Path
@@ -15,18 +15,18 @@ _MEBIBYTE = 1 << 20
 
 
 def sweep_file(spec: Path, out: Path, *, workers: int, scheduler: str | None, memory: int, plot: bool) -> None:
-    """Work out what a sweep file asks for, write it, and show it.
+    """Compute a sweep file, write the result, and print it.
 
     Args:
         spec: sweep file.
         out: folder of the store.
-        workers: processes on this machine; this one alone where 0.
+        workers: processes on this machine; this process alone where 0.
         scheduler: address of a Dask scheduler, or None.
-        memory: for the chunks in work [MiB].
-        plot: whether the summary is drawn.
+        memory: for the chunks of a process [MiB].
+        plot: whether the summary is plotted.
 
     Raises:
-        InputError: for a bad file, or without the extra `sweep`.
+        InputError: bad file, or the extra `sweep` is missing.
     """
     asked = read_sweep_file(spec)
     try:
@@ -54,7 +54,7 @@ def sweep_file(spec: Path, out: Path, *, workers: int, scheduler: str | None, me
 
 
 def _write_result(result, path: Path) -> None:
-    """The result under its name only when it is whole."""
+    """Write the result; it gets its name only when complete."""
     waiting = path.with_name(f".{path.name}")
     shutil.rmtree(waiting, ignore_errors=True)
     result.to_zarr(waiting, mode="w", consolidated=False)
@@ -63,7 +63,7 @@ def _write_result(result, path: Path) -> None:
 
 
 def _text(result) -> str:
-    """What a terminal shows of a sweep."""
+    """Text of a sweep for a terminal."""
     a = result.attrs
     lines = [
         f"{a['points']} points: {a['route']}",
@@ -71,9 +71,7 @@ def _text(result) -> str:
         f"{a['checked_error']:.1e} at most, {a['checked_median_error']:.1e} in the median",
     ]
     if not a["tolerance_kept"]:
-        lines.append(
-            f"The asked tolerance of {a['tolerance']:g} is not kept on these points: some motions magnify errors"
-        )
+        lines.append(f"The tolerance of {a['tolerance']:g} is exceeded on these points: some motions amplify errors")
     if "motions" in result:
         several, lost = int((result.motions > 1).sum()), int(result.lost.sum())
         missing = f"; at {lost} one was not found, mostly at a fold" if lost else ""

@@ -34,10 +34,10 @@ def counting(what: str, *, first: str | None = None) -> Iterator[Callable[[int, 
     done.
 
     Args:
-        what: is counted.
-        first: what is done before there is anything to count.
+        what: the counted items.
+        first: message before counting starts.
     """
-    # Loaded here: most commands have nothing to count.
+    # Imported here: most commands have nothing to count.
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 

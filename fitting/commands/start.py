@@ -4,22 +4,22 @@ import contextlib
 import os
 from pathlib import Path
 
-# A log of usual length has too few lanes for more.
+# A log of usual length has too few segments for more.
 _MOST_DEVICES = 8
 
 
 def start_jax() -> None:
-    """Switch double precision on, take a device for each core, and keep compiled programs between runs.
+    """Enable double precision, use one device per core, and cache compiled programs on disk.
 
-    A command calls this before it imports what needs JAX.
+    Called before modules that need JAX are imported.
     """
-    # XLA reads this once, when jax loads. With a warm cache it would warn at length that the processor lacks
+    # XLA reads this once, at the import of jax. With a warm cache it would warn that the processor lacks
     # "+prefer-no-gather", a tuning flag that it set itself.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    with contextlib.suppress(RuntimeError):  # JAX has started: this is not the process' first command
+    with contextlib.suppress(RuntimeError):  # JAX has started already: this is not the first command of the process
         jax.config.update("jax_num_cpu_devices", min(os.cpu_count() or 1, _MOST_DEVICES))
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdjax"
     try:

@@ -1,4 +1,4 @@
-"""The commands that follow a file of questions: `hdjax sweep | design`."""
+"""The commands with a study file: `hdjax sweep | design`."""
 
 from pathlib import Path
 
@@ -10,25 +10,24 @@ from fitting.errors import InputError
 def sweep(
     spec: Path, /, *, out: Path, workers: int = 0, scheduler: str | None = None, memory: int = 512, plot: bool = True
 ) -> None:
-    """Work out the response of very many drives and forcings, chunk by chunk, into a store.
+    """Compute the response of many drives and forcings, chunk by chunk, into a store.
 
-    A run that was cut off goes on where it stopped. Needs the extra `sweep`.
+    An interrupted run is resumed. Needs the extra `sweep`.
 
     Parameters
     ----------
     spec
-        Sweep file (TOML): drive, forcing, axes or sample, and what is wanted of each point.
+        Sweep file (TOML): drive, forcing, axes or sample, and outputs of each point.
     out
-        Folder of the store. Each request has a folder of its own in it, named by its content, with result.zarr and
-        summary.png.
+        Folder of the store. Each request has a subfolder, named by its content, with result.zarr and summary.png.
     workers
-        Processes on this machine among which the chunks are shared; this process alone where 0.
+        Processes on this machine that share the chunks; this process alone where 0.
     scheduler
-        Address of a Dask scheduler whose workers do it, for instance tcp://10.0.0.1:8786.
+        Address of a Dask scheduler, for instance tcp://10.0.0.1:8786.
     memory
-        What the chunks in work may take in each process [MiB].
+        Memory of the chunks in each process [MiB].
     plot
-        Whether summary.png is drawn.
+        Whether summary.png is written.
     """
     require_folder(out)
     if workers < 0 or memory < 1:
@@ -42,16 +41,16 @@ def sweep(
 def design(spec: Path, /, *, out: Path, plot: bool = True) -> None:
     """Find the best design of a drive by gradients, from several starts, and confirm it by a sweep around it.
 
-    Takes a minute or two where the steady response counts, most of it compilation.
+    Takes a minute or two with the steady response, most of it compilation.
 
     Parameters
     ----------
     spec
-        Design file (TOML): drive, variables, objective, limits, what is not known exactly.
+        Design file (TOML): drive, variables, objective, limits, uncertainty.
     out
         Folder for design.json and design.png.
     plot
-        Whether design.png is drawn.
+        Whether design.png is written.
     """
     require_folder(out)
     start_jax()

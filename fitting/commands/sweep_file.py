@@ -1,4 +1,4 @@
-"""The sweep file: which drive, which forcing, which points, and what is wanted of them."""
+"""The sweep file: drive, forcing, points and outputs."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -23,12 +23,12 @@ _SWEEP = tuple(f.name for f in dataclasses.fields(Request) if f.name != "points"
 
 @dataclasses.dataclass(frozen=True)
 class SweepFile:
-    """What a sweep file asks for.
+    """Content of a sweep file.
 
     Attributes:
         model: the equations.
         forcing: the motor torque, or a reduced drive's forcing.
-        request: the points, and what is wanted.
+        request: the points and outputs.
     """
 
     model: Model
@@ -40,7 +40,7 @@ def read_sweep_file(path: Path) -> SweepFile:
     """Read a sweep file.
 
     Raises:
-        InputError: where it is missing or can't be understood; names the section and the key.
+        InputError: it is missing or not understood; names section and key.
     """
     file = Sections(path, _SECTIONS)
     sections = {name: file.section(name) for name in _SECTIONS}
@@ -68,7 +68,7 @@ def _forcing(file: Sections, table: dict[str, Any]) -> Harmonic:
 
 
 def _settings(file: Sections, table: dict[str, Any]) -> dict[str, Any]:
-    """What is wanted of each point, of the right kinds."""
+    """Settings of a sweep, with their types checked."""
     file.known("sweep", table, _SWEEP)
     found: dict[str, Any] = {}
     for key, value in table.items():

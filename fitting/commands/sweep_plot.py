@@ -1,4 +1,4 @@
-"""The summary picture of a sweep: a heat map, a response curve, or the worst cases of a sample."""
+"""Summary plot of a sweep: a heat map, a response curve, or the worst cases of a sample."""
 
 from io import BytesIO
 from typing import Any
@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 _WORST = 15
 _FIRST = ("peak", "amplitude", "settling_time", "x_end", "x")
 _LONGEST = 400
-_WIDE = 30.0  # from the smallest to the largest value: told apart by the logarithm
+_WIDE = 30.0  # ratio of largest and smallest value above which the scale is logarithmic
 
 
 def summary(result: Any) -> bytes:
     """A PNG of a sweep.
 
-    Two axes give a heat map, the largest motion over all else; one gives a curve; a sample alone its worst cases.
+    Two axes give a heat map of the maximum over all others; one gives a curve; a sample alone its worst cases.
 
     Args:
         result: an xarray.Dataset from [`hdjax.sweep.sweep`][].
@@ -61,7 +61,7 @@ def _worst_cases(plot: Any, result: Any, values: np.ndarray, label: str) -> None
 
 
 def _scale(values: Any) -> str:
-    """Of an axis: logarithmic where its values are evenly spaced so."""
+    """Scale of an axis: logarithmic if its values are spaced logarithmically."""
     v = np.asarray(values, dtype=float)
     if v.size < 3 or not (v > 0.0).all():
         return "linear"

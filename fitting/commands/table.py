@@ -1,4 +1,4 @@
-"""Logs that commands write."""
+"""Output logs of commands."""
 
 from pathlib import Path
 

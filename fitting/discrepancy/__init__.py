@@ -1,1 +1,1 @@
-"""Terms that are learned where no name explains what is missing."""
+"""Nonparametric terms, learned where no named effect explains the model discrepancy."""

@@ -1,4 +1,5 @@
-"""Names challenged by a learned term: where they leave something, one is learned beside them and in their place."""
+"""Check of named effects by learned terms: where a residual remains, one is learned beside them and one in their
+place."""
 
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from fitting.attribution.support import (
     is_noise,
     leaves_imperfection,
     noise_evidence,
-    told_from_zero,
+    nonzero_effects,
 )
 from fitting.discrepancy.learn import Unknown, learn_supported, share_of
 from fitting.estimation.base_fit import leaves_white_noise
@@ -27,13 +28,13 @@ from fitting.validation.account import excess
 
 
 class Challenge(eqx.Module):
-    """The outcome of a challenge.
+    """Result of a check of named effects by learned terms.
 
     Attributes:
-        trusted: the model whose names can be trusted.
-        unknown: what was learned beside them, or in the place of all.
-        left: noise of the sensors and of the torque, where that is what the names leave.
-        seen: what that rests on.
+        trusted: the model with the accepted names.
+        unknown: the term learned beside them, or in place of all.
+        left: noise of sensors and torque, where that explains the named model's residual.
+        seen: evidence for the decision.
     """
 
     trusted: Trial
@@ -43,15 +44,15 @@ class Challenge(eqx.Module):
 
 
 def challenge_names(base: Trial, named: Trial, study: Study, *, noise: MeasurementNoise) -> Challenge:
-    """Learn what decides whether names can be trusted, as far as the rules ask for it.
+    """Learn the terms that the rules need to accept or reject the named effects.
 
-    Names of which a learned term beside them leaves nothing fall in any case.
+    Names that a learned term beside them makes superfluous are dropped in any case.
 
     Args:
         base: the model without effects.
-        named: the model with those that were found.
-        study: the data, and how they are cut.
-        noise: of the measured outputs, as far as fits have been asked for it.
+        named: the model with named effects.
+        study: the data and their segmentation.
+        noise: of the measured outputs, where it was estimated.
     """
 
     def seen_as(trial: Trial) -> ModelEvidence:
@@ -86,14 +87,14 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
     if instead is not None:
         rival = named if beside is None else beside.trial
         gains = long_gains(base, [rival, instead.trial], study)
-        # Where both leave the numbers neither is worse.
+        # Where both diverge, neither is worse.
         follow = gains is not None and np.isfinite(gains).any()
         seen = replace(seen, longer_worse=gains[0] - gains[1] if gains is not None and follow else 0.0)
     if instead is not None and beside is not None:
         names = {e.name for e in named.model.effects}
         seen = replace(
             seen,
-            shown=told_from_zero(beside.trial.training, names) == names,
+            shown=nonzero_effects(beside.trial.training, names) == names,
             one_shape=beside.chosen.of == instead.chosen.of
             and any(instead.chosen.variables == (e.one_shape_of,) for e in named.model.effects),
         )
@@ -102,14 +103,14 @@ def challenge_names(base: Trial, named: Trial, study: Study, *, noise: Measureme
 
 
 def _learned(standing: Standing, study: Study) -> Unknown | None:
-    """What can be learned that the data support, beyond noise where that would explain as much."""
+    """The learned term that the data support, also against a noise model; None without any."""
     found = learn_supported(standing.before, study)
     supported = found is not None and standing.over_noise(found.trial) > RULES.noise_gain
     return found if supported else None
 
 
 def model_evidence(trial: Trial, noise: MeasurementNoise) -> ModelEvidence:
-    """A fitted model as decisions see it.
+    """Evidence on a fitted model for the decisions.
 
     Args:
         trial: the model.
@@ -121,22 +122,22 @@ def model_evidence(trial: Trial, noise: MeasurementNoise) -> ModelEvidence:
         selection=trial.held_out.objective,
         parameters=len(trial.training.free.paths),
         excess=tuple(map(float, excess(trial.held_out, noise.covariance))),
-        # What moves a motor as a whole hardly twists the gear.
+        # Rigid-body motion of the motor hardly twists the gear.
         white=leaves_white_noise(trial.training) and bool(np.all(left < RULES.excess)),
     )
 
 
 def _names(base: Trial, named: Trial) -> set[str]:
-    """What was found: effects, or another hold of the torque."""
+    """Names of a model's effects and of another hold."""
     found = {e.name for e in named.model.effects}
     return found | ({"hold"} if named.hold != base.hold else set())
 
 
 def _without_superfluous(base: Trial, named: Trial, beside: Unknown, study: Study) -> tuple[Trial, Unknown]:
-    """Names, and what was learned beside them, without the effects that this has made superfluous: none of their
-    strengths is told from zero any more, and selection data hardly miss them."""
+    """The model without effects that the learned term has made superfluous: none of their strengths is significantly
+    nonzero, and without them the error on selection data hardly changes."""
     names = {e.name for e in named.model.effects}
-    fallen = names - told_from_zero(beside.trial.training, names)
+    fallen = names - nonzero_effects(beside.trial.training, names)
     if not fallen:
         return named, beside
     trial = refitted_without(fallen, beside.trial, base, study)

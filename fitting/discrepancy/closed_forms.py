@@ -1,4 +1,4 @@
-"""Which closed form a learned function resembles: friction's sign, a dead zone, orders of an angle, powers."""
+"""Closed forms that resemble a learned function: sign of a rate, dead zone, orders of an angle, powers."""
 
 import itertools
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from hdjax.effects.learned_axes import ANGLES, DRIFTS
 
 Kind = Literal["constant", "linear", "even", "odd", "magnitude", "knee", "sign", "stribeck", "order"]
 
-# Share of a curve's mean square that an expression must explain to stand for it.
+# Share of a curve's mean square that an expression must explain to describe it.
 _STANDS_FOR = 0.99
 _TOLD = 4
 _IN_PAIRS = 14
 # Knees, dead zones and Stribeck rates, as shares of the largest value.
 _FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8)
 
-# What a closed form at a place is called in the catalogue.
+# Family of the catalogue for a closed form at a place.
 _FAMILIES: dict[tuple[str, str, Kind], str] = {
     ("mesh", "x", "even"): "stiffness_shape",
     ("mesh", "x", "odd"): "stiffness_shape",
@@ -51,12 +51,12 @@ _DEAD_ZONE = 0.2
 
 @dataclass(frozen=True)
 class Shape:
-    """A closed form beside a learned function.
+    """A closed form compared with a learned function.
 
     Attributes:
         expression: the form with its coefficients, all in SI units.
         explained: share of the learned function's mean square over the data that it accounts for.
-        families: families of the catalogue that look like it.
+        families: families of the catalogue with this form.
     """
 
     expression: str
@@ -66,7 +66,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Shapes:
-    """What a learned function looks like.
+    """Closed forms that resemble a learned function.
 
     Attributes:
         closest: single closed forms, best first.
@@ -87,7 +87,7 @@ class _Form:
 
 
 def shapes(curve: LearnedCurve) -> Shapes:
-    """Project a learned function on closed forms, beside what the drive's own parameters can do."""
+    """Project a learned function on closed forms, beside the influence of the drive's parameters."""
     target = without(curve.value, curve.known)
     forms = [f for f in _forms(curve) if _is_own(f, curve)]
     single = sorted((_projected(curve, target, (f,)), i) for i, f in enumerate(forms))[::-1]
@@ -103,7 +103,7 @@ def shapes(curve: LearnedCurve) -> Shapes:
 
 
 def _distinct(ranked: list[_Form]) -> list[_Form]:
-    """The best of the forms that differ in where their knee is only."""
+    """The best of the forms that differ only in the position of their knee."""
     heads = {f.labels[0].split("(")[0]: f for f in reversed(ranked)}
     return [f for f in ranked if heads[f.labels[0].split("(")[0]] is f]
 
@@ -145,7 +145,7 @@ def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:
             labels = (f"cos({times}{variable})", f"sin({times}{variable})")
             yield form("order", labels, np.cos(n * values), np.sin(n * values))
         if variable == "theta_l":
-            # What ties the load to the ground does not come back after a turn.
+            # A spring from load to ground is not periodic in a revolution.
             yield form("linear", (variable,), values)
             yield form("odd", (f"{variable}^3",), values**3)
         return
@@ -175,7 +175,7 @@ def _of_one(place: str, variable: str, values: np.ndarray) -> Iterator[_Form]:
 
 
 def _family_of_product(curve: LearnedCurve, one: _Form, other: _Form) -> str | None:
-    """What a product is called in the catalogue."""
+    """Family of a product in the catalogue."""
     if "temperature" in curve.variables:
         return "temperature"
     if curve.place == "load" or not set(curve.variables) & set(ANGLES):
@@ -187,13 +187,13 @@ def _family_of_product(curve: LearnedCurve, one: _Form, other: _Form) -> str | N
 
 
 def _is_own(form: _Form, curve: LearnedCurve) -> bool:
-    """Whether the drive's own parameters can't do the same."""
+    """Whether a form is independent of the drive's parameters."""
     left = without(form.columns, curve.known)
     return bool(np.all(np.mean(left**2, axis=0) > 1e-6 * np.mean(form.columns**2, axis=0)))
 
 
 def _fitted(curve: LearnedCurve, target: np.ndarray, forms: tuple[_Form, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares of a curve on forms, and what is left."""
+    """Least-squares fit of a curve by forms, and its residual."""
     columns = without(np.concatenate([f.columns for f in forms], axis=1), curve.known)
     scale = np.sqrt(np.mean(columns**2, axis=0))
     found = np.linalg.lstsq(columns / scale, target, rcond=1e-8)[0] / scale

@@ -1,4 +1,4 @@
-"""A learned function as a curve (or a surface) with standard errors, over the range that the data have."""
+"""A learned function as a curve (or a surface) with standard errors, over the range of the data."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,10 +25,10 @@ WORDS = {
     "motor encoder": "error of the motor's encoder",
     "load encoder": "error of the load's encoder",
 }
-"""What each place's learned function is, in words."""
+"""Quantity and place of each learned function, for reports."""
 
 PLACES = dict(zip((form.name for form in LEARNED), WORDS, strict=True))
-"""Where each learned function acts."""
+"""Name of the place of each learned function."""
 
 _POINTS = {1: 200, 2: 41}
 
@@ -39,16 +39,17 @@ class LearnedCurve(eqx.Module):
     Attributes:
         place: "mesh", "motor" or "load" of a torque; "mesh angle", "motor encoder" or "load encoder" of an error there.
         quantity: "torque" or "error".
-        variables: what it depends on.
-        period: after which a function of time comes back [s]; None where it does not.
-        at: variables at instants of the training data, by column; angles within one turn where the data have more, and
+        variables: its arguments.
+        period: of a periodic function of time [s]; None otherwise.
+        at: variables at instants of the training data, by column; angles within one turn if the data exceed it, and
             time within one period.
         value: at those instants [N m or rad].
         std: its standard error.
-        known: what the drive's own parameters stand for at those instants: the function is without it.
-        grid: evenly spaced values of each variable over the range of the data.
-        on_grid: the value there, one axis for each variable.
-        std_on_grid: its standard error.
+        known: functions that the drive's parameters represent at those instants; the learned function is orthogonal to
+            them.
+        grid: evenly spaced values of each variable over its range in the data.
+        on_grid: value on the grid, one axis for each variable.
+        std_on_grid: standard error on the grid.
     """
 
     place: str = eqx.field(static=True)
@@ -68,9 +69,9 @@ def learned_curve(found: Unknown, model: Model, uncertainty: Uncertainty) -> Lea
     """The curve of a learned function.
 
     Args:
-        found: the learned function and the motion that it was learned from.
+        found: the learned function and its training motion.
         model: with the final values.
-        uncertainty: of them.
+        uncertainty: of the values.
     """
     name = found.chosen.form.name
     effect = model.effect(name)
@@ -127,10 +128,10 @@ def with_errors(
     """Values of a function of parameters and a row, and their standard errors to first order.
 
     Args:
-        function: one number.
+        function: scalar.
         parameters: estimates.
-        covariance: of them.
-        at: rows.
+        covariance: of the estimates.
+        at: rows of arguments.
     """
     along = jax.vmap(jax.value_and_grad(function), in_axes=(None, 0))
     value, slopes = (np.asarray(a) for a in along(parameters, jnp.asarray(at)))

@@ -1,4 +1,4 @@
-"""A torque with a memory of its own, where no function of the present motion explains what is missing."""
+"""Torques with memory, for a discrepancy that no function of the present motion explains."""
 
 import equinox as eqx
 import numpy as np
@@ -9,21 +9,21 @@ from fitting.attribution.candidate_refit import try_lead
 from fitting.attribution.screening import Lead, Screen, screen
 from fitting.attribution.shortlist import worth_a_refit
 from fitting.attribution.study import Study
-from fitting.discrepancy.variable_selection import LearnedLook, own_functions
+from fitting.discrepancy.variable_selection import SearchContext, own_functions
 from fitting.first_order.motion import place_of
 from hdjax.effects.learned import LearnedMeshTorque
 from hdjax.effects.learned_memory import LEARNED_WITH_MEMORY, LearnedMemory
 
-# Laws that are put inside the equations, the likeliest first.
+# Number of laws that are refitted inside the equations, the most likely first.
 _TRIED = 2
 
 
-class Remembered(eqx.Module):
-    """A law with memory at a place, as the first look sees it.
+class MemoryCandidate(eqx.Module):
+    """A law with memory at a place, with first-order estimates.
 
     Attributes:
-        lead: that look.
-        known: what the free parameters stand for at its place, at the instants that are kept.
+        lead: result of screening.
+        known: functions that the free parameters represent at its place, at the kept instants.
     """
 
     lead: Lead
@@ -43,7 +43,7 @@ class Remembered(eqx.Module):
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """What it remembers."""
+        """The variable that its hidden states follow."""
         return (self.form.angle,)
 
     @property
@@ -52,28 +52,28 @@ class Remembered(eqx.Module):
         return self.form, self.variables
 
 
-class Remembering(eqx.Module):
-    """What torques with memory would explain.
+class MemoryScreen(eqx.Module):
+    """Screening result of torques with memory.
 
     Attributes:
-        candidates: places and laws, best first by the first look.
-        screen: that look.
+        candidates: places and laws, best first by first-order gain.
+        screen: result of screening.
     """
 
-    candidates: tuple[Remembered, ...]
+    candidates: tuple[MemoryCandidate, ...]
     screen: Screen
 
     def put_inside(
         self, before: Trial, study: Study, *, rival: tuple[object, Trial] | None
-    ) -> tuple[Remembered, Trial] | None:
-        """The candidate that explains most inside the equations, of the likeliest ones, and the model with it.
+    ) -> tuple[MemoryCandidate, Trial] | None:
+        """The candidate with the largest gain inside the equations, of the most likely ones, and the model with it.
 
         Args:
-            before: the model that was looked at.
-            study: the data, and how they are cut.
-            rival: what else was learned, and a model that it has to better.
+            before: the current model.
+            study: the data and their segmentation.
+            rival: another learned term and its model, which it must improve on.
         """
-        best: tuple[Remembered, Trial] | None = None
+        best: tuple[MemoryCandidate, Trial] | None = None
         limit = (before if rival is None else rival[1]).training.objective
         for candidate in self.candidates[:_TRIED]:
             study.progress(f"learning a {candidate.form.name.replace('_', ' ')}")
@@ -83,28 +83,27 @@ class Remembering(eqx.Module):
         return best
 
 
-def remembering(before: Trial, seen: LearnedLook, study: Study, *, least: float) -> Remembering:
-    """Look for torques with memory.
+def screen_memory(before: Trial, seen: SearchContext, study: Study, *, least: float) -> MemoryScreen:
+    """Screen torques with memory.
 
-    Where an effect of the model remembers already, no further memory is looked for: two of the same thing could not be
-    told apart.
+    Not done where an effect of the model already has memory: the two would be confounded.
 
     Args:
-        before: the model.
-        seen: a look at it.
+        before: the current model.
+        seen: its search context.
         study: supplies the seed of the surrogates.
-        least: gain to first order that is worth a refit.
+        least: smallest first-order gain for a refit.
     """
     taken = {place_of(e) for e in before.model.effects if e.states}
     forms = [form for form in LEARNED_WITH_MEMORY if place_of(form) not in taken]
-    study.progress("looking for a memory")
+    study.progress("screening torques with memory")
     screened = screen(before.training, before.held_out, catalogue=forms, seed=study.seed)
     worth = worth_a_refit(screened, least=least)
-    return Remembering(tuple(Remembered(lead, _known(lead, seen)) for lead in worth), screened)
+    return MemoryScreen(tuple(MemoryCandidate(lead, _known(lead, seen)) for lead in worth), screened)
 
 
-def _known(lead: Lead, seen: LearnedLook) -> Float[np.ndarray, "instants known"]:
-    """What the free parameters stand for in the mesh; none of them acts on a shaft alone."""
+def _known(lead: Lead, seen: SearchContext) -> Float[np.ndarray, "instants known"]:
+    """Functions that the free parameters represent in the mesh; none of them acts on a shaft alone."""
     if place_of(lead.effect) is not LearnedMeshTorque:
         return np.zeros((seen.instants.size, 0))
     own = own_functions(seen, LearnedMeshTorque)

@@ -1,4 +1,4 @@
-"""A learned torque that lags, as a stiffness over frequency with standard errors."""
+"""A learned lagging torque as a dynamic stiffness over frequency, with standard errors."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from hdjax import Model
 from hdjax.effects.learned_memory import Lagging
 
 _POINTS = 300
-# The range that is told reaches from the natural frequency by this factor to either side.
+# The frequency range extends from the natural frequency by this factor to either side.
 _REACH = 30.0
 
 
@@ -21,9 +21,9 @@ class LearnedResponse(eqx.Module):
 
     Attributes:
         place: "mesh", "motor" or "load".
-        angle: what it lags behind.
+        angle: that it lags behind.
         frequency: [Hz].
-        stiffness: size of the torque over the angle [N m/rad].
+        stiffness: magnitude of torque over angle [N m/rad].
         std: standard error of its logarithm.
     """
 
@@ -40,7 +40,7 @@ def learned_response(name: str, model: Model, uncertainty: Uncertainty) -> Learn
     Args:
         name: of the effect.
         model: with the final values.
-        uncertainty: of them.
+        uncertainty: of the values.
     """
     effect = model.effect(name)
     assert isinstance(effect, Lagging)

@@ -1,8 +1,8 @@
-"""What is missing where the catalogue does not say: learned inside the equations, as a function of what matters.
+"""Nonparametric terms learned inside the equations, where no effect of the catalogue explains the discrepancy.
 
-Which place and which variables is decided on training data alone ([`fitting.discrepancy.variable_selection`][]); the
-held-out stretches then judge one learned function, like any other effect. What no function of the present motion
-explains may have a memory ([`fitting.discrepancy.dynamic_laws`][]).
+Place and variables are chosen on training data alone ([`fitting.discrepancy.variable_selection`][]); one learned
+function is then evaluated on held-out data, like any other effect. A discrepancy that no function of the present motion
+explains may have memory ([`fitting.discrepancy.dynamic_laws`][]).
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from jaxtyping import Array, Float, Int
 from fitting.attribution.candidate_fit import Trial, challenge
 from fitting.attribution.rules import RULES
 from fitting.attribution.study import Study
-from fitting.discrepancy.dynamic_laws import Remembered, Remembering, remembering
+from fitting.discrepancy.dynamic_laws import MemoryCandidate, MemoryScreen, screen_memory
 from fitting.discrepancy.variable_selection import (
     NEARLY,
     Candidate,
-    LearnedLook,
+    SearchContext,
     candidates,
-    learned_look,
-    looked_again,
+    reselected,
+    search_context,
     sizes_along,
 )
 from fitting.estimation.base_fit import leaves_white_noise
@@ -37,33 +37,32 @@ from hdjax.effects import Conditions, Motion
 from hdjax.effects.learned import Learned, LearnedReading
 from hdjax.parameters import as_scalar
 
-# What explains less than this share of the error, to first order, is not refitted: of what the base model leaves,
-# and beside effects that have a name already.
+# Smallest first-order gain for a refit: on the residual of the base model, and beside named effects.
 _LEAST_SHARE, _LEAST_SHARE_BESIDE = 0.005, 0.02
-# Steps that together take less than this share off the sum of squares are no better than one more coefficient.
+# Least relative decrease of the sum of squares over a few steps: that of one more coefficient.
 _LEAST_PROGRESS = 2.0 * RULES.coefficient
 
 
 class Unknown(eqx.Module):
-    """What was learned and the data support: a function of the motion, or a torque with a memory of it.
+    """A learned term: a function of the motion, or a torque with memory.
 
     Attributes:
         before: the model without it.
         trial: the model with it.
-        candidates: all places and variables, best first by the first look.
-        chosen: the one that was taken.
-        instants: of the training motion that stand for the density of the data, counted along its segments.
-        states: of the model without it, there.
-        conditions: time and temperature there.
-        push: what a unit of torque adds to their rates: at its place, or in the mesh for an error of an angle.
+        candidates: all places and variables, best first by first-order gain.
+        chosen: the selected candidate.
+        instants: sample of the training motion with the density of the data, counted along its segments.
+        states: of the model without it, at these instants.
+        conditions: time and temperature at these instants.
+        push: change of the states' rates by a unit of torque: at its place, or in the mesh for an error of an angle.
         gain: decrease of the held-out objective.
-        p_value: chance of such a gain where nothing is missing.
+        p_value: of this gain.
     """
 
     before: Trial
     trial: Trial
-    candidates: tuple[Candidate | Remembered, ...]
-    chosen: Candidate | Remembered
+    candidates: tuple[Candidate | MemoryCandidate, ...]
+    chosen: Candidate | MemoryCandidate
     instants: Int[np.ndarray, " instants"]
     states: Float[np.ndarray, "instants states"]
     conditions: Conditions
@@ -78,26 +77,26 @@ class Unknown(eqx.Module):
 
 
 def learn(before: Trial, study: Study) -> Unknown | None:
-    """Learn what a model lacks.
+    """Learn a term that a model lacks.
 
     Args:
-        before: the model.
-        study: the data, and how they are cut.
+        before: the current model.
+        study: the data and their segmentation.
 
     Returns:
-        What was learned; None where nothing brings the training error down.
+        The learned term; None where none reduces the training error.
     """
-    study.progress("looking for what the missing torque depends on")
-    seen = learned_look(before.training)
+    study.progress("screening variables of a learned term")
+    seen = search_context(before.training)
     least = _LEAST_SHARE_BESIDE if before.model.effects else _LEAST_SHARE
     found = sorted((c for c in candidates(seen) if c.gain > least), key=lambda c: -c.gain)
     alone, pairs = ([c for c in found if (len(c.variables) > 1) == several] for several in (False, True))
 
     best = _likeliest(alone, None, before, study)
-    memory: Remembering | None = None
-    remembered: tuple[Remembered, Trial] | None = None
+    memory: MemoryScreen | None = None
+    remembered: tuple[MemoryCandidate, Trial] | None = None
     if not _is_enough(best):
-        memory = remembering(before, seen, study, least=least)
+        memory = screen_memory(before, seen, study, least=least)
         # A law with memory has fewer parameters than a function of two variables.
         if memory.candidates and memory.candidates[0].gain > max((c.gain for c in alone), default=0.0):
             remembered = memory.put_inside(before, study, rival=best)
@@ -131,7 +130,7 @@ def learn(before: Trial, study: Study) -> Unknown | None:
 
 
 def learn_supported(before: Trial, study: Study) -> Unknown | None:
-    """[`learn`][], None also where the data do not support what was learned."""
+    """[`learn`][], None also where the data do not support the term."""
     found = learn(before, study)
     return found if is_supported(found) else None
 
@@ -139,33 +138,33 @@ def learn_supported(before: Trial, study: Study) -> Unknown | None:
 def _likeliest(
     found: Sequence[Candidate], best: tuple[Candidate, Trial] | None, before: Trial, study: Study
 ) -> tuple[Candidate, Trial] | None:
-    """The best of the likeliest candidates and of what was the best so far, inside the equations."""
+    """The best, inside the equations, of the most likely candidates and the best one so far."""
     for candidate in _rivals(found):
         study.progress(f"learning a function of {' and '.join(candidate.variables)}")
-        # A whole step to what the first look found may leave the present model, where it is nothing, far behind.
+        # A full step to the first-order estimate may be far worse than the current model, where the term is zero.
         trial = _refitted(before, candidate, study, np.zeros(len(candidate.effect.c)))
         if trial is not None and _penalised(trial) < _penalised(before if best is None else best[1]):
             best = candidate, trial
     return best
 
 
-def _is_enough(found: tuple[Candidate | Remembered, Trial] | None) -> bool:
+def _is_enough(found: tuple[Candidate | MemoryCandidate, Trial] | None) -> bool:
     return found is not None and leaves_white_noise(found[1].training)
 
 
 def _betters(trial: Trial, other: Trial, before: Trial) -> bool:
-    """Whether a model explains more than another one: of the training data, with what its parameters cost, and of
-    those it has not seen, where what it remembers has to last."""
+    """Whether a model is better than another one: on training data, penalised for its parameters, and on held-out data,
+    where the gain of memory must persist."""
     return _penalised(trial) < _penalised(other) and trial.gain_over(before) > other.gain_over(before)
 
 
 def _refined(best: tuple[Candidate, Trial], study: Study) -> tuple[Candidate, Trial]:
-    """The same variables with those functions of them, and as many, that a second look calls for, along the motion that
-    the first fit found: the first look is but first order."""
+    """A refit with the same variables, and functions selected again along the motion of the first fit, since the first
+    selection was of first order only."""
     first, trial = best
-    seen = learned_look(trial.training)
-    for candidate in looked_again(first, seen):
-        study.progress("learning its shape more closely")
+    seen = search_context(trial.training)
+    for candidate in reselected(first, seen):
+        study.progress("refining the learned function")
         finer = _refitted(trial, candidate, study, _as_before(first, trial, candidate, seen))
         if finer is not None and _penalised(finer) < _penalised(best[1]):
             best = eqx.tree_at(lambda c: c.gain, candidate, first.gain), finer
@@ -173,20 +172,20 @@ def _refined(best: tuple[Candidate, Trial], study: Study) -> tuple[Candidate, Tr
 
 
 def is_supported(found: Unknown | None) -> bool:
-    """Whether a learned function is more than chance and more than an imperfection of the solver."""
+    """Whether a learned function is significant, and its gain exceeds what solver errors may cause."""
     return found is not None and found.gain > RULES.least_gain and found.p_value <= RULES.significance
 
 
 def share_of(named: Model, found: Unknown, fit: Fit | None = None) -> float:
-    """Share of a learned torque's mean square that the effects of a model, beyond those it was learned with, make up.
+    """Share of a learned torque's mean square that further effects of a model reproduce.
 
-    Near one the learned torque, which was free to be anything, has come out as those effects. Effects that cancel each
-    other count with what they are apart: they are terms of a series.
+    Near one, the learned torque is equal to those effects. Effects that cancel each other count separately: they are
+    terms of a series.
 
     Args:
         named: the model with the effects.
-        found: what was learned.
-        fit: of that model, whose effects' own states count; where not given they are as after a long rest.
+        found: the learned term.
+        fit: of that model, which supplies hidden states; where not given they are those after a long rest.
     """
     known = found.before.model.effects
     apart = [
@@ -200,8 +199,7 @@ def share_of(named: Model, found: Unknown, fit: Fit | None = None) -> float:
 
 
 def _done(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " instants"]:
-    """What the effects of a model, beyond those a function was learned with, do where the function acts: as a torque
-    there, or to what an encoder reads."""
+    """Contribution of a model's further effects at the learned function's place: a torque, or an encoder error."""
     if not issubclass(found.chosen.form, LearnedReading):
         return _torques(model, found, fit)
     unit = np.asarray(unit_reading(model, found.chosen.form))
@@ -212,8 +210,7 @@ def _done(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " 
 
 
 def _torques(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray, " instants"]:
-    """What the effects of a model, beyond those a function was learned with, are as a torque at the function's place,
-    at the instants."""
+    """A model's further effects as a torque at the learned function's place, at the instants."""
     bare = eqx.tree_at(lambda m: m.effects, model, found.before.model.effects)
     zero = jnp.zeros(())
     silence = sampled(np.arange(2.0), np.zeros(2), hold="zero-order")
@@ -221,7 +218,7 @@ def _torques(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray,
     count = found.states.shape[1]
 
     def added(state: Array, conditions: Conditions) -> Array:
-        # An error of the torque is an effect as well.
+        # Actuator effects count as well.
         steady = silence.affine(jnp.ones(()), zero if conditions.T_m is None else conditions.T_m)
         acting, before = (m.actuate(steady)(zero) for m in (model, bare))
         own = model.rates(state, acting, zero, conditions)
@@ -232,7 +229,7 @@ def _torques(model: Model, found: Unknown, fit: Fit | None) -> Float[np.ndarray,
 
 
 def _own_motion(model: Model, found: Unknown, fit: Fit | None) -> Float[Array, "instants states"]:
-    """The states at the instants, with those of effects that the model before has not as a fit has them."""
+    """The states at the instants, with the fit's hidden states of effects that the preceding model lacks."""
     states, rest = jnp.asarray(found.states), jnp.asarray(model.rest())
     further = model.state_names[states.shape[1] :]
     if fit is None or not further:
@@ -243,12 +240,12 @@ def _own_motion(model: Model, found: Unknown, fit: Fit | None) -> Float[Array, "
 
 
 def without(values: np.ndarray, known: Float[np.ndarray, "instants known"]) -> np.ndarray:
-    """What of values is no combination of known functions."""
+    """The part of values that is orthogonal to known functions."""
     return values - known @ np.linalg.lstsq(known, values, rcond=1e-10)[0]
 
 
 def _rivals(found: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates, best first, that are worth a refit: the best one, and another one that gains nearly as much."""
+    """The candidates to refit, best first: the best one, and another with nearly the same gain."""
     return [c for c in found[:2] if c.gain > NEARLY * found[0].gain]
 
 
@@ -261,8 +258,8 @@ def _refitted(before: Trial, candidate: Candidate, study: Study, c: np.ndarray) 
     return challenge([bare.with_effects(effect)], patient, before.hold, champion=before)
 
 
-def _as_before(old: Candidate, trial: Trial, new: Candidate, seen: LearnedLook) -> np.ndarray:
-    """The coefficients at which one candidate comes closest to what another one has come to in a trial."""
+def _as_before(old: Candidate, trial: Trial, new: Candidate, seen: SearchContext) -> np.ndarray:
+    """The coefficients with which one candidate approximates another one's fitted function best."""
     fitted = trial.model.effect(old.effect.name)
     assert isinstance(fitted, Learned)
     ours, theirs = (sizes_along(c, seen)[0].reshape(-1, len(c.effect.c))[seen.instants] for c in (new, old))
@@ -270,6 +267,6 @@ def _as_before(old: Candidate, trial: Trial, new: Candidate, seen: LearnedLook) 
 
 
 def _penalised(trial: Trial) -> float:
-    """The training objective, with what each parameter would gain on noise (Schwarz 1978)."""
+    """The training objective with a penalty per parameter (Schwarz 1978)."""
     samples = float(trial.training.problem.segments.count)
     return trial.training.objective + 0.5 * len(trial.training.free.paths) * np.log(samples) / samples

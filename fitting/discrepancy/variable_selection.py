@@ -1,7 +1,7 @@
-"""The first look for what a learned function may depend on: places and variables, by what they would explain.
+"""Selection of places and variables of learned functions, by first-order gain.
 
-Along the fitted motion everything is linear. How many coefficients a function is worth is decided on training data
-alone, by leaving parts of them out in turn.
+Along the fitted motion the problem is linear. The number of coefficients is chosen by cross-validation on training
+data.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,12 +16,12 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import effect_paths
 from fitting.first_order.gains import (
     Acting,
-    Look,
+    LinearisedFit,
     Products,
     Sizes,
     best_steps,
     left_after,
-    look_along,
+    linearise_along,
     parameter_torques,
     products,
 )
@@ -51,33 +51,33 @@ from hdjax.effects.learned_axes import (
 )
 from hdjax.engine.pointwise import at_instants, slopes_at_instants
 
-# Parts that training data are left out in, in turn.
+# Number of parts of the cross-validation.
 _FOLDS = 4
-# How many coefficients a function of one variable may have, and of two.
+# Most coefficients of a function of one variable, and of two.
 _SIZES = {1: (1, 2, 3, 4, 5, 6, 7, 9, 11, 13, 16), 2: (1, 2, 3, 5, 7, 9, 12, 16, 20, 24)}
-# What explains this share of what the best one does, to first order, may be the better one after all.
+# A candidate with this share of the best first-order gain may be the better one after a refit.
 NEARLY = 0.8
-# Share of its mean square that the functions of the same variables must reach to take a free parameter for one of them.
+# A free parameter is a function of the same variables if these reproduce this share of its mean square.
 _SAME_FUNCTION = 0.99
-# Motions that so few samples reach are no part of the range.
+# Quantiles of a variable's range: rare extremes are not part of it.
 _RARE = 5e-4
-# What the functions of a `PowerAxis` count as rough: so much apart that they come one by one, by their degree.
+# Roughness of the functions of a `PowerAxis`, so different that they enter one by one, by degree.
 _ROUGHNESS_OF_POWERS = (0.0, 1e-8, 1.0, 1e-4, 1e4)
-# A sign comes after the constant and before all else.
+# Roughness of a sign: after the constant and before all others.
 _ROUGHNESS_OF_A_SIGN = 1e-10
-# Instants of the motion that stand for the density of the data.
+# Number of instants that sample the density of the data.
 _INSTANTS = 3000
 
 
 class Candidate(eqx.Module):
-    """A place and variables, as the first look sees them.
+    """A place and variables with first-order estimates.
 
     Attributes:
         form: the place.
-        variables: what the function depends on.
-        gain: decrease of the objective on parts of the training data that were left out, to first order.
-        effect: the learned function, at the coefficients that suit best to first order.
-        known: functions of the variables that the free parameters stand for already, at the instants that are kept.
+        variables: arguments of the function.
+        gain: cross-validated decrease of the training objective, to first order.
+        effect: the learned function with first-order estimates of its coefficients.
+        known: functions of the variables that free parameters represent, at the kept instants.
     """
 
     form: type[Learned] = eqx.field(static=True)
@@ -92,53 +92,53 @@ class Candidate(eqx.Module):
         return self.form, self.variables
 
 
-class LearnedLook(eqx.Module):
-    """A look at a fit, with what candidates share.
+class SearchContext(eqx.Module):
+    """A linearised fit with data that candidates share.
 
     Attributes:
-        look: at the fit.
+        look: the linearised fit.
         values: variables at each knot.
         weight: of each knot.
-        lines: frequencies that stand out of what the fit leaves over [rad/s].
+        lines: frequencies of significant lines of the fit's residual [rad/s].
     """
 
-    look: Look
+    look: LinearisedFit
     values: dict[str, Float[np.ndarray, "segments knots"]]
     weight: Float[np.ndarray, "segments knots"]
     lines: tuple[float, ...] = eqx.field(static=True)
 
     @property
     def instants(self) -> Int[np.ndarray, " instants"]:
-        """Some of the knots with weight, evenly spread: they stand for the density of the data."""
+        """Evenly spaced valid knots, which sample the density of the data."""
         kept = np.flatnonzero(self.weight.reshape(-1) > 0)
         return kept[np.unique(np.linspace(0, kept.size - 1, min(_INSTANTS, kept.size)).astype(int))]
 
     def acting(self, form: type[Learned]) -> Acting:
-        """What a unit of a form's function does, and one of its slope as well for an error of the mesh."""
+        """Influence of a unit of a form's function, and of its slope for an error of the mesh."""
         if issubclass(form, LearnedReading):
             return Acting(reading=unit_reading(self.look.model, form))
         names = (form.name,) if issubclass(form, LearnedTorque) else (ERROR, SLOPE)
         return Acting(tuple(self.look.pushes[name] for name in names))
 
     def torque_push(self, place: type[LearnedTorque] | None) -> Float[np.ndarray, "segments knots states"]:
-        """What a unit of torque does at a place; in the mesh where it is none."""
+        """Change of the state's rates by a unit of torque at a place; in the mesh for an error of an angle."""
         return self.look.pushes[(place or LearnedMeshTorque).name]
 
 
-def learned_look(fit: Fit) -> LearnedLook:
-    """Look at a fit, of a model that lacks something, along its motion."""
-    look = look_along(fit)
+def search_context(fit: Fit) -> SearchContext:
+    """Linearise a fit for the search of learned functions."""
+    look = linearise_along(fit)
     values = {n: np.asarray(getattr(look.motion, n)) for n in UNITS if getattr(look.motion, n) is not None}
     weight = np.asarray(look.problem.segments.weight)
     finite = np.all([np.isfinite(v).all(axis=1) for v in values.values()], axis=0)
-    # The last knot of a segment is the first one of the next.
+    # The last knot of a segment is the first one of the next segment.
     weight = np.pad(weight * finite[:, None], ((0, 0), (0, 1)))
-    return LearnedLook(look, values, weight, spectral_lines(fit))
+    return SearchContext(look, values, weight, spectral_lines(fit))
 
 
-def candidates(seen: LearnedLook) -> list[Candidate]:
-    """Every place with every variable, and with pairs of them: the best one and another, or any two where no variable
-    alone explains anything."""
+def candidates(seen: SearchContext) -> list[Candidate]:
+    """Candidates of every place with every variable, and with pairs: the best variable with another, or any two where
+    no single one has a gain."""
     reduced = isinstance(seen.look.model, ReducedModel)
     forms = [form for form in LEARNED if not (form.needs_motor and reduced)]
     own = {form: own_functions(seen, form) for form in forms}
@@ -154,16 +154,16 @@ def candidates(seen: LearnedLook) -> list[Candidate]:
     for form, those in alone.items():
         best = {max(those, key=lambda c: c.gain).variables[0]} if those and not any_two else set()
         pairs = (p for p in combinations(may[form], 2) if any_two or best & set(p))
-        # The angles of both shafts are one and the same, but for the twist.
+        # The angles of both shafts are equal except for the twist.
         found += look_at(form, (p for p in pairs if not set(p) <= set(ANGLES)))
     return found
 
 
-def looked_again(first: Candidate, seen: LearnedLook) -> list[Candidate]:
-    """A candidate's place and variables again, with the coefficients that another look calls for: the function that
-    explains most, and before it the simplest one that explains nearly as much.
+def reselected(first: Candidate, seen: SearchContext) -> list[Candidate]:
+    """A candidate's place and variables with functions selected again along another motion: the simplest one with
+    nearly the best gain, then the one with the best gain.
 
-    To first order a steep slope is as good as a jump along a motion that was found with a slope."""
+    To first order, a steep slope and a jump are equivalent along a motion that was fitted with a slope."""
     found = _functions_of(seen, first.form, first.variables, own_functions(seen, first.form))
     if not found:
         return []
@@ -172,15 +172,15 @@ def looked_again(first: Candidate, seen: LearnedLook) -> list[Candidate]:
     return [simplest] if simplest is best else [simplest, best]
 
 
-def sizes_along(chosen: Candidate, seen: LearnedLook) -> Sizes:
+def sizes_along(chosen: Candidate, seen: SearchContext) -> Sizes:
     """The functions that a candidate's coefficients multiply, along another fit's motion."""
     values = {name: np.nan_to_num(value) for name, value in seen.values.items()}
     mixing = np.asarray(chosen.effect.mixing)
     return tuple(part @ mixing for part in _functions(chosen.form, chosen.effect.axes, values))
 
 
-def own_functions(seen: LearnedLook, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
-    """The free parameters as torques at the place of a form; none of them is an error of an angle."""
+def own_functions(seen: SearchContext, form: type[Learned]) -> Float[np.ndarray, "segments knots parameters"]:
+    """The free parameters as torques at the place of a form; none of them represents an error of an angle."""
     if issubclass(form, LearnedTorque):
         return parameter_torques(seen.look, seen.torque_push(place_of(form)))
     return np.zeros((*seen.weight.shape, len(seen.look.problem.free.paths)))
@@ -204,8 +204,8 @@ def _all_products(parts: Sequence[np.ndarray]) -> np.ndarray:
     return found
 
 
-def _ranges(seen: LearnedLook, variables: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    """Between which values the data have each quantity."""
+def _ranges(seen: SearchContext, variables: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """Range of each quantity in the data."""
     found = {}
     for variable in variables:
         low, high = np.quantile(seen.values[variable][seen.weight > 0], [_RARE, 1.0 - _RARE])
@@ -223,12 +223,12 @@ def _functions_of_one(value: Array, axis: Axis) -> Array:
 
 
 def _simplest(
-    seen: LearnedLook,
+    seen: SearchContext,
     form: type[Learned],
     variables: tuple[str, ...],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
-    """One place and choice of variables, by the simplest function that explains as much as any."""
+    """A candidate of given place and variables, with the simplest function among those of equal gain."""
     best: Candidate | None = None
     for candidate in _functions_of(seen, form, variables, own):
         if best is None or candidate.gain > best.gain + RULES.coefficient:
@@ -237,14 +237,14 @@ def _simplest(
 
 
 def _functions_of(
-    seen: LearnedLook,
+    seen: SearchContext,
     form: type[Learned],
     variables: tuple[str, ...],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> list[Candidate]:
-    """One place and choice of variables with all that a function of them may be made of, fewest coefficients first."""
+    """Candidates of given place and variables with all types of axes, fewest coefficients first."""
     jumps_with = next((name for name in variables if form.may_jump_with(name)), None)
-    # A second look knows how sharp a jump is, and at which frequency a torque comes back.
+    # The previous candidate supplies the width of a jump and the frequency of a periodic torque.
     before = next((e for e in seen.look.model.effects if isinstance(e, form)), None)
     corner = float(before.corner) if isinstance(before, LearnedFriction) else None
     lines = (float(before.omega),) if isinstance(before, LearnedPeriodic) else seen.lines
@@ -254,12 +254,12 @@ def _functions_of(
 
 
 def _candidate(
-    seen: LearnedLook,
+    seen: SearchContext,
     form: type[Learned],
     axes: tuple[Axis, ...],
     own: Float[np.ndarray, "segments knots parameters"],
 ) -> Candidate | None:
-    """One place and choice of variables, with as many coefficients as parts of the data that were left out call for."""
+    """A candidate of given place and variables, with the cross-validated number of coefficients."""
     instants = seen.instants
     raw = _functions(form, axes, seen.values)
     flat = np.asarray(raw[0]).reshape(-1, raw[0].shape[2])[instants]
@@ -289,16 +289,16 @@ def _candidate(
 
 
 def _of_its_own(model: Model, form: type[Learned]) -> int:
-    """How many free parameters a learned function at this place has that a model has already; its last effect."""
+    """Number of free parameters of the model's learned function at this place (its last effect)."""
     return next((len(effect_paths(e)) for e in model.effects if isinstance(e, form)), 0)
 
 
-def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Products:
-    """Products with what the model's learned torque explains put back into the residual, and its columns left out."""
+def _instead_of_own(found: Products, look: LinearisedFit, kept: int, free: int) -> Products:
+    """Products with the model's learned torque added back to the residual, and its columns removed."""
     if kept == free:
         return found
     own = np.zeros(found.gram.shape[-1])
-    # What is no coefficient, only moves the corner of a jump.
+    # The parameters other than coefficients only set the width of a jump.
     linear = [i for i in range(kept, free) if not look.problem.free.logarithmic[i]]
     own[linear] = np.asarray(look.problem.free.pack(look.model))[linear]
     moved = found.gram @ own
@@ -313,8 +313,8 @@ def _instead_of_own(found: Products, look: Look, kept: int, free: int) -> Produc
 
 
 def _same_functions(raw: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Those free parameters that are functions of the same variables at the same place: the learned torque leaves what
-    they can do to them."""
+    """Free parameters that are functions of the same variables at the same place; the learned torque is made orthogonal
+    to them."""
     size = np.sqrt(np.mean(own**2, axis=0))
     own = own[:, size > 0] / size[size > 0]
     if own.shape[1] == 0:
@@ -347,12 +347,12 @@ def _roughness_along(axis: Axis) -> np.ndarray:
         return np.zeros((1, 1))
     bends = np.diff(np.eye(axis.count), 2, axis=0)
     rises = np.diff(np.eye(axis.count), axis=0)
-    # The slope, counted little, puts the constant before the straight line.
+    # A small penalty on the slope orders the constant before the straight line.
     return axis.count**3 * bends.T @ bends + axis.count * rises.T @ rises
 
 
 def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """The penalty, where any part of what is known already costs nothing: it is among the functions."""
+    """The penalty without cost for known functions, which are among the functions."""
     if known.shape[1] == 0:
         return roughness
     own = np.linalg.lstsq(raw, known / np.sqrt(np.mean(known**2, axis=0)), rcond=1e-10)[0]
@@ -361,15 +361,15 @@ def _but_for(known: np.ndarray, raw: np.ndarray, roughness: np.ndarray) -> np.nd
 
 
 def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Combinations of functions, smoothest first, each of unit rms on the data, uncorrelated with each other and with
-    what is known already (the basis of Demmler and Reinsch 1975)."""
+    """Combinations of functions, smoothest first, of unit rms on the data, uncorrelated with each other and with known
+    functions (basis of Demmler and Reinsch 1975)."""
     from scipy.linalg import eigh, null_space
 
     moment = raw.T @ raw / len(raw)
     free = null_space((raw.T @ known / len(raw)).T, rcond=1e-8) if known.shape[1] else np.eye(raw.shape[1])
     inside = free.T @ moment @ free
     seen, directions = np.linalg.eigh(inside)
-    # Where there are no data, nothing can be learned.
+    # Directions without data are removed.
     free = free @ directions[:, seen > 1e-12 * np.max(seen, initial=0.0)]
     if free.shape[1] == 0:
         return free
@@ -378,13 +378,12 @@ def _smooth_first(raw: np.ndarray, known: np.ndarray, roughness: np.ndarray) -> 
 
 
 def _left_out(found: Products, counts: Sequence[int]) -> Float[np.ndarray, " counts"]:
-    """The objective over the parts of the data, each after least squares on the others, with so many of the first
-    columns free."""
+    """Cross-validated objective for each number of free columns: on each part after least squares on the others."""
     most = max(counts)
     free = np.arange(most) < np.asarray(counts)[:, None]
 
     def for_each(products: Products) -> Products:
-        """Once for each count; columns that are not free explain nothing."""
+        """Repeat for each count; columns that are not free have no effect."""
         first = products.first(most)
         gradient = first.gradient * free[:, None, None, None, :]
         gram = first.gram * free[:, None, None, None, :, None] * free[:, None, None, None, None, :]

@@ -1,1 +1,1 @@
-"""Least squares over segments of logs: parameters, initial states, what is left over."""
+"""Least squares over segments of logs: parameters, initial states and residual."""

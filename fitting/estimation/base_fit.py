@@ -1,8 +1,8 @@
-"""The base model's fit, from nothing but the log: starting values, coarse fits from each, and the best one refined.
+"""Fit of the base model from the log alone: starting values, coarse fits from each, refinement of the best one.
 
-Short simulations find their minimum from far away, because a wrong frequency can't run out of phase; long ones use the
-data fully. So each start is fitted over short horizons first, and the best goes on to longer ones from the states that
-it has found.
+Fits over short horizons converge from far away, because a wrong frequency can't run out of phase; long horizons are
+more accurate. So each start is fitted over short horizons first. The best fit is continued over longer ones, from its
+own states.
 """
 
 import functools
@@ -34,25 +34,26 @@ from fitting.estimation.whiteness import autocorrelation, left_over, ljung_box
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.drive import Prior
 
-# Iterations that tell a start that leads somewhere from one that does not.
+# Iterations of a trial fit, enough to rank the starts.
 _TRIAL_STEPS = 10
-# A start whose trial is this much worse than the best (in the objective: 10 % of the error) is given up.
+# A start whose trial is this much worse than the best (in the objective: 10 % of the error) is dropped.
 _HOPELESS = 0.1
-# A fit whose stiffness is off by so much (in its logarithm) from all weak forms that see no steady load may be in a
-# minimum that a large load has made; so it is where steady loads leave less than this share of its error.
+# First: distance of a fit's log stiffness from all weak forms that are insensitive to constant loads. Beyond it, an
+# unlogged load may have caused a wrong minimum. It has, where constant loads per segment leave less than the second
+# number, a share of the error.
 _OFF, _MUCH = 0.3, 0.5
-# Rounds of leaving out what stands alone; each tells the noise better, and so shows smaller outliers.
+# Passes of outlier removal; each improves the noise estimate, and so detects smaller outliers.
 _CLEANINGS = 3
-# Lags of the test for whiteness, and the chance that it takes white noise for anything else.
+# Lags of the whiteness test, and its significance level.
 _LAGS = 20
 _FALSE_ALARM = 1e-3
 
 
 def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit:
-    """Fit a drive without effects, from starting values that the data supply; the fit's `problem.model` holds them.
+    """Fit a drive without effects, from starting values estimated from the data. The fit's `problem.model` holds these.
 
-    Where what acts on the motor (friction, say) or a load that is not logged leaves the model no minimum near the
-    drive's parameters, they are held (see [`is_held`][]).
+    Friction of the motor or an unlogged load may leave the objective without a minimum near the true parameters. Then
+    they are fixed (see [`is_held`][]).
 
     Args:
         model: the base model; its stiffness and damping are only placeholders.
@@ -60,7 +61,7 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
         halo: intervals of torque before a segment.
 
     Raises:
-        DataError: where the data supply no starting values.
+        DataError: no starting values follow from the data.
     """
     training = without_glitches(training)
     if sees_twist(training):
@@ -89,10 +90,10 @@ def base_fit(model: Model, training: Sequence[Stretch], *, halo: int = 0) -> Fit
 
 
 def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
-    """The fit over short horizons where the dynamic error was measured, and where it started."""
+    """The fit over short horizons where the dynamic error was measured, and its starting model."""
     priors = ()
     if isinstance(model, TwoInertiaModel):
-        # What the base model lacks would go into inertias that are free, before the load's equation is asked.
+        # Free inertias would absorb what the base model lacks before the load's equation is used.
         priors = model.drive.priors
         model = with_priors(with_starting_inertias(model, training), ())
     best, start = _coarse_fit(starting_models(model, training), training, halo)
@@ -105,8 +106,8 @@ def _fit_of_twist(model: Model, training: Sequence[Stretch], halo: int) -> tuple
 
 
 def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Model]:
-    """The best of the fits from each start, over horizons that suit the fastest of them; and where it started."""
-    # Judged on equally short segments, a start with the wrong frequency can't hide.
+    """The best of the fits from each start, over horizons that suit the fastest of them; and its starting model."""
+    # Equally short segments for all starts make their objectives comparable.
     horizon = segment_length(min(short_horizon(s, training) for s in starts))
     substeps = max(suggested_substeps(s, training) for s in starts)
 
@@ -133,17 +134,18 @@ def _coarse_fit(starts: Sequence[Model], training: Sequence[Stretch], halo: int)
 def _fitted(
     model: Model, *, training: Sequence[Stretch], segmentation: Segmentation, strategy: Strategy = Strategy()
 ) -> Fit:
-    """Fit all that the model has of its own, from where it stands; arguments as in
+    """Fit the base parameters from the model's current values; arguments as in
     [`fitting.estimation.estimate.fit`][]."""
     return fit(model, training, base_paths(model), segmentation, strategy=strategy)
 
 
 def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
-    """The minimum to which steady loads in each segment lead, where they explain most of what is left; else the same.
+    """The fit started with a constant load torque in each segment, where such loads explain most of the residual; else
+    the given fit.
 
-    Under a large load that is not logged (a weight, a spring to the ground) the twist hardly follows the motor's
-    torque, and a drive with a wrong stiffness fits better than the right one. Where there is no minimum near the right
-    one, the parameters are held at what the steady loads tell.
+    Under a large unlogged load (a weight, a spring to the ground) the twist hardly depends on the motor torque, and a
+    wrong stiffness fits better than the right one. Where there is no minimum near the right one, the parameters are
+    fixed at their values in the fit with constant loads.
     """
     drive = best.model.drive
     if not isinstance(drive, Drive) or leaves_white_noise(best):
@@ -164,8 +166,8 @@ def _beside_loads(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
 
 
 def _with_inertias_free(found: Fit, priors: tuple[Prior, ...]) -> Fit:
-    """The fit with all that its drive's priors are of free as well; one whose parameters are held stays so, unless that
-    leaves nothing but noise: then an inertia was wrong, and nothing acts on the motor."""
+    """The fit with all parameters that have a prior free as well. A fit with fixed parameters keeps them fixed unless
+    freeing leaves only noise: then an inertia was wrong, and nothing unmodelled acts on the motor."""
     model = with_priors(found.model, priors)
     fitted = functools.partial(
         fit, model, found.stretches, base_paths(model), found.segmentation, start=Start(states=found.unknowns.states)
@@ -177,9 +179,8 @@ def _with_inertias_free(found: Fit, priors: tuple[Prior, ...]) -> Fit:
 def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
     """Whether the load's own equation, which holds whatever acts on the motor, contradicts a fit of the drive.
 
-    A motor whose friction is a good part of its torque moves far less than the base model makes it. Nothing in that
-    model takes energy from the motor alone. So the fit brakes the motor by tying it to the load, with a damping B_sp so
-    large that the twist stands still and K no longer matters.
+    Large friction makes the motor move far less than the base model predicts. In that model only the mesh can dissipate
+    the motor's energy. So the fit raises B_sp until the twist vanishes and K has no influence.
     """
     if driven is None:
         return False
@@ -187,7 +188,7 @@ def _contradicts(driven: Fit | None, best: Fit) -> TypeGuard[Fit]:
 
 
 def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) -> Fit:
-    """The base model with its parameters held at what the load's own equation tells."""
+    """The base model with its parameters fixed at estimates from the load's equation of motion."""
     told = model.replace({path: driven.model.get(path) for path in MESH})
     horizon = short_horizon(told, training)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
@@ -195,15 +196,15 @@ def _held_at(driven: Fit, model: Model, training: Sequence[Stretch], halo: int) 
 
 
 def is_held(found: Fit) -> bool:
-    """Whether its parameters were held."""
+    """Whether the fit's parameters were fixed."""
     return not np.any(np.asarray(found.problem.active))
 
 
 def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     """The fit over horizons of six natural periods, from one over shorter ones."""
     paths = base_paths(best.model)
-    # The reach of a horizon is in inverse proportion to it, so that none may be skipped. Joined segments make a longer
-    # one by the same program.
+    # The range of convergence is inversely proportional to the horizon, so that none may be skipped. Longer horizons
+    # are made of joined segments, by the same program.
     while 4 * best.horizon <= short_horizon(best.model, training):
         best = fit(
             best.model,
@@ -219,9 +220,9 @@ def _refined(best: Fit, training: Sequence[Stretch], halo: int) -> Fit:
     return fit(best.model, training, paths, segmentation, start=Start(states=states))
 
 
-def told_by_load(found: Fit) -> Fit | None:
-    """The fit whose values a base fit holds, of the load's own equation or beside friction of the motor; None where it
-    holds none, or others."""
+def fit_behind_fixed_values(found: Fit) -> Fit | None:
+    """The fit that supplied a base fit's fixed values: of the load's equation, or beside motor friction. None where
+    nothing was fixed, or by other means."""
     if not is_held(found) or not isinstance(found.model, TwoInertiaModel):
         return None
     if not sees_twist(found.stretches):
@@ -229,13 +230,13 @@ def told_by_load(found: Fit) -> Fit | None:
     driven = motor_driven_fit(with_priors(found.model, ()), found.stretches)
     if driven is None or any(float(found.model.get(p)) != float(driven.model.get(p)) for p in MESH):
         return None
-    # The stiffness is known in proportion to the load's inertia, and no better.
+    # The fit determines the stiffness only in proportion to the load's inertia.
     known = tuple(p for p in found.model.drive.priors if p.path == "J_l" and np.isfinite(p.tolerance))
     return motor_driven_fit(with_priors(found.model, known), found.stretches) if known else driven
 
 
 def need_double_precision() -> None:
-    """Refuse to go on in single precision, which fits do not converge in.
+    """Refuse single precision, in which fits do not converge.
 
     Raises:
         ValueError: JAX computes in single precision.
@@ -245,14 +246,13 @@ def need_double_precision() -> None:
 
 
 def leaves_white_noise(found: Fit) -> bool:
-    """Whether nothing is left of the dynamic error that a better minimum could explain: a test of its first
-    autocorrelations (Ljung and Box 1978)."""
+    """Whether the residual of the dynamic error is white: a test of its first autocorrelations (Ljung and Box 1978)."""
     _, p_value = ljung_box(autocorrelation(found, _LAGS)[1:], left_over(found).size)
     return p_value > _FALSE_ALARM
 
 
 def as_followed(found: Fit) -> tuple[Stretch, ...]:
-    """The stretches with the outputs that a fit gives in place of the measured ones."""
+    """The stretches with a fit's simulated outputs in place of the measured ones."""
     parts = []
     for stretch, error in zip(found.stretches, found.by_stretch(np.asarray(found.error)), strict=True):
         measured = stretch.experiment.measured.copy()

@@ -1,8 +1,9 @@
-"""A base fit where the dynamic error was not measured, with and without friction of the motor beside it.
+"""Base fit where the dynamic error was not measured, with and without friction of the motor.
 
 The base model can take energy from the motor only through the mesh, so that friction of the motor leads its fit to any
-K. Where both angles were measured, the load's own equation tells (see [`fitting.estimation.motor_driven`][]). Here
-friction is fitted beside the drive instead, and holds its parameters where it explains most of what is left.
+K. Where both angles were measured, the load's equation of motion determines K (see
+[`fitting.estimation.motor_driven`][]). Here friction is fitted together with the drive. Where it explains most of the
+residual, the drive's parameters are fixed at that fit's values.
 """
 
 import functools
@@ -16,23 +17,23 @@ from fitting.estimation.scales import largest_torque, scales
 from hdjax import Model
 from hdjax.effects import MotorFriction
 
-# Friction that a fit begins with, over the largest torque; it moves by its logarithm.
+# Starting value of friction over the largest torque; it is fitted by its logarithm.
 _BEGIN = 0.05
-# Iterations that tell a start that leads somewhere from one that does not.
+# Iterations of a trial fit, enough to rank the starts.
 _TRIAL_STEPS = 10
 # Share of the rms speed over which the sign of friction turns.
 _TURN = 0.01
 
 
 def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: int) -> tuple[Fit, Fit, Model]:
-    """The fit of the drive alone, that of the drive beside friction of its motor, and where they started.
+    """The fit of the drive alone, that of the drive with motor friction, and their starting model.
 
     Args:
         starts: models with starting values.
         training: the data.
         halo: intervals of torque before a segment.
     """
-    # Judged on equally short segments, a start with the wrong frequency can't hide.
+    # Equally short segments for all starts make their objectives comparable.
     horizon = min(short_horizon(s, training) for s in starts)
     substeps = max(suggested_substeps(s, training) for s in starts)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, substeps)
@@ -42,21 +43,21 @@ def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: i
     beside = fitted(best.model)
     alone = fitted(start)
     if beside.objective < alone.objective:
-        # Where friction is small, the drive beside it is near the drive alone.
+        # Where friction is small, both fits have similar parameters.
         other = fitted(beside.model.without_effect(MotorFriction.name))
         alone = min(alone, other, key=lambda f: f.objective)
     return alone, beside, start
 
 
 def beside_friction(model: Model, training: Sequence[Stretch]) -> Model:
-    """The model with friction on the motor that a fit may begin with."""
+    """The model with motor friction at its starting value."""
     speed = scales(training, model).omega_m
     friction = MotorFriction(T_c=_BEGIN * largest_torque(training), transition=_TURN * speed)
     return model.with_effects(friction)
 
 
 def held_beside(beside: Fit, start: Model, training: Sequence[Stretch], halo: int) -> Fit:
-    """The base model with its parameters held at what they are beside friction."""
+    """The base model with its parameters fixed at those of the fit with friction."""
     told = start.replace({path: beside.model.get(path) for path in base_paths(start)})
     horizon = short_horizon(told, training)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, suggested_substeps(told, training))
@@ -64,7 +65,7 @@ def held_beside(beside: Fit, start: Model, training: Sequence[Stretch], halo: in
 
 
 def refitted_beside(held: Fit) -> Fit:
-    """The fit beside friction that a base fit's values are of."""
+    """The fit with friction that supplied a base fit's fixed values."""
     return _fitted(beside_friction(held.model, held.stretches), training=held.stretches, segmentation=held.segmentation)
 
 

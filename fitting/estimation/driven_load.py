@@ -1,18 +1,18 @@
 """The load as a filter of the motor's motion: starting values and twist where the dynamic error was not measured.
 
-Behind the mesh the load answers the motor's turn q = theta_m/N and the torque on it alone,
+The load responds to the motor's motion q = theta_m/N and to the load torque alone,
 
     theta_l = G q + (G_0 / J_l) T_l,   G = (c_B s + c_K) G_0,   G_0 = 1 / (s^2 + c_B s + c_K),
 
-with c_K = K/J_l (the square of the antiresonance) and c_B = B_sp/J_l. For given c_K and c_B, what was measured is
-linear in all else,
+with c_K = K/J_l (the square of the antiresonance) and c_B = B_sp/J_l. For given c_K and c_B, the measured signals are
+linear in all other unknowns,
 
     N k_T T_m + G T_l = N^2 J_m q'' + J_l (G q)'' + friction of the motor      (momentum of the motor)
     tau + G T_l = J_l (G q)''                                                   (a sensor of the joint torque)
     theta_l'' = (G q)''                                                         (a sensor of the load)
 
-so that only c_K and c_B are searched. Test functions take the place of derivatives as in
-[`fitting.estimation.starting_values`][]. Neither friction of the motor nor its inertia moves the antiresonance.
+so that only c_K and c_B are searched. Test functions replace derivatives as in
+[`fitting.estimation.starting_values`][]. Friction and inertia of the motor do not affect the antiresonance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,38 +27,38 @@ from hdjax import Drive, Model, TwoInertiaModel
 
 Signal = Float[np.ndarray, " samples"]
 Rows = Float[np.ndarray, " rows"]
-"""A signal against test functions."""
+"""Inner products of a signal with test functions."""
 Order = Literal[0, 1]
 """0 for an angle, 1 for a velocity."""
 
-# Of the search: antiresonances over the decades that a log can show, with the damping ratio of the first look, which
-# makes minima wide.
+# Search grid of antiresonances over the decades that a log can resolve, and the damping ratio of the first pass, large
+# enough to make minima wide.
 _FREQUENCIES, _DAMPING = 60, 0.1
 _STEPS = 60
-# Least damping ratio of a filter whose start is not known.
+# Least damping ratio of a filter whose initial state is unknown.
 _LEAST_DAMPING = 0.02
-# Windows of each width at most: they tell c_K to a percent.
+# Windows of each width at most: they determine c_K to a percent.
 _MOST_WINDOWS = 500
-# Share of what was measured that a start may leave.
+# Largest unexplained share of the measured signals for a start to be accepted.
 _MOST_MISSED = 0.5
-# Stands for values that no drive has.
+# Objective of infeasible values.
 _NO_START = 1e6
 
 
 class Seen(NamedTuple):
-    """A side's motion: its angle, or its velocity."""
+    """A side's motion: its angle or its velocity."""
 
     values: Signal
     order: Order
 
 
 def seen_motor(experiment: Experiment, N: float) -> Seen | None:
-    """The motor's turn theta_m/N, or its rate; None where neither was measured."""
+    """The motor's angle theta_m/N or its rate; None where neither was measured."""
     return _seen(experiment, {"motor_turn": (1.0, 0), "motor_angle": (N, 0), "motor_velocity": (N, 1)})
 
 
 def seen_load(experiment: Experiment) -> Seen | None:
-    """The load's angle or rate; None where neither was measured."""
+    """The load's angle or its rate; None where neither was measured."""
     return _seen(experiment, {"load_angle": (1.0, 0), "load_velocity": (1.0, 1)})
 
 
@@ -71,16 +71,16 @@ def _seen(experiment: Experiment, names: dict[str, tuple[float, Order]]) -> Seen
 
 
 def through_load(signal: Signal, c_K: float, c_B: float, time_step: float) -> Signal:
-    """G applied to a signal that was constant before: straight lines between samples."""
+    """G applied to a signal that was constant before, linear between samples."""
     return _filtered(signal, [c_B, c_K], float(np.sqrt(c_K)), c_B, time_step) + signal[0]
 
 
 def starts_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> list[dict[str, float]]:
-    """Values of K, B_sp and of the inertias of which nothing is known, for each width of the test functions that
-    explains what was measured; none where the motor was not seen.
+    """Starting values of K, B_sp and the unknown inertias, for each width of test functions that explains the measured
+    signals; none where the motor was not measured.
 
     Args:
-        model: supplies what is known.
+        model: supplies the known parameters.
         stretches: the data.
     """
     found = []
@@ -93,7 +93,7 @@ def starts_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> l
 
 
 class _Part(NamedTuple):
-    """One stretch against test functions."""
+    """Inner products of one stretch's signals with test functions."""
 
     motor: Seen
     load: Seen | None
@@ -120,14 +120,14 @@ class _Part(NamedTuple):
 
 
 class _Equation(NamedTuple):
-    """One balance against test functions.
+    """One momentum or torque balance in weak form.
 
     Attributes:
-        inertias: what each is multiplied by.
-        beside: columns of the motor's friction.
-        right: what they are to explain.
-        whole: what was measured of it, by which it is counted.
-        known: the inertias that are not wanted.
+        inertias: regressor of each inertia.
+        beside: regressors of the motor's friction.
+        right: right-hand side.
+        whole: the measured signal, by which the balance is normalised.
+        known: the inertias that are not estimated.
     """
 
     inertias: dict[str, Rows]
@@ -137,14 +137,14 @@ class _Equation(NamedTuple):
     known: dict[str, float]
 
     def rows(self, wanted: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Columns of the wanted inertias and of what is beside them, and the right-hand side."""
+        """Regressors of the inertias to estimate and of friction, and the right-hand side."""
         size = np.linalg.norm(self.whole) or 1.0
         left = self.right - sum((J * self.inertias[path] for path, J in self.known.items()), np.zeros(1))
         return np.stack([*(self.inertias[path] for path in wanted), *self.beside], axis=1) / size, left / size
 
 
 class _Balance:
-    """What was measured of some stretches against test functions of one width, to be explained."""
+    """Measured signals of some stretches in weak form, with test functions of one width."""
 
     def __init__(self, model: TwoInertiaModel, parts: Sequence[_Part], width: int) -> None:
         self.model, self.parts, self.width = model, parts, width
@@ -160,7 +160,7 @@ class _Balance:
         return cls(model, [p for p in parts if p is not None], width) if parts and None not in parts else None
 
     def _against(self, values: Signal, part: _Part, derivatives: int) -> Rows:
-        """A signal's derivative of an order against the test functions."""
+        """Inner products of a signal's derivative of an order with the test functions."""
         functions = bump_functions(self.width, part.time_step)[derivatives]
         return (
             (-1.0) ** derivatives
@@ -169,7 +169,7 @@ class _Balance:
         )
 
     def _of_motor(self, part: _Part) -> list[Rows]:
-        """Of the motor: acceleration, direction, speed, a constant; and the torque."""
+        """Regressors of the motor (acceleration, direction, speed, a constant) and the torque."""
         values, order = part.motor
         speed = np.gradient(values) if order == 0 else values
         return [
@@ -181,7 +181,7 @@ class _Balance:
         ]
 
     def missed(self, c_K: float, c_B: float) -> tuple[float, dict[str, float]]:
-        """The share of what was measured that is missed, and the inertias that were wanted."""
+        """The unexplained share of the measured signals, and the estimated inertias."""
         equations = [
             equation
             for part, of_motor in zip(self.parts, self.motor, strict=True)
@@ -198,7 +198,7 @@ class _Balance:
         return share, dict(zip(self.wanted, map(float, inertias), strict=True))
 
     def _equations(self, part: _Part, of_motor: list[Rows], c_K: float, c_B: float) -> Iterator["_Equation"]:
-        """What holds of one stretch."""
+        """The balances of one stretch."""
         N, drive = float(self.model.drive.N), self.model.drive
         known = {path: float(getattr(drive, path)) for path in ("J_m", "J_l") if path not in self.wanted}
         acceleration, *friction, torque = of_motor
@@ -217,8 +217,8 @@ class _Balance:
             yield _Equation({"J_m": none, "J_l": none}, [none] * 3, seen - answer, seen, known)
 
     def solved(self) -> tuple[float, dict[str, float]]:
-        """The share that is missed, and the values that miss the least."""
-        # Loaded here: logs with both angles have no use for it.
+        """The unexplained share, and the values that minimise it."""
+        # Imported here: logs with both angles do not need it.
         from scipy.optimize import minimize
 
         part = max(self.parts, key=lambda p: p.torque.size)
@@ -239,17 +239,17 @@ class _Balance:
 
 
 def _coefficients(logarithms: np.ndarray) -> tuple[float, float]:
-    """c_K and c_B of an antiresonance and a damping ratio, by their logarithms."""
+    """c_K and c_B from the logarithms of an antiresonance and a damping ratio."""
     omega, damping = np.exp(logarithms[0]), np.exp(np.clip(logarithms[1], -12.0, 2.0))
     return float(omega**2), float(2.0 * damping * omega)
 
 
 def twist(stretch: Stretch, model: Model | None) -> Signal:
-    """The dynamic error of a stretch: as measured, or as a model has it under what was measured.
+    """The dynamic error of a stretch: as measured, or as a model filters it from the measured signals.
 
     Args:
         stretch: the data.
-        model: of a drive; needed where the dynamic error was not measured.
+        model: the drive; needed where the dynamic error was not measured.
     """
     experiment, part = stretch.experiment, slice(stretch.start, stretch.stop)
     measured = experiment.output("dynamic_error")
@@ -271,9 +271,9 @@ def twist(stretch: Stretch, model: Model | None) -> Signal:
 
 
 def _filtered(signal: Signal, top: list[float], omega: float, damping: float, time_step: float) -> Signal:
-    """`top / (s^2 + damping s + omega^2)` applied to a signal that was constant before, less what that left: straight
-    lines between samples, by partial fractions."""
-    # Loaded here: logs with both angles have no use for it.
+    """`top / (s^2 + damping s + omega^2)` applied to a signal that was constant before, relative to the steady
+    response; linear between samples, by partial fractions."""
+    # Imported here: logs with both angles do not need it.
     from scipy.signal import lfilter
 
     # Equal poles have no partial fractions.

@@ -1,4 +1,4 @@
-"""Which engine evaluates a residual: machine code where this processor and the model allow it, XLA otherwise."""
+"""Choice of the engine that evaluates a residual: machine code where processor and model allow it, else XLA."""
 
 import dataclasses
 
@@ -29,23 +29,23 @@ from hdjax.lanes import jit_lanes
 
 
 def with_engine(problem: Problem, *, values: bool = False) -> Problem:
-    """The problem with machine code for its model, where that can be.
+    """The problem with machine code for its model, where possible.
 
     Args:
-        problem: what is solved.
-        values: whether the residual is wanted without derivatives as well.
+        problem: the least-squares problem.
+        values: whether the residual is needed without derivatives as well.
     """
     return _ready(problem, values)[0]
 
 
 def why_not(problem: Problem) -> str | None:
-    """Why XLA evaluates the residual; None where machine code does."""
+    """The reason why XLA evaluates the residual; None where machine code does."""
     return _ready(problem, values=False)[1]
 
 
 def _ready(problem: Problem, values: bool) -> tuple[Problem, str | None]:
-    """The problem with machine code; or as it is, and why."""
-    reason = unusable() if problem.engine is None else f"{problem.engine} was asked for"
+    """The problem with machine code; or unchanged, and the reason."""
+    reason = unusable() if problem.engine is None else f"{problem.engine} was requested"
     if reason is not None:
         return problem, reason
     try:
@@ -58,12 +58,12 @@ def _ready(problem: Problem, values: bool) -> tuple[Problem, str | None]:
             values=values,
         )
     except UntranslatableError as error:
-        return problem, f"the model uses {error}, which the engine for machine code does not know"
+        return problem, f"the model uses {error}, which the machine-code engine does not support"
     return dataclasses.replace(problem, kernel=made), None
 
 
 def linearise(problem: Problem, unknowns: Unknowns) -> Blocks:
-    """Residual and Jacobian of a problem at some point, by its engine."""
+    """Residual and Jacobian of a problem at given unknowns, by its engine."""
     if problem.kernel is not None:
         return blocks_by_machine_code(problem, unknowns)
     return _linearise_by_xla(problem, unknowns)
@@ -75,8 +75,8 @@ _linearise_by_xla = jit_lanes(blocks)
 def residual_at(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array | np.ndarray, "segments rows"], Float[Array | np.ndarray, "segments states"]]:
-    """[`fitting.estimation.residual.residual`][] at some point: by machine code without derivatives, or by the program
-    of XLA that computes these too, so that no other is compiled."""
+    """[`fitting.estimation.residual.residual`][] at given unknowns: by machine code without derivatives, or by the XLA
+    program that computes derivatives too, so that no second one is compiled."""
     if problem.kernel is not None:
         return plain_residual_by_machine_code(problem, unknowns)
     found = _linearise_by_xla(problem, unknowns)
@@ -84,14 +84,14 @@ def residual_at(
 
 
 def blocks_inside(problem: Problem, unknowns: Unknowns) -> Blocks:
-    """[`linearise`][] inside a program of JAX."""
+    """[`linearise`][] inside a JAX program."""
     return blocks(problem, unknowns) if problem.kernel is None else blocks_by_machine_code(problem, unknowns)
 
 
 def residual_inside(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
-    """[`fitting.estimation.residual.residual`][] inside a program of JAX, by the problem's engine."""
+    """[`fitting.estimation.residual.residual`][] inside a JAX program, by the problem's engine."""
     if problem.kernel is None or problem.kernel.values is None:
         return residual(problem, unknowns)
     return residual_by_machine_code(problem, unknowns)
@@ -100,7 +100,7 @@ def residual_inside(
 def simulate(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
-    """Outputs of a problem's model on each segment, and the state it ends in, by the engine that suits it."""
+    """Outputs of a problem's model on each segment, and its final state, by the problem's engine."""
     ready = with_engine(problem)
     return _simulate_by_xla(problem, unknowns) if ready.kernel is None else simulated(ready, unknowns)
 
@@ -109,8 +109,8 @@ _simulate_by_xla = jit_lanes(simulate_segments)
 
 
 def residual_and_products(unknowns: Unknowns, problem: Problem) -> tuple[LinearisedResidual, Products]:
-    """What [`fitting.estimation.levenberg_marquardt.ArrowLevenbergMarquardt`][] minimises: the residual with weighted
-    gaps; and what it needs of it."""
+    """The residual with weighted gaps, which [`fitting.estimation.levenberg_marquardt.ArrowLevenbergMarquardt`][]
+    minimises; and its products for the normal equations."""
     found = blocks_inside(problem, unknowns)
     free = problem.free
     products = Products.of(found).beside_prior(free.off_prior(unknowns.parameters), free.precision * problem.active)
@@ -119,8 +119,8 @@ def residual_and_products(unknowns: Unknowns, problem: Problem) -> tuple[Lineari
 
 @eqx.filter_custom_jvp
 def residual_with_blocks(unknowns: Unknowns, problem: Problem) -> LinearisedResidual:
-    """[`fitting.estimation.residual.residual`][] with weighted gaps, inside a program of JAX; its derivative is a
-    product with the blocks rather than a second simulation."""
+    """[`fitting.estimation.residual.residual`][] with weighted gaps, inside a JAX program. Its derivative is a product
+    with the Jacobian's blocks, not a second simulation."""
     rows, gap = residual_inside(problem, unknowns)
     return LinearisedResidual(rows, gap * problem.gap_weight[None])
 

@@ -1,4 +1,4 @@
-"""The only least squares: parameters, initial states and noise covariance from segments of logs."""
+"""Least-squares fit of parameters, initial states and noise covariance to segments of logs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,23 +19,23 @@ from fitting.estimation.weighing import Shown, weighed
 from hdjax import Model
 
 REWEIGHTINGS = 3
-"""Passes of "fit, then weigh the outputs by what was left over"; the covariance settles after two or three."""
+"""Passes of "fit, then reweigh the outputs by the residual's covariance"; it converges after two or three."""
 
-# An output that the model can't follow may take longer to lose its say.
+# An output that the model can't follow may take longer to be down-weighted.
 _MOST_REWEIGHTINGS = 12
-# Simulations longer than this many segments start from states that shorter ones have found already.
+# Simulations longer than this many segments start from the states of shorter ones.
 _LONGEST_RETRY = 16
 # A segment with this many times the median sum of squares may have ended in a wrong minimum.
 _OUTLIER = 6.0
-# Iterations in each window of samples, of windows that grow.
+# Iterations in each of the growing windows of samples.
 _WINDOW_STEPS = 12
 
 
 class Start(eqx.Module):
-    """Where a fit begins, beside the values of its model.
+    """Start of a fit, beside the values of its model.
 
     Attributes:
-        covariance: of the outputs' errors, to start the weighing with; that of the model where not given.
+        covariance: initial covariance of the outputs' errors; the model's where not given.
         states: initial states of the segments; from their first samples where not given.
     """
 
@@ -45,18 +45,19 @@ class Start(eqx.Module):
 
 @dataclass(frozen=True)
 class Strategy:
-    """How a fit is iterated.
+    """Settings of a fit's iteration.
 
     Attributes:
-        max_steps: iterations of each pass at most; no further pass begins after twice as many in all.
-        least_progress: share of the sum of squares that a few steps must take off it, see
+        max_steps: iterations of each pass at most; no pass begins after twice as many in total.
+        least_progress: least relative decrease of the sum of squares over a few steps, see
             [`fitting.estimation.solve.solve`][].
-        reweigh: whether to weigh by what is left over; with False the covariance at the start is kept.
+        reweigh: whether to reweigh by the residual's covariance; with False the initial covariance is kept.
         hold_parameters: fit the initial states only, by the same program that fits the parameters.
-        begin_anew_above: an objective above which a first pass that does not converge is begun anew, from the first
-            samples of each segment: it may have lost its way.
-        retry_states: whether the segments that stand out after it are: they may have ended in a wrong minimum.
-        give_up_above: an objective that the fit must reach in its first pass to be worth another.
+        begin_anew_above: an objective above which a first pass that does not converge is repeated from the first
+            samples of each segment.
+        retry_states: whether segments with a large error after the first pass are repeated likewise: they may have
+            ended in a wrong minimum.
+        give_up_above: an objective above which no second pass follows the first.
     """
 
     max_steps: int = 60
@@ -68,20 +69,20 @@ class Strategy:
     give_up_above: float = np.inf
 
     def solve(self, problem: Problem, begin: Unknowns, damping: float) -> Solution:
-        """One pass: the least squares under fixed weights, by [`fitting.estimation.solve.solve`][]."""
+        """One pass: least squares with fixed weights, by [`fitting.estimation.solve.solve`][]."""
         return solve(problem, begin, self.max_steps, damping, least_progress=self.least_progress)
 
 
 class Fit(eqx.Module):
-    """A fitted model and what it leaves over.
+    """A fitted model and its residual.
 
     Attributes:
         model: with the fitted values.
-        problem: what was solved (its model holds the starting values).
+        problem: the least-squares problem (its model holds the starting values).
         unknowns: the solution.
         error: measured minus simulated outputs on each segment.
-        covariance: of the output error, from the error itself.
-        objective: half the log-determinant of that covariance; a decrease of 0.01 is 1 % less error.
+        covariance: of the output error, estimated from it.
+        objective: half the log-determinant of that covariance; a decrease of 0.01 means 1 % less error.
         stretches: the data.
         horizon: samples until a simulation starts anew.
         converged: whether the iteration met its tolerance.
@@ -101,7 +102,7 @@ class Fit(eqx.Module):
 
     @property
     def free(self) -> FreeParameters:
-        """What was free."""
+        """The free parameters."""
         return self.problem.free
 
     @property
@@ -111,13 +112,13 @@ class Fit(eqx.Module):
 
     @property
     def segmentation(self) -> Segmentation:
-        """How its data are cut: other fits on segments as long and as many share its compiled program."""
+        """The segmentation of its data; fits with the same segmentation share the compiled program."""
         count, length = self.problem.segments.weight.shape
         return Segmentation(self.horizon, length, self.problem.segments.halo, self.substeps, count)
 
     @property
     def at_solution(self) -> Problem:
-        """What was solved, at the fitted values."""
+        """The problem at the fitted values."""
         return eqx.tree_at(lambda p: p.model, self.problem, self.model)
 
     @property
@@ -127,21 +128,21 @@ class Fit(eqx.Module):
 
     @property
     def pieces(self) -> Int[np.ndarray, " stretches"]:
-        """How many segments each stretch was cut into; those that only fill up a program come last."""
+        """Number of segments of each stretch; padding segments come last."""
         return np.array([-(-len(s) // self.error.shape[1]) for s in self.stretches])
 
     def by_stretch(self, values: Shaped[np.ndarray, "segments samples *each"]) -> list[Shaped[np.ndarray, "_ *each"]]:
-        """What belongs to samples of segments, stretch by stretch and without padding."""
+        """Values per sample of the segments, rearranged by stretch, without padding."""
         parts = np.split(values, np.cumsum(self.pieces))
         return [a.reshape(-1, *a.shape[2:])[: len(s)] for s, a in zip(self.stretches, parts, strict=False)]
 
     def with_all_free(self) -> "Fit":
-        """The same with fixed parameters counted as free, so that the data are asked what they say of them."""
+        """The same with fixed parameters counted as free, to compute what the data say about them."""
         return eqx.tree_at(lambda f: f.problem.active, self, jnp.asarray(np.ones(self.problem.active.shape)))
 
     @property
     def principal_std(self) -> float:
-        """Rms of what is left of the principal output."""
+        """Rms residual of the principal output."""
         return float(np.sqrt(self.covariance[-1, -1]))
 
 
@@ -157,20 +158,20 @@ def fit(
 ) -> Fit:
     """Fit parameters of a model to stretches of logs.
 
-    Simulations start anew every so many samples (the horizon), and their initial states are fitted with the shared
-    parameters. Longer horizons are cut into joined segments that run side by side; their gaps close as the fit
-    converges, so that the result is that of one simulation (multiple shooting). The outputs are weighed by the
-    covariance of what is left over, which maximises the likelihood of Gaussian errors of unknown covariance: an output
-    that the model cannot follow is down-weighted.
+    Simulations start anew after each horizon, and their initial states are fitted together with the shared parameters.
+    Long horizons are cut into joined segments that are simulated in parallel. Their gaps close as the fit converges, so
+    that the result equals that of one simulation (multiple shooting). The outputs are weighted by the residual's
+    covariance, which maximises the likelihood of Gaussian errors of unknown covariance. An output that the model can't
+    follow is down-weighted.
 
     Args:
         model: equations and starting values.
         stretches: the data.
-        paths: dotted paths of what is free; may be empty.
-        segmentation: how the data are cut.
-        start: where the fit begins.
-        strategy: how it is iterated.
-        engine: what evaluates the residual; machine code where not given, or XLA where there can be none.
+        paths: dotted paths of the free parameters; may be empty.
+        segmentation: how the data are cut into segments.
+        start: covariance and initial states to start with.
+        strategy: settings of the iteration.
+        engine: that evaluates the residual; where not given, machine code, or XLA where that is impossible.
 
     Returns:
         The fit.
@@ -186,7 +187,7 @@ def fit(
     )
     moves = float(scales(stretches, model).x) * of_twist(model)[-1]
     shown = Shown.of(problem.model, moves)
-    # The scale of a single output changes nothing but what priors count: of parameters, and of hidden states.
+    # The scale of a single output affects only the weight of priors: of parameters, and of hidden states.
     priors = np.any(np.asarray(problem.free.precision) > 0) or unknowns.states.shape[1] > len(model.motion_states)
     scale_matters = problem.segments.measured.shape[-1] > 1 or bool(priors)
     covariance = start.covariance
@@ -206,7 +207,7 @@ def fit(
         if settled or objective > strategy.give_up_above or steps >= 2 * strategy.max_steps:
             break
     assert solution is not None
-    # By way of the host: what is computed with the model alone need not run on every device.
+    # Via the host: computations with the model alone need not run on every device.
     values = jnp.asarray(np.asarray(unknowns.parameters))
     return Fit(
         model=problem.free.unpack(model, values),
@@ -223,13 +224,13 @@ def fit(
 
 
 def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution, strategy: Strategy) -> Solution:
-    """Repeat the first pass from other initial states, in all segments or in some, where the strategy says so.
+    """Repeat the first pass from other initial states, in all or some segments, as the strategy states.
 
     Args:
-        problem: what is solved.
-        begin: where the first pass began.
-        found: where it came to.
-        strategy: how the fit is iterated.
+        problem: the least-squares problem.
+        begin: start of the first pass.
+        found: its result.
+        strategy: settings of the iteration.
     """
     reached = half_log_determinant(found.left_over.covariance)
     if reached > strategy.begin_anew_above and not (found.success or strategy.hold_parameters):
@@ -241,11 +242,11 @@ def _with_poor_states_retried(problem: Problem, begin: Unknowns, found: Solution
 
 
 def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unknowns:
-    """Fit the first samples of each segment, then ever more of them, until it is all of them.
+    """Fit a growing window of each segment's first samples, up to the whole segment.
 
-    Over half a natural period a simulation depends on parameters and state so smoothly that the fit finds its way from
-    afar; each window starts near the solution of the next one. Masking the later samples lets the same compiled
-    program do it.
+    Over half a natural period a simulation depends so smoothly on parameters and state that the fit converges from far
+    away. Each window's solution is a good start for the next one. Later samples are masked, so that the compiled
+    program stays the same.
     """
     weight = problem.segments.weight
     length = weight.shape[1]
@@ -259,8 +260,7 @@ def _grown(problem: Problem, unknowns: Unknowns, least_progress: float) -> Unkno
 
 
 def _retry_states(problem: Problem, found: Solution, least_progress: float) -> Unknowns | None:
-    """Fit each segment's initial state anew, from its first samples to all of them, and keep the better one; None where
-    none is better.
+    """Refit each segment's initial state over growing windows and keep the better one; None where none is better.
 
     A nonsmooth model gives a segment several minima; a poor initial state ends in a wrong one, and a few such
     segments would dominate the sum of squares.
@@ -280,12 +280,12 @@ def _retry_states(problem: Problem, found: Solution, least_progress: float) -> U
 
 
 def zeros_like(array: Array) -> Array:
-    """Zeros in the place of an array, without a program that makes them."""
+    """Zeros of an array's shape, without compiling a program."""
     return jax.device_put(np.zeros(array.shape, array.dtype), array.sharding if array.committed else None)
 
 
 def _growing(problem: Problem, length: int) -> list[int]:
-    """From half a natural period, within which hardly a wrong state runs away, to the whole segment."""
+    """Window lengths from half a natural period, within which few wrong states diverge, to the whole segment."""
     knots = np.asarray(problem.segments.torque.knots)
     half = np.pi / float(problem.model.drive.omega_0) / float(np.median(np.diff(knots)))
     first = min(length, max(4, round(half)))
@@ -293,17 +293,17 @@ def _growing(problem: Problem, length: int) -> list[int]:
 
 
 def half_log_determinant(covariance: Array | np.ndarray) -> float:
-    """The objective that errors of this covariance make; infinite where it is none."""
+    """The objective of errors with this covariance; infinite where it is not positive definite."""
     sign, value = np.linalg.slogdet(np.asarray(covariance))
     return float(0.5 * value) if sign > 0 else np.inf
 
 
 def segments_of_logs(found: Fit) -> Bool[np.ndarray, "stretches segments"]:
-    """Which segments of a fit are of which of its stretches."""
+    """The segments of a fit that belong to each of its stretches."""
     ends, place = np.cumsum(found.pieces)[:, None], np.arange(len(found.error))
     return (ends - found.pieces[:, None] <= place) & (place < ends)
 
 
 def lost(found: Fit) -> Bool[np.ndarray, " segments"]:
-    """The segments in which the simulation runs away."""
+    """The segments in which the simulation diverges."""
     return np.logical_not(np.all(np.abs(found.white_error) < RUNAWAY, axis=(1, 2)))

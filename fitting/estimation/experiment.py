@@ -1,4 +1,4 @@
-"""A log made ready for simulation: torque between samples, measured outputs, and the stretches they are cut into."""
+"""Logs prepared for simulation: torque between samples, measured outputs, stretches and segments."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from fitting.logs.log import Log
 from hdjax import Hold, PiecewisePolynomial, sampled
 from hdjax.dynamics import BOTH_ANGLES
 
-# Both assumed: a Runge-Kutta step this much longer than the others is cut; so many samples may be put in per row.
+# Both assumed: largest step over the usual one, beyond which samples are inserted; most samples inserted per row.
 _LONGEST_STEP = 1.5
 _MOST_PUT_IN = 10
 
@@ -30,15 +30,15 @@ class Experiment(eqx.Module):
         load_torque: torque on the load [N m], or None.
         measured: outputs by row; (theta_m/N, dynamic error) [rad], or the dynamic error alone, where `outputs` does not
             say otherwise. The last one is the principal output, by which a fit is judged.
-        motor_angle: measured motor angle [rad], or what the motor's velocity makes of it; None where neither is known.
-        weight: 1 for a sample whose outputs count, 0 for one that was put in or is not believed; None where all count.
-            The outputs of a sample without weight are something finite in between.
-        rows: which samples are rows of the log, the others having been put in; None where all are.
+        motor_angle: measured motor angle [rad], or the integral of its velocity; None where neither was measured.
+        weight: 1 for a valid sample, 0 for an inserted or invalid one; None where all are valid. Outputs of samples
+            with weight zero are interpolated.
+        rows: which samples are rows of the log; the others were inserted. None where all are.
         temperature: of the drive [K], or None.
-        origin: when the log starts, on the clock of `time` [s].
+        origin: start of the log, on the clock of `time` [s].
         log: the name of the log that it is a part of.
-        rate_std: relative standard deviation of the sample interval, as far as the log's stamps leave it open.
-        outputs: names of what was measured, see `hdjax.dynamics.OUTPUTS`.
+        rate_std: relative standard deviation of the sample interval, from the rounding of the log's stamps.
+        outputs: names of the measured outputs, see `hdjax.dynamics.OUTPUTS`.
     """
 
     name: str = eqx.field(static=True)
@@ -86,12 +86,12 @@ class Stretch(eqx.Module):
 
     @property
     def weight(self) -> Float[np.ndarray, " n"]:
-        """1 for a sample whose outputs count, 0 for the others."""
+        """1 for a valid sample, 0 for the others."""
         weight = self.experiment.weight
         return np.ones(len(self)) if weight is None else weight[self.start : self.stop]
 
     def beginning(self, count: int) -> "Stretch":
-        """The shortest part from the start on that has `count` samples with weight, or all of them."""
+        """The shortest part from the start that has `count` valid samples; else the whole stretch."""
         enough = np.flatnonzero(np.cumsum(self.weight) >= count)
         known = np.flatnonzero(self.weight)
         last = enough[0] if len(enough) else known[-1] if len(known) else len(self) - 1
@@ -99,21 +99,21 @@ class Stretch(eqx.Module):
 
 
 class Segments(eqx.Module):
-    """Stretches cut into equally long pieces, the lanes of one program. Missing samples have weight zero.
+    """Stretches cut into segments of equal length, simulated in parallel. Missing samples have weight zero.
 
-    A segment either starts anew, or it is joined to the one before and must start where that one ends. Which it is
-    are data, so that one compiled program fits short horizons and whole logs.
+    A segment starts with a free state, or is joined to the one before and must start where that one ends. Which of the
+    two is data, so that one compiled program fits short horizons and whole logs.
 
     Attributes:
-        torque: logged torque of each segment; its first `halo` intervals lie before the segment, so that a delay
-            has something to reach back to. Its knots count from the log's start.
+        torque: logged torque of each segment; its first `halo` intervals lie before the segment, for delays. Its knots
+            count from the log's start.
         load_torque: coefficients of the load torque, or None.
         measured: outputs at the samples.
-        weight: 1 for a sample whose outputs count, 0 for the others and for padding.
-        goes_on: whether a segment's data go on where those of the one before it end.
-        joined: whether a segment's simulation goes on as well, where the one before it ends.
+        weight: 1 for a valid sample, 0 for the others and for padding.
+        goes_on: whether a segment's data continue those of the one before without a gap.
+        joined: whether a segment's simulation also continues that of the one before.
         halo: intervals before each segment's first sample.
-        temperature: likewise of the drive's temperature, or None where a log lacks it.
+        temperature: coefficients of the drive's temperature, or None where a log lacks it.
     """
 
     torque: PiecewisePolynomial
@@ -127,7 +127,7 @@ class Segments(eqx.Module):
 
     @property
     def count(self) -> Array:
-        """Number of samples that carry weight."""
+        """Number of valid samples."""
         return jnp.sum(self.weight)
 
     @property
@@ -137,13 +137,12 @@ class Segments(eqx.Module):
 
     @property
     def width(self) -> Float[np.ndarray, "segments samples"]:
-        """Time from each sample to the next one."""
+        """Sample intervals."""
         return np.diff(self.knots)
 
 
 def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tuple[Experiment, ...]:
-    """The stretches of a log between its gaps, each an experiment of its own; arguments as in
-    [`experiment_from_log`][]."""
+    """The stretches of a log between its gaps, each as an experiment; arguments as in [`experiment_from_log`][]."""
     if log.pieces is None:
         return (experiment_from_log(log, hold=hold, N=N),)
     several = len(log.pieces) > 1
@@ -161,16 +160,16 @@ def experiments_from_log(log: Log, *, hold: Hold, N: float | None = None) -> tup
 def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Experiment:
     """Turn a log without wide gaps into an experiment.
 
-    Where the log lacks samples, the torque's are bridged and the simulation gets steps of the usual length; the outputs
-    put in there have no weight.
+    Where samples are missing, the torque is interpolated and samples are inserted at the usual interval, with weight
+    zero.
 
     Args:
-        log: what was measured.
-        hold: what the torque does between samples.
+        log: the log.
+        hold: inter-sample behaviour of the torque.
         N: reduction ratio of a drive log.
 
     Raises:
-        DataError: for a log that is mostly a gap.
+        DataError: the log is mostly a gap.
     """
     drive_log = log.kind == "drive"
     input_samples = log.motor_torque if drive_log else log.forcing
@@ -186,7 +185,7 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
     stamps, samples = bridged(log.time[known], input_samples[known])
     time, rows = _grid(log, stamps)
     torque = _on_grid(sampled(stamps, samples, hold=hold), time)
-    # What a digital drive commands is held on both sides; what sensors measure runs on, and straight lines follow it.
+    # Commands of a digital drive are held between samples; measured torques are continuous and interpolated linearly.
     load_hold = hold if hold == "zero-order" else "linear"
     load_torque = _channel(log, log.load_torque, time, load_hold) if drive_log else None
     outputs = fitted_outputs(log)
@@ -215,12 +214,12 @@ def experiment_from_log(log: Log, *, hold: Hold, N: float | None = None) -> Expe
 
 
 def fitted_outputs(log: Log) -> tuple[str, ...]:
-    """Names of what a fit of a log explains, of `hdjax.dynamics.OUTPUTS`, the principal one last."""
+    """Names of a log's fitted outputs, from `hdjax.dynamics.OUTPUTS`, the principal one last."""
     return BOTH_ANGLES if log.outputs == ("motor_angle", "load_angle") else log.outputs
 
 
 def _column(log: Log, output: str, N: float | None) -> np.ndarray:
-    """What was measured of an output."""
+    """The measured values of an output."""
     if output == "motor_turn":
         assert log.motor_angle is not None and N is not None
         return log.motor_angle / N
@@ -228,7 +227,7 @@ def _column(log: Log, output: str, N: float | None) -> np.ndarray:
 
 
 def _motor_angle(log: Log, time: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
-    """The motor's angle on the grid; where it was not measured, its velocity over time."""
+    """The motor's angle on the grid; where it was not measured, the integral of its velocity."""
     if log.motor_angle is not None:
         return _filled(log, log.motor_angle, time, rows)
     if log.motor_velocity is None:
@@ -243,7 +242,8 @@ def _channel(log: Log, values: np.ndarray | None, time: np.ndarray, hold: Hold) 
 
 
 def _grid(log: Log, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The log's stamps with those of the torque and others where a step would be long, and which are the log's."""
+    """The log's stamps with those of the torque and inserted ones where a step would be long; and which are the
+    log's."""
     time = np.union1d(log.time, stamps)
     step = np.diff(time)
     usual = max(float(np.median(step)), float(np.median(np.diff(log.time))))
@@ -275,7 +275,7 @@ def _on_grid(signal: PiecewisePolynomial, time: np.ndarray) -> PiecewisePolynomi
 
 
 def _filled(log: Log, values: np.ndarray, time: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """An output on the grid; where it was not measured or is not believed, a straight line."""
+    """An output on the grid, interpolated linearly where it is missing or invalid."""
     if log.trusted is None and log.outputs_until is None and rows.all():
         return values
     known = np.ones(len(log), dtype=bool) if log.trusted is None else log.trusted
@@ -291,11 +291,11 @@ def whole(experiments: Sequence[Experiment]) -> tuple[Stretch, ...]:
 def split(
     experiments: Sequence[Experiment], *, held_out: float = 0.2
 ) -> tuple[tuple[Stretch, ...], tuple[Stretch, ...]]:
-    """The part of each experiment that candidates are fitted to, and the stretch at its end by which one is selected.
+    """Training and selection stretch of each experiment.
 
     Args:
         experiments: without the test data.
-        held_out: share that serves selection.
+        held_out: share of the selection data.
     """
     training, selection = [], []
     for experiment in experiments:
@@ -306,7 +306,7 @@ def split(
 
 
 def _border(experiment: Experiment, held_out: float) -> int:
-    """The sample that parts the experiment so that each side has its share of the samples with weight."""
+    """The sample that divides the experiment so that each side has its share of the valid samples."""
     if experiment.weight is None:
         return round(len(experiment) * (1.0 - held_out))
     total = np.cumsum(experiment.weight)
@@ -314,7 +314,7 @@ def _border(experiment: Experiment, held_out: float) -> int:
 
 
 def segment_count(stretches: Sequence[Stretch], length: int) -> int:
-    """How many segments of `length` samples the stretches need, rounded up so that logs of similar length share a
+    """Number of segments of `length` samples for the stretches, rounded up so that logs of similar length share a
     compiled program."""
     needed = sum(-(-len(s) // length) for s in stretches)
     return needed if needed <= 8 else needed + -needed % 16
@@ -328,9 +328,9 @@ def cut(
     Args:
         stretches: the data.
         length: samples in a segment.
-        horizon: samples until a simulation starts anew; the length where not given.
+        horizon: samples of one simulation; the length where not given.
         halo: intervals of torque before each segment.
-        count: number of segments, the superfluous ones without weight; [`segment_count`][] where not given.
+        count: number of segments, the superfluous ones with weight zero; [`segment_count`][] where not given.
     """
     pieces = 1 if horizon is None else max(1, -(-horizon // length))
     loaded = any(s.experiment.load_torque is not None for s in stretches)
@@ -357,8 +357,8 @@ def cut(
 
 
 def _goes_on(before: Stretch | None, stretch: Stretch, length: int) -> Bool[np.ndarray, " segments"]:
-    """Whether each segment of a stretch goes on where the one before it ends; of the first one, behind a stretch of
-    whole segments."""
+    """Whether each segment of a stretch continues the one before; for the first one, the last segment of the preceding
+    stretch, if that consists of whole segments."""
     found = np.ones(-(-len(stretch) // length), dtype=bool)
     ends = None if before is None or len(before) % length else (before.name, before.stop)
     found[0] = ends == (stretch.name, stretch.start)
@@ -368,14 +368,14 @@ def _goes_on(before: Stretch | None, stretch: Stretch, length: int) -> Bool[np.n
 def _cut_one(
     stretch: Stretch, length: int, pieces: int, halo: int, *, loaded: bool, warm: bool
 ) -> tuple[np.ndarray, ...]:
-    """Of one stretch's segments by row: knots, torque, load torque (none acts where only other logs have one),
+    """Arrays of one stretch's segments, by row: knots, torque, load torque (zero where only other logs have one),
     temperature, measured outputs, weight, whether joined."""
     experiment = stretch.experiment
     last = len(experiment) - 1
     begin = np.arange(stretch.start, stretch.stop, length)
     index = begin[:, None] + np.arange(-halo, length)
     inside = np.clip(index, 0, last)
-    # Before the record the first torque is assumed to have been held; beyond it the last.
+    # Before the log the first torque is assumed to have been held; after it the last.
     torque = np.asarray(experiment.torque.coefficients)[inside]
     torque[index != inside, 1:] = 0.0
     outer = begin[:, None] + np.arange(-halo, length + 1)
@@ -384,7 +384,7 @@ def _cut_one(
     own = index[:, halo:]
     load, warmth = experiment.load_torque, experiment.temperature
     on_load = np.zeros((last + 1, torque.shape[-1] if loaded else 0)) if load is None else np.asarray(load.coefficients)
-    # Straight lines need no higher powers.
+    # Linear interpolation needs no higher powers.
     line = np.asarray(warmth.coefficients)[:, :2] if warm and warmth is not None else np.zeros((last + 1, 0))
     own_row = np.clip(own, 0, last)
     return (

@@ -1,4 +1,4 @@
-"""What a fit may change: parameters by dotted path, on scales where they are of order one."""
+"""Free parameters of a fit, by dotted path, scaled to order one."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,27 +16,27 @@ from hdjax.drive import Prior
 from hdjax.effects import Effect
 from hdjax.parameters import own_parameters
 
-# A parameter that the data push towards zero or infinity stops here, long after it ceased to matter.
+# Bounds of a parameter that the data drive towards zero or infinity, far beyond where it has any influence.
 LARGEST_LOG = 100.0
 
 
 ModelT = TypeVar("ModelT", bound=Model)
 
 MESH = ("K", "alpha", "B_sp")
-"""What is fitted of the mesh."""
+"""Fitted parameters of the mesh."""
 
 
 class FreeParameters(eqx.Module):
     """The parameters that a fit changes, as a vector of order one.
 
-    A parameter that must be positive moves by its logarithm, any other in units of `scale`.
+    A positive parameter is represented by its logarithm, any other in units of `scale`.
 
     Attributes:
         paths: dotted paths.
-        logarithmic: which move by their logarithm.
+        logarithmic: which are represented by their logarithm.
         scale: unit of each of the others.
-        centre: what is known beforehand of each entry of the vector.
-        precision: inverse of its standard deviation; zero where nothing is known.
+        centre: prior mean of each entry of the vector.
+        precision: inverse of the prior's standard deviation; zero without a prior.
     """
 
     paths: tuple[str, ...] = eqx.field(static=True)
@@ -46,16 +46,15 @@ class FreeParameters(eqx.Module):
     precision: Float[Array, " parameters"]
 
     def off_prior(self, vector: Float[Array | np.ndarray, " parameters"]) -> Float[Array | np.ndarray, " parameters"]:
-        """How many standard deviations each entry of a vector is off what is known beforehand."""
+        """Deviation of each entry of a vector from its prior mean, in standard deviations."""
         return self.precision * (vector - self.centre)
 
     def pack(self, model: Model) -> Float[Array, " parameters"]:
-        """The vector that stands for the model's values."""
+        """The vector of the model's values."""
         return self._each(model, lambda library, v, positive, s: library.log(v) if positive else v / s)
 
     def _each(self, model: Model, entry: Callable[..., Any]) -> Float[Array, " parameters"]:
-        """A number for each parameter: of what to calculate with, its value, whether it moves by its logarithm, and its
-        unit."""
+        """The array library, then for each parameter its value, whether it is logarithmic, and its unit."""
         values = [model.get(p) for p in self.paths]
         library, (*values, scale) = _library(*values, self.scale)
         with np.errstate(all="ignore"):
@@ -63,13 +62,13 @@ class FreeParameters(eqx.Module):
         return jnp.asarray(library.stack(entries) if entries else np.zeros(0))
 
     def unpack(self, model: Model, vector: Float[Array | np.ndarray, " parameters"]) -> Model:
-        """The model with the values that the vector stands for."""
+        """The model with the values of the vector."""
         if not self.paths:
             return model
         return model.replace(dict(zip(self.paths, self.values(vector), strict=True)))
 
     def values(self, vector: Float[Array | np.ndarray, " parameters"]) -> list[Any]:
-        """The physical values that the vector stands for."""
+        """The physical values of the vector."""
         library, (entries, scale) = _library(vector, self.scale)
         return [
             library.exp(library.clip(v, -LARGEST_LOG, LARGEST_LOG)) if positive else v * s
@@ -82,8 +81,7 @@ class FreeParameters(eqx.Module):
 
 
 def _library(*arrays: Any) -> tuple[Any, Sequence[Any]]:
-    """What to calculate with, and the arrays for it: JAX inside a program; outside it would compile one for each
-    operation, so there numpy."""
+    """The array library and its arrays: JAX under tracing; numpy outside, where JAX would compile each operation."""
     if any(isinstance(array, Tracer) for array in arrays):
         return jnp, arrays
     return np, [np.asarray(array) for array in arrays]
@@ -93,12 +91,12 @@ def free_parameters(model: Model, paths: Sequence[str], scale: dict[str, float])
     """Free the parameters at `paths`.
 
     Args:
-        model: holds the current values.
+        model: supplies the current values.
         paths: dotted paths.
         scale: a typical magnitude for those that may be zero; the larger of it and the current value is the unit.
 
     Raises:
-        ValueError: for an unknown path, or a positive parameter whose current value is not.
+        ValueError: unknown path, or a positive parameter whose current value is not positive.
     """
     known = model.parameters()
     for path in paths:
@@ -125,22 +123,22 @@ def with_priors(model: ModelT, priors: tuple[Prior, ...]) -> ModelT:
 
 
 def base_paths(model: Model) -> tuple[str, ...]:
-    """What is fitted of a drive without effects."""
+    """Fitted parameters of a drive without effects."""
     if isinstance(model.drive, Drive):
         return (*MESH, *(prior.path for prior in model.drive.priors))
     return ("mu", "omega_0", "alpha", "gain")
 
 
 def effect_paths(effect: Effect) -> tuple[str, ...]:
-    """What is fitted of an effect: its strengths and shapes."""
+    """Fitted parameters of an effect: strengths and shapes."""
     return tuple(f"{effect.name}.{n}" for n, i in own_parameters(effect) if i.role != "base")
 
 
 def fitted_paths(model: Model) -> tuple[str, ...]:
-    """What is fitted of a drive with its effects."""
+    """Fitted parameters of a drive with its effects."""
     return sum((effect_paths(effect) for effect in model.effects), base_paths(model))
 
 
 def strength_paths(effect: Effect) -> tuple[str, ...]:
-    """Those parameters of an effect whose zero removes it."""
+    """Parameters of an effect that remove it when they are zero."""
     return tuple(f"{effect.name}.{n}" for n, i in own_parameters(effect) if i.role == "strength")

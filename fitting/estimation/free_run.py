@@ -1,4 +1,4 @@
-"""Free runs: the initial state from a short window, then the model alone."""
+"""Free runs: simulations from an initial state that is fitted to a short window."""
 
 from collections.abc import Sequence
 
@@ -17,9 +17,9 @@ from fitting.estimation.residual import Problem, Unknowns
 from hdjax import Model, TwoInertiaModel
 
 WINDOW = 50
-"""Samples from which the initial state is taken."""
+"""Samples of the initial-state window."""
 
-# Periods of the antiresonance that show a twist which no sensor sees, and share of a stretch at most, both assumed.
+# Window where no sensor observes the twist: periods of the antiresonance, and largest share of a stretch, both assumed.
 _PERIODS, _MOST = 1.0, 0.25
 
 # 99 % point of chi-squared with as many degrees of freedom as there are rates (one or two).
@@ -27,11 +27,11 @@ _REST_LIMIT = {1: 6.63, 2: 9.21}
 
 
 Pair = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
-"""Of an output: predicted and measured."""
+"""Predicted and measured values of an output."""
 
 
 def window(model: Model, stretches: Sequence[Stretch]) -> int:
-    """Samples from which the initial state is taken: [`WINDOW`][], or as many as show a twist that no sensor sees."""
+    """Samples of the initial-state window: [`WINDOW`][], or more where no sensor observes the twist."""
     if not isinstance(model, TwoInertiaModel) or "dynamic_error" in model.measured:
         return WINDOW
     period = 2 * np.pi * np.sqrt(float(model.drive.J_l / model.drive.K)) / stretches[0].experiment.time_step
@@ -45,9 +45,9 @@ class FreeRun(eqx.Module):
         name: the log's name.
         time: sample stamps [s].
         predicted: principal output, the dynamic error [rad] where that was measured.
-        measured: likewise.
+        measured: the same output, measured.
         beside: the other outputs, predicted and measured, by their names in the log.
-        weight: 1 for a sample whose measurement counts, 0 for the others; None where all count.
+        weight: 1 for a valid sample, 0 for the others; None where all are valid.
         output: name of the principal output.
         reach: largest twist, speed and torque of the stretch, as in [`fitting.estimation.reach`][].
     """
@@ -74,22 +74,22 @@ class FreeRun(eqx.Module):
 
     @property
     def counts(self) -> Bool[np.ndarray, " n"]:
-        """Which samples count."""
+        """Which samples are valid."""
         return np.ones(self.time.size, dtype=bool) if self.weight is None else self.weight > 0
 
     @property
     def squared_error(self) -> Float[np.ndarray, " counted"]:
-        """Squares of measured minus predicted principal output, of the samples that count."""
+        """Squared residuals of the principal output at valid samples."""
         return ((self.measured - self.predicted) ** 2)[self.counts]
 
     @property
     def rmse(self) -> float:
-        """Rms of measured minus predicted principal output."""
+        """Rms residual of the principal output."""
         return rms_error((self,))
 
 
 def rms_error(runs: Sequence[FreeRun], output: str | None = None) -> float:
-    """Rms of measured minus predicted over several runs; infinite where a run left the numbers.
+    """Rms residual over several runs; infinite where a run diverged.
 
     Args:
         runs: the runs.
@@ -118,11 +118,11 @@ def free_run(
 
     Args:
         model: the equations with their values.
-        stretches: where to run. Measured outputs beyond the window are not looked at.
+        stretches: to simulate. Measured outputs beyond the window are not used.
         covariance: of the measurement noise of the outputs.
         halo: intervals of torque before the start, for delays.
         substeps: solver steps in a sample interval.
-        like: a fit of the same model, whose compiled program then finds the initial states as well.
+        like: a fit of the same model, whose compiled program is reused for the initial states.
     """
     if substeps is None:
         substeps = suggested_substeps(model, stretches)
@@ -157,7 +157,7 @@ def free_run(
 
 
 def as_logged(model: Model) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """What a log calls each output of a model, and what makes it of the output in the log's unit."""
+    """Name of each model output in the log, and the conversion to the log's unit."""
     names = tuple("motor_angle" if name == "motor_turn" else name for name in model.measured)
     N = float(model.drive.N) if isinstance(model, TwoInertiaModel) else 1.0
     return names, tuple(N if name == "motor_turn" else 1.0 for name in model.measured)
@@ -170,8 +170,8 @@ def whole_simulations(
 
     Args:
         model: the equations.
-        free: parameters to differentiate by.
-        stretches: where to run.
+        free: parameters of the sensitivities.
+        stretches: to simulate.
         halo: intervals of torque before the start.
         substeps: solver steps in a sample interval.
     """
@@ -212,10 +212,10 @@ def _holds(like: Fit, count: int, window: int) -> bool:
 
 
 def _rest_where_at_rest(model: Model, starts: Fit, lanes: int) -> Array:
-    """Initial states, with rates set to zero where the window can't tell them from zero.
+    """Initial states, with rates set to zero where they are not significantly nonzero in the window.
 
-    A short window knows a rate poorly, and the error grows with time. A log that begins at rest is common; where
-    that is compatible with the window (1 % level), rest is taken.
+    A short window determines a rate poorly, and the error grows with time. Logs often begin at rest; where the window
+    agrees with rest (1 % level), rest is assumed.
     """
     found = linearise(starts.problem, starts.unknowns)
     slopes = np.asarray(found.by_state)
@@ -231,7 +231,7 @@ def _rest_where_at_rest(model: Model, starts: Fit, lanes: int) -> Array:
         covariance = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale[None, :]
         block = covariance[np.ix_(rates, rates)] * float(excess[lane])
         rate = states[lane, rates]
-        # What the window does not see at all is as good as at rest.
+        # A rate that the window does not determine at all is set to zero.
         towards = np.linalg.pinv(block, rcond=1e-12, hermitian=True) @ rate
         if rate @ towards < _REST_LIMIT[rates.size]:
             states[lane] -= covariance[:, rates] @ towards * float(excess[lane])

@@ -8,7 +8,7 @@ from hdjax import Drive, TwoInertiaModel
 
 
 def rates_of(drive: Drive) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 2"]]:
-    """The state's rate by the state, and by the torques on motor and load."""
+    """Derivatives of the state's rate by the state, and by the torques on motor and load."""
     N, J_m, J_l, K, B, k_T = (float(getattr(drive, p)) for p in ("N", "J_m", "J_l", "K", "B_sp", "k_T"))
     mesh = np.array([K / N, -K, B / N, -B])
     by_state, by_torque = np.zeros((4, 4)), np.zeros((4, 2))
@@ -19,8 +19,8 @@ def rates_of(drive: Drive) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, 
 
 
 def over_a_step(drive: Drive, step: float) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]]:
-    """The state after a step by the state before it; and by value and slope of the torque on the motor, then by those
-    of the torque on the load."""
+    """Derivatives of the state after a step by the state before it; and by value and slope of motor torque, then of
+    load torque."""
     by_state, by_torque = rates_of(drive)
     rates = np.zeros((8, 8))
     rates[:4, :4], rates[:4, [4, 6]] = by_state, by_torque
@@ -30,7 +30,7 @@ def over_a_step(drive: Drive, step: float) -> tuple[Float[np.ndarray, "4 4"], Fl
 
 
 def readings(model: TwoInertiaModel) -> Float[np.ndarray, "outputs 4"]:
-    """The outputs by the state."""
+    """Derivatives of the outputs by the state."""
     N, K, B = (float(getattr(model.drive, p)) for p in ("N", "K", "B_sp"))
     rows = {
         "motor_turn": [1.0 / N, 0.0, 0.0, 0.0],

@@ -1,8 +1,8 @@
-"""The motion that a fit found, sample by sample, and how a small force anywhere along it would change it.
+"""The fitted motion and its linear response to small forces in each sample interval.
 
-To first order every candidate effect is a force (or a reading) along the motion that the model has found. How the
-model answers a force is the same for all of them, so that it is computed once: one matrix a sample interval carries
-the deviation on, two more add what a force that runs in a straight line through the interval does.
+To first order every candidate effect is a force (or a sensor error) along the fitted motion. The response to a force is
+the same for all candidates and computed once. One transition matrix per sample interval propagates the deviation, and
+two input matrices add a force that is linear in the interval.
 """
 
 import equinox as eqx
@@ -25,7 +25,7 @@ from hdjax.lanes import jit_small_lanes
 from hdjax.simulate import march
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
-"""Where a sample interval, from -1 to 1, is looked into; exact for a sextic's mean and a quintic's first moment."""
+"""Quadrature nodes in a sample interval, from -1 to 1; exact for a sextic's mean and a quintic's first moment."""
 
 
 class Followed(eqx.Module):
@@ -34,9 +34,10 @@ class Followed(eqx.Module):
     Attributes:
         states: at each knot, the end of the last interval included.
         between: at the `NODES` of each interval.
-        transition: what a deviation of the state at an interval's start is at its end.
-        from_start: what a force (a rate of the state) that falls from one to zero through the interval adds.
-        from_end: likewise of one that rises from zero to one.
+        transition: derivative of the state at an interval's end by that at its start.
+        from_start: response at the end to a force (a rate of the state) that falls from one to zero through the
+            interval.
+        from_end: response to one that rises from zero to one.
         readout: derivative of the outputs by the state, at each sample.
     """
 
@@ -49,7 +50,7 @@ class Followed(eqx.Module):
 
 
 def follow(problem: Problem, unknowns: Unknowns) -> Followed:
-    """Simulate the segments and linearise every sample interval along the way."""
+    """Simulate the segments and linearise every sample interval."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
     if problem.kernel is None:
         found = _response_by_xla(problem, unknowns)
@@ -110,7 +111,7 @@ def _response_by_xla(problem: Problem, unknowns: Unknowns) -> Response:
 
 
 def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments intervals powers"]:
-    """Coefficients of the torque that acts on a drive, or of the forcing; those before each segment come first."""
+    """Coefficients of the torque after actuator effects, or of the forcing; those before each segment come first."""
     effects = tuple(e for e in model.effects if isinstance(e, ActuatorEffect))
     if not effects:
         return np.asarray(segments.torque.coefficients)
@@ -118,7 +119,7 @@ def acting(model: Model, segments: Segments) -> Float[np.ndarray, "segments inte
 
 
 def polynomial(coefficients: Float[np.ndarray, "*many powers"], late: np.ndarray) -> np.ndarray:
-    """Values of polynomials so late in their intervals."""
+    """Values of polynomials at given times in their intervals."""
     return polyval(late, np.moveaxis(coefficients, -1, 0), tensor=False)
 
 
@@ -126,7 +127,7 @@ class Inputs(eqx.Module):
     """Inputs of a model at many instants.
 
     Attributes:
-        torque: that acts on a drive, or the forcing.
+        torque: motor torque after actuator effects, or the forcing.
         load_torque: on the output.
         conditions: time and temperature.
     """
@@ -137,7 +138,7 @@ class Inputs(eqx.Module):
 
 
 def inputs_at(model: Model, segments: Segments, late: Float[np.ndarray, "segments samples *nodes"]) -> Inputs:
-    """Inputs so late in each sample interval."""
+    """Inputs at given times in each sample interval."""
     nodes = (slice(None), slice(None), *[None] * (late.ndim - 2))
 
     def at(coefficients: Array | np.ndarray) -> np.ndarray:
@@ -173,11 +174,11 @@ def _between(
 
 
 class Forces(eqx.Module):
-    """What acts along a motion: in each sample interval a sum of parts.
+    """Forces along a motion: in each sample interval a sum of parts.
 
     Attributes:
-        lands: what a unit of each part adds to the state by the end of the interval.
-        sizes: how much of each part each force has.
+        lands: response of the state at the interval's end to a unit of each part.
+        sizes: coefficient of each part in each force.
     """
 
     lands: Float[np.ndarray, "segments samples states parts"]
@@ -190,13 +191,13 @@ def respond(
     start: Float[np.ndarray, "#segments states columns"] | float = 0.0,
     readout: Float[np.ndarray, "segments samples outputs states"] | None = None,
 ) -> tuple[Float[np.ndarray, "segments samples outputs columns"], Float[np.ndarray, "segments states columns"]]:
-    """What forces along the motion do to the outputs and to each segment's end.
+    """Response of the outputs and of each segment's final state to forces along the motion.
 
     Args:
         followed: the motion.
         forces: along it.
-        start: where each segment starts.
-        readout: derivative of what is wanted by the state; that of the outputs where not given.
+        start: deviation of each segment's initial state.
+        readout: derivative of the wanted signals by the state; that of the outputs where not given.
     """
     segments, samples, states, _ = forces.lands.shape
     deviation = np.broadcast_to(start, (segments, states, forces.sizes.shape[-1]))

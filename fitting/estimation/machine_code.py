@@ -1,5 +1,5 @@
-"""The residual by machine code: the same numbers as [`fitting.estimation.residual`][] gives by XLA, without compiling a
-program for each model."""
+"""The residual by machine code: equal to that of [`fitting.estimation.residual`][] by XLA, without compilation per
+model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,29 +20,29 @@ from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
 from hdjax.engine.kernel import Mode, Wanted, march_arrays
 
-# The model's constants come in tables of so many, so that few sizes of them make few programs.
+# Sizes of the tables of model constants are multiples of this, so that few programs suffice.
 _CONSTANTS = 32
-# Segments whose torque a program of JAX changes at a time.
+# Segments per call of the JAX program that applies actuator effects.
 _SEGMENTS = 256
 
 
 def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
-    """What the machine code needs of a problem."""
+    """Input of the machine code for a problem."""
     acting = _acting(problem, kernel)
     lanes = _as_logged(problem, unknowns, kernel)
     return lanes if acting is None else acting.on(lanes)
 
 
 def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
-    """What the machine code needs of a problem, with the torque as it was logged.
+    """Input of the machine code for a problem, with the logged torque.
 
     Args:
-        problem: what is solved.
-        unknowns: where.
-        kernel: of the problem's model.
+        problem: the least-squares problem.
+        unknowns: point of evaluation.
+        kernel: machine code of the problem's model.
     """
     free = problem.free
-    # Outside a program of JAX numpy does this, for which nothing is compiled.
+    # numpy outside a JAX program, to compile nothing.
     library = jnp if is_traced(problem, unknowns) else np
     values = free.values(unknowns.parameters)
     model = problem.model.replace(dict(zip(free.paths, values, strict=True))) if free.paths else problem.model
@@ -52,7 +52,7 @@ def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
 
 
 def _data(problem: Problem, kernel: Kernel, free: Any, slopes: Any, states: Any, *, library: Any) -> Lanes:
-    """The same for what is free, and initial states."""
+    """The same for given free parameters and initial states."""
     segments = problem.segments
     _, others, _ = split_model(problem.model, kernel.paths)
     constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
@@ -81,8 +81,8 @@ class Acting(eqx.Module):
     Attributes:
         effects: in order.
         paths: their free parameters.
-        places: where these are among all free parameters.
-        torque: what was logged.
+        places: their indices among all free parameters.
+        torque: the logged torque.
     """
 
     effects: tuple[ActuatorEffect, ...]
@@ -91,15 +91,15 @@ class Acting(eqx.Module):
     torque: PiecewisePolynomial
 
     def on(self, lanes: Lanes) -> Lanes:
-        """Lanes with the torque that acts, and its derivatives by the parameters at the paths, in the place of what was
-        logged."""
+        """Lanes with the torque after actuator effects, and its derivatives by the parameters at the paths, in place of
+        the logged one."""
         values = jnp.asarray(lanes.free[np.array(self.places, dtype=int)])
         torque, slopes = actuated(self.effects, self.paths, values, self.torque)
         return replace(lanes, signals=(torque, *lanes.signals[1:], *slopes))
 
 
 def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
-    """The effects on a problem's logged torque; None where there are none."""
+    """The actuator effects of a problem; None where there are none."""
     effects = tuple(e for e in problem.model.effects if isinstance(e, ActuatorEffect))
     paths = tuple(kernel.paths[i] for i in kernel.acting)
     return Acting(effects, paths, kernel.acting, problem.segments.torque) if effects else None
@@ -108,7 +108,7 @@ def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
 def actuated(
     actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
 ) -> tuple[Any, tuple[Any, ...]]:
-    """The torque that acts, and its derivatives by the parameters at the paths."""
+    """The torque after actuator effects, and its derivatives by the parameters at the paths."""
     if is_traced(values, torque):
         return _actuated(tuple(actuators), paths, values, torque)
     return some_at_a_time(
@@ -123,7 +123,7 @@ def actuated(
 def _actuated(
     actuators: tuple[ActuatorEffect, ...], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
 ) -> tuple[Array, tuple[Array, ...]]:
-    """[`actuated`][] of so many segments."""
+    """[`actuated`][] of a batch of segments."""
 
     def places(own: tuple[ActuatorEffect, ...]) -> list[Any]:
         by_name = {e.name: e for e in own}
@@ -168,7 +168,7 @@ def blocks_by_machine_code(problem: Problem, unknowns: Unknowns) -> Blocks:
 def plain_residual_by_machine_code(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[np.ndarray, "segments rows"], Float[np.ndarray, "segments states"]]:
-    """[`fitting.estimation.residual.residual`][] by the machine code that has derivatives, without computing them."""
+    """[`fitting.estimation.residual.residual`][] by the machine code with derivatives, without computing these."""
     kernel = problem.kernel
     assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel)
@@ -177,24 +177,23 @@ def plain_residual_by_machine_code(
 
 
 def _march(address: Array | np.ndarray, lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian") -> Marched:
-    """Outside a program of JAX none is compiled."""
+    """Run the machine code; outside a JAX program nothing is compiled."""
     return (march_lanes if is_traced(address, lanes) else march_arrays)(address, lanes, hidden, mode, wanted)
 
 
 class Task(eqx.Module):
-    """A problem that can be looked at from any point, outside programs of JAX.
+    """A problem that can be evaluated at any point outside JAX programs.
 
     Attributes:
         address: of the machine code.
-        lanes: the data as logged; what is free and the states are replaced.
+        lanes: the logged data; free parameters and states are replaced.
         acting: effects on the logged torque; None where there are none.
-        logarithmic: which parameters move by their logarithm.
+        logarithmic: which parameters are represented by their logarithm.
         scale: unit of each of the others.
-        active: 1 for a parameter that may move, 0 for one that is held.
-        centre: what is known beforehand of each parameter's entry, see
-            [`fitting.estimation.free_parameters.FreeParameters`][].
-        precision: likewise.
-        hidden: how many states are effects' own.
+        active: 1 for a free parameter, 0 for a fixed one.
+        centre: prior mean of each parameter's entry, see [`fitting.estimation.free_parameters.FreeParameters`][].
+        precision: inverse of the prior's standard deviation.
+        hidden: number of hidden states.
     """
 
     address: Array | np.ndarray
@@ -208,7 +207,7 @@ class Task(eqx.Module):
     hidden: int = eqx.field(static=True)
 
     def look(self, unknowns: Unknowns) -> tuple[Products, Float[np.ndarray, "segments rows"]]:
-        """The normal equations of the residual at a point, and its rows."""
+        """Normal equations and rows of the residual at a point."""
         vector = unknowns.parameters
         with np.errstate(over="ignore"):
             power = np.exp(np.clip(vector, -LARGEST_LOG, LARGEST_LOG))
@@ -225,13 +224,13 @@ class Task(eqx.Module):
 
 
 def task(problem: Problem, unknowns: Unknowns) -> Task | None:
-    """A problem ready to be looked at by machine code, from any unknowns; None where there is none."""
+    """A problem prepared for evaluation by machine code; None without machine code."""
     kernel, free = problem.kernel, problem.free
     if kernel is None:
         return None
     acting, values = _acting(problem, kernel), np.asarray([*free.values(unknowns.parameters)], dtype=float)
     lanes = on_host(_data(problem, kernel, values, np.zeros(values.size), unknowns.states, library=np))
-    # Where nothing moves the torque, what acts is one for all looks.
+    # Without free actuator parameters the torque is the same at all points.
     if acting is not None and not np.asarray(problem.active).any():
         lanes, acting = acting.on(lanes), None
     return Task(
@@ -248,7 +247,7 @@ def task(problem: Problem, unknowns: Unknowns) -> Task | None:
 
 
 def _ends(lanes: Lanes, found: Marched) -> tuple[Any, Any, Any]:
-    """The gap before each segment, and the derivatives of the end of the segment before."""
+    """The gap before each segment, and the derivatives of the preceding segment's final state."""
     library = library_of(lanes.states, found.end)
     joined, gap = library.asarray(lanes.joined)[:, None] > 0, _gap(lanes, found)
     near = library.abs(gap) < LOST
@@ -257,7 +256,7 @@ def _ends(lanes: Lanes, found: Marched) -> tuple[Any, Any, Any]:
         moved = library.roll(slope, 1, axis=0)
         return library.where((joined & near)[:, :, None] & library.isfinite(moved), moved, 0.0)
 
-    # A state that has run away stands for itself: nothing before it moves the gap.
+    # A diverged state has no derivative: the gap does not depend on what precedes it.
     own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
     by_parameter, by_state = before(found.end_by_parameter), before(found.end_by_state) + own
     return gap, by_parameter, by_state
@@ -266,7 +265,7 @@ def _ends(lanes: Lanes, found: Marched) -> tuple[Any, Any, Any]:
 def residual_by_machine_code(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
-    """[`fitting.estimation.residual.residual`][] by machine code that has no derivatives."""
+    """[`fitting.estimation.residual.residual`][] by machine code without derivatives."""
     kernel = problem.kernel
     assert kernel is not None and kernel.values is not None
     lanes = lanes_of(problem, unknowns, kernel)
@@ -275,7 +274,7 @@ def residual_by_machine_code(
 
 
 def _gap(lanes: Lanes, found: Marched) -> Any:
-    """How far each joined segment starts from where the one before it ends."""
+    """Initial state of each joined segment minus the final state of the one before."""
     library = library_of(lanes.states, found.end)
     with np.errstate(invalid="ignore"):
         gap = library.asarray(lanes.states) - library.roll(found.end, 1, axis=0)
@@ -286,8 +285,8 @@ def _gap(lanes: Lanes, found: Marched) -> Any:
 def simulated(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
-    """[`fitting.estimation.residual.simulate_segments`][] by the machine code that has derivatives, without
-    computing them."""
+    """[`fitting.estimation.residual.simulate_segments`][] by the machine code with derivatives, without computing
+    these."""
     kernel = problem.kernel
     assert kernel is not None
     lanes = lanes_of(problem, unknowns, kernel)

@@ -1,10 +1,10 @@
-"""A fit of the load's own equation: the motor's motion as measured drives the load.
+"""Fit of the load's equation of motion: the measured motion of the motor drives the load.
 
     J_l theta_l'' = K f(x) + B_sp x' + T_l,    x = theta_m/N - theta_l
 
-holds whatever acts on the motor: neither the motor's friction nor an error of the torque is in it. Both angles must be
-measured. A cubic spline through the motor's angle stands for its motion; the second derivative of the spline forces the
-twist, and integrating it twice gives the spline back, so that differentiating does not amplify the encoder's noise.
+holds whatever acts on the motor: it contains neither the motor's friction nor an error of the torque. Both angles must
+be measured. The motor's motion is a cubic spline through its angle. The spline's second derivative forces the twist.
+Integrating it twice gives the spline back, so that encoder noise is not amplified.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ from hdjax import Model, MotorDrivenModel, PiecewisePolynomial, TwoInertiaModel
 
 
 def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fit | None:
-    """Fit K, alpha and B_sp to the load's motion under the motor's.
+    """Fit K, alpha and B_sp to the load's motion for the measured motion of the motor.
 
     Args:
-        model: the base model; its stiffness and damping are only placeholders. Of its priors, none may be of the motor.
+        model: the base model; its stiffness and damping are only placeholders, and it has no priors of the motor.
         stretches: the data.
 
     Returns:
-        The best of the fits from each start that the load's equation supplies; None where it supplies none.
+        The best of the fits from all starts of the load's equation; None where there are none.
     """
     driven = tuple(_driven(stretch) for stretch in stretches)
     starts = [
@@ -38,7 +38,7 @@ def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fi
     ]
     if not starts:
         return None
-    # Judged on equally short segments, a start with the wrong frequency can't hide.
+    # Equally short segments for all starts make their objectives comparable.
     horizon = min(short_horizon(start, driven) for start in starts)
     coarse = [_fitted(start, driven, horizon) for start in starts]
     best = min(coarse, key=lambda found: found.objective)
@@ -46,11 +46,11 @@ def motor_driven_fit(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Fi
 
 
 def held_at(model: Model, found: Fit) -> Fit:
-    """A motor-driven fit with K, alpha and B_sp held at those of another model.
+    """A motor-driven fit with K, alpha and B_sp fixed at those of another model.
 
     Args:
         model: supplies the values.
-        found: the fit with its own values.
+        found: the motor-driven fit.
     """
     return fit(
         found.model.replace({path: model.get(path) for path in found.free.paths}),
@@ -68,8 +68,8 @@ def _fitted(model: Model, driven: Sequence[Stretch], horizon: int) -> Fit:
 
 
 def _driven(stretch: Stretch) -> Stretch:
-    """A stretch with the motor's acceleration over N in the place of the torque."""
-    # Loaded here: the base model explains most logs.
+    """A stretch with the motor's acceleration over N in place of the torque."""
+    # Imported here: most logs do not need it.
     from scipy.interpolate import CubicSpline
 
     whole = stretch.experiment

@@ -1,4 +1,4 @@
-"""First states of segments whose sensors do not see all of the motion: least squares of the linear drive."""
+"""Initial states of segments where not all states are measured: least squares with the linear drive."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,19 +7,19 @@ from fitting.estimation.experiment import Segments
 from fitting.estimation.linear_drive import over_a_step, readings
 from hdjax import TwoInertiaModel
 
-# Periods of the slower resonance over which a first state shows.
+# Periods of the slower resonance from which an initial state is estimated.
 _PERIODS = 1.0
 _MOST_SAMPLES = 256
-# Directions of the state that outputs hardly see stay at zero.
+# Singular values below this share are cut off: weakly observable directions of the state stay at zero.
 _BLIND = 1e-9
 
 
 def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndarray, "segments 4"]:
-    """The first state (theta_m, theta_l, omega_m, omega_l) of each segment, as the drive without effects explains the
-    segment's first samples by it.
+    """The initial state (theta_m, theta_l, omega_m, omega_l) of each segment, fitted to its first samples with the
+    drive without effects.
 
     Args:
-        model: supplies the drive, and says what was measured.
+        model: supplies the drive and the outputs.
         segments: the data.
     """
     drive, N = model.drive, float(model.drive.N)
@@ -28,7 +28,7 @@ def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndar
     slowest = float(np.sqrt(drive.K / drive.J_l))
     samples = int(np.clip(np.ceil(2 * np.pi * _PERIODS / slowest / step), 8, _MOST_SAMPLES))
     samples = min(samples, weight.shape[1])
-    # Angles are counted from where the segment begins: many turns would cost the digits of a twist.
+    # Angles are relative to the segment's start: over many turns rounding would spoil the twist.
     scale = {"motor_turn": 1.0, "motor_angle": N, "load_angle": 1.0}
     turns = np.array([scale.get(name, 0.0) for name in model.measured])
     angles = np.flatnonzero(turns)
@@ -56,13 +56,13 @@ def observed_states(model: TwoInertiaModel, segments: Segments) -> Float[np.ndar
 
 
 def _pushed(coefficients: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """What a torque does to the state over a step: its value and slope."""
+    """Change of the state over a step by a torque's value and slope."""
     count = min(coefficients.shape[-1], 2)
     return coefficients[:, :count] @ by[:, :count].T
 
 
 def _noise(values: Float[np.ndarray, "segments samples outputs"]) -> Float[np.ndarray, " outputs"]:
-    """Size of what neighbouring samples do not share, by output."""
+    """Rms of each output's high-frequency noise, from differences of neighbouring samples."""
     third = np.diff(values, n=3, axis=1) if values.shape[1] > 3 else values
     size = np.sqrt(np.mean(third**2, axis=(0, 1)) / 20.0)
     return np.where(size > 0, size, 1.0)

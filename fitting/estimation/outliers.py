@@ -1,8 +1,8 @@
-"""Samples that are wrong on their own: they lose their weight, and what is left is fitted as if they had been missing.
+"""Isolated outliers: they get weight zero, as if they were missing, and the fit is repeated.
 
-A lone wrong sample says nothing about the drive, however far off it is, so it is left out rather than weighed down.
-Errors that come in company are another matter: they may be an effect that the model lacks, and stay. Where no sample
-stands out by more than Gaussian noise does, nothing changes.
+An isolated wrong sample has no information about the drive, so it is removed rather than down-weighted. Large errors of
+many neighbouring samples stay: they may be an effect that the model lacks. Where no sample exceeds what Gaussian noise
+explains, nothing changes.
 """
 
 import dataclasses
@@ -15,20 +15,20 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Stretch
 from fitting.logs.masks import glitches
 
-# Chance that the noise of a whole log has a sample left out.
+# Chance that pure noise of a whole log loses a sample.
 _FALSE_ALARM = 1e-3
-# Of the standard deviation: what the neighbours of a lone wrong sample may be off.
+# Largest error of an isolated outlier's neighbours, in standard deviations.
 _ORDINARY = 3.0
-# Wrong samples in a row that still pass for a glitch, and ordinary ones that must stand on either side.
+# Longest run of outliers that counts as a glitch, and number of ordinary samples required on either side.
 _LONGEST = 3
 _BESIDE = 2
-# More than this share is the nature of the noise, not a fault.
+# A larger share than this is a property of the noise, not a fault.
 _MOST = 0.05
 
 
 def without_glitches(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
-    """The stretches without gross spikes, which would spoil starting values and scales; of a log that was read from a
-    file they are known already."""
+    """The stretches without gross spikes, which would spoil starting values and scales. The log reader has already
+    removed those of files."""
     found = []
     for stretch in stretches:
         part = slice(stretch.start, stretch.stop)
@@ -40,7 +40,7 @@ def without_glitches(stretches: Sequence[Stretch]) -> tuple[Stretch, ...]:
 
 
 def without_lone_errors(found: Fit) -> tuple[Stretch, ...] | None:
-    """The stretches of a fit without the samples whose error stands alone, or None where there are none."""
+    """The stretches of a fit without isolated outliers; None where there are none."""
     white = found.white_error
     weight = np.asarray(found.problem.segments.weight) > 0
     spread = np.array([_spread(output[weight]) for output in np.moveaxis(white, -1, 0)])
@@ -56,7 +56,7 @@ def without_lone_errors(found: Fit) -> tuple[Stretch, ...] | None:
 
 
 def with_weights(stretches: Sequence[Stretch], believed: Sequence[Stretch]) -> tuple[Stretch, ...]:
-    """The same stretches under another assumption about the torque, with the outputs and weights of `believed`."""
+    """The same stretches with another hold of the torque, and the outputs and weights of `believed`."""
 
     def one(stretch: Stretch, known: Stretch) -> Stretch:
         fields = {name: getattr(known.experiment, name) for name in ("measured", "motor_angle", "weight")}
@@ -66,13 +66,13 @@ def with_weights(stretches: Sequence[Stretch], believed: Sequence[Stretch]) -> t
 
 
 def left_out(stretches: Sequence[Stretch]) -> int:
-    """How many samples of the stretches carry no weight."""
+    """Number of samples with weight zero."""
     weights = [s.experiment.weight[s.start : s.stop] for s in stretches if s.experiment.weight is not None]
     return int(sum(np.sum(w == 0) for w in weights))
 
 
 def _left_out(stretch: Stretch, wrong: np.ndarray) -> Stretch:
-    """The stretch with further samples that have no weight; their outputs are put in from those around."""
+    """The stretch with further samples of weight zero, whose outputs are interpolated."""
     if not wrong.any():
         return stretch
     experiment = stretch.experiment
@@ -93,7 +93,7 @@ def _left_out(stretch: Stretch, wrong: np.ndarray) -> Stretch:
 
 
 def _alone(size: np.ndarray, limit: float) -> np.ndarray:
-    """Which errors are beyond the limit, a few in a row at most, with ordinary ones on either side."""
+    """Which errors exceed the limit, in short runs, with ordinary ones on either side."""
     found = np.zeros(size.size, dtype=bool)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (size > limit).astype(np.int8), [0]])))
     for start, stop in edges.reshape(-1, 2):
@@ -104,5 +104,5 @@ def _alone(size: np.ndarray, limit: float) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> float:
-    """Standard deviation of the body of a distribution: its 95 % quantile, as if it were normal."""
+    """Robust standard deviation: from the 95 % quantile, as if normal."""
     return float(np.quantile(np.abs(values), 0.95)) / 1.96

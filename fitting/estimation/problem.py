@@ -1,4 +1,4 @@
-"""What a fit solves, as data and model pose it: segments, where their simulations start, steps, what is free."""
+"""Least-squares problem of a fit: segments, initial states, solver steps and free parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from hdjax.dynamics import BOTH_ANGLES
 from hdjax.engine.pointwise import at_instants
 from hdjax.lanes import spread
 
-# Segments are no longer than this; longer simulations join several, which are then lanes of one program.
+# Longest segment; longer simulations join several, which run in parallel.
 _LONGEST_SEGMENT = 256
 STEP_ANGLE = 0.15
 """A step of Tsit5 turns the fastest oscillation by at most this angle [rad]: it shifts K by less than 1e-6."""
@@ -26,11 +26,10 @@ STEP_ANGLE = 0.15
 
 @dataclass(frozen=True)
 class Segmentation:
-    """How data are cut into segments, and how finely these are simulated.
+    """Segment lengths and solver steps of a fit.
 
     Attributes:
-        horizon: samples until a simulation starts anew. Short ones converge from far away, long ones use the data
-            fully.
+        horizon: samples of one simulation. Short ones converge from far away, long ones are more accurate.
         length: samples in a segment; see [`segment_length`][] where not given.
         halo: intervals of torque before each segment, for delays.
         substeps: solver steps in a sample interval; from the natural frequency where not given.
@@ -44,7 +43,7 @@ class Segmentation:
     count: int | None = None
 
     def of(self, stretches: Sequence[Stretch]) -> Segments:
-        """The segments of some data."""
+        """The segments of the data."""
         length = segment_length(self.horizon) if self.length is None else self.length
         return cut(stretches, length, horizon=self.horizon, halo=self.halo, count=self.count)
 
@@ -59,16 +58,16 @@ def pose(
     states: Float[Array | np.ndarray, "segments states"] | None = None,
     engine: Engine | None = None,
 ) -> tuple[Problem, Unknowns]:
-    """Pose a fit: what is solved, not weighed yet, and where the iteration begins.
+    """Set up a fit: the problem without output weights, and the initial unknowns.
 
     Args:
         model: equations and starting values.
         stretches: the data.
-        paths: dotted paths of what is free.
-        segmentation: how the data are cut.
+        paths: dotted paths of the free parameters.
+        segmentation: how the data are cut into segments.
         hold_parameters: whether only the initial states are free.
         states: initial states of the segments; from their first samples where not given.
-        engine: what evaluates the residual, see [`fitting.estimation.estimate.fit`][].
+        engine: that evaluates the residual, see [`fitting.estimation.estimate.fit`][].
     """
     segments, substeps = segmentation.of(stretches), segmentation.substeps
     if substeps is None:
@@ -85,23 +84,23 @@ def pose(
 
 
 def on_all_devices(problem: Problem, unknowns: Unknowns) -> tuple[Problem, Unknowns]:
-    """The same, its segments shared among the devices where XLA evaluates the residual."""
+    """The same problem, its segments distributed over the devices where XLA evaluates the residual."""
     if problem.kernel is not None:
         return problem, unknowns
     return spread((problem, unknowns), unknowns.states.shape[0])
 
 
 def segment_length(horizon: int) -> int:
-    """Samples in a segment of simulations that start anew every `horizon` samples."""
+    """Samples in a segment, for simulations of `horizon` samples."""
     return min(horizon, _LONGEST_SEGMENT)
 
 
 def initial_states(model: Model, segments: Segments) -> Float[Array, "segments states"]:
-    """Each segment's first state from a local polynomial, through its first samples and, where the log goes on, the
-    last ones of the segment before; hidden states as if it had long moved like this.
+    """Each segment's initial state from a cubic through its first samples and, where possible, the last ones of the
+    preceding segment. Hidden states are in steady state with this motion.
 
-    A cubic follows a quarter of a natural period; fewer samples than that would turn noise into speed. What no sensor
-    sees of the motion is put in by the equations.
+    The cubic spans a quarter of a natural period; with fewer samples noise would dominate the rate. States that are not
+    measured follow from the equations.
     """
     if isinstance(model, TwoInertiaModel) and model.measured != BOTH_ANGLES:
         return _with_own_states(model, observed_states(model, segments))
@@ -134,7 +133,7 @@ def initial_states(model: Model, segments: Segments) -> Float[Array, "segments s
 def _with_own_states(
     model: Model, motion: Float[np.ndarray, "segments motion_states"]
 ) -> Float[Array, "segments states"]:
-    """The motion's states with those of the effects, as if the drive had long moved like this."""
+    """The mechanical states with hidden states in steady state."""
     hidden = any(e.states for e in model.effects)
     return jnp.asarray(at_instants(_settled, (motion, 1), (model, 0)) if hidden else motion)
 
@@ -142,11 +141,11 @@ def _with_own_states(
 def states_from(
     model: Model, near: Model, states: Float[Array | np.ndarray, "segments near_states"]
 ) -> Float[Array, "segments states"]:
-    """Initial states from those of another model on the same segments: what both have, and hidden ones of the new model
-    as if it had long moved like this. From poor states the first step would pull the parameters far away.
+    """Initial states from those of another model on the same segments; new hidden states are in steady state. Poor
+    initial states would make the first step move the parameters far away.
 
     Args:
-        model: with the same motion.
+        model: the new model, of the same mechanical states.
         near: the other model.
         states: its initial states.
     """
@@ -171,7 +170,7 @@ def _value_and_rate(time: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray,
 
 
 def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, float]:
-    """Units for parameters that may be zero: what makes each term visible at the measured twist."""
+    """Units of parameters that may be zero: values at which each term matters at the measured twist."""
     motion = scales(stretches, model)
     drive = model.drive
     stiffness = float(drive.stiffness)
@@ -182,7 +181,7 @@ def typical_scales(model: Model, stretches: Sequence[Stretch]) -> dict[str, floa
 
 
 def natural_frequency(model: Model, stretches: Sequence[Stretch]) -> float:
-    """The fastest oscillation of the dynamic error on the data [rad/s], hardening at full twist included."""
+    """Natural frequency of the dynamic error [rad/s], with hardening at the largest twist."""
     drive = model.drive
     stiffening = max(0.0, 3.0 * float(drive.alpha) * scales(stretches, model).x_max ** 2)
     return float(drive.omega_0) * float(np.sqrt(1.0 + stiffening))
@@ -193,8 +192,8 @@ def suggested_substeps(model: Model, stretches: Sequence[Stretch], *, step_angle
 
     Args:
         model: supplies the natural frequency.
-        stretches: supply the sample interval, and the twist that hardens the spring.
-        step_angle: by which a step may turn the oscillation [rad].
+        stretches: supply the sample interval and the largest twist.
+        step_angle: largest phase advance of the oscillation per step [rad].
     """
     angle = natural_frequency(model, stretches) * stretches[0].experiment.time_step
     return int(np.clip(np.ceil(angle / step_angle), 1, 16))

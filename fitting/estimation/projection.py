@@ -1,4 +1,4 @@
-"""What forces along a motion explain of the residual, beside the parameters that are free already."""
+"""Projection of forces' responses and parameter sensitivities orthogonal to the initial states."""
 
 from dataclasses import replace
 
@@ -12,18 +12,18 @@ from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.linear_response import Followed, Forces, respond
 from fitting.estimation.residual import Blocks
 
-# Numbers whose square leaves what a computer can hold.
+# Numbers whose square overflows.
 _NOTHING = 1e-200
 
 
 class FirstStates(eqx.Module):
-    """What the state that each simulation starts from, a chain of joined segments, does to a residual.
+    """Sensitivity of a residual to the initial state of each simulation (a chain of joined segments).
 
     Attributes:
         joined: whether a segment starts where the one before it ends.
-        by_state: the residual's derivative by each segment's own first state.
-        before_by_state: derivative of the end of the segment before by its first state.
-        by_first: the residual's derivative by the first state of the simulation that a segment belongs to.
+        by_state: the residual's derivative by each segment's initial state.
+        before_by_state: derivative of the preceding segment's final state by its initial state.
+        by_first: the residual's derivative by the initial state of the simulation that a segment belongs to.
     """
 
     joined: Bool[np.ndarray, " segments"]
@@ -33,7 +33,7 @@ class FirstStates(eqx.Module):
 
     @classmethod
     def of(cls, found: Blocks, joined: Bool[Array | np.ndarray, " segments"]) -> "FirstStates":
-        """Of a residual's derivatives."""
+        """From a residual's derivatives."""
         joined, by_state, before = np.asarray(joined), np.asarray(found.by_state), np.asarray(found.before_by_state)
         first = np.where(joined[:, None, None], 0.0, np.eye(before.shape[-1]))
         return cls(joined, by_state, before, by_state @ through_segments(joined, before, first))
@@ -43,11 +43,11 @@ class FirstStates(eqx.Module):
         columns: Float[Array | np.ndarray, "segments rows columns"],
         before: Float[Array | np.ndarray, "segments states columns"],
     ) -> Float[np.ndarray, "segments rows columns"]:
-        """Columns of the residual without what the first states could do as well.
+        """Columns projected orthogonal to the effect of the initial states.
 
         Args:
             columns: by segment.
-            before: what goes with each at the end of the segment before, where segments are joined.
+            before: corresponding change of the preceding segment's final state, where segments are joined.
         """
         with np.errstate(all="ignore"):
             moved = np.asarray(columns)
@@ -60,21 +60,20 @@ class FirstStates(eqx.Module):
             return moved - self.by_first @ _solved_each(own, coupling)[np.cumsum(~self.joined) - 1]
 
     def parameters_without(self, found: Blocks) -> Float[np.ndarray, "segments rows parameters"]:
-        """The parameters' columns alike."""
+        """The parameters' columns, projected likewise."""
         return self.without(found.by_parameter, found.before_by_parameter)
 
 
 class Answers(eqx.Module):
-    """How whitened outputs answer what acts along a motion, without what the first state of each simulation could do as
-    well.
+    """Response of whitened outputs to forces along a motion, projected orthogonal to the initial states.
 
     Attributes:
         followed: the motion.
         weight: of the samples.
         whitening: of the outputs.
-        readout: of the weighted and whitened outputs from the state.
-        states: what the first states do.
-        parameters: the answer to a unit of each parameter that is free already.
+        readout: derivative of the weighted and whitened outputs by the state.
+        states: sensitivity to the initial states.
+        parameters: sensitivity to each free parameter.
     """
 
     followed: Followed
@@ -88,10 +87,10 @@ class Answers(eqx.Module):
     def of(
         cls, found: Blocks, followed: Followed, segments: Segments, whitening: Float[np.ndarray, "outputs outputs"]
     ) -> "Answers":
-        """The answers of a motion.
+        """The responses along a motion.
 
         Args:
-            found: the residual's derivatives by what is free already.
+            found: the residual's derivatives by the free parameters.
             followed: the motion.
             segments: the data.
             whitening: of the outputs.
@@ -107,11 +106,11 @@ class Answers(eqx.Module):
         forces: Forces | None,
         reading: Float[np.ndarray, "segments samples outputs columns"] | None = None,
     ) -> Float[np.ndarray, "segments samples outputs columns"]:
-        """The answers to forces.
+        """The responses to forces.
 
         Args:
-            forces: along the motion; None where nothing acts.
-            reading: what goes with each and is no motion, a change of what the encoders read; None where there is none.
+            forces: along the motion; None without any.
+            reading: change of the encoders' readings that accompanies each force; None without any.
         """
         if forces is not None:
             outputs, end = respond(self.followed, forces, readout=self.readout)
@@ -124,14 +123,14 @@ class Answers(eqx.Module):
         columns = outputs.reshape(len(end), -1, end.shape[-1])
         rows, further = columns.shape[1], self.states.by_state.shape[1] - columns.shape[1]
         if further:
-            # What follows a segment's rows of outputs is its states' prior.
+            # After a segment's rows of outputs come those of its states' prior.
             columns = np.pad(columns, ((0, 0), (0, further), (0, 0)))
         before = np.where(self.states.joined[:, None, None], np.roll(end, 1, axis=0), 0.0)
         return self.states.without(columns, -before)[:, :rows].reshape(outputs.shape)
 
 
 def through_segments(joined: np.ndarray, before_by_state: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """What moves the state in which each segment starts: its own, and where it is joined what moves the one before."""
+    """Accumulate changes of each segment's initial state along joined segments."""
     found = np.empty_like(own)
     for i, goes_on in enumerate(joined):
         found[i] = own[i] + before_by_state[i] @ found[i - 1] if goes_on else own[i]
@@ -139,7 +138,7 @@ def through_segments(joined: np.ndarray, before_by_state: np.ndarray, own: np.nd
 
 
 def _solved_each(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve symmetric systems after scaling their diagonals to one; a direction without information does not move."""
+    """Solve symmetric systems after scaling their diagonals to one; components without information are zero."""
     size = np.diagonal(matrix, axis1=1, axis2=2)
     scale = np.where(size > 0, 1.0 / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)[..., None]
     scaled = matrix * scale * np.swapaxes(scale, 1, 2)
@@ -147,9 +146,9 @@ def _solved_each(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return scale * np.linalg.solve(scaled, scale * right)
 
 
-def without_untold(found: Blocks, free: FreeParameters) -> Blocks:
-    """The same without the columns of positive parameters that the data do not tell to within a factor e (a corner too
-    sharp to be seen): what they would explain to first order lies far beyond where that reaches."""
+def without_undetermined(found: Blocks, free: FreeParameters) -> Blocks:
+    """The same without the columns of positive parameters that the data do not determine to within a factor e. For
+    these, the linearisation does not reach as far as their uncertainty."""
     by_parameter, before = np.asarray(found.by_parameter), np.asarray(found.before_by_parameter)
     told = (np.sum(by_parameter**2, axis=(0, 1)) > 1.0) | ~np.asarray(free.logarithmic, dtype=bool)
     return replace(
@@ -162,10 +161,10 @@ def without_untold(found: Blocks, free: FreeParameters) -> Blocks:
 def solved(
     gram: Float[np.ndarray, "*many columns columns"], gradient: Float[np.ndarray, "*many columns sides"]
 ) -> Float[np.ndarray, "*many columns sides"]:
-    """Least squares; directions without information do not move.
+    """Least-squares solution; components without information are zero.
 
-    Nor do columns without any, as of a parameter that has gone to infinity: they would not explain, and what rounding
-    leaves of them on other data would be all that counts.
+    Columns that vanish, as of a parameter at infinity, get zero as well: otherwise their rounding errors on other data
+    would dominate.
     """
     size = np.diagonal(gram, axis1=-2, axis2=-1)
     scale = np.where(size > _NOTHING, 1.0 / np.sqrt(np.maximum(size, _NOTHING)), 0.0)[..., None]

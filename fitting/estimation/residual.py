@@ -1,4 +1,4 @@
-"""Measured minus simulated on every segment, and its derivatives: the one program that all fits run."""
+"""Measured minus simulated outputs on every segment and their Jacobian, as all fits compute them."""
 
 from dataclasses import replace
 from typing import Literal
@@ -18,15 +18,15 @@ from hdjax.engine import Kernel
 from hdjax.simulate import march, simulate
 from hdjax.where import where
 
-# A simulation that runs away, or leaves the numbers, is this many standard deviations off: a rejected step. (Its own
-# size would overflow where it is squared.)
+# Residual of a diverged simulation, in standard deviations, so that the step is rejected. (Its own square would
+# overflow.)
 LOST = 1e8
 RUNAWAY = 1e-3 * LOST
-"""Standard deviations beyond which a simulation has lost its way; the weights may have changed since."""
+"""Standard deviations beyond which a simulation counts as diverged; smaller than its residual, as weights may have
+changed since."""
 
 Engine = Literal["XLA", "diffrax"]
-"""What evaluates a residual in place of machine code: the same steps as a program of XLA, or `diffrax.diffeqsolve` with
-adaptive steps."""
+"""Engines other than machine code: the same solver steps by XLA, or `diffrax.diffeqsolve` with adaptive steps."""
 
 
 def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
@@ -34,21 +34,20 @@ def _as_integer(value: int | Int[Array, ""]) -> Int[Array, ""]:
 
 
 class Problem(eqx.Module):
-    """Everything that the residual depends on except what is fitted.
+    """All that the residual depends on except the unknowns.
 
     Attributes:
-        model: supplies the parameters that are not free.
-        free: what is free.
+        model: supplies the fixed parameters.
+        free: the free parameters.
         segments: the data.
         whitening: `whitening @ e` has unit covariance for an output error e.
-        active: 1 for a parameter that may move, 0 for one that is held; one program fits and evaluates.
-        gap_weight: what a unit of each state counts where a joined segment does not yet start where the one before
-            it ends.
+        active: 1 for a free parameter, 0 for a fixed one; as data, so that one program serves both.
+        gap_weight: weight of each state in the gaps between joined segments.
         solver: explicit Runge-Kutta solver of diffrax.
         substeps: its steps in each sample interval; data, so that finer steps need no other program.
-        kernel: machine code that does the same faster, see [`fitting.estimation.machine_code`][]; None where XLA does
-            it.
-        engine: what evaluates the residual, where it is not to be machine code if that can be.
+        kernel: machine code that computes the same faster, see [`fitting.estimation.machine_code`][]; None where XLA is
+            used.
+        engine: requested in place of machine code; None for machine code where possible.
     """
 
     model: Model
@@ -64,22 +63,23 @@ class Problem(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """What is fitted: the free parameters, and the initial state of each segment."""
+    """Unknowns of a fit: the free parameters, and the initial state of each segment."""
 
     parameters: Float[Array | np.ndarray, " parameters"]
     states: Float[Array | np.ndarray, "segments states"]
 
 
 class Blocks(eqx.Module):
-    """Residual and Jacobian: a segment's rows and its end depend on the shared parameters and on its own initial
-    state only.
+    """Residual and Jacobian. A segment's rows and final state depend only on the shared parameters and its own initial
+    state.
 
     Attributes:
         residual: see [`residual`][].
         by_parameter: derivative of the residual.
         by_state: likewise.
-        gap: how far each joined segment starts from where the one before it ends; zero where a segment starts anew.
-        before_by_parameter: derivative of the end of the segment before; zero where a segment starts anew.
+        gap: initial state of each joined segment minus the preceding segment's final state; zero where a segment is not
+            joined.
+        before_by_parameter: derivative of the preceding segment's final state; zero where a segment is not joined.
         before_by_state: likewise, with respect to the initial state of the segment before.
     """
 
@@ -92,7 +92,7 @@ class Blocks(eqx.Module):
 
 
 class Products(eqx.Module):
-    """What the normal equations need of residual and Jacobian.
+    """Products of residual and Jacobian for the normal equations.
 
     Attributes:
         products: of each segment's columns with each other: derivatives by parameters, by states, and the residual.
@@ -108,7 +108,7 @@ class Products(eqx.Module):
 
     @staticmethod
     def of(found: Blocks) -> "Products":
-        """Those of a residual with its Jacobian."""
+        """Products of a residual and its Jacobian."""
         library = library_of(found.residual, found.by_state)
         columns = library.concatenate([found.by_parameter, found.by_state, found.residual[:, :, None]], axis=2)
         ends = found.gap, found.before_by_parameter, found.before_by_state
@@ -117,11 +117,11 @@ class Products(eqx.Module):
     def beside_prior(
         self, off: Float[Array | np.ndarray, " parameters"], slope: Float[Array | np.ndarray, " parameters"]
     ) -> "Products":
-        """With what is known of the parameters beforehand as rows of the first segment.
+        """Add the parameters' prior as rows of the first segment.
 
         Args:
-            off: how many standard deviations each parameter's entry is off.
-            slope: derivative of that by the entry; zero for a parameter that is held.
+            off: deviation of each parameter's entry from its prior mean, in standard deviations.
+            slope: its derivative by the entry; zero for a fixed parameter.
         """
         library = library_of(self.products, off, slope)
         more = self.products.shape[1] - off.size - 1
@@ -139,8 +139,7 @@ class Products(eqx.Module):
 def simulate_segments(
     problem: Problem, unknowns: Unknowns, intervals: Int[Array, ""] | None = None
 ) -> tuple[Float[Array, "segments samples outputs"], Float[Array, "segments states"]]:
-    """The outputs that the model gives on each segment, and the state it ends in; `intervals` as in
-    [`hdjax.simulate.march`][]."""
+    """Simulated outputs and final state of each segment; `intervals` as in [`hdjax.simulate.march`][]."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
     segments = problem.segments
     temperature = segments.temperature if any(e.needs_temperature for e in model.effects) else None
@@ -179,11 +178,11 @@ def simulate_segments(
 def residual(
     problem: Problem, unknowns: Unknowns
 ) -> tuple[Float[Array, "segments rows"], Float[Array, "segments states"]]:
-    """Whitened output error of each segment by row, then its hidden initial states in units of their prior; and the
-    gap before each joined segment."""
+    """Whitened output error of each segment, then its hidden initial states in units of their prior; and the gap before
+    each joined segment."""
     weight = problem.segments.weight[:, :, None]
     outputs, end = simulate_segments(problem, unknowns, _needed(problem.segments))
-    # A simulation may run away where there are no data; infinity times zero is no zero.
+    # A simulation may diverge where weights are zero; infinity times zero is not zero.
     error = where(weight > 0, (problem.segments.measured - outputs) * weight, 0.0)
     white = jnp.einsum("ij,snj->sni", problem.whitening, error)
     rows = white.reshape(white.shape[0], -1)
@@ -196,8 +195,8 @@ def residual(
 
 
 def _needed(segments: Segments) -> Int[Array, ""]:
-    """How many sample intervals have to be simulated: up to the last sample that counts in any segment, all where
-    segments are joined at their ends."""
+    """Number of sample intervals to simulate: up to the last valid sample of any segment; all where segments are
+    joined."""
     length = segments.weight.shape[1]
     counts = jnp.any(segments.weight > 0, axis=0)
     last = jnp.max(where(counts, jnp.arange(length), 0))
@@ -205,7 +204,7 @@ def _needed(segments: Segments) -> Int[Array, ""]:
 
 
 def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments hidden"]:
-    """Hidden states start unseen: without a prior they could take any value where the data say nothing."""
+    """Hidden initial states need a prior: some are not observable from the data."""
     model = problem.free.unpack(problem.model, unknowns.parameters)
     motion = len(model.motion_states)
     scale = [e.state_scale() for e in model.effects if e.states]
@@ -218,7 +217,7 @@ def _state_prior(problem: Problem, unknowns: Unknowns) -> Float[Array, "segments
 
 
 def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
-    """Residual and Jacobian from one simulation whose lanes are segments x sensitivities (forward mode)."""
+    """Residual and Jacobian from one simulation, vectorised over segments and sensitivities (forward mode)."""
 
     def along(tangent: Unknowns):
         return jax.jvp(lambda u: residual(problem, u), (unknowns,), (tangent,))
@@ -231,8 +230,8 @@ def blocks(problem: Problem, unknowns: Unknowns) -> Blocks:
 
 
 def seeds(unknowns: Unknowns) -> Unknowns:
-    """Tangents, by row, that move one parameter, or one and the same state of every segment: no row of the residual
-    depends on the states of two segments."""
+    """Tangents, by row, of one parameter, or of the same state in every segment: no row of the residual depends on two
+    segments' states."""
     parameters = unknowns.parameters.shape[0]
     segments, states = unknowns.states.shape
 
@@ -243,10 +242,11 @@ def seeds(unknowns: Unknowns) -> Unknowns:
 
 
 def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, joined: Array) -> Blocks:
-    """The blocks behind what [`seeds`][], along the last axis, do to residual (columns) and gaps (slopes)."""
+    """The Jacobian's blocks from the derivatives of residual (columns) and gaps (slopes) along [`seeds`][], on the last
+    axis."""
     states = gap.shape[1]
     parameters = columns.shape[2] - states
-    # A gap is a segment's own initial state minus the end of the one before.
+    # A gap is a segment's initial state minus the preceding segment's final state.
     own = where(joined[:, None, None], jnp.eye(states), 0.0)
     return Blocks(
         residual=value,
@@ -259,22 +259,22 @@ def blocks_of_columns(value: Array, gap: Array, columns: Array, slopes: Array, j
 
 
 class LinearisedResidual(eqx.Module):
-    """What the least squares solver of optimistix minimises the squares of: residual and weighted gaps. (Their
-    derivatives are carried along by [`fitting.estimation.engines.residual_with_blocks`][].)"""
+    """Residual and weighted gaps, whose squares the solver of optimistix minimises.
+    ([`fitting.estimation.engines.residual_with_blocks`][] supplies derivatives.)"""
 
     rows: Float[Array | np.ndarray, "segments rows"]
     gap: Float[Array | np.ndarray, "segments states"]
 
 
 def seen_residual(found: Blocks, gap_weight: Float[Array, " states"]) -> LinearisedResidual:
-    """What [`fitting.estimation.engines.residual_with_blocks`][] is where the blocks are of."""
+    """Value of [`fitting.estimation.engines.residual_with_blocks`][] at the blocks' point."""
     return LinearisedResidual(found.residual, found.gap * gap_weight[None])
 
 
 def moved_residual(
     found: Blocks, gap_weight: Float[Array, " states"], joined: Bool[Array, " segments"], tangent: Unknowns
 ) -> LinearisedResidual:
-    """How [`fitting.estimation.engines.residual_with_blocks`][] changes there along a tangent, parts of which may be
+    """Derivative of [`fitting.estimation.engines.residual_with_blocks`][] along a tangent, parts of which may be
     None."""
     rows = jnp.zeros_like(found.residual)
     if tangent.parameters is not None:
@@ -287,7 +287,7 @@ def moved_residual(
 def moved_gap(
     found: Blocks | Products, joined: Bool[Array | np.ndarray, " segments"], tangent: Unknowns
 ) -> Float[Array | np.ndarray, "segments states"]:
-    """How the gaps change along a tangent, parts of which may be None."""
+    """Derivative of the gaps along a tangent, parts of which may be None."""
     library = library_of(found.gap, tangent.parameters, tangent.states)
     gap = library.zeros_like(found.gap)
     if tangent.parameters is not None:

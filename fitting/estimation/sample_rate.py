@@ -1,8 +1,8 @@
-"""Sample rates that rounded stamps leave open: what a fit says of them, and what they do to its parameters.
+"""Sample rates that are uncertain because stamps are rounded: their estimate, and their influence on parameters.
 
 Where the sample interval of a log is known to a relative standard deviation, it is one more parameter with that prior.
-To a drive with known inertias a wrong rate looks like a torque that is too large or too small, so that it would pass
-for an error of the torque sensor.
+With known inertias, a wrong rate has the same effect as a wrong torque gain, and would be taken for an error of the
+torque sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,21 +20,21 @@ from fitting.estimation.projection import FirstStates
 from fitting.estimation.residual import Problem
 from hdjax import Hold, PiecewisePolynomial
 
-# A shift of less than this, in standard errors of parameters and intervals, is not worth another fit (assumed).
+# Shift of parameters or intervals, in standard errors, below which the fit is not repeated (assumed).
 _SEEN = 0.1
-# By which share intervals are changed for a difference: rounding and curvature are then far below what is fitted.
+# Relative change of intervals for a difference quotient: rounding and curvature are then negligible.
 _CHANGE = 1e-5
 
 
 class RateColumns(eqx.Module):
-    """How a fit's residual answers to the sample intervals of its logs.
+    """Sensitivity of a fit's residual to the sample intervals of its logs.
 
     Attributes:
-        logs: those whose rate is open.
+        logs: logs of uncertain rate.
         std: relative standard deviation of each log's interval, by its stamps alone.
-        residual: the fit's.
-        parameters: its derivative by the free vector, without what initial states could do as well.
-        columns: likewise by the logarithm of each log's interval.
+        residual: of the fit.
+        parameters: its derivative by the free vector, projected orthogonal to the initial states.
+        columns: its derivative by the logarithm of each log's interval, projected likewise.
     """
 
     logs: tuple[str, ...] = eqx.field(static=True)
@@ -45,7 +45,7 @@ class RateColumns(eqx.Module):
 
 
 def rate_columns(found: Fit) -> RateColumns | None:
-    """The answers of a fit to the rates of its logs; None where all are known."""
+    """Sensitivities of a fit to the rates of its logs; None where all are known."""
     open_logs = _open_logs([s.experiment for s in found.stretches])
     if not open_logs:
         return None
@@ -63,7 +63,7 @@ def rate_columns(found: Fit) -> RateColumns | None:
     of_log = np.stack(
         [np.any(own[[s.experiment.log == log for s in found.stretches]], axis=0) for log in open_logs], axis=-1
     )
-    # A gap is a segment's own initial state minus the end of the one before.
+    # A gap is a segment's initial state minus the preceding segment's final state.
     columns = states.without(change[:, :, None] * of_log[:, None], -gap[:, :, None] * of_log[:, None])
     return RateColumns(
         logs=tuple(open_logs),
@@ -75,10 +75,10 @@ def rate_columns(found: Fit) -> RateColumns | None:
 
 
 def refined_intervals(found: Fit) -> dict[str, float]:
-    """Factors by which a fit, with the stamps, would change the sample intervals of its logs; only those left open, and
-    none where nothing would move by what could be seen.
+    """Correction factors of uncertain sample intervals, estimated from fit and stamps; none where the shift would be
+    negligible.
 
-    A Gauss-Newton step: intervals differ by so little that a second one would move nothing.
+    One Gauss-Newton step suffices, as corrections are small.
     """
     seen = rate_columns(found)
     if seen is None:
@@ -100,12 +100,12 @@ def refined_intervals(found: Fit) -> dict[str, float]:
 def with_intervals(
     experiments: Mapping[Hold, Sequence[Experiment]], factors: Mapping[str, float]
 ) -> dict[Hold, tuple[Experiment, ...]]:
-    """Experiments with the sample intervals of their logs changed by factors, about the start of each log."""
+    """Experiments with the sample intervals of their logs scaled by factors, about the start of each log."""
     return {h: tuple(_scaled(e, factors.get(e.log, 1.0)) for e in some) for h, some in experiments.items()}
 
 
 def _open_logs(experiments: Sequence[Experiment]) -> dict[str, float]:
-    """The logs whose rate is open, with its relative standard deviation."""
+    """The logs of uncertain rate, with its relative standard deviation."""
     return {e.log: e.rate_std for e in experiments if e.rate_std > 0.0}
 
 
@@ -134,7 +134,7 @@ def _stretched(signal: PiecewisePolynomial, factor: float, origin: float = 0.0) 
 
 
 def _with_intervals(problem: Problem, factor: float) -> Problem:
-    """The problem with the sample intervals of all segments changed by a factor."""
+    """The problem with the sample intervals of all segments scaled by a factor."""
     segments = problem.segments
     load, warmth = (
         None if signal is None else _stretched(signal, factor)

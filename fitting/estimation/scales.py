@@ -1,4 +1,4 @@
-"""Orders of magnitude of what was measured."""
+"""Orders of magnitude of the measured signals."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,12 +13,12 @@ from hdjax.effects import Scales
 
 
 def largest_torque(stretches: Sequence[Stretch]) -> float:
-    """The largest motor torque of the logs [N m], in size."""
+    """Largest magnitude of the logs' motor torque [N m]."""
     return max(float(np.max(np.abs(np.asarray(s.experiment.torque.coefficients)[:, 0]))) for s in stretches)
 
 
 def of_twist(model: Model) -> Float[np.ndarray, " outputs"]:
-    """What a radian of twist, as it swings at the natural frequency, is in each output."""
+    """Amplitude of each output per radian of twist, at the natural frequency."""
     drive = model.drive
     if not isinstance(drive, Drive) or model.measured == BOTH_ANGLES:
         return np.ones(len(model.measured))
@@ -39,7 +39,7 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
     step = stretches[0].experiment.time_step
 
     def rate(values: np.ndarray) -> float:
-        """Rms slope over a few samples, so that encoder noise does not pass for speed."""
+        """Rms slope over a few samples, so that encoder noise does not dominate."""
         span = 8
         return float(np.sqrt(np.mean(((values[span:] - values[:-span]) / (span * step)) ** 2)))
 
@@ -63,7 +63,8 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
 
 
 def _speed(stretch: Stretch, model: Model | None, rate: Callable[[np.ndarray], float]) -> float:
-    """Rms rate of the first output; of the side that is seen where that is no turn of the output [rad/s]."""
+    """Rms rate of the first output, or of the measured side where the first output is not an angle of the output side
+    [rad/s]."""
     experiment, part = stretch.experiment, slice(stretch.start, stretch.stop)
     seen = Seen(experiment.measured[:, 0], 0)
     if isinstance(model, TwoInertiaModel) and experiment.output("motor_turn") is None:

@@ -1,4 +1,4 @@
-"""How finely a fit must simulate, for its solver's error to matter neither to its residual nor to its parameters."""
+"""Number of solver steps for a negligible solver error in a fit's residual and parameters."""
 
 from dataclasses import replace
 
@@ -16,11 +16,11 @@ def needed_substeps(found: Fit, *, tolerance: float = 0.05, shift: float = np.in
     """Solver steps in a sample interval that keep the step error below a fraction of the residual.
 
     Args:
-        found: a fit; its own solution is simulated again with twice the steps, until that makes no difference.
+        found: a fit; its solution is simulated with twice the steps, until the difference is negligible.
         tolerance: largest rms difference in units of the residual's standard deviation.
-        shift: by how many standard errors the difference may move a parameter. An error too small to be seen in a
-            sample adds up over all of them.
-        most: where to stop.
+        shift: largest change of a parameter, in standard errors. An error that is small per sample accumulates over all
+            samples.
+        most: largest number of steps.
     """
     problem, substeps = found.at_solution, found.substeps
     slopes = linearise(problem, found.unknowns) if np.isfinite(shift) else None
@@ -48,15 +48,15 @@ def _moved(
     change: Float[np.ndarray, "segments rows"],
     gap: Float[np.ndarray, "segments states"],
 ) -> float:
-    """How many standard errors a change of a fit's residual moves any of its parameters at most.
+    """Largest change of any parameter, in standard errors, due to a change of a fit's residual.
 
-    Coefficients of learned functions do not count, nor what the data do not tell: a corner too sharp to be seen, say.
+    Coefficients of learned functions do not count, nor parameters that the data do not determine.
 
     Args:
         found: the fit.
-        slopes: of its residual.
-        change: of its rows.
-        gap: change of the gaps between joined segments, which goes on through all segments that follow.
+        slopes: derivatives of its residual.
+        change: change of its rows.
+        gap: change of the gaps between joined segments, which propagates to all following segments.
     """
     columns = np.concatenate([np.asarray(slopes.by_parameter), change[:, :, None]], axis=2)
     before = np.concatenate([np.asarray(slopes.before_by_parameter), -gap[:, :, None]], axis=2)
@@ -73,6 +73,6 @@ def _moved(
 
 
 def _named(found: Fit) -> Bool[np.ndarray, " parameters"]:
-    """Which parameters are no coefficients of something learned."""
+    """Which parameters are not coefficients of learned terms."""
     learned = {e.name for e in found.model.effects if e.family == FAMILY}
     return np.array([path.partition(".")[0] not in learned for path in found.free.paths], dtype=bool)

@@ -1,12 +1,12 @@
-"""Starting values without asking the user: the weak form of the equation of motion.
+"""Starting values from the data, by the weak form of the equation of motion.
 
 Multiplied by a compact test function phi and integrated by parts, the equation of the dynamic error needs no
 derivative of a measured signal,
 
     int phi'' x + mu int (-phi') x + omega_0^2 int phi x + omega_0^2 alpha int phi x^3 = gain int phi u,
 
-and is linear in what is sought (Schaeffer and McCalla 2017; Messenger and Bortz 2021). Test functions whose integral is
-zero do not see a constant load that the log does not contain.
+and is linear in the unknowns (Schaeffer and McCalla 2017; Messenger and Bortz 2021). Test functions whose integral is
+zero are insensitive to an unlogged constant load.
 """
 
 import itertools
@@ -21,20 +21,20 @@ from fitting.estimation.experiment import Stretch
 from fitting.estimation.weak_form import WIDTHS, blind_functions, bump_functions
 from hdjax import Drive, Model, ReducedModel, TwoInertiaModel
 
-# Starts whose stiffness differs by less than this (in its logarithm) end in the same minimum.
+# Starts whose log stiffness differs by less than this end in the same minimum.
 _DISTINCT = 0.1
 
 
 def starting_models(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
-    """Models with starting values of K, alpha, B_sp (or mu, omega_0, alpha, gain), one for each weak form that gives
-    a stable oscillator; near-duplicates are dropped.
+    """Models with starting values of K, alpha, B_sp (or mu, omega_0, alpha, gain), one for each weak form that gives a
+    stable oscillator; near duplicates are dropped.
 
     Args:
-        model: supplies everything that is not estimated here.
+        model: supplies all other parameters.
         stretches: the data.
 
     Raises:
-        DataError: where no weak form gives a positive stiffness.
+        DataError: no weak form gives a positive stiffness.
     """
     if not sees_twist(stretches):
         assert isinstance(model, TwoInertiaModel)
@@ -49,7 +49,7 @@ def sees_twist(stretches: Sequence[Stretch]) -> bool:
 
 
 def _usable(found: list[dict[str, float]], stretches: Sequence[Stretch], what: str) -> list[dict[str, float]]:
-    """The estimates, where there are any."""
+    """The estimates; an error where there are none."""
     if found:
         return found
     outputs = dict.fromkeys(name for s in stretches for name in s.experiment.outputs)
@@ -62,28 +62,29 @@ def _usable(found: list[dict[str, float]], stretches: Sequence[Stretch], what: s
 
 
 def starts_blind_to_loads(model: Model, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
-    """Those of the weak forms that see no steady load; there may be none. Arguments as in [`starting_models`][]."""
+    """Starting values from the weak forms that are insensitive to constant loads; may be empty. Arguments as in
+    [`starting_models`][]."""
     return _distinct(model, _estimates(model, stretches, blind=True))
 
 
 def starts_of_load_equation(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[Model, ...]:
-    """Those of the load's own equation, which holds whatever acts on the motor; there may be none. Arguments as in
+    """Starting values from the load's equation, which holds whatever acts on the motor; may be empty. Arguments as in
     [`starting_models`][]."""
     found = (_estimates(model, stretches, blind=blind, equations=("load",)) for blind in (False, True))
     return _distinct(model, list(itertools.chain(*found)))
 
 
 def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> Model:
-    """The model with starting values of the inertias of which nothing is known.
+    """The model with starting values of the unknown inertias.
 
-    Both inertias' momenta, in which the spring cancels, change as the torques from outside say,
+    The balance of both sides' momenta, in which the mesh torque cancels, is
 
         N J_m theta_m'' + J_l theta_l'' = N k_T T_m + T_l,
 
-    less the friction of either side, of which the motor's may be large: it is estimated beside the inertias.
+    without friction. The motor's friction may be large: it is estimated together with the inertias.
 
     Raises:
-        DataError: where no positive inertias follow from the torque.
+        DataError: no positive inertias follow from the torque.
     """
     wanted = [p.path for p in model.drive.priors if np.isinf(p.tolerance) and p.path in ("J_m", "J_l")]
     if not wanted:
@@ -103,7 +104,7 @@ def with_starting_inertias(model: TwoInertiaModel, stretches: Sequence[Stretch])
 def _momentum(
     model: TwoInertiaModel, stretches: Sequence[Stretch], width: int, wanted: Sequence[str]
 ) -> tuple[float, tuple[float, ...]] | None:
-    """The share of the torque's mean square that is missed, and the wanted inertias; None for too few data."""
+    """The unexplained share of the torque's mean square, and the estimated inertias; None for too few data."""
     drive, parts = model.drive, []
     for stretch in stretches:
         if len(stretch) < 3 * width:
@@ -159,7 +160,7 @@ def _distinct(model: Model, estimates: Sequence[dict[str, float]]) -> tuple[Mode
 
 
 def apart(model: Model, other: Model) -> float:
-    """By how much the stiffness of two models differs, in its logarithm."""
+    """Difference of two models' log stiffness."""
     return _apart(float(model.drive.stiffness), float(other.drive.stiffness))
 
 
@@ -168,7 +169,8 @@ def _apart(stiffness: float, other: float) -> float:
 
 
 def _equations(model: Model) -> tuple[str, ...]:
-    """The load's own equation does not contain the motor torque, so that an error of the torque can't spoil it."""
+    """The weak-form equations. The load's equation does not contain the motor torque, so that torque errors do not
+    affect it."""
     return ("error", "load") if isinstance(model, TwoInertiaModel) else ("error",)
 
 
@@ -197,7 +199,7 @@ def _values(model: Model, solution: np.ndarray, stretches: Sequence[Stretch], eq
     if not np.isfinite(solution).all() or stiffness <= 0:
         return None
     x_max = max(float(np.max(np.abs(s.experiment.measured[s.start : s.stop, -1]))) for s in stretches)
-    # Beyond this the restoring force would turn back inside the data.
+    # Beyond this the restoring torque would not be monotonic within the data.
     alpha = float(np.clip(cubic / stiffness, -0.2 / x_max**2, 3.0 / x_max**2))
     if isinstance(model, ReducedModel):
         omega_0 = np.sqrt(stiffness)

@@ -1,4 +1,4 @@
-"""A torque that is another in each segment of a log: what a fit takes out to see what moves faster."""
+"""A torque that is constant in each segment of a log, to remove slow disturbances from a fit."""
 
 from typing import ClassVar
 
@@ -12,12 +12,12 @@ from hdjax.parameters import Scalar, parameter
 
 
 class SteadyTorque(ShaftEffect):
-    """A constant torque on a shaft; a state, and thus fitted to each segment on its own."""
+    """A constant torque on a shaft; it is a state, and thus fitted to each segment separately."""
 
     states: ClassVar[tuple[str, ...]] = ("share",)
     drawn_against: ClassVar[str | None] = None
 
-    reach: Scalar = parameter(unit="N m", doc="torque that it may well have", bounds=(0.0, 1e9))
+    reach: Scalar = parameter(unit="N m", doc="typical size of the torque", bounds=(0.0, 1e9))
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
@@ -37,14 +37,14 @@ class SteadyTorque(ShaftEffect):
 
 
 class SteadyLoad(SteadyTorque, LoadSideEffect):
-    """On the load."""
+    """A constant torque on the load."""
 
     family: ClassVar[str] = "load_disturbance"
     name: ClassVar[str] = "steady_load"
 
 
 class SteadyMotorTorque(SteadyTorque, MotorSideEffect):
-    """On the motor, beside what was logged."""
+    """A constant torque on the motor, in addition to the logged one."""
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "steady_motor_torque"

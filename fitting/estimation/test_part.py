@@ -1,4 +1,4 @@
-"""The test part of a log: cut off as soon as it is read, so that no fit, no choice and no check can look at it."""
+"""The test part of a log, cut off when it is read, so that no fit, selection or check uses it."""
 
 from dataclasses import replace
 
@@ -10,22 +10,23 @@ from fitting.logs.masks import masked
 from fitting.logs.zeroing import counted_from, zeroed
 
 TEST_SHARE = 0.2
-"""Share of a log, at its end, that is test data where no other log is named for it."""
+"""Share at the end of a log that is test data, unless test logs are named."""
 
-# A free run takes its initial state from a window; as many rows again are the least that tell an error.
+# Rows of a free run's initial-state window, and as many again to estimate an error.
 _FEWEST = 2 * WINDOW
 
 
 def parted(log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE) -> tuple[Log, Log | None]:
-    """A log without its test part, made ready for a fit, and that part.
+    """A log without its test part, prepared for a fit, and the test part.
 
     Args:
         log: as read.
         drive_file: for the load's inertia.
-        share: of the log that is test data; 0 where other logs are.
+        share: of the log that is test data; 0 where test logs are named.
 
     Returns:
-        Both parts masked, and zeroed as the first one is; no second part where it would be too short to tell an error.
+        Both parts masked, with the zero offsets of the first; no test part where it would be too short to estimate an
+        error.
     """
     border = len(log) - round(share * len(log))
     if share <= 0.0 or len(log) - border < _FEWEST:
@@ -42,10 +43,10 @@ def parted(log: Log, drive_file: DriveFile, *, share: float = TEST_SHARE) -> tup
 
 
 def whole_test_log(log: Log, drive_file: DriveFile) -> Log:
-    """A log that is test data from its beginning to its end, as read; its zero is taken from where a free run begins.
+    """A log that is test data as a whole. Its zero offsets are those of the free run's initial-state window.
 
     Raises:
-        DataError: Hardly an output can be believed.
+        DataError: too few valid outputs.
     """
     ready = masked(log)
     zero = zeroed(replace(ready, outputs_until=WINDOW), drive_file).zero

@@ -1,4 +1,4 @@
-"""Test functions of the weak form, and signals against them."""
+"""Test functions of the weak form, and inner products of signals with them."""
 
 import functools
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 WIDTHS = (12, 24, 48, 96, 192, 384)
-"""Samples that test functions reach over."""
+"""Samples in the support of the test functions."""
 
 TestFunctions = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Functions by row, with first and second derivatives."""
@@ -40,7 +40,7 @@ def bump_functions(width: int, dt: float) -> TestFunctions:
 
 
 def blind_functions(width: int, dt: float) -> TestFunctions:
-    """The modulations, each less so much of the bump that nothing is left of a constant."""
+    """The modulations minus a multiple of the bump, so that their integral is zero."""
     tests, slopes, curvatures = bump_functions(width, dt)
     share = tests[1:].sum(axis=1, keepdims=True) / tests[0].sum()
     return tests[1:] - share * tests[0], slopes[1:] - share * slopes[0], curvatures[1:] - share * curvatures[0]

@@ -1,4 +1,4 @@
-"""How outputs are weighed by the covariance of their errors, and the gaps between joined segments."""
+"""Weights of outputs, from the covariance of their errors, and of the gaps between joined segments."""
 
 from dataclasses import replace
 
@@ -14,14 +14,14 @@ from hdjax.dynamics import BOTH_ANGLES
 
 
 class Shown(eqx.Module):
-    """What shows of a unit of each state, for what it counts in a gap.
+    """Visibility of each state in the outputs, for its weight in a gap.
 
     Attributes:
         angles: derivatives of the outputs by the angles.
         rates: likewise by the rates.
         omega_0: natural frequency [rad/s].
         hidden: units of the hidden states.
-        swing: of the principal output, as the spring is wound.
+        swing: amplitude of the principal output per twist.
         sides: each side's angle over that of the output, where other signals than both angles are measured.
     """
 
@@ -34,7 +34,7 @@ class Shown(eqx.Module):
 
     @classmethod
     def of(cls, model: Model, swing: float) -> "Shown":
-        """Of a model's states."""
+        """From a model's states."""
         count = len(model.motion_states) // 2
         slopes = readout(model, model.rest())
         hidden = np.concatenate([np.zeros(0), *(np.asarray(e.state_scale()) for e in model.effects if e.states)])
@@ -58,15 +58,14 @@ def whitening(covariance: Float[Array | np.ndarray, "outputs outputs"]) -> Float
 
 
 def _gap_weight(white: np.ndarray, shown: Shown) -> Float[np.ndarray, " states"]:
-    """What the states count in a gap: about what each sample of the segment behind it would pay for it.
+    """Weight of each state in a gap: about its effect on each sample of the following segment.
 
-    An angle shows in every sample, a rate as the angle that it becomes within a radian of the oscillation, a hidden
-    state by what the error does while it runs through its range. Counted less, the residual that a closed gap costs
-    would look too dear.
+    An angle appears in every sample, a rate as the angle that it causes within a radian of the oscillation. A hidden
+    state has the effect of its range on the error. With smaller weights the solver would avoid closing the gaps.
     """
     angles = np.linalg.norm(white @ shown.angles, axis=0)
     if shown.sides is not None:
-        # What no sensor sees shows as what it drives does.
+        # States without a sensor count by the motion that they cause.
         rates = np.linalg.norm(white @ shown.rates, axis=0) * shown.omega_0
         angles = np.max(np.maximum(angles, rates) * shown.sides) / shown.sides
     visible = 0.1 * shown.swing * np.linalg.norm(white[:, -1])

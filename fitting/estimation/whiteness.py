@@ -1,4 +1,4 @@
-"""How long the dynamic error that a fit leaves over remembers itself, freed of what the fitting has put into it."""
+"""Autocorrelation of the residual dynamic error, corrected for the fitted initial states."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,14 +8,14 @@ from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit
 from fitting.estimation.projection import FirstStates
 
-# Directions of a chain's first state that its samples hardly see.
+# Singular values below this share: weakly observable directions of a chain's initial state.
 _BLIND = 1e-12
-# Slopes beyond any whose square is a number.
+# Derivatives beyond this overflow when squared.
 _NO_SLOPE = 1e150
 
 
 def left_over(fit: Fit) -> Float[np.ndarray, " samples"]:
-    """Measured minus simulated dynamic error of all samples, in order."""
+    """Residual of the dynamic error at all valid samples, in order."""
     return np.asarray(fit.error)[..., -1][np.asarray(fit.problem.segments.weight) > 0]
 
 
@@ -27,29 +27,29 @@ def autocovariance(values: Float[np.ndarray, "*rows n"], lags: int) -> Float[np.
 
 
 def autocorrelation(fit: Fit, lags: int) -> Float[np.ndarray, " lags"]:
-    """Autocorrelation of the dynamic error that a fit leaves over, at lags from 0 to `lags` samples.
+    """Autocorrelation of a fit's residual dynamic error, at lags from 0 to `lags` samples.
 
-    Each simulation that starts anew has had its initial state fitted, which takes something out of white noise and
-    leaves a memory behind: with P the projection on what the initial states can do, the noise e becomes (1 - P) e,
-    whose autocovariance is known. It is taken off, so that white noise is seen as white also where segments are short.
+    Fitted initial states change the autocorrelation of white noise e: with P the projection on their sensitivities, it
+    becomes (1 - P) e, whose autocovariance is known. It is subtracted, so that white noise appears white also on short
+    segments.
     """
     residual = left_over(fit)
     found = autocovariance(residual - residual.mean(), lags)
     if found[0] <= 0:
         return found
     taken = _taken_by_states(fit, lags)
-    # What is left of the variance is less than there was, by what was taken.
+    # The residual variance is smaller than the noise variance by the removed part.
     share = min(taken[0] / found[0], 0.9)
     corrected = found + taken / (1.0 - share)
     return corrected / corrected[0]
 
 
 def ljung_box(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> tuple[float, float]:
-    """The statistic of Ljung and Box (1978), and the chance that white noise has one as large.
+    """The statistic of Ljung and Box (1978), and its p-value under white noise.
 
     Args:
         autocorrelation: at lags 1, 2, ...
-        samples: that it was estimated from.
+        samples: number of samples that it was estimated from.
     """
     lags = np.arange(1, autocorrelation.size + 1)
     statistic = float(samples * (samples + 2) * np.sum(autocorrelation**2 / (samples - lags)))
@@ -57,7 +57,7 @@ def ljung_box(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> tupl
 
 
 def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
-    """Autocovariance that the fitted initial states take out of white noise as large as the residual."""
+    """Autocovariance removed by the fitted initial states from white noise of the residual's size."""
     first = np.linalg.inv(np.asarray(fit.problem.whitening))[-1]
     weight = np.asarray(fit.problem.segments.weight) > 0
     segments, samples = weight.shape
@@ -72,10 +72,10 @@ def _taken_by_states(fit: Fit, lags: int) -> np.ndarray:
 
 
 def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directions"], Int[np.ndarray, " segments"]]:
-    """What the initial states that a fit has fitted can do to its whitened outputs, and the simulation (a chain of
-    joined segments) to which each segment belongs.
+    """Orthonormal basis of the fitted initial states' effect on whitened outputs, and the simulation (chain of joined
+    segments) of each segment.
 
-    The columns of each chain are orthonormal over its rows and those of the prior of its hidden states.
+    Each chain's columns are orthonormal over its rows and those of its hidden states' prior.
     """
     problem = fit.at_solution
     slopes = FirstStates.of(linearise(problem, fit.unknowns), problem.segments.joined).by_first
@@ -85,7 +85,7 @@ def basis_of_states(fit: Fit) -> tuple[Float[np.ndarray, "segments rows directio
 
 def _orthonormal(slopes: np.ndarray, chain: np.ndarray) -> np.ndarray:
     """Columns that span the same as those of each chain, orthonormal over its rows."""
-    # Where a simulation runs away, no slope tells what its first state could do.
+    # A diverged simulation has no usable derivatives.
     slopes = np.where(np.abs(slopes) < _NO_SLOPE, slopes, 0.0)
     count = int(chain[-1]) + 1
     square = np.zeros((count, *slopes.shape[2:] * 2))

@@ -1,4 +1,4 @@
-"""The last fit, over simulations as long as the logs, where small errors of a parameter add up and show."""
+"""The final fit, over simulations as long as the logs, where small parameter errors accumulate."""
 
 from dataclasses import replace
 
@@ -11,35 +11,36 @@ from fitting.estimation.problem import Segmentation
 from fitting.estimation.solver_steps import needed_substeps
 
 _STEPS = 20
-# From a solution near by, which has not lost its way.
+# Damping for a start near the solution.
 _CONTINUED = Strategy(_STEPS, begin_anew_above=np.inf, retry_states=False)
-# By how many standard errors the solver's steps may move the parameters, and how many steps a sample may take on the
-# way and in the end: dry friction that tells K to 1e-7 asks for 128 (`docs/uncertainty.md`).
+# Largest parameter shift by solver error, in standard errors; largest number of solver steps per sample during and at
+# the end of the fit. Dry friction that determines K to 1e-7 needs 128 (`docs/uncertainty.md`).
 _SHIFT = 0.1
 _MOST_SUBSTEPS, _MOST_IN_THE_END = 32, 256
-# What the long fit may cost in the objective: 2 % of the error.
+# Largest increase of the objective by the long fit: 2 % of the error.
 _LOSS = 0.02
 
 
 def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
-    """Fit the same parameters to the same data, over horizons as long as the stretches and with steps fine enough.
+    """Fit the same parameters to the same data, over horizons as long as the stretches and with sufficiently small
+    solver steps.
 
-    Where a long simulation has lost its way, the short horizons stay. So they do where the long one leaves more over,
-    or gaps between its segments, and does not converge: a motion whose errors grow without end (backlash, say) has long
-    simulations that promise far more than they can tell.
+    The short horizons are kept where a long simulation diverges. They are also kept where the long fit does not
+    converge and has a larger residual or open gaps. Unstable motions (with backlash, for example) would give long fits
+    whose standard errors are far too small.
 
     Args:
         start: a fit over shorter horizons.
-        must_explain: whether the short horizons stay as well where long simulations converge but leave more over. Then
-            something drives the motion that the model does not know (noise of the torque, missing physics); what piles
-            up over a long simulation imitates parameters, and their standard errors would not tell.
+        must_explain: whether the short horizons are also kept where long simulations converge with a larger residual.
+            Then unmodelled inputs (torque noise, missing physics) accumulate over a long simulation and bias the
+            parameters beyond their standard errors.
     """
     substeps = _fine_enough(start)
     if substeps > start.substeps:
-        # A corner that is sharper than its steps resolved has moved by then.
+        # A sharp nonlinearity that the steps did not resolve may have changed by then.
         start = _again(start, replace(start.segmentation, substeps=substeps))
     long = _again(start, replace(start.segmentation, horizon=_longest(start)))
-    # Long horizons know the parameters better, and so ask for finer steps.
+    # Long horizons determine the parameters better, and so need smaller solver steps.
     substeps = _fine_enough(long)
     if substeps > long.substeps:
         long = _again(long, replace(long.segmentation, substeps=substeps))
@@ -59,15 +60,14 @@ def long_fit(start: Fit, *, must_explain: bool = False) -> Fit:
 
 
 def refitted_on_all(found: Fit, selection: Fit) -> Fit:
-    """The same parameters fitted to the data that selected the model as well, with steps as fine as their standard
-    errors ask for.
+    """The same parameters fitted to training and selection data, with solver steps that suit their standard errors.
 
     Args:
         found: the fit to training data, over horizons of any length.
-        selection: the same model on the data that selected it, over short horizons.
+        selection: the same model on the selection data, over short horizons.
 
     Returns:
-        The fit to both; over short horizons where longer ones do not follow the logs any more.
+        The fit to both; over short horizons where longer ones no longer follow the logs.
     """
     horizons = dict.fromkeys((found.horizon, selection.horizon))
     substeps = needed_substeps(found, shift=_SHIFT, most=_MOST_IN_THE_END)
@@ -79,7 +79,7 @@ def refitted_on_all(found: Fit, selection: Fit) -> Fit:
 
 def _on_both(found: Fit, selection: Fit, horizon: int, substeps: int) -> Fit:
     states = np.concatenate([np.asarray(f.unknowns.states)[: f.pieces.sum()] for f in (found, selection)])
-    # Parameters that a fit has not moved were held.
+    # Unchanged parameters were fixed.
     held = all(float(found.model.get(p)) == float(found.problem.model.get(p)) for p in found.free.paths)
     both = fit(
         found.model,
@@ -93,7 +93,7 @@ def _on_both(found: Fit, selection: Fit, horizon: int, substeps: int) -> Fit:
 
 
 def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_progress: float = 0.0) -> Fit:
-    """The same model over horizons as long as the stretches, its outputs weighed as over short ones.
+    """The same model over horizons as long as the stretches, with the output weights of the short ones.
 
     Args:
         found: a fit over short horizons.
@@ -105,10 +105,10 @@ def over_whole_stretches(found: Fit, *, hold_parameters: bool = True, least_prog
 
 
 def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_progress: float = 0.0) -> Fit:
-    """A fit over short horizons that has gone by way of horizons as long as the stretches, where that leaves less.
+    """A fit over short horizons, started from one over whole stretches where that reduces its residual.
 
-    What an effect remembers is not seen, and where it slips it forgets its start: on a short segment a start that is
-    far off hardly changes the error, and finds no way back. Over a whole stretch it follows from the motion.
+    Hidden states are not measured. On a short segment, a wrong hidden initial state hardly changes the error and is not
+    corrected. Over a whole stretch, hidden states follow from the motion.
 
     Args:
         found: a fit over short horizons.
@@ -124,15 +124,15 @@ def with_memory_carried(found: Fit, *, hold_parameters: bool = False, least_prog
 
 
 def follows(found: Fit, *, share: float = 0.5) -> bool:
-    """Whether the simulation errs by less than a share (half) of how much each output moves."""
+    """Whether each output's rms residual is less than a share of its variation."""
     segments = found.problem.segments
     measured = np.asarray(segments.measured)[np.asarray(segments.weight) > 0]
     return bool(np.all(np.diag(np.asarray(found.covariance)) < share**2 * measured.var(axis=0)))
 
 
 def with_gaps_closed(found: Fit) -> float:
-    """The objective, about, if what gaps are left between joined segments were closed: a fit that came no closer does
-    not follow the log for so long."""
+    """Approximate objective with all gaps between joined segments closed. Large gaps mean that the model does not
+    follow the log over this horizon."""
     gap = np.asarray(linearise(found.problem, found.unknowns).gap) * np.asarray(found.problem.gap_weight)
     return found.objective + 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
 
@@ -143,11 +143,11 @@ def _longest(found: Fit) -> int:
 
 
 def _freedom_of_states(found: Fit, states: int) -> float:
-    """By how much fitting so many initial states of each short segment lowers the objective over nothing but noise.
+    """Decrease of the objective on pure noise by the fitted initial states of short segments.
 
     Args:
         found: a fit over short horizons.
-        states: of each segment.
+        states: number per segment.
     """
     segments = found.problem.segments
     kept = np.asarray(segments.weight).sum(axis=1)
@@ -161,6 +161,7 @@ def _fine_enough(found: Fit) -> int:
 
 
 def _again(found: Fit, segmentation: Segmentation, strategy: Strategy = _CONTINUED) -> Fit:
-    """A fit of the same data on segments of the same length, which share its compiled program, from its states."""
+    """A fit of the same data on segments of the same length, with the same compiled program, started from its
+    states."""
     start = Start(found.covariance, found.unknowns.states)
     return fit(found.model, found.stretches, found.free.paths, segmentation, start=start, strategy=strategy)

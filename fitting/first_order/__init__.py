@@ -1,1 +1,1 @@
-"""The linearised fit that screening, learned terms, evidence and clocks share."""
+"""Linearisation of a fit along its motion, shared by screening, learned terms, evidence and clock alignment."""

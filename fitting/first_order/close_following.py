@@ -1,9 +1,8 @@
-"""The measured motion, from simulations so short that they stay with the log.
+"""The measured motion, smoothed by simulations short enough to follow the log.
 
-A model that lacks much of what acts (friction that takes most of the torque) leaves the log within a few samples. What
-an effect would do along that model's own motion then says nothing of what it does in the drive. Simulations that start
-anew every few samples, with a steady torque of their own on either side, stay with the log: their states are the
-measured motion, smoothed by the equations.
+A model without a dominant effect (friction that takes most of the torque) deviates from the log within a few samples.
+Regressors along its motion then say nothing about the drive. Simulations over a few samples, with a free constant
+torque on either side, follow the log. Their states are the measured motion, smoothed by the equations.
 """
 
 from dataclasses import replace
@@ -17,17 +16,17 @@ from fitting.estimation.scales import largest_torque
 from fitting.estimation.steady_torque import SteadyLoad, SteadyMotorTorque
 from hdjax import TwoInertiaModel
 
-# Samples of the shortest simulations, which still tell each state from noise.
+# Samples of the shortest simulations, which still separate each state from noise.
 _SHORTEST = 8
 
 
 def followed_closely(found: Fit) -> Followed:
-    """The motion along a fit's data from simulations whose length suits the log best, in the fit's own segments.
+    """The motion along a fit's data from simulations of the best length, in the fit's segments.
 
-    Shorter simulations have more initial states, which also follow noise; Akaike's criterion (1974) weighs the two.
+    Shorter simulations have more initial states, which also fit noise; Akaike's criterion (1974) selects the length.
 
     Args:
-        found: a fit whose own motion does not stay with the log.
+        found: a fit whose motion does not follow the log.
     """
     best = _held(found, _SHORTEST)
     while 2 * best.horizon <= found.error.shape[1]:
@@ -39,7 +38,7 @@ def followed_closely(found: Fit) -> Followed:
 
 
 def _held(found: Fit, horizon: int) -> Fit:
-    """The same parameters over simulations that start anew every `horizon` samples, beside steady torques."""
+    """The same parameters over simulations of `horizon` samples, with constant torques."""
     segmentation = replace(found.segmentation, horizon=horizon, length=horizon, count=None)
     model = found.model
     if isinstance(model, TwoInertiaModel):
@@ -51,19 +50,19 @@ def _held(found: Fit, horizon: int) -> Fit:
 
 
 def _criterion(found: Fit) -> float:
-    """Akaike's, of the outputs' Gaussian errors and the initial states."""
+    """Akaike's criterion, for Gaussian output errors and the initial states."""
     segments = found.problem.segments
     anew = int(np.sum(~np.asarray(segments.joined)[: found.pieces.sum()]))
     return float(np.sum(np.asarray(segments.weight))) * found.objective + anew * len(found.model.state_names)
 
 
 def _in_segments_of(found: Fit, shorter: Fit) -> Followed:
-    """What the shorter simulations go through, cut as the fit's own segments are."""
+    """States of the shorter simulations, cut into the fit's segments."""
     followed = follow(shorter.at_solution, shorter.unknowns)
     length, own = found.error.shape[1], len(found.model.state_names)
 
     def cut(values: np.ndarray) -> np.ndarray:
-        """Sample by sample, each stretch filled up to whole segments with its last sample."""
+        """Cut values per sample, each stretch padded to whole segments with its last sample."""
         flat = values.reshape(-1, *values.shape[2:])
         samples = shorter.pieces * shorter.error.shape[1]
         ends = np.cumsum(samples)

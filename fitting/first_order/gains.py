@@ -1,4 +1,4 @@
-"""What forces along a fitted motion would explain of what a fit leaves over, to first order."""
+"""Gain of forces along a fitted motion, to first order."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit
 from fitting.estimation.linear_response import Followed, Forces
-from fitting.estimation.projection import Answers, solved, without_untold
+from fitting.estimation.projection import Answers, solved, without_undetermined
 from fitting.estimation.residual import Problem
-from fitting.first_order.linearised_fit import where_it_goes
+from fitting.first_order.linearised_fit import motion_and_residual
 from fitting.first_order.motion import (
     acting_at_knots,
     acting_slopes_at_knots,
@@ -25,24 +25,24 @@ from hdjax import Model, TwoInertiaModel
 from hdjax.effects import Conditions, Motion
 from hdjax.engine.pointwise import slopes_at_instants
 
-# Passes of "least squares, then weigh the outputs by what is left over".
+# Passes of "least squares, then reweigh the outputs by the residual's covariance".
 _REWEIGHTINGS = 2
 
 
 Sizes = tuple[Float[np.ndarray, "segments knots forces"], ...]
-"""How much of each thing there is."""
+"""Size of each force at each knot."""
 
 
-class Look(eqx.Module):
-    """A fit, linearised along its motion.
+class LinearisedFit(eqx.Module):
+    """A fit linearised along its motion.
 
     Attributes:
-        problem: what was solved, at the solution.
+        problem: the least-squares problem at the solution.
         followed: the motion.
-        answers: of the residual to what acts along it.
+        answers: responses of the residual to forces along it.
         motion: at each knot.
-        conditions: likewise.
-        pushes: what a unit of each thing that effects can add does there to the state's rates, by its name.
+        conditions: time and temperature at each knot.
+        pushes: change of the state's rates by a unit of each effect place, by its name.
         error: whitened output error.
     """
 
@@ -61,11 +61,11 @@ class Look(eqx.Module):
 
 
 class Acting(eqx.Module):
-    """What a unit of each of a force's parts does.
+    """Influence of a unit of each part of a force.
 
     Attributes:
-        pushes: to the state's rates.
-        reading: to the outputs, in place of that, where it is no force but an error of what an encoder reads.
+        pushes: on the state's rates.
+        reading: on the outputs instead, for an encoder error.
     """
 
     pushes: tuple[Float[np.ndarray, "segments knots states"], ...] = ()
@@ -73,17 +73,16 @@ class Acting(eqx.Module):
 
 
 class Products(eqx.Module):
-    """Inner products of what forces would do to the outputs, for each part of the data (a segment, or several) and pair
+    """Inner products of the outputs' responses to forces, for each part of the data (one segment or several) and pair
     of outputs.
 
-    The free parameters' columns come first, then those of the forces; what each simulation's first state could do as
-    well is taken off.
+    The free parameters' columns come first, then those of the forces, all projected orthogonal to the initial states.
 
     Attributes:
         gram: of the columns.
         gradient: columns of one output against the residual of the other.
         square: of the residual.
-        samples: number of samples with weight.
+        samples: number of valid samples.
     """
 
     gram: Float[np.ndarray, "parts outputs outputs columns columns"]
@@ -92,38 +91,38 @@ class Products(eqx.Module):
     samples: Float[np.ndarray, " parts"]
 
     def in_parts(self, many: int) -> "Products":
-        """Added up in parts of what follows one another, so many at most."""
+        """Summed over at most so many contiguous parts."""
         size = self.samples.size
         return self.added(np.arange(size) * many // size == np.arange(many)[:, None])
 
     def others(self) -> "Products":
-        """For each part all the others, added up."""
+        """For each part the sum of all others."""
         return self.added(~np.eye(self.samples.size, dtype=bool))
 
     def first(self, columns: int) -> "Products":
-        """Those of the first columns alone."""
+        """The products of the first columns."""
         return Products(self.gram[..., :columns, :columns], self.gradient[..., :columns], self.square, self.samples)
 
     def columns(self, which: Sequence[int]) -> "Products":
-        """Those of some columns alone."""
+        """The products of some columns."""
         kept = np.asarray(which)
         return Products(self.gram[..., kept[:, None], kept], self.gradient[..., kept], self.square, self.samples)
 
     def added(self, which: Bool[np.ndarray, "sums parts"]) -> "Products":
-        """Added up over the parts that each row of `which` names."""
+        """Sums over the parts that each row of `which` selects."""
         return Products(*(np.tensordot(which.astype(float), a, axes=1) for a in vars(self).values()))
 
 
-def look_along(fit: Fit) -> Look:
+def linearise_along(fit: Fit) -> LinearisedFit:
     """Linearise a fit along its motion."""
     problem = fit.with_all_free().at_solution
-    followed, segments, error = where_it_goes(fit, problem, fit.unknowns)
+    followed, segments, error = motion_and_residual(fit, problem, fit.unknowns)
     problem = replace(problem, segments=segments)
     conditions = conditions_at_knots(problem.segments)
     if isinstance(fit.model, TwoInertiaModel):
         conditions = replace(conditions, T_m=jnp.asarray(acting_at_knots(fit.model, problem.segments)))
-    found = without_untold(linearise(problem, fit.unknowns), problem.free)
-    return Look(
+    found = without_undetermined(linearise(problem, fit.unknowns), problem.free)
+    return LinearisedFit(
         problem,
         followed,
         Answers.of(found, followed, segments, np.asarray(problem.whitening)),
@@ -135,9 +134,9 @@ def look_along(fit: Fit) -> Look:
 
 
 def parameter_torques(
-    look: Look, push: Float[np.ndarray, "segments knots states"]
+    look: LinearisedFit, push: Float[np.ndarray, "segments knots states"]
 ) -> Float[np.ndarray, "segments knots parameters"]:
-    """The free parameters as torques at one place: what torque there a unit of each stands for, at each knot.
+    """The free parameters as torques at one place: the torque equivalent to a unit of each, at each knot.
 
     Zero for a parameter that acts at another place.
     """
@@ -159,20 +158,19 @@ def parameter_torques(
 
 
 def _rates_at(both: Array, posed: tuple[tuple[str, ...], Model], state: Array, conditions: Conditions) -> Array:
-    """The state's rates with some values of the parameters at the paths, and a torque."""
+    """The state's rates for given values of the parameters at the paths, and a torque."""
     paths, model = posed
     moved = model.replace(dict(zip(paths, both[:-1], strict=True))) if paths else model
     return moved.rates(state, both[-1], jnp.zeros_like(both[-1]), conditions)
 
 
-def products(look: Look, acting: Acting, sizes: Sizes) -> Products:
-    """What forces would do to the outputs.
+def products(look: LinearisedFit, acting: Acting, sizes: Sizes) -> Products:
+    """Inner products of the outputs' responses to forces.
 
     Args:
         look: the fit.
-        acting: what each force is made of, some of the look's pushes: a torque at one place, mostly; or what a unit of
-            a reading is.
-        sizes: how much of each, at each knot; in a straight line between.
+        acting: influence of the forces' parts: mostly a torque at one place, or a sensor error.
+        sizes: of each, at each knot; linear between.
     """
     columns = _columns(look, acting, sizes)
     segments, samples, outputs, count = columns.shape
@@ -184,8 +182,10 @@ def products(look: Look, acting: Acting, sizes: Sizes) -> Products:
     return Products(np.swapaxes(gram, 2, 3), gradient, square, np.sum(look.answers.weight, axis=1))
 
 
-def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[np.ndarray, "segments samples outputs columns"]:
-    """The whitened outputs' derivative by the free parameters and by each force."""
+def _columns(
+    look: LinearisedFit, acting: Acting, sizes: Sizes
+) -> Float[np.ndarray, "segments samples outputs columns"]:
+    """Derivatives of the whitened outputs by the free parameters and by each force."""
     followed = look.followed
     if acting.reading is not None:
         reading = acting.reading[:, None] * sizes[0][:, :-1, None, :]
@@ -200,8 +200,8 @@ def _columns(look: Look, acting: Acting, sizes: Sizes) -> Float[np.ndarray, "seg
 
 
 def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:
-    """For each part of the data the step that leaves the smallest determinant of the outputs' error covariance there:
-    least squares that weigh the outputs by what is left over."""
+    """For each part of the data the step that minimises the determinant of the outputs' error covariance: least
+    squares, reweighted by the residual's covariance."""
     samples = np.maximum(found.samples, 1.0)[:, None, None]
     weight = np.broadcast_to(np.eye(found.square.shape[1]), found.square.shape)
     steps = np.zeros((found.samples.size, found.gram.shape[-1]))
@@ -216,7 +216,7 @@ def best_steps(found: Products) -> Float[np.ndarray, "parts columns"]:
 def left_after(
     found: Products, steps: Float[np.ndarray, "parts columns"]
 ) -> Float[np.ndarray, "parts outputs outputs"]:
-    """Squares of the outputs' errors in each part of the data after a step for it."""
+    """Squared output errors of each part of the data after its step."""
     against = np.einsum("sijp,sp->sij", found.gradient, steps)
     explained = np.einsum("sijpq,sp,sq->sij", found.gram, steps, steps, optimize=True)
     return found.square - against - np.swapaxes(against, 1, 2) + explained

@@ -1,4 +1,4 @@
-"""The own states of effects along a motion: settled where it starts, then driven by it."""
+"""Hidden states of effects along a motion: in steady state at its start, then driven by it."""
 
 import equinox as eqx
 import jax
@@ -12,15 +12,15 @@ from hdjax.engine.driven import own_states_along
 from hdjax.engine.pointwise import at_instants
 
 OwnStates = Float[np.ndarray, "segments knots proposals own"]
-"""The own states of each proposal, at each knot."""
+"""Hidden states of each proposal at each knot."""
 
 
 class Memory(eqx.Module):
-    """An effect's own states along a motion, for each proposal.
+    """An effect's hidden states at starts and ends, for each proposal.
 
     Attributes:
-        at_starts: where each segment starts.
-        at_ends: where each stretch ends.
+        at_starts: at each segment's start.
+        at_ends: at each stretch's end.
     """
 
     at_starts: Float[np.ndarray, "segments own proposals"]
@@ -28,18 +28,18 @@ class Memory(eqx.Module):
 
 
 def own_states(seen: Along, stacked: Effect, proposals: int, before: Memory | None = None) -> OwnStates:
-    """Own states at each knot.
+    """Hidden states at each knot.
 
     Args:
         seen: the motion.
         stacked: proposals of one form, along the first axis of each array.
-        proposals: how many.
-        before: own states along stretches that these ones continue.
+        proposals: their number.
+        before: hidden states along the preceding stretches.
     """
     width = seen.segments.width
     segments, samples = width.shape
     motion = jax.tree.map(np.asarray, seen.at_knots)
-    # A segment that starts anew does not start where the motion of the one before it ends.
+    # A segment that is not joined does not start at the final state of the preceding one.
     before_each, after_each = (
         jax.tree.map(lambda a, side=side: a[:, side], motion) for side in (slice(-1), slice(1, None))
     )
@@ -53,7 +53,7 @@ def own_states(seen: Along, stacked: Effect, proposals: int, before: Memory | No
     starts = np.flatnonzero(~seen.goes_on)
     lengths = np.diff(np.append(starts, segments))
     for length in np.unique(lengths):
-        # What goes on from segment to segment is one chain.
+        # Joined segments form one chain.
         own = starts[lengths == length][:, None] + np.arange(length)
 
         def joined(intervals: np.ndarray, own: np.ndarray = own) -> np.ndarray:
@@ -77,13 +77,13 @@ def _settled(effect: Effect, motion: Motion) -> Array:
 
 
 def memory_of(seen: Along, states: OwnStates) -> Memory:
-    """What own states leave for what comes after."""
+    """Hidden states at starts and ends."""
     ends = states[seen.ends[:, 0], seen.ends[:, 1]]
     return Memory(np.swapaxes(states[:, 0], 1, 2), np.swapaxes(ends, 1, 2))
 
 
 def own_between(states: OwnStates) -> Float[np.ndarray, "proposals segments samples nodes own"]:
-    """Own states at the nodes of each interval, in a straight line from its start to its end."""
+    """Hidden states at the nodes of each interval, by linear interpolation."""
     by_proposal = np.moveaxis(states, 2, 0)[..., None, :]
     part = PART[:, None]
     return by_proposal[:, :, :-1] * (1.0 - part) + by_proposal[:, :, 1:] * part

@@ -1,4 +1,4 @@
-"""Fitted motions, and what all proposals of the catalogue would do along them, some at a time."""
+"""Fitted motions, and the responses to all proposals of the catalogue along them, in batches."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from fitting.estimation.experiment import Segments
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.linear_response import Followed, follow
 from fitting.estimation.problem import STEP_ANGLE, suggested_substeps
-from fitting.estimation.projection import Answers, without_untold
+from fitting.estimation.projection import Answers, without_undetermined
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.first_order.close_following import followed_closely
 from fitting.first_order.motion import Along, along
@@ -23,21 +23,21 @@ from fitting.first_order.regressors import regressors
 from fitting.first_order.surrogates import surrogates
 from hdjax.effects import Effect
 
-# Numbers that the columns of a batch have: what a computer has room for.
+# Numbers in the columns of a batch, limited by memory.
 _NUMBERS = 1 << 22
 
-# Of training and of held-out segments, which are not as many.
+# For training and held-out segments, whose numbers differ.
 Answered = Float[np.ndarray, "_ _ outputs columns"]
 
 
-class Sight(eqx.Module):
-    """A fit's motion, and its residual in the form that inner products take.
+class FittedMotion(eqx.Module):
+    """A fit's motion, its residual and its responses to forces.
 
     Attributes:
-        seen: the motion as effects look at it.
-        answers: of the residual to what acts, parameters that are free already in physical units.
+        seen: inputs of effects along the motion.
+        answers: responses of the residual to forces, and to free parameters in physical units.
         residual: whitened.
-        surrogates: of it.
+        surrogates: of the residual.
     """
 
     seen: Along
@@ -46,25 +46,25 @@ class Sight(eqx.Module):
     surrogates: Float[np.ndarray, "draws segments rows"]
 
 
-def sight(fit: Fit, seed: int, *, measured: bool = False) -> Sight:
-    """Look along a fit's motion.
+def fitted_motion(fit: Fit, seed: int, *, measured: bool = False) -> FittedMotion:
+    """Linearise a fit along its motion.
 
     Args:
-        fit: of the model without what is looked for.
+        fit: of the current model.
         seed: of the surrogates.
-        measured: whether effects look at the measured motion, see [`fitting.first_order.close_following`][].
+        measured: whether effects act along the measured motion, see [`fitting.first_order.close_following`][].
     """
-    problem, unknowns = _looked_at(fit)
-    found = without_untold(linearise(problem, unknowns), problem.free)
+    problem, unknowns = _linearised(fit)
+    found = without_undetermined(linearise(problem, unknowns), problem.free)
     slopes = np.asarray(fit.free.slopes(fit.model))
     found = replace(
         found,
         by_parameter=jnp.asarray(np.asarray(found.by_parameter) / slopes),
         before_by_parameter=jnp.asarray(np.asarray(found.before_by_parameter) / slopes),
     )
-    followed, segments, residual = where_it_goes(fit, problem, unknowns)
+    followed, segments, residual = motion_and_residual(fit, problem, unknowns)
     seen = followed_closely(fit) if measured else followed
-    return Sight(
+    return FittedMotion(
         seen=along(fit.model, seen, segments, fit.stretches),
         answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
         residual=residual,
@@ -72,15 +72,15 @@ def sight(fit: Fit, seed: int, *, measured: bool = False) -> Sight:
     )
 
 
-def where_it_goes(
+def motion_and_residual(
     fit: Fit, problem: Problem, unknowns: Unknowns
 ) -> tuple[Followed, Segments, Float[np.ndarray, "segments samples outputs"]]:
-    """A fitted motion, its data, and the whitened residual; zero, and without weight, in segments in which the model
-    runs away: there is no motion to look along.
+    """A fitted motion, its data, and the whitened residual. Segments in which the simulation diverges are zero, with
+    weight zero.
 
     Args:
         fit: the fit.
-        problem: what it has solved, or the first segments of that.
+        problem: its problem, or the first segments of it.
         unknowns: the solution.
     """
     followed, segments = follow(problem, unknowns), problem.segments
@@ -97,24 +97,25 @@ def where_it_goes(
 
 
 def motion_states(fit: Fit) -> Float[np.ndarray, "segments knots states"]:
-    """The states that a fitted model goes through, in its segments with data; zero where it runs away."""
-    return np.nan_to_num(follow(*_looked_at(fit)).states, posinf=0.0, neginf=0.0)
+    """The states of a fitted model in its segments with data; zero where it diverges."""
+    return np.nan_to_num(follow(*_linearised(fit)).states, posinf=0.0, neginf=0.0)
 
 
 def follow_on(training: Fit, held_out: Fit) -> bool:
-    """Whether each held-out stretch begins where a training stretch ends."""
+    """Whether each held-out stretch begins at the end of a training stretch."""
     ends = [(s.name, s.stop) for s in training.stretches]
     return ends == [(s.name, s.start) for s in held_out.stretches]
 
 
 class Batch(eqx.Module):
-    """Some proposals, looked at together.
+    """Proposals evaluated together.
 
     Attributes:
         proposals: effects at zero strength.
         columns: of each proposal.
-        answers: of the outputs to a unit of each strength, along the training motion and along the held-out one.
-        own_states: where each proposal's own states start in each training segment; None where it has none.
+        answers: responses of the outputs to a unit of each strength, along the training motion and along the held-out
+            one.
+        own_states: hidden states of each proposal at the start of each training segment; None without any.
     """
 
     proposals: list[Effect]
@@ -123,24 +124,28 @@ class Batch(eqx.Module):
     own_states: list[np.ndarray | None]
 
 
-def batches(sights: tuple[Sight, Sight], proposals: Sequence[Effect], goes_on: bool) -> Iterator[Batch]:
-    """What the proposals would do, form by form, as many forms at a time as there is room for.
+def batches(
+    fitted_motions: tuple[FittedMotion, FittedMotion], proposals: Sequence[Effect], goes_on: bool
+) -> Iterator[Batch]:
+    """Responses to the proposals, in batches of forms limited by memory.
 
     Args:
-        sights: along training stretches, and along held-out ones.
+        fitted_motions: along training stretches, and along held-out ones.
         proposals: effects at zero strength.
-        goes_on: whether the held-out stretches begin where the training stretches end, see [`follow_on`][].
+        goes_on: whether the held-out stretches begin at the ends of the training stretches, see [`follow_on`][].
     """
-    room = max(1, _NUMBERS // max(s.residual.size for s in sights))
+    room = max(1, _NUMBERS // max(s.residual.size for s in fitted_motions))
     waiting: list[Batch] = []
     for form in dict.fromkeys(type(p) for p in proposals):
         same = [p for p in proposals if type(p) is form]
-        fitted, memory = regressors(sights[0].seen, same)
-        unseen, _ = regressors(sights[1].seen, same, memory if goes_on else None)
+        fitted, memory = regressors(fitted_motions[0].seen, same)
+        unseen, _ = regressors(fitted_motions[1].seen, same, memory if goes_on else None)
         strengths = len(strength_paths(same[0]))
         columns = [list(range(i * strengths, (i + 1) * strengths)) for i in range(len(same))]
         own = [None if memory is None else memory.at_starts[..., i] for i in range(len(same))]
-        first, second = (s.answers.to(f.forces, f.reading) for s, f in zip(sights, (fitted, unseen), strict=True))
+        first, second = (
+            s.answers.to(f.forces, f.reading) for s, f in zip(fitted_motions, (fitted, unseen), strict=True)
+        )
         waiting.append(Batch(same, columns, (first, second), own))
         if sum(batch.answers[0].shape[-1] for batch in waiting) >= room:
             yield _together(waiting)
@@ -150,7 +155,7 @@ def batches(sights: tuple[Sight, Sight], proposals: Sequence[Effect], goes_on: b
 
 
 def _together(parts: Sequence[Batch]) -> Batch:
-    """Batches side by side."""
+    """Batches joined into one."""
     widths = [part.answers[0].shape[-1] for part in parts]
     firsts = np.cumsum(widths) - widths
     columns = [[int(first) + c for c in own] for part, first in zip(parts, firsts, strict=True) for own in part.columns]
@@ -159,13 +164,13 @@ def _together(parts: Sequence[Batch]) -> Batch:
     return Batch(proposals, columns, (first, second), own)
 
 
-def _looked_at(fit: Fit) -> tuple[Problem, Unknowns]:
-    """What a fit has solved, and where, at its solution; without segments that only fill up."""
+def _linearised(fit: Fit) -> tuple[Problem, Unknowns]:
+    """A fit's problem and unknowns at its solution, without padding segments."""
     problem, count = fit.with_all_free().at_solution, fit.pieces.sum()
     segments, states = jax.tree.map(
         lambda a: jnp.asarray(np.asarray(a)[:count]), (problem.segments, fit.unknowns.states)
     )
-    # Held-out fits hold their parameters; here all of them count. A first-order look needs no finer sensitivities
-    # than this; the residual is the fit's own.
+    # Held-out fits fix their parameters; here all of them are free. Sensitivities need no more solver steps than this;
+    # the residual is that of the fit.
     substeps = suggested_substeps(fit.model, fit.stretches, step_angle=2 * STEP_ANGLE)
     return replace(problem, segments=segments, substeps=substeps), replace(fit.unknowns, states=states)

@@ -1,4 +1,4 @@
-"""A fitted motion as effects look at it, and what a unit of each thing that they can add does there."""
+"""Inputs of effects along a fitted motion, and the influence of a unit of each quantity that effects add."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,14 +29,14 @@ from hdjax.engine.pointwise import at_instants, slopes_at_instants
 from hdjax.parameters import Scalar, parameter
 
 PART = 0.5 * (NODES + 1.0)
-"""The nodes as parts of an interval."""
+"""The nodes as fractions of an interval."""
 
 INPUT, ERROR, SLOPE = "input", "error", "slope"
-"""What effects add beside a torque at one of the places of [`hdjax.effects.learned`][]."""
+"""Quantities that effects add, other than torques at the places of [`hdjax.effects.learned`][]."""
 
 
 class Along(eqx.Module):
-    """A motion, as effects look at it.
+    """Inputs of effects along a motion.
 
     Attributes:
         model: whose motion it is.
@@ -44,10 +44,10 @@ class Along(eqx.Module):
         segments: the data that it belongs to.
         at_knots: the motion at each knot.
         between: the motion at the nodes of each interval.
-        pushes: what a unit of each thing that effects add does there to the state's rates, see [`unit_pushes`][].
-        carried: and what it adds to the state by the end of the interval, see [`carried`][].
-        goes_on: whether a segment's data go on where those of the one before it end.
-        firsts: the first segment of each stretch.
+        pushes: change of the state's rates there by a unit of each quantity that effects add, see [`unit_pushes`][].
+        carried: the resulting change of the state at the interval's end, see [`carried`][].
+        goes_on: whether a segment's data continue those of the one before without a gap.
+        firsts: first segment of each stretch.
         ends: segment and knot where each stretch ends.
     """
 
@@ -64,13 +64,13 @@ class Along(eqx.Module):
 
 
 def along(model: Model, followed: Followed, segments: Segments, stretches: Sequence[Stretch]) -> Along:
-    """The motion of a model as effects look at it.
+    """Inputs of effects along a model's motion.
 
     Args:
         model: at the solution.
         followed: its states.
         segments: the data that it belongs to.
-        stretches: what was cut into them.
+        stretches: that were cut into them.
     """
     length, samples = segments.weight.shape[1], np.array([len(s) for s in stretches])
     pieces = -(-samples // length)
@@ -94,8 +94,8 @@ def conditions_at_knots(segments: Segments) -> Conditions:
 
 
 def acting_at_knots(model: Model, segments: Segments) -> Float[np.ndarray, "segments knots"]:
-    """The torque that acts on a drive, or the forcing, at each knot; where it jumps the middle, so that a straight line
-    from knot to knot is not late."""
+    """The torque after actuator effects, or the forcing, at each knot; at jumps the mean, so that linear interpolation
+    is not delayed."""
     return _at_knots(acting(model, segments)[:, segments.halo :], segments.width)
 
 
@@ -117,7 +117,7 @@ def acting_slopes_at_knots(
 
 
 def motions(model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions) -> Motion:
-    """The motion that each of many states means."""
+    """The motion of each of many states."""
     return at_instants(_motion, (model, 0), (states, states.ndim - 1), (conditions, states.ndim - 1))
 
 
@@ -126,7 +126,7 @@ def _motion(model: Model, state: Array, conditions: Conditions) -> Motion:
 
 
 class _UnitGeometry(MeshGeometryEffect):
-    """An error of the mesh and a slope of it, each by itself."""
+    """An error of the mesh and its slope as independent quantities."""
 
     family: ClassVar[str] = "kinematic_error"
     name: ClassVar[str] = "unit_geometry"
@@ -148,9 +148,9 @@ class _UnitGeometry(MeshGeometryEffect):
 def unit_pushes(
     model: Model, states: Float[Array | np.ndarray, "*many states"], conditions: Conditions
 ) -> dict[str, Float[np.ndarray, "*many states"]]:
-    """What a unit of each thing that effects can add does to the rates of each of many states: a torque at each place
-    of [`hdjax.effects.learned`][], by the name of the learned torque there; the torque that comes in; an error of the
-    mesh, and its slope."""
+    """Change of the state's rates, at each of many states, by a unit of each quantity that effects add. These are a
+    torque at each place of [`hdjax.effects.learned`][], by the name of the learned torque there, the incoming torque,
+    an error of the mesh, and its slope."""
     whole = isinstance(model, TwoInertiaModel)
     names = [f.name for f in _torques(model)] + [ERROR, SLOPE] * whole + [INPUT]
     axes = states.ndim - 1
@@ -163,8 +163,8 @@ def _torques(model: Model) -> list[type[LearnedTorque]]:
 
 
 def _rates(strengths: Array, model: Model, state: Array, conditions: Conditions) -> Array:
-    """With a unit of each thing times its strength; the last one is the torque."""
-    # Added afresh, not set by name: the model may have something learned already.
+    """The state's rates with each quantity at its strength; the last one is the torque."""
+    # Added, not set by name: the model may have a learned term already.
     forms = zip(_torques(model), strengths, strict=False)
     torques = [form(axes=(), mixing=jnp.ones((1, 1)), c=(strength,)) for form, strength in forms]
     whole = isinstance(model, TwoInertiaModel)
@@ -176,32 +176,31 @@ def _rates(strengths: Array, model: Model, state: Array, conditions: Conditions)
 def carried(
     followed: Followed, push: Float[np.ndarray, "segments samples nodes states"]
 ) -> Float[np.ndarray, "segments samples states nodes"]:
-    """What pushes at the nodes of each interval add to the state by its end."""
+    """Change of the state at each interval's end by forces at its nodes."""
     pushed = np.swapaxes(push, -1, -2)
     first, second = (ends @ (pushed * by) for ends, by in carriers(followed))
     return first + second
 
 
 def carriers(followed: Followed) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """What the two ends of a push's straight line add to the state by the end of its interval, and the part that each
-    node has in them.
+    """Change of the state at an interval's end by the two ends of a linear force, and the weight of each node in them.
 
-    The line is that which has the pushes' mean and first moment: a system that is slow against the interval sees the
-    same.
+    The line has the same mean and first moment as the force at the nodes, which is equivalent for dynamics slower than
+    the interval.
     """
     mean, rise = 0.5 * WEIGHTS, 1.5 * WEIGHTS * NODES
     return (followed.from_start, mean - rise), (followed.from_end, mean + rise)
 
 
 def unit_reading(model: Model, form: type[LearnedReading]) -> Float[np.ndarray, " outputs"]:
-    """What a unit of error of what an encoder reads does to the outputs."""
+    """Change of the outputs by a unit of encoder error."""
     bare, at_rest = replace(model, effects=()), jnp.zeros(len(model.motion_states))
     probed = bare.with_effects(form(axes=(), mixing=jnp.ones((1, 1)), c=(jnp.ones(()),)))
     return np.asarray(probed.outputs(at_rest) - bare.outputs(at_rest))
 
 
 def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
-    """The learned torque that acts where an effect, or a form, does; None where that is no torque."""
+    """The learned torque at the place of an effect or form; None where that adds no torque."""
     own = effect if isinstance(effect, type) else type(effect)
     kinds = (MeshTorqueEffect, MotorSideEffect, LoadSideEffect)
     return next((form for form, kind in zip(LEARNED_TORQUES, kinds, strict=True) if issubclass(own, kind)), None)
@@ -210,6 +209,6 @@ def place_of(effect: Effect | type[Effect]) -> type[LearnedTorque] | None:
 def _at_knots(
     coefficients: Float[np.ndarray, "segments samples powers"], width: Float[np.ndarray, "segments samples"]
 ) -> Float[np.ndarray, "segments knots"]:
-    """A signal's values at the samples and at the end of the last interval; where it jumps the middle."""
+    """A signal's values at the samples and at the end of the last interval; at jumps the mean."""
     after, before = coefficients[:, :, 0], polynomial(coefficients, width)
     return np.concatenate([after[:, :1], 0.5 * (before[:, :-1] + after[:, 1:]), before[:, -1:]], axis=1)

@@ -1,4 +1,4 @@
-"""What an effect of little strength would do along a motion: a force, or a change of what the encoders read."""
+"""Regressors of effects at zero strength along a motion: forces, or changes of the encoders' readings."""
 
 import functools
 import math
@@ -32,7 +32,7 @@ from hdjax.effects.learned import LearnedMotorTorque
 from hdjax.engine.pointwise import slopes_at_instants
 from hdjax.parameters import own_value
 
-# What a sensor effect adds.
+# Quantity that a sensor effect adds.
 _READING = "reading"
 
 
@@ -40,8 +40,8 @@ class Regressors(eqx.Module):
     """Derivatives by the strengths of an effect, one column for each strength of each proposal.
 
     Attributes:
-        forces: of what acts along the motion; None where nothing does.
-        reading: of the outputs at the samples; None where nothing changes there.
+        forces: derivatives of the forces along the motion; None without any.
+        reading: derivatives of the readings at the samples; None without any.
     """
 
     forces: Forces | None
@@ -51,12 +51,12 @@ class Regressors(eqx.Module):
 def regressors(
     seen: Along, proposals: Sequence[Effect], before: Memory | None = None
 ) -> tuple[Regressors, Memory | None]:
-    """The regressors of proposals of one form along a motion, and the effect's own states there.
+    """The regressors of proposals of one form along a motion, and the effect's hidden states there.
 
     Args:
         seen: the motion.
         proposals: effects of one and the same form, at zero strength.
-        before: own states along stretches that these ones continue.
+        before: hidden states along the preceding stretches.
     """
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *proposals)
     segments = seen.segments
@@ -75,7 +75,7 @@ def regressors(
         if isinstance(stacked, SensorEffect):
             motion = jax.tree.map(lambda a: np.asarray(a)[:, :-1], seen.at_knots)
             own = np.moveaxis(states[:, :-1], 2, 0)
-        # What an effect adds is the same whatever others there are.
+        # An effect's contribution does not depend on other effects.
         bare = replace(seen.model, effects=())
         added = _by_strength(_added, stacked, bare, motion, own=own)
     added = {name: _finite(values) for name, values in added.items()}
@@ -83,28 +83,27 @@ def regressors(
         return Regressors(None, added[_READING]), None
     lands, sizes = [seen.carried[name] for name in added], list(added.values())
     forces = Forces(np.concatenate(lands, axis=3), np.concatenate(sizes, axis=2))
-    # A sensor of the joint torque reads what is added to it.
+    # A sensor of the joint torque measures the added torque directly.
     in_the_mesh = isinstance(stacked, MeshTorqueEffect | MeshGeometryEffect)
     read = isinstance(stacked, SensorEffect) or (in_the_mesh and JOINT_TORQUE in seen.model.measured)
     return Regressors(forces, _finite(_readings(seen, stacked, states)) if read else None), memory
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
-    """An effect that runs away along the motion explains nothing."""
+    """Set the regressors of an effect that diverges along the motion to zero."""
     lost = ~np.isfinite(values).all(axis=tuple(range(values.ndim - 1)))
     return np.where(lost, 0.0, values) if lost.any() else values
 
 
 def _by_strength(function: Callable[..., Any], stacked: Effect, model: Model, *looked_at: Any, own: np.ndarray) -> Any:
-    """Derivatives of what is found of an effect at each instant by each strength of each proposal, as columns: a
-    proposal's strengths side by side.
+    """Derivatives of a function of an effect at each instant by each strength of each proposal, as columns.
 
     Args:
-        function: of the strengths, the effect, the model, what else is looked at, and the effect's own states.
+        function: of the strengths, the effect, the model, further inputs, and the effect's hidden states.
         stacked: the proposals, along the first axis of each array.
         model: the equations.
-        looked_at: trees of arrays whose first axes are those of the instants.
-        own: each proposal's, on the first axis. At zero strength they don't depend on it.
+        looked_at: further inputs: trees of arrays whose first axes are those of the instants.
+        own: hidden states of each proposal, on the first axis. At zero strength they don't depend on it.
     """
     instants = own.shape[1:-1]
     each = jax.tree.map(lambda a: a[:, None], stacked)
@@ -131,7 +130,7 @@ def _with(effect: Effect, strengths: Array) -> Effect:
 
 
 def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: Array) -> dict[str, Array]:
-    """What an effect adds at an instant, by what that is."""
+    """The quantities that an effect adds at an instant, by name."""
     effect = _with(effect, strengths)
     if isinstance(effect, SensorEffect):
         assert motion.theta_m is not None and motion.theta_l is not None
@@ -150,7 +149,7 @@ def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: A
 
 
 def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples nodes columns"]:
-    """Derivatives of the torque that acts, at the nodes."""
+    """Derivatives of the torque after actuator effects, at the nodes."""
     segments = seen.segments
     knots, logged = np.asarray(segments.torque.knots), acting(seen.model, segments)
     found = some_at_a_time(functools.partial(_actuated, stacked), knots, logged)[:, segments.halo :]
@@ -160,8 +159,8 @@ def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples
 
 @jit_small
 def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array, "segments intervals columns powers"]:
-    """Derivatives of a torque that effects have changed by the strengths of each proposal: what happens to a torque
-    looks back in time, which the graph of an instant has no words for."""
+    """Derivatives of the torque after actuator effects by the strengths of each proposal. Actuator effects act on the
+    torque signal as a whole, not at an instant."""
 
     def changed(effect: Effect, strengths: Array) -> Array:
         whole = _with(effect, strengths)
@@ -169,7 +168,7 @@ def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array
         return jax.vmap(lambda *own: whole.actuate(PiecewisePolynomial(*own)).coefficients)(knots, coefficients)
 
     columns = []
-    # Written out: there are few, and lanes of lanes take long to compile.
+    # A loop: there are few, and nested vmap takes long to compile.
     for i in range(len(jax.tree.leaves(stacked)[0])):
         effect = jax.tree.map(lambda a, i=i: a[i], stacked)
         strengths = jnp.stack(_strengths(effect))
@@ -179,7 +178,7 @@ def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array
 
 
 def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:
-    """Of effects that take inertia: what the others do changes with it."""
+    """Regressors of effects that change the inertia, and with it the influence of all forces."""
     model, segments, followed = seen.model, seen.segments, seen.followed
     inputs = inputs_at(model, segments, PART * segments.width[..., None])
     rates = _by_strength(_rates, stacked, model, followed.between, inputs, own=own_between(states))
@@ -194,7 +193,7 @@ def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressor
 def _readings(
     seen: Along, stacked: Effect, states: np.ndarray
 ) -> Float[np.ndarray, "segments samples outputs columns"]:
-    """Derivatives of the outputs at the samples, where the motion stays as it is."""
+    """Derivatives of the outputs at the samples for a fixed motion."""
     own = np.moveaxis(states[:, :-1], 2, 0)
     return _by_strength(_outputs, stacked, seen.model, seen.followed.states[:, :-1], own=own)
 

@@ -1,36 +1,36 @@
-"""The strongest lines in what a fit leaves over: where to look for a frequency that no shaft turns at."""
+"""Strongest spectral lines of a residual: starting values for frequencies that are not orders of a shaft."""
 
 import numpy as np
 from jaxtyping import Float
 
 from fitting.estimation.estimate import Fit
 
-# A line stands out of the median of so many frequencies around it.
+# Neighbouring frequencies of the median that a line must exceed.
 _NEIGHBOURS = 41
-# Frequencies from one line to the next at least: the window spreads a line over so many.
+# Least distance of two lines, in frequencies: the width of a line under the window.
 _APART = 8
-# By this factor in power at least: among 10,000 frequencies of noise the largest is about 10 times the mean.
+# Least power of a line over that median: among 10,000 frequencies of noise the largest is about 10 times the mean.
 STANDS_OUT = 15.0
-"""Power of a line against the median of its surroundings, at least."""
+"""Least power of a line over the median of its surroundings."""
 
 
 def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
     """Frequencies [rad/s] of the strongest lines in the residual, strongest first.
 
     The periodogram of the longest stretch's whitened residual (Hann window), summed over the outputs and divided by the
-    median of its surroundings, so that the colour of the noise and the drive's resonance do not pass for lines.
+    median of its surroundings, so that coloured noise and the drive's resonance are not taken for lines.
 
     Args:
         fit: a fit.
-        most: how many lines at most.
+        most: largest number of lines.
     """
-    # Along the longest stretch, samples without weight zero.
+    # Invalid samples of the longest stretch are zero.
     series = max(reversed(fit.by_stretch(fit.white_error)), key=len)
     count = series.shape[0]
     if count < 4 * _NEIGHBOURS:
         return ()
     window = np.hanning(count)[:, None]
-    # Twice the length: a frequency between two of the grid's is then no more than a quarter of a step away.
+    # Zero padding to twice the length: the nearest grid frequency is then at most a quarter of a step away.
     power = np.sum(np.abs(np.fft.rfft(series * window, n=2 * count, axis=0)) ** 2, axis=1)
     around = surroundings(power, neighbours=_NEIGHBOURS)
     ratio = power / around
@@ -43,7 +43,7 @@ def spectral_lines(fit: Fit, *, most: int = 3) -> tuple[float, ...]:
 
 
 def _peaks(ratio: np.ndarray) -> np.ndarray:
-    """Places of the maxima that stand out, the higher one of any two that are close; in rising order."""
+    """Indices of significant maxima, the higher one of any two that are close; in rising order."""
     inner = ratio[1:-1]
     found = np.flatnonzero((inner > ratio[:-2]) & (inner > ratio[2:]) & (inner >= STANDS_OUT)) + 1
     kept: list[int] = []
@@ -54,7 +54,7 @@ def _peaks(ratio: np.ndarray) -> np.ndarray:
 
 
 def surroundings(power: Float[np.ndarray, " n"], *, neighbours: int = _NEIGHBOURS // 2) -> Float[np.ndarray, " n"]:
-    """The median of a periodogram around each frequency: the colour of the noise without its lines.
+    """The median of a periodogram around each frequency: the noise spectrum without lines.
 
     Args:
         power: of a series without padding.
@@ -66,20 +66,20 @@ def surroundings(power: Float[np.ndarray, " n"], *, neighbours: int = _NEIGHBOUR
 
 
 def without_lines(spectrum: np.ndarray) -> np.ndarray:
-    """A spectrum whose lines are cut down to what noise of the colour around them may reach.
+    """A spectrum with lines reduced to the largest value plausible for the surrounding noise.
 
-    A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave.
+    A significant line is not coloured noise, but may be caused by a periodic effect.
 
     Args:
-        spectrum: of one series or of several, (n,) or (series, n); their lines are looked for in the sum of powers.
+        spectrum: of one series or of several, (n,) or (series, n); lines are searched in the sum of powers.
     """
     power = np.sum(np.abs(np.atleast_2d(spectrum)) ** 2, axis=0)
     return spectrum / np.sqrt(np.maximum(power / (STANDS_OUT * surroundings(power)), 1.0))
 
 
 def _off_the_grid(power: Float[np.ndarray, " n"], peaks: np.ndarray) -> np.ndarray:
-    """How far from its highest point each line is: the vertex of the parabola through the logarithms. Unseen data come
-    later, where an error of frequency has become one of phase."""
+    """Distance of each line from its highest grid frequency: the vertex of the parabola through the logarithms.
+    Held-out data come later in time, where a frequency error has become a phase error."""
     inner = np.clip(peaks, 1, power.size - 2)
     left, top, right = (np.log(np.maximum(power[inner + k], 1e-300)) for k in (-1, 0, 1))
     curvature = np.minimum(left - 2 * top + right, -1e-12)

@@ -1,4 +1,4 @@
-"""What chance might have left over: residuals of the same colour, with random phases."""
+"""Surrogates: residuals of the same spectrum with random phases."""
 
 from typing import Any
 
@@ -11,15 +11,15 @@ from fitting.estimation.projection import solved
 from fitting.first_order.spectral_lines import without_lines
 
 DRAWS = 200
-"""Surrogates of the residual of each part of the data."""
+"""Number of surrogates of the residual of each part of the data."""
 
 PARTNERS = 5
-"""With how many of the unseen data each of the fitted data goes, which are independent of each other: in all they are
-1,000 draws, and the smallest p-value that they can show is 1/1001."""
+"""Number of held-out surrogates paired with each training surrogate, which are independent. In total there are 1,000
+draws, and the smallest possible p-value is 1/1001."""
 
 
 def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
-    """Residuals with the same spectra and cross-spectra and random phases: noise of the residual's own colour."""
+    """Residuals with the same spectra and cross-spectra and random phases."""
     from scipy.fft import irfft
 
     random = np.random.default_rng(seed)
@@ -36,14 +36,14 @@ def surrogates(fit: Fit, seed: int) -> Float[np.ndarray, "draws segments rows"]:
 
 
 def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
-    """How often noise of the residual's own colour makes a learned model gain as much on unseen data.
+    """p-value of a learned model's gain on held-out data, under noise of the residual's spectrum.
 
-    These had no part in what was learned, however many candidates were searched. So what it changes of the error is
-    fixed, and only the noise is drawn anew.
+    Held-out data were not used for learning, however many candidates were searched. So the change of the error is
+    fixed, and only the noise is random.
 
     Args:
-        before: fit of the model before to unseen data, its parameters held.
-        after: likewise, of the model with what was learned.
+        before: fit of the preceding model to held-out data, with fixed parameters.
+        after: likewise, of the model with the learned term.
         seed: of the draws.
     """
     random = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
     changed = (np.asarray(before.error) - np.asarray(after.error)) @ np.asarray(before.problem.whitening).T
     spectrum, length = _noise_spectrum(before.white_error[weight].T)
     series = changed[weight].T
-    # Frequencies stand for their mirror images as well.
+    # Each frequency also represents its negative.
     against = 2.0 / length * np.sum(np.fft.rfft(series[:, :length]).conj() * spectrum, axis=0)
     draws = DRAWS * PARTNERS
     explained = np.array([float(np.real(against @ _turn(random, spectrum))) for _ in range(draws)])
@@ -60,10 +60,10 @@ def chance_of_gain(before: Fit, after: Fit, seed: int) -> float:
 
 
 def _noise_spectrum(series: Float[np.ndarray, "outputs n"]) -> tuple[Complex[np.ndarray, "outputs frequencies"], int]:
-    """The spectrum of residuals, and of how many samples.
+    """The spectrum of residuals, and the number of samples.
 
-    A line that stands out of its surroundings is no colour of noise, but what a periodic effect would leave: with a
-    phase of its own it would still be explained by that effect.
+    Lines are reduced: a significant line is not coloured noise, but may be caused by a periodic effect, which would
+    explain it with any phase.
     """
     from scipy.fft import prev_fast_len
 
@@ -74,19 +74,19 @@ def _noise_spectrum(series: Float[np.ndarray, "outputs n"]) -> tuple[Complex[np.
 def _turn(random: np.random.Generator, spectrum: np.ndarray) -> Complex[np.ndarray, " frequencies"]:
     """Random phases."""
     turn = np.exp(1j * random.uniform(0.0, 2 * np.pi, spectrum.shape[1]))
-    # Noise has no mean; what mean there is may be the very thing that is looked for.
+    # Noise has zero mean; a nonzero mean may be caused by the missing effect.
     turn[0] = 0.0
     return turn
 
 
 class Scores(eqx.Module):
-    """Inner products of sensitivities with each other, with the residual, and with its surrogates.
+    """Inner products of sensitivities, of residual and of surrogates.
 
     Attributes:
-        gram: of the columns: of what was free already, then of strengths.
+        gram: of the columns: first of free parameters, then of strengths.
         gradient: columns against the residual.
         surrogate_gradients: columns against each surrogate.
-        samples: with weight, at least one.
+        samples: number of valid ones, at least one.
     """
 
     gram: Float[np.ndarray, "columns columns"]
@@ -102,22 +102,22 @@ class Scores(eqx.Module):
         residual: Float[np.ndarray, "segments samples outputs"],
         surrogates: Float[np.ndarray, "draws segments rows"],
     ) -> "Scores":
-        """Of the whitened outputs' derivatives, the weight of each sample, and what is to be explained."""
+        """From the whitened outputs' derivatives, the weight of each sample, residual and surrogates."""
         flat = columns.reshape(-1, columns.shape[-1])
-        # Where the model runs away in every segment, nothing is told.
+        # Where the model diverges in every segment, there are no valid samples.
         samples = max(float(np.sum(weight)), 1.0)
         against = (surrogates.reshape(len(surrogates), -1) @ flat).T
         return cls(flat.T @ flat, flat.T @ residual.reshape(-1), against, samples)
 
     def columns(self, which: list[int]) -> "Scores":
-        """Those of some columns alone."""
+        """The scores of some columns."""
         own = self.gram[np.ix_(which, which)], self.gradient[which], self.surrogate_gradients[which]
         return Scores(*own, self.samples)
 
     def steps(
         self, gradient: Float[np.ndarray, "columns draws"], chosen: list[int]
     ) -> Float[np.ndarray, "columns draws"]:
-        """Least squares over the chosen columns, for each column of gradients; zero for the other ones."""
+        """Least-squares steps of the chosen columns, for each column of gradients; zero for the others."""
         found = np.zeros_like(gradient)
         found[chosen] = solved(self.gram[np.ix_(chosen, chosen)], gradient[chosen])
         return found
@@ -125,18 +125,19 @@ class Scores(eqx.Module):
     def loss(
         self, step: Float[np.ndarray, "columns draws"], gradient: Float[np.ndarray, "columns draws"]
     ) -> Float[np.ndarray, " draws"]:
-        """Change of the objective by a step, for each column of it: half the log-determinant of the covariance of the
-        outputs' errors, whose whitened squares add up to the number of samples for each output."""
+        """Change of the objective (half the log-determinant of the outputs' error covariance) by each column of a step.
+        Whitened squares of each output sum to the number of samples."""
         return (np.sum(step * (self.gram @ step), axis=0) - 2 * np.sum(step * gradient, axis=0)) / (2 * self.samples)
 
 
 def null_gains(fitted: Scores, unseen: Scores, known: int) -> Float[np.ndarray, " draws"]:
-    """What a least-squares step gains on unseen surrogates beyond refitting what was free already, the first columns.
+    """Gain of a least-squares step on held-out surrogates, relative to refitting the free parameters (the first
+    columns).
 
     Args:
-        fitted: scores of the data that are fitted.
-        unseen: likewise of unseen data.
-        known: how many columns were free already.
+        fitted: scores of the training data.
+        unseen: scores of the held-out data.
+        known: number of columns of free parameters.
     """
     steps = [fitted.steps(fitted.surrogate_gradients, list(range(count))) for count in (known, len(fitted.gram))]
     partners = [np.roll(unseen.surrogate_gradients, shift, axis=1) for shift in range(PARTNERS)]

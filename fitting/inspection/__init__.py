@@ -1,1 +1,1 @@
-"""What a log that nobody has described holds: columns, signals, units, and what a fit could tell from it."""
+"""Inspection of a log without a drive file: columns, signals, units, and what a fit could determine."""

@@ -1,4 +1,4 @@
-"""All columns of a log, as numbers, with what their names say."""
+"""All columns of a log as numbers, with the meaning of their names."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +13,9 @@ from fitting.logs.raw_table import RawColumn, RawTable, split_unit
 from fitting.logs.read_table import read_table
 
 _FEWEST_ROWS = 8
-_MOST_TEXT = 0.05  # share of rows; what has more is no channel
+_MOST_TEXT = 0.05  # largest share of rows with text or blanks for a channel
 _MOST_IN_A_MATRIX = 64
-_FILL = 1e30  # beyond it lie fill values
+_FILL = 1e30  # larger values are fill values
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,11 +23,11 @@ class Column:
     """One column of numbers.
 
     Attributes:
-        name: By which a drive file asks for it.
-        unit: As the file or the name states it, or None.
+        name: As used in a drive file.
+        unit: As stated by the file or the name, or None.
         values: float64, (n,), NaN where unknown.
-        time: Own stamps [s], (n,), or None.
-        sense: What its name says.
+        time: Separate stamps [s], (n,), or None.
+        sense: Meaning of its name.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Column:
 
     @property
     def constant(self) -> bool:
-        """Whether it never changes."""
+        """Whether it is constant."""
         known = self.values[np.isfinite(self.values)]
         return len(known) == 0 or bool(np.ptp(known) == 0)
 
@@ -48,11 +48,11 @@ class Table:
     """The columns of one log.
 
     Attributes:
-        path: Of the file, or what stands for a table in memory.
+        path: Of the file, or the name of a table in memory.
         source: The table in memory, or None.
-        columns: That hold numbers, in the file's order, all of one length but for own clocks.
-        left_out: Why other columns are not among them, by name.
-        sample_rate: Hz, where it stands beside the data, or None.
+        columns: Numeric ones, in the file's order, of equal length except for separate clocks.
+        left_out: Reasons why other columns are omitted, by name.
+        sample_rate: Hz, if stored with the data, or None.
     """
 
     path: Path
@@ -63,12 +63,12 @@ class Table:
 
     @property
     def names(self) -> frozenset[str]:
-        """Of all columns."""
+        """Names of all columns."""
         return frozenset(column.name for column in self.columns)
 
     @property
     def rows(self) -> int:
-        """Of the longest column."""
+        """Number of rows of the longest column."""
         return max(len(column.values) for column in self.columns)
 
     def column(self, name: str) -> Column:
@@ -80,11 +80,11 @@ def read_columns(path: Path, source: Any = None) -> Table:
     """Read all columns of a log.
 
     Args:
-        path: File of any format of [`fitting.logs.read_table`][], or what messages call a table.
+        path: File of any format of [`fitting.logs.read_table`][], or the name of a table for messages.
         source: A table in memory in place of the file, as in [`fitting.logs.frames.table_of`][].
 
     Raises:
-        InputError: The file can't be read, or holds no column of numbers.
+        InputError: The file can't be read, or has no column of numbers.
     """
     read = _reader(path, source)
     names = tuple(dict.fromkeys(read(()).names))
@@ -99,7 +99,7 @@ def read_columns(path: Path, source: Any = None) -> Table:
     if not kept:
         raise InputError(f"{path}: no column holds numbers; give the log file itself, or export it with its samples")
     lengths = [len(column.values) for column in kept.values() if column.time is None]
-    # Of arrays of several lengths, those that belong together are the most.
+    # Of arrays of several lengths, the most frequent length is used.
     usual = max(lengths, key=lambda n: (lengths.count(n), n), default=0)
     for name, column in list(kept.items()):
         if column.time is None and len(column.values) != usual:
@@ -116,20 +116,20 @@ Read = Callable[[Sequence[str]], RawTable]
 def _reader(path: Path, source: Any) -> Read:
     if source is None:
         return lambda wanted: read_table(path, wanted)
-    # Loaded here: tables in memory need polars, which takes long to load.
+    # Imported here: tables in memory need polars, which takes long to import.
     from fitting.logs.frames import table_of
 
     return lambda wanted: table_of(path, source, wanted)
 
 
 def _all(read: Read, names: Sequence[str]) -> tuple[dict[str, RawColumn], dict[str, str], float | None]:
-    """The columns that can be read, why others can't, and a sample rate beside them."""
+    """The readable columns, the reasons why others are not, and a stored sample rate."""
     try:
         table = read(names)
         return {name: table.columns[name] for name in names if name in table.columns}, {}, table.sample_rate
     except InputError as error:
         if len(names) > 1:
-            # One column that is no vector of numbers hides all others.
+            # A column that is not a vector of numbers prevents reading all others.
             half = len(names) // 2
             first, second = _all(read, names[:half]), _all(read, names[half:])
             return first[0] | second[0], first[1] | second[1], first[2] or second[2]
@@ -139,7 +139,7 @@ def _all(read: Read, names: Sequence[str]) -> tuple[dict[str, RawColumn], dict[s
 
 
 def _matrix(read: Read, name: str) -> dict[str, RawColumn]:
-    """The columns of a matrix, as readers of arrays name them."""
+    """The columns of a matrix, with the names of array readers."""
     found: dict[str, RawColumn] = {}
     for k in range(1, _MOST_IN_A_MATRIX + 1):
         column = f"{name}(:,{k})"
@@ -173,6 +173,6 @@ def _column(name: str, raw: RawColumn, plain: Sequence[str]) -> Column:
 
 
 def _plain_unit(unit: str | None) -> str | None:
-    """A unit without the marks that exports put around it; None for one that says nothing."""
+    """A unit without the marks of exports; None for an empty one."""
     unit = (unit or "").strip().strip("[]()").strip()
     return unit if unit not in ("", "-", "1", "none", "None") else None

@@ -1,4 +1,4 @@
-"""A drive file in words: what was guessed of a log, each guess with its reason, and lines for what can't be known."""
+"""Text of a drive file: guesses from a log with their reasons, and lines to fill in for unknown values."""
 
 import json
 from collections.abc import Iterable
@@ -24,14 +24,14 @@ _ORDER = (
 )
 _INERTIAS = {
     "motor_inertia": 'rotor, wave generator and brake about the motor\'s axis, e.g. "5.26 kg cm^2"',
-    "load_inertia": "all that the output moves, about its axis [kg m^2]",
+    "load_inertia": "everything that moves with the output, about its axis [kg m^2]",
 }
 _WHERE_TO_FILL = "FILL IN"
-_WHY_NO_ANGLE = "no column was recognised as this angle, which tells the twist"
+_WHY_NO_ANGLE = "no column was recognised as this angle, which is needed for the twist"
 
 
 def drive_tables(inspection: Inspection) -> dict[str, Any]:
-    """What is known of a drive as the tables of a drive file, without what must be filled in."""
+    """The known tables of a drive file, without values that must be filled in."""
     joint = inspection.joint
     drive: dict[str, Any] = {"name": _name(inspection)}
     if joint.ratio is not None and joint.ratio.sure and _known_angles(inspection):
@@ -43,7 +43,7 @@ def drive_tables(inspection: Inspection) -> dict[str, Any]:
 
 
 def unknowns(inspection: Inspection) -> dict[str, str]:
-    """What must be filled in before the logs can be fitted, by its place in the drive file, and why."""
+    """Values that must be filled in before a fit, by their place in the drive file, with the reason."""
     joint = inspection.joint
     missing: dict[str, str] = {}
     both = set(_ANGLES) <= set(joint.signals)
@@ -69,15 +69,15 @@ def drive_file_text(inspection: Inspection, made_by: str) -> str:
     """The drive file.
 
     Args:
-        inspection: What was found.
+        inspection: The guesses.
         made_by: The command or verb, for the first line.
     """
     tables = drive_tables(inspection)
     names = ", ".join(table.path.name for table in inspection.tables)
     head = [
         f"# Written by {made_by} from {names}.",
-        "# Each guess has its reason behind it: check it. Lines with FILL IN are not known from the logs:",
-        "# complete them and take away the # before them.",
+        "# Each guess is followed by its reason: check it. Lines with FILL IN are not known from the logs:",
+        "# complete them and remove the # before them.",
     ]
     lines = [*head, "", "[drive]", f"name = {_toml(tables['drive']['name'])}"]
     lines += [*_ratio_lines(inspection), *_inertia_lines(inspection), "", "[signals]", *_sampling_lines(inspection)]
@@ -88,7 +88,7 @@ def drive_file_text(inspection: Inspection, made_by: str) -> str:
         if signal in written:
             lines.append(_with_reason(f"{signal} = {_toml(_place(guess))}", guess))
         elif _spare(inspection, signal):
-            lines.append(f"# {signal} = {_toml(_place(guess))}  # beside the motor torque it is not needed")
+            lines.append(f"# {signal} = {_toml(_place(guess))}  # not needed in addition to the motor torque")
         else:
             lines.append(f"# {signal} = {_open_place(guess)}  # {_WHERE_TO_FILL}: {_why_not_written(guess)}")
     lines += [f"# {signal} = ...  # {_WHERE_TO_FILL}: {_WHY_NO_ANGLE}" for signal in _unseen_angles(inspection)]
@@ -106,7 +106,7 @@ def _in_order(signals: Iterable[str]) -> list[str]:
 
 
 def _written(inspection: Inspection) -> list[str]:
-    """The signals whose lines need nothing more."""
+    """The signals whose lines are complete."""
     signals = inspection.joint.signals
     return [
         s for s in _in_order(signals) if not _spare(inspection, s) and s != "motor_current" and _is_read(signals[s])
@@ -114,7 +114,7 @@ def _written(inspection: Inspection) -> list[str]:
 
 
 def _is_read(guess: SignalGuess) -> bool:
-    """Whether a reader knows what the numbers count."""
+    """Whether the unit is known."""
     if guess.unit is None:
         return guess.signal not in _ANGLES
     return guess.signal not in SI or si_size(guess.unit, SI[guess.signal]) is not None
@@ -125,7 +125,7 @@ def _spare(inspection: Inspection, signal: str) -> bool:
 
 
 def _unseen_angles(inspection: Inspection) -> list[str]:
-    """The angles that a log of the load side lacks, and that no doubtful column may be."""
+    """Missing angles of a log of the load side, for which there is no uncertain column."""
     joint = inspection.joint
     if joint.kind != "motor side" or {"motor_angle", "motor_velocity"} & set(joint.signals):
         return []
@@ -134,7 +134,7 @@ def _unseen_angles(inspection: Inspection) -> list[str]:
 
 
 def _known_angles(inspection: Inspection) -> bool:
-    """Whether the ratio of the angles is that of the drive: units that cancel need not be known."""
+    """Whether the ratio of the angles is that of the drive: units that cancel may be unknown."""
     signals = inspection.joint.signals
     return all(s in signals for s in _ANGLES)
 
@@ -147,7 +147,7 @@ def _place(guess: SignalGuess) -> dict[str, Any]:
 
 
 def _open_place(guess: SignalGuess) -> str:
-    """A place with the part that is not known left to be written."""
+    """A place in which the unknown part is left to fill in."""
     sign = ", sign = -1" if guess.sign < 0 else ""
     if guess.signal == "motor_current":
         unit = f", unit = {_toml(guess.unit)}" if guess.unit else ""
@@ -160,7 +160,7 @@ def _why_not_written(guess: SignalGuess) -> str:
         return "the torque constant [N m / A] is not known from a log"
     if guess.unit is not None:
         return f"write the size of one '{guess.unit}', such as \"0.27 N m\""
-    return 'the unit can\'t be seen; for counts write "rev / 65536" with the counts of a revolution'
+    return 'the unit is unknown; for counts write "rev / 65536" with the counts of a revolution'
 
 
 def _with_reason(line: str, guess: SignalGuess) -> str:
@@ -174,9 +174,9 @@ def _ratio_lines(inspection: Inspection) -> list[str]:
     if ratio is not None and known:
         said = f"reduction_ratio = {_toml(_number(ratio.value))}"
         if ratio.value == 1:
-            why = "both angles turn alike, so that motor inertia and torque count as seen from the output"
+            why = "both angles move equally, so that motor inertia and torque are referred to the output"
         else:
-            why = f"the angles leave {ratio.low:.4g} to {ratio.high:.4g}"
+            why = f"the angles admit {ratio.low:.4g} to {ratio.high:.4g}"
         return [f"{said}  # guess: {why}"]
     if inspection.joint.kind == "reduced" or (inspection.joint.kind == "quasi-static" and not both):
         return []
@@ -187,8 +187,8 @@ def _ratio_lines(inspection: Inspection) -> list[str]:
 def _why_no_ratio(inspection: Inspection) -> str:
     ratio = inspection.joint.ratio
     if ratio is None:
-        return "motor turns per output turn; the log does not show it"
-    return f"motor turns per output turn; the angles leave {ratio.low:.4g} to {ratio.high:.4g}"
+        return "motor revolutions per output revolution; the log does not determine it"
+    return f"motor revolutions per output revolution; the angles admit {ratio.low:.4g} to {ratio.high:.4g}"
 
 
 def _inertia_lines(inspection: Inspection) -> list[str]:
@@ -201,7 +201,7 @@ def _sampling_lines(inspection: Inspection) -> list[str]:
     lines = []
     if inspection.time.column is None and inspection.rates[0] is None:
         lines.append(f"# sample_rate = ...  # {_WHERE_TO_FILL}: Hz; no column is a clock")
-    hold = '# torque_hold = "zero-order"  # what the torque does between samples, where you know it'
+    hold = '# torque_hold = "zero-order"  # inter-sample behaviour of the torque, if known'
     return [*lines, hold] if inspection.joint.kind != "quasi-static" else lines
 
 
@@ -216,7 +216,7 @@ def _time_lines(inspection: Inspection) -> list[str]:
 def _open_lines(inspection: Inspection) -> list[str]:
     lines = []
     for column, shares in inspection.joint.open.items():
-        lines.append(f"# {_WHERE_TO_FILL}: {_plain(repr(column))} may be {_listed(shares)}; take the # from one line")
+        lines.append(f"# {_WHERE_TO_FILL}: {_plain(repr(column))} may be {_listed(shares)}; remove the # from one line")
         unit = inspection.tables[0].column(column).unit
         place = {"column": column} | ({} if unit is None or is_counts(unit) else {"unit": unit})
         lines += [f"# {signal} = {_toml(place)}" for signal in shares]
@@ -236,15 +236,15 @@ def _number(value: float) -> int | float:
 
 
 def _plain(text: str) -> str:
-    """Text that may stand in a comment: names of columns may hold line ends."""
+    """Text for a comment: names of columns may contain line ends."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def _toml(value: Any) -> str:
-    """A value as TOML writes it; its strings are those of JSON."""
+    """A value in TOML notation; its strings are those of JSON."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, str):
-        # JSON leaves the delete character as it is, TOML does not.
+        # JSON does not escape the delete character, TOML does.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)

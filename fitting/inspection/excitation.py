@@ -1,4 +1,4 @@
-"""How a log moves its drive: ranges, the band of the torque, and where the response follows it."""
+"""Excitation of a log: ranges of signals, band of the torque, and band of coherent response."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,9 @@ from fitting.inspection.inspection import Inspection
 from fitting.logs.channels import SI
 
 COHERENT = 0.9
-"""Coherence from which a response is said to follow its input; assumed."""
+"""Coherence above which a response counts as linear in its input; assumed."""
 
-_POWER = (0.05, 0.95)  # of a torque, between these shares lies its band
+_POWER = (0.05, 0.95)  # shares of a torque's power that limit its band
 _SEGMENTS = 16
 # How many times a side that turns freely integrates the torque: what drifts would hide what follows.
 _ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1}
@@ -20,15 +20,15 @@ _FEWEST = 256
 
 @dataclass(frozen=True)
 class Excitation:
-    """How one log moves its drive.
+    """Excitation and response of one log.
 
     Attributes:
         ranges: Lowest and highest value of each signal, and its unit, by name.
-        driver: The torque or forcing that was looked at, or None.
-        response: What follows it, or None.
-        band: Hz, between which 90 % of the driver's power lies, or None.
-        coherent: Hz, the widest band in which the response follows the driver, or None.
-        twist: Range of what both angles do not share [rad], or None.
+        driver: The torque or forcing, or None.
+        response: The responding signal, or None.
+        band: Hz, limits of 90 % of the driver's power, or None.
+        coherent: Hz, the widest band of coherent response, or None.
+        twist: Range of the twist from both angles [rad], or None.
     """
 
     ranges: dict[str, tuple[float, float, str]]
@@ -40,10 +40,10 @@ class Excitation:
 
 
 def excitation(inspection: Inspection, log: int = 0) -> Excitation:
-    """How a log moves its drive.
+    """Excitation and response of a log.
 
     Args:
-        inspection: What was guessed.
+        inspection: The guesses.
         log: Number of the log.
     """
     signals = inspection.joint.signals
@@ -75,7 +75,7 @@ def _range(inspection: Inspection, signal: str, log: int) -> tuple[float, float,
 
 
 def _twist(inspection: Inspection, log: int) -> np.ndarray | None:
-    """theta_m/N - theta_l [rad] less its mean, evenly sampled, where both angles and the ratio are known."""
+    """theta_m/N - theta_l [rad] without its mean, evenly sampled, if both angles and the ratio are known."""
     joint, rate = inspection.joint, inspection.rates[log]
     both = {"motor_angle", "load_angle"} <= set(joint.signals)
     if not both or rate is None or joint.ratio is None or not joint.ratio.sure:

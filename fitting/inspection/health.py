@@ -1,4 +1,4 @@
-"""What the health gate says of logs as they were guessed, before anything is filled in."""
+"""Health check of logs with guessed signals, before anything is filled in."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ from fitting.logs.findings import Finding
 from fitting.logs.log import read_log
 from fitting.logs.masks import masked
 
-# What stands for what is not known yet; no finding hangs on it.
+# Placeholder of unknown values; no finding depends on it.
 _ANY_INERTIA = 1.0
 _ANY_RATE = 1.0
 _ANY_CONSTANT = 1.0
@@ -38,7 +38,7 @@ def health(inspection: Inspection) -> tuple[tuple[Finding, ...], ...]:
 
 
 def _complete(inspection: Inspection, tables: Mapping[str, Any]) -> bool:
-    """Whether every signal has its unit, so that the log can be read as a fit would."""
+    """Whether every signal has a unit, so that the log can be read as for a fit."""
     signals = set(inspection.joint.signals)
     return all(s in tables["columns"] for s in signals - ({"motor_current"} if "motor_torque" in signals else set()))
 
@@ -56,12 +56,12 @@ def _of_log(inspection: Inspection, k: int, tables: Mapping[str, Any]) -> tuple[
         return (Finding("refusal", str(error).removeprefix(f"{path}: "), path.name, "`hdjax fit` refuses this"),)
     if ratio is None and log.motor_angle is not None and log.load_angle is not None:
         return log.findings
-    # Without inertias, nothing is held against them.
+    # Without inertias, findings on them are dropped.
     return examine(log, drive_of({**tables, "drive": known, "signals": signals}, _DRIVE_FILE))
 
 
 def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:
-    """What can be said of columns of which no log is made."""
+    """Findings on the columns where they do not make up a log."""
     table, time = inspection.tables[k], inspection.time
     found = [] if time.column is None else [*sampling_findings(table, table.column(time.column), time.unit)]
     for guess in inspection.joint.signals.values():
@@ -69,7 +69,7 @@ def _of_columns(inspection: Inspection, k: int) -> tuple[Finding, ...]:
         blank = int((~np.isfinite(values)).sum())
         if blank:
             what = f"blank in {blank} rows ({100 * blank / len(values):.2g} %)"
-            found.append(Finding("note", what, guess.column, "they will have no weight in a fit"))
+            found.append(Finding("note", what, guess.column, "they will have weight zero in a fit"))
         if table.column(guess.column).constant:
-            found.append(Finding("warning", "it never changes", guess.column, "it tells nothing in this log"))
+            found.append(Finding("warning", "it is constant", guess.column, "it has no information in this log"))
     return tuple(found)

@@ -1,7 +1,7 @@
-"""Which columns are the angles of a drive, and which all others: every way to say it, weighed as a whole.
+"""Assignment of columns to signals, by log odds of complete hypotheses.
 
-The angles are enumerated, since all equations hang on them; given these, each other column has log odds of its own for
-each signal, and one assignment over all columns together is best.
+The angles are enumerated, since all equations depend on them. Given these, each other column has log odds for each
+signal, and the best assignment over all columns is computed.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from fitting.inspection.columns import Column
 from fitting.inspection.name_evidence import NameEvidence, in_context, name_evidence
-from fitting.inspection.relations import NOTHING, Relations, Told
+from fitting.inspection.relations import NOTHING, RelationEvidence, Relations
 from fitting.inspection.unit_evidence import UnitChoice, angle_units, velocity_units
 
 ANGLES = ("motor_angle", "load_angle", "dynamic_error")
@@ -30,11 +30,11 @@ OTHERS = (
 # A reduced log has a forcing, a quasi-static one a joint torque.
 _EITHER = ("forcing", "joint_torque")
 
-# Log odds, assumed; what each is for stands beside it.
-_WORST_NAME = -5.0  # a column whose name contradicts a signal more than this is no candidate for it
-_WORST_RELATION = -1.0  # friction and noise hide relations: their absence says little
+# Log odds, assumed; meaning beside each.
+_WORST_NAME = -5.0  # a column whose name contradicts a signal more than this is not a candidate for it
+_WORST_RELATION = -1.0  # friction and noise mask relations: their absence is weak evidence
 _FAR_FETCHED = -3.0  # a forcing beside a drive's angles, a torque without any
-# Where the drive moves as one mass, a torque through the gear accelerates it as well as the motor's.
+# Where the drive moves as a rigid body, joint torque and motor torque both accelerate it.
 _AS_ONE_MASS = {"motor_torque": -0.3, "joint_torque": -1.0}
 _RATIO_FITS, _RATIO_BESIDE, _RATIO_ONE, _RATIO_WRONG = 0.0, -2.0, -2.5, -6.0
 _NO_WHOLE_RATIO = -1.5
@@ -43,19 +43,19 @@ _RATE_FITS, _RATE_CONTRADICTS = 0.0, -4.0
 _TWIST_UNITS = (1.0, float(np.pi / 180.0), 1e-3)  # rad, deg, mrad
 _USUAL_RATIOS, _POSSIBLE_RATIOS = (25.0, 330.0), (4.0, 1100.0)
 _RATE_TOLERANCE = 0.03
-_ABOUT_ONE = 0.15  # no gear has such a ratio
+_ABOUT_ONE = 0.15  # limits of reduction ratios
 _WHOLE_TOLERANCE = 2e-3
 _COPY = 5.0  # odds of proportionality above which two columns are the same channel
-_NEARLY = 12.0  # what is less likely than the best by this much is not looked at
+_NEARLY = 12.0  # hypotheses less likely than the best by this much are dropped
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One way to say what the columns are.
+    """An assignment of columns to signals.
 
     Attributes:
-        columns: number of the column of each signal that there is.
-        odds: log odds of it all.
+        columns: number of the column of each assigned signal.
+        odds: total log odds.
     """
 
     columns: dict[str, int]
@@ -63,11 +63,11 @@ class Hypothesis:
 
 
 class Evidence:
-    """All that is known about the columns of one joint.
+    """Evidence on the columns of one joint.
 
     Attributes:
-        columns: looked at.
-        relations: among them, by the same numbers.
+        columns: of the joint.
+        relations: between them, by the same numbers.
     """
 
     def __init__(self, columns: Sequence[Column], relations: Relations):
@@ -79,13 +79,13 @@ class Evidence:
         }
         self.angle_choices = [angle_units(c) for c in self.columns]
         self.velocity_choices = [velocity_units(c) for c in self.columns]
-        self._cache: dict[tuple, tuple[Told, ...]] = {}
+        self._cache: dict[tuple, tuple[RelationEvidence, ...]] = {}
 
     def candidates(self, signal: str) -> list[int]:
-        """Columns that could be a signal by their names."""
+        """Columns that may be a signal, by their names."""
         return [k for k, name in enumerate(self.names[signal]) if name.odds > _WORST_NAME]
 
-    def told(self, relation: str, *angles: int) -> tuple[Told, ...]:
+    def told(self, relation: str, *angles: int) -> tuple[RelationEvidence, ...]:
         """A relation of all columns to some angles; see [`Relations`][]."""
         key = (relation, *angles)
         if key not in self._cache:
@@ -94,7 +94,7 @@ class Evidence:
         return self._cache[key]
 
     def geometry(self, motor: int | None, load: int | None, twist: int | None) -> float:
-        """Log odds of the angles: their names, their ratio, and a twist that is made of them."""
+        """Log odds of the angles: names, ratio, and a twist computed from them."""
         chosen = zip(ANGLES, (motor, load, twist), strict=True)
         odds = sum(self.names[signal][k].odds for signal, k in chosen if k is not None)
         if motor is not None and load is not None:
@@ -107,8 +107,8 @@ class Evidence:
                 odds += max(made.odds, _WORST_RELATION) + self._scale_of_twist(made, told, load)
         return odds
 
-    def _scale_of_twist(self, made: Told, together: Told, load: int) -> float:
-        """Log odds of the scale of a twist: it counts the load's angle once, in units of its own."""
+    def _scale_of_twist(self, made: RelationEvidence, together: RelationEvidence, load: int) -> float:
+        """Log odds of the scale of a twist: it contains the load's angle once, in its unit."""
         if made.odds <= 0 or together.odds <= 0:
             return 0.0
         times = abs(made.slope * together.slope)
@@ -116,14 +116,14 @@ class Evidence:
         return 0.0 if min(abs(times / unit - 1.0) for unit in units) < _RATE_TOLERANCE else _RATE_CONTRADICTS
 
     def ratios(self, motor: int, load: int, slope: float) -> list[tuple[UnitChoice, UnitChoice, float]]:
-        """Units of both angles with the log odds of the reduction ratio that they make."""
+        """Units of both angles with the log odds of the resulting reduction ratio."""
         return [
             (m, f, m.odds + f.odds + ratio_odds(abs(slope) * m.size / f.size) + _beside(m, f))
             for m, f in product(self.angle_choices[motor], self.angle_choices[load])
         ]
 
     def other(self, signal: str, column: int, motor: int | None, load: int | None, twist: int | None) -> float:
-        """Log odds of a column for a signal that is no angle, given the angles."""
+        """Log odds of a column for a signal other than angles, given the angles."""
         return self.names[signal][column].odds + self._related(signal, column, motor, load, twist)
 
     def _related(self, signal: str, column: int, motor: int | None, load: int | None, twist: int | None) -> float:
@@ -135,14 +135,14 @@ class Evidence:
             return self._of_motor(column, angles) if angles else _FAR_FETCHED
         if signal == "joint_torque":
             together = self.accelerated(column, angles[-1:]).odds + _AS_ONE_MASS[signal] if angles else 0.0
-            # What accelerates the motor against the spring is no torque of the spring.
+            # A torque that accelerates the motor against the spring is not that of the spring.
             apart = self.accelerated(column, angles).odds if len(angles) == 2 else 0.0
             held = max(self.held(column, motor, load, twist).odds, together)
             return max(held - max(apart, 0.0), 0.0)
         if signal == "forcing":
             if twist is None:
                 return _FAR_FETCHED
-            # What holds both ways tells no direction: so do the two angles of a drive.
+            # A relation that holds in both directions is no evidence, as for the two angles of a drive.
             driven = max(self._oscillates(twist, column) - self._oscillates(column, twist), 0.0)
             return driven + (_FAR_FETCHED if angles else 0.0)
         return 0.0
@@ -151,15 +151,15 @@ class Evidence:
         apart = self.accelerated(column, angles).odds
         together = self.accelerated(column, angles[:1]).odds
         odds = max(apart, together + _AS_ONE_MASS["motor_torque"], 0.0)
-        # Alone, an angle that a spring pulls back is a twist, and what drives it a forcing.
+        # A single angle with a restoring torque is a twist, and its input a forcing.
         return odds - (max(self.told("pulled_back", angles[0])[column].odds, 0.0) if len(angles) == 1 else 0.0)
 
-    def accelerated(self, column: int, angles: Sequence[int]) -> Told:
-        """How a torque accelerates the first angle."""
+    def accelerated(self, column: int, angles: Sequence[int]) -> RelationEvidence:
+        """Evidence that a torque accelerates the first angle."""
         return self.told("accelerates", *angles)[column]
 
-    def held(self, column: int, motor: int | None, load: int | None, twist: int | None) -> Told:
-        """How a torque twists the drive."""
+    def held(self, column: int, motor: int | None, load: int | None, twist: int | None) -> RelationEvidence:
+        """Evidence that a torque twists the drive."""
         if twist is not None:
             return self.told("holds", twist)[column]
         if motor is not None and load is not None:
@@ -167,13 +167,13 @@ class Evidence:
         return NOTHING
 
     def _oscillates(self, twist: int, forcing: int) -> float:
-        """Log odds that a channel is an oscillator under a forcing: it has an inertia, and it has a spring."""
+        """Log odds that a channel is an oscillator under a forcing: with inertia and spring."""
         told = (self.told(relation, twist)[forcing].odds for relation in ("drives", "pulled_back"))
         return sum(max(odds, 0.0) for odds in told)
 
     def _of_velocity(self, column: int, side: int | None, angles: Sequence[int]) -> float:
         if side is None:
-            # The rate of the other side's angle is more likely said to be of that side.
+            # The rate of the other side's angle more likely belongs to that side.
             return _FAR_FETCHED if angles else 0.0
         told = self.relations.is_rate_of(column, side)
         if told.odds <= 0:
@@ -181,7 +181,7 @@ class Evidence:
         return told.odds + max(odds for _, _, odds in self.rate_units(column, side, told.slope))
 
     def rate_units(self, velocity: int, angle: int, slope: float) -> list[tuple[UnitChoice, UnitChoice, float]]:
-        """Units of an angle and of its rate, with log odds: one is the derivative of the other in SI."""
+        """Units of an angle and of its rate, with log odds from the derivative in SI."""
         found = []
         for a, v in product(self.angle_choices[angle], self.velocity_choices[velocity]):
             off = abs(abs(slope) * a.size / v.size - 1.0)
@@ -190,14 +190,14 @@ class Evidence:
 
 
 def _beside(one: UnitChoice, other: UnitChoice) -> float:
-    """Log odds of two units in one log: where neither is stated, they are most often the same; encoders differ."""
+    """Log odds of two units in one log: where neither is stated, they are mostly equal; encoders differ."""
     if one.unit == other.unit or "stated" in (one.reason, other.reason):
         return 0.0
     return _OTHER_COUNTS if one.unit.startswith("rev /") and other.unit.startswith("rev /") else _MIXED
 
 
 def ratio_odds(ratio: float) -> float:
-    """Log odds of a reduction ratio, as gears are built."""
+    """Log odds of a reduction ratio, from those of real gears."""
     off = abs(ratio - round(ratio)) > max(_WHOLE_TOLERANCE * ratio, 0.1)
     broken = _NO_WHOLE_RATIO if off else 0.0
     if _USUAL_RATIOS[0] <= ratio <= _USUAL_RATIOS[1]:
@@ -208,7 +208,7 @@ def ratio_odds(ratio: float) -> float:
 
 
 def hypotheses(evidence: Evidence) -> list[Hypothesis]:
-    """The ways to say what the columns are that are worth a thought, the best first."""
+    """The likely assignments, the best first."""
     motors, loads, twists = ([None, *evidence.candidates(signal)] for signal in ANGLES)
     frames = [(m, f, x) for m, f, x in product(motors, loads, twists) if _distinct(m, f, x)]
     weighed = [(evidence.geometry(*frame), frame) for frame in frames]
@@ -227,7 +227,7 @@ def _distinct(*columns: int | None) -> bool:
 
 
 def _rest(evidence: Evidence, motor: int | None, load: int | None, twist: int | None) -> tuple[float, dict[str, int]]:
-    """The best assignment of the columns that are no angles, and its log odds."""
+    """The best assignment of the columns other than angles, and its log odds."""
     taken = {motor, load, twist}
     free = [k for k in range(len(evidence.columns)) if k not in taken]
     odds = np.zeros((len(OTHERS), len(free)))
@@ -239,7 +239,7 @@ def _rest(evidence: Evidence, motor: int | None, load: int | None, twist: int | 
 
 
 def _assigned(odds: np.ndarray, free: Sequence[int], without: str) -> tuple[float, dict[str, int]]:
-    """The best assignment that leaves one signal out."""
+    """The best assignment without one signal."""
     odds = odds * (np.array(OTHERS) != without)[:, None]
     rows, columns = linear_sum_assignment(odds, maximize=True)
     chosen = {OTHERS[r]: free[c] for r, c in zip(rows, columns, strict=True) if odds[r, c] > 0}
@@ -247,16 +247,16 @@ def _assigned(odds: np.ndarray, free: Sequence[int], without: str) -> tuple[floa
 
 
 def _weights(found: Sequence[Hypothesis]) -> np.ndarray:
-    """Of each hypothesis, together 1."""
+    """Weights of the hypotheses, with sum 1."""
     odds = np.array([h.odds for h in found])
     weights = np.exp(odds - odds.max())
     return weights / weights.sum()
 
 
 def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[str, float]]:
-    """For each column the signals that it may be, with the weight of the hypotheses that say so, 0 to 1.
+    """For each column its possible signals, with the total weight of their hypotheses, 0 to 1.
 
-    A hypothesis that takes a copy of the column speaks for it as well.
+    A hypothesis with a copy of the column counts for it as well.
     """
     weights = _weights(found)
     shares: dict[int, dict[str, float]] = {}
@@ -277,8 +277,8 @@ def weighed(found: Sequence[Hypothesis], evidence: Evidence) -> dict[int, dict[s
 
 
 def readings(found: Sequence[Hypothesis], evidence: Evidence, column: int) -> dict[str, float]:
-    """What a column that is no angle may be, with the confidence of each, the likeliest first: every reading under the
-    best hypothesis, and that of each other one."""
+    """Possible signals of a column other than angles, with confidence, the most likely first: all under the best
+    hypothesis, and that of each other hypothesis."""
     best, weights = found[0], _weights(found)
     frame = tuple(best.columns.get(signal) for signal in ANGLES)
     idle = [s for s in OTHERS if s not in best.columns or best.columns[s] == column]
@@ -293,7 +293,7 @@ def readings(found: Sequence[Hypothesis], evidence: Evidence, column: int) -> di
 
 
 def _margin(evidence: Evidence, best: Hypothesis, signal: str, column: int, frame: tuple) -> float:
-    """How much is lost where a column is not the signal: no other column is, or it is another signal."""
+    """Loss of log odds if a column is not the signal: no other column is, or it is another signal."""
     own = evidence.other(signal, column, *frame)
     free = [k for k in range(len(evidence.columns)) if k not in best.columns.values()]
     heirs = [evidence.other(signal, k, *frame) for k in free if evidence.names[signal][k].odds > _WORST_NAME]

@@ -1,4 +1,4 @@
-"""What logs hold that nobody has described."""
+"""Inspection of logs without a drive file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,28 +19,31 @@ from fitting.inspection.windows import Uniform, scales, uniform
 from fitting.logs.channels import SI
 from fitting.logs.unwrapping import unwrapped_angle
 
-_COPY = 5.0  # log odds of proportionality above which a column is said to follow another
-_RIVAL, _WORTH_A_WORD = 0.05, 0.3  # confidence below which a reading is not told, and a column is said to be none
-_TOLD_UNIT, _SURE_UNIT = 0.5, 0.95  # confidence below which a unit is not told at all, or said to be assumed
+_COPY = 5.0  # log odds of proportionality above which a column counts as a copy of another
+_RIVAL, _WORTH_A_WORD = (
+    0.05,
+    0.3,
+)  # confidence below which a possible signal is not reported, and a column counts as none
+_TOLD_UNIT, _SURE_UNIT = 0.5, 0.95  # confidence below which a unit is not reported, or reported as assumed
 _WITHOUT_SIGN = ("temperature", "load_torque")
 _SHARED = ("angle", "velocity", "torque", "current", "twist")
 
 
 @dataclass(frozen=True, eq=False)
 class SignalGuess:
-    """A signal and the column it stands in.
+    """A signal and its column.
 
     Attributes:
         signal: Of a drive file.
         column: Name of the column.
-        unit: Stated or guessed, or None where it can't be told.
+        unit: Stated or guessed, or None if unknown.
         unit_stated: Whether the file states it.
         size: Of the unit in SI.
         sign: +1 or -1.
         confidence: 0 to 1.
-        reasons: In words.
+        reasons: As text.
         unit_reason: For the unit, where it is guessed.
-        doubts: What can't be told of the unit.
+        doubts: Uncertainty of the unit.
     """
 
     signal: str
@@ -56,7 +59,7 @@ class SignalGuess:
 
     @property
     def why(self) -> str:
-        """All that speaks for the guess and against it."""
+        """All evidence for the guess and against it."""
         unit = (f"{self.unit}: {self.unit_reason}",) if self.unit_reason and self.unit else ()
         return "; ".join((*self.reasons, *unit, *self.doubts))
 
@@ -67,11 +70,11 @@ class JointInspection:
 
     Attributes:
         label: Of the joint, or None.
-        signals: That were found, by name.
-        open: Columns that could be several signals, with the confidence of each.
-        copies: Columns that follow another one, with what they follow and how many times it.
-        ratio: The reduction ratio, or None where it can't be seen.
-        span: Range of the output's angle, or else of the motor's or the twist, in the column's own unit.
+        signals: Recognised ones, by name.
+        open: Columns with several possible signals, with the confidence of each.
+        copies: Columns proportional to another one, with its name and the factor.
+        ratio: The reduction ratio, or None if unknown.
+        span: Range of the output's angle, or else of the motor's or the twist, in the column's unit.
     """
 
     label: str | None
@@ -83,13 +86,13 @@ class JointInspection:
 
     @property
     def travel(self) -> float:
-        """Range of the output's angle, or else of the motor's or the twist, in SI as far as the unit is known."""
+        """Range of the output's angle, or else of the motor's or the twist, in SI if the unit is known."""
         found = [self.signals[s].size for s in ("load_angle", "motor_angle") if s in self.signals]
         return self.span * (found or [1.0])[0]
 
     @property
     def kind(self) -> str | None:
-        """What kind of log the joint's columns are: "drive", "reduced", "quasi-static", "motor side"; None for none."""
+        """Kind of log of the joint's columns: "drive", "reduced", "quasi-static", "motor side"; None for none."""
         found = set(self.signals)
         driven = found & {"motor_torque", "motor_current"}
         if {"motor_angle", "load_angle"} <= found and driven:
@@ -103,14 +106,14 @@ class JointInspection:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Logs of one drive or robot, looked at without a drive file.
+    """Inspected logs of one drive or robot.
 
     Attributes:
         tables: The logs' columns.
         clocks: The logs' stamps.
-        time: The column that is the clock.
-        joints: Of the robot; one without a label where there is a single drive.
-        joint: The one that moves the most, or the one asked for.
+        time: The clock column.
+        joints: Of the robot; one without a label for a single drive.
+        joint: The one that moves the most, or the requested one.
     """
 
     tables: tuple[Table, ...]
@@ -121,11 +124,11 @@ class Inspection:
 
     @cached_property
     def rates(self) -> tuple[float | None, ...]:
-        """Samples per second of each log [Hz]; None where no seconds are known."""
+        """Samples per second of each log [Hz]; None without a known time unit."""
         return tuple(1.0 / float(np.median(np.diff(c.base.time))) if c.known else None for c in self.clocks)
 
     def samples(self, signal: str, log: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps [s] and values of a signal of the chosen joint, in SI as guessed, (n,) each, where both are known."""
+        """Stamps [s] and values of a signal of the chosen joint, in SI as guessed, (n,) each, if both are known."""
         guess = self.joint.signals[signal]
         values, own = _samples(self.tables[log], guess.column, self.clocks[log], self.time)
         stamps = self.clocks[log].base.time if own is None else own
@@ -134,11 +137,11 @@ class Inspection:
 
 
 def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Inspection:
-    """Look at logs of one drive or robot.
+    """Inspect logs of one drive or robot.
 
     Args:
         tables: All columns of each.
-        joint: Label of the joint that matters; where None, the one that moves the most.
+        joint: Label of the joint; if None, the one that moves the most.
 
     Raises:
         InputError: The logs have different columns, or there is no such joint.
@@ -151,7 +154,7 @@ def inspect_tables(tables: Sequence[Table], *, joint: str | None = None) -> Insp
             f"{others[0].path}: its columns are not those of {first.path} ({differing}); give logs of one drive that "
             "were recorded alike, or one at a time"
         )
-    # Numbers of any size may stand in a file; what overflows tells nothing.
+    # Files may contain numbers of any size; those that overflow carry no information.
     with np.errstate(all="ignore"):
         return _inspected(tables, joint)
 
@@ -167,7 +170,7 @@ def _inspected(tables: Sequence[Table], joint: str | None) -> Inspection:
 
 
 def alike(tables: Sequence[Table]) -> list[tuple[Table, ...]]:
-    """Tables in groups that have the same columns."""
+    """Tables in groups with the same columns."""
     groups: dict[frozenset[str], list[Table]] = {}
     for table in tables:
         groups.setdefault(table.names, []).append(table)
@@ -175,13 +178,13 @@ def alike(tables: Sequence[Table]) -> list[tuple[Table, ...]]:
 
 
 def joint_labels(columns: Sequence[Column]) -> tuple[str, ...]:
-    """The labels of the joints of a robot, which its columns repeat; nothing where there is one drive."""
+    """The labels of a robot's joints, from repeated column names; empty for one drive."""
     stems: dict[str, set[str]] = {}
     for column in columns:
         if column.sense.joint is not None and column.sense.quantities[:1] and column.sense.quantities[0] in _SHARED:
             stems.setdefault(column.sense.joint, set()).add(column.sense.stem)
     bare = [c.sense for c in columns if c.sense.joint is None]
-    # Two encoders of one drive are numbered as well; there its torque is not.
+    # Two encoders of one drive may also be numbered, but not its torque.
     one_torque = any(s.quantities[:1] in (("torque",), ("current",)) for s in bare)
     labelled = any("torque" in c.sense.quantities or "current" in c.sense.quantities for c in columns if c.sense.joint)
     if one_torque and not labelled:
@@ -201,7 +204,7 @@ def _chosen(joints: tuple[JointInspection, ...], wanted: str | None, path: Path)
 
 
 def _unwrapped(column: Column) -> np.ndarray:
-    """The values, without the jumps of an angle that wraps."""
+    """The values, unwrapped."""
     said = column.sense.quantities
     if said and "angle" not in said:
         return column.values
@@ -230,7 +233,7 @@ def _joint(
 
 
 def _as_others(joint: JointInspection, joints: Sequence[JointInspection], table: Table) -> JointInspection:
-    """A joint whose unknown units are those of the same channel of another joint."""
+    """A joint with unknown units taken from the same channel of another joint."""
 
     def known(guess: SignalGuess) -> SignalGuess:
         others = [other.signals[guess.signal] for other in joints if guess.signal in other.signals]
@@ -244,14 +247,14 @@ def _as_others(joint: JointInspection, joints: Sequence[JointInspection], table:
 
 
 def _samples(table: Table, name: str, clock: Clock, time: TimeGuess) -> tuple[np.ndarray, np.ndarray | None]:
-    """The values of a column and its own stamps, or those of its rows that the clock has."""
+    """The values of a column and its stamps, or those of the table's clock."""
     column = table.column(name)
     values, own = _unwrapped(column), own_stamps(table, column, time)
     return (values, own) if own is not None else (values[clock.base.rows], None)
 
 
 def _is_of(column: Column, label: str | None, labels: tuple[str, ...]) -> bool:
-    """Whether a column is a joint's, or of none, and may be a signal."""
+    """Whether a column belongs to a joint, or to none, and may be a signal."""
     if column.sense.quantities[:1] in (("other",), ("time",), ("counter",)):
         return False
     return label is None or column.sense.joint == label or column.sense.joint not in labels
@@ -262,9 +265,9 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
     best, shares = found[0].columns, weighed(found, evidence)
     sure = {s: k for s, k in best.items() if shares[k].get(s, 0.0) >= SURE}
     if {"motor_torque", "motor_current"} <= set(sure) and evidence.columns[sure["motor_torque"]].sense.commanded:
-        # The measured current tells the torque better than a command does.
+        # A measured current is better evidence of the torque than a command.
         del sure["motor_torque"]
-    # What is not sure enough to be told still bears on the units and signs of the rest.
+    # Guesses that are too uncertain to report still affect units and signs of the others.
     (units, alike), signs = units_of(best, evidence, logs), signs_of(best, evidence)
     ratio = ratio_of(sure, (units, alike), evidence, logs)
     names = _names(sure)
@@ -287,13 +290,13 @@ def _settled(label: str | None, evidence: Evidence, logs: Sequence[Uniform]) -> 
 
 
 def _names(sure: dict[str, int]) -> dict[str, str]:
-    """What drive files call the signals: the twist of a quasi-static log is no dynamic error of a reduced one."""
+    """Signal names for drive files: the twist of a quasi-static log is not the dynamic error of a reduced one."""
     slow = "joint_torque" in sure and "forcing" not in sure
     return {s: "twist" if s == "dynamic_error" and slow else s for s in (*ANGLES, *OTHERS)}
 
 
 def _copies(evidence: Evidence, taken: set[int]) -> dict[str, tuple[str, float]]:
-    """Columns that are no signal, but move as one does."""
+    """Columns that are not a signal, but proportional to one."""
     copies = {}
     for k, column in enumerate(evidence.columns):
         if k in taken:
@@ -329,7 +332,7 @@ def _signal(
         confidence=confidence,
         reasons=tuple(reasons),
     )
-    doubts = () if sign is not None or signal in _WITHOUT_SIGN or signal == reference else ("its sign does not show",)
+    doubts = () if sign is not None or signal in _WITHOUT_SIGN or signal == reference else ("its sign is unknown",)
     if unit is None or unit.reason == "stated":
         return replace(guess, doubts=doubts)
     rivals = " or ".join(unit.rivals)
@@ -337,5 +340,5 @@ def _signal(
         doubts = (f"its unit may be {unit.unit} or {rivals}", *doubts)
         return replace(guess, unit=None, unit_stated=False, size=unit.size, doubts=doubts)
     if unit.confidence < _SURE_UNIT:
-        doubts = (f"{unit.unit} is assumed, {rivals} would do", *doubts)
+        doubts = (f"{unit.unit} is assumed, {rivals} is possible", *doubts)
     return replace(guess, unit=unit.unit, unit_stated=False, size=unit.size, unit_reason=unit.reason, doubts=doubts)

@@ -1,4 +1,4 @@
-"""How well a column's name and stated unit suit each signal, in log odds against no signal at all."""
+"""Evidence of a column's name and stated unit for each signal, in log odds against no signal."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -8,34 +8,34 @@ from fitting.inspection.unit_evidence import is_counts, si_size
 from fitting.logs.channels import SI
 from fitting.logs.column_names import QUANTITY, NameSense
 
-# Log odds, assumed; what each is for stands beside it.
-_OWN_NAME = 9.0  # the signal's own name
-_SAME, _FIRST, _PERHAPS = 2.5, 1.5, 0.3  # quantity as the name's only one, the first of several, or another
+# Log odds, assumed; meaning beside each.
+_OWN_NAME = 9.0  # name equal to the signal's
+_SAME, _FIRST, _PERHAPS = 2.5, 1.5, 0.3  # quantity is the name's only one, the first of several, or another
 _OTHER = -8.0  # another quantity
-_SILENT = -0.5  # a name that says nothing
+_SILENT = -0.5  # a name without known meaning
 _SIDE, _WRONG_SIDE = 2.5, -6.0
 _JOINT_SIDE, _NO_MOTOR = 1.0, -2.0  # "joint" is most often the output
-_COMMAND, _COMMANDED_TORQUE = -12.0, -3.0  # a command is no measurement
+_COMMAND, _COMMANDED_TORQUE = -12.0, -3.0  # a command is not a measurement
 _UNIT, _WRONG_UNIT = 1.5, -10.0
 _EXTERNAL = 2.0
-_RARE: dict[str, float] = {"load_torque": -1.5}  # signals that few logs have
+_RARE: dict[str, float] = {"load_torque": -1.5}  # rare signals
 _UNNAMED: dict[str, float] = dict.fromkeys(
     ("motor_current", "load_torque", "temperature"), -6.0
-)  # that only a name or a unit tells
-_OF_THE_JOINT = -1.0  # a torque of the joint that is the motor's all the same
-_CONSTANT, _LOCKED = -5.0, -2.0  # a channel that never changes, or an angle: one side may be locked
-_BARE_TORQUE = {"motor_torque": 0.5, "joint_torque": -0.5, "load_torque": -2.5}  # that a torque of no side is which
+)  # signals that only name or unit identify
+_OF_THE_JOINT = -1.0  # a torque named after the joint that is the motor's
+_CONSTANT, _LOCKED = -5.0, -2.0  # a constant channel, or a constant angle: one side may be locked
+_BARE_TORQUE = {"motor_torque": 0.5, "joint_torque": -0.5, "load_torque": -2.5}  # a torque without a side
 
 _SI = SI | {"motor_current": "A"}
 
 
 @dataclass(frozen=True)
 class NameEvidence:
-    """What a name says for one signal.
+    """Evidence of a name for one signal.
 
     Attributes:
         odds: log odds.
-        reasons: in words; empty where it says nothing.
+        reasons: as text; empty without evidence.
     """
 
     odds: float
@@ -43,7 +43,7 @@ class NameEvidence:
 
 
 def in_context(columns: Sequence[Column]) -> tuple[NameSense, ...]:
-    """What the names say, each read beside the others.
+    """Meaning of the names, each in context of the others.
 
     In a robot's log `theta` is the motor's angle where `q` is the link's, and so are their rates. In a system's log `u`
     is the input and `y` the output.
@@ -64,11 +64,11 @@ def _beside(sense: NameSense, leaf: str, robot: bool, system: bool) -> NameSense
 
 
 def name_evidence(column: Column, sense: NameSense, signal: str) -> NameEvidence:
-    """How well a column suits a signal by its name and unit.
+    """Evidence of name and unit that a column is a signal.
 
     Args:
         column: for its name and unit.
-        sense: of its name, beside the others'.
+        sense: of its name, in context of the others.
         signal: one of a drive file's.
     """
     odds, reasons = 0.0, []
@@ -120,7 +120,7 @@ def _of_torque_side(sense: NameSense, signal: str, wanted: str) -> tuple[float, 
         return _BARE_TORQUE[signal], ()
     if sense.side == wanted:
         return _SIDE, (f"of the {wanted}",)
-    # A torque sensor behind the gear is said to be of the joint or of the link.
+    # A torque sensor behind the gear is named after the joint or the link.
     if sense.side in ("joint", "load") and signal == "joint_torque":
         return _JOINT_SIDE, ()
     if sense.side == "joint" and signal == "motor_torque":
@@ -135,7 +135,7 @@ def _of_unit(column: Column, signal: str) -> tuple[float, Iterable[str]]:
     if column.unit is None:
         return 0.0, ()
     if signal in ("dynamic_error", "forcing"):
-        # In a reduced log they have any unit.
+        # In a reduced log units are arbitrary.
         return (_UNIT if si_size(column.unit, "rad") is not None and signal == "dynamic_error" else 0.0), ()
     if is_counts(column.unit):
         return (_UNIT, (f"its unit '{column.unit}'",)) if signal.endswith("_angle") else (_WRONG_UNIT, ())

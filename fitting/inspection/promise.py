@@ -1,18 +1,18 @@
-"""What such a log can and can't tell, before it is fitted."""
+"""What a fit of a log could determine, from its signals and excitation."""
 
 from collections.abc import Iterator
 
 from fitting.inspection.excitation import Excitation
 from fitting.inspection.inspection import Inspection
 
-# rad^-2, of the piecewise stiffness in vendors' catalogues (effects.md).
+# rad^-2, of the piecewise stiffness in vendors' catalogues.
 _ALPHAS = (1e5, 4.5e5)
 _OUTPUTS = ("motor_angle", "motor_velocity", "load_angle", "load_velocity", "joint_torque")
 _VISIBLE = 0.01  # change of stiffness below which alpha is hardly identifiable; assumed
 
 
 def promises(inspection: Inspection, moved: Excitation) -> tuple[str, ...]:
-    """Sentences on what a fit of the logs can and can't tell."""
+    """Sentences on what a fit of the logs can and can't determine."""
     by_kind = {
         "drive": _of_drive,
         "motor side": _of_motor_side,
@@ -27,15 +27,15 @@ def _of_drive(inspection: Inspection, moved: Excitation) -> Iterator[str]:
     current = "motor_torque" not in inspection.joint.signals
     yield (
         f"A drive log (both angles and a motor {'current' if current else 'torque'}): stiffness K, cubic coefficient "
-        "alpha, mesh damping B_sp, and effects beside them."
+        "alpha, mesh damping B_sp, and effects."
     )
-    yield "It needs the inertias of motor and load: without them, a wrong stiffness and a wrong torque look alike."
+    yield "It needs the inertias of motor and load: without them, stiffness and torque scale are confounded."
     if current:
-        yield "The torque constant scales the inertias and K alike; a log does not tell it."
+        yield "The torque constant scales the inertias and K equally; a log does not determine it."
     yield from _of_alpha(moved)
     if moved.band is not None:
         yield (
-            "B_sp and the inertias show near the resonance: it must lie inside the band of the torque "
+            "B_sp and the inertias are determined near the resonance: it must lie inside the band of the torque "
             f"({moved.band[0]:.3g} to {moved.band[1]:.3g} Hz)."
         )
 
@@ -56,33 +56,33 @@ def _of_alpha(moved: Excitation) -> Iterator[str]:
 def _of_motor_side(inspection: Inspection, moved: Excitation) -> Iterator[str]:
     has = [s for s in _OUTPUTS if s in inspection.joint.signals]
     if not any(s.startswith("motor") for s in has):
-        yield f"One side alone ({' and '.join(has)} and torque): without the motor's motion no fit can be made."
+        yield f"One side alone ({' and '.join(has)} and torque): a fit needs the motor's motion."
         return
     side = "One side alone" if len(has) == 1 else "No twist"
     yield f"{side} ({' and '.join(has)} and torque): K, B_sp and inertias, where the torque reaches the resonance."
-    yield "The motor side shows antiresonance and resonance, of which both inertias and K follow with the ratio."
+    yield "The motor side has antiresonance and resonance, which give both inertias and K with the ratio."
     if moved.band is not None:
         yield f"Both must lie inside the band of the torque ({moved.band[0]:.3g} to {moved.band[1]:.3g} Hz)."
-    yield "alpha and effects of the mesh show poorly: a second angle would tell them, so look for one in the log."
+    yield "alpha and effects of the mesh are poorly determined: a second angle would help, so look for one in the log."
 
 
 def _of_quasi_static(inspection: Inspection, moved: Excitation) -> Iterator[str]:
     yield "A quasi-static log (a twist and the joint torque): stiffness by torque, hysteresis, lost motion, ripple."
-    yield "It tells neither damping nor inertias, and needs none."
+    yield "It determines neither damping nor inertias, and needs none."
     velocity = {"motor_angle", "load_angle"} <= set(inspection.joint.signals)
     if velocity:
-        yield "The motion must be slow: what accelerates the load is counted as torque through the gear."
+        yield "The motion must be slow: torque that accelerates the load counts as torque through the gear."
 
 
 def _of_reduced(inspection: Inspection, moved: Excitation) -> Iterator[str]:
-    yield "A reduced log (a dynamic error and a forcing): mu, omega_0, alpha and a gain, in the log's own units."
-    yield "It tells neither K nor inertias, since the forcing has any scale."
+    yield "A reduced log (a dynamic error and a forcing): mu, omega_0, alpha and a gain, in the log's units."
+    yield "It determines neither K nor inertias, since the scale of the forcing is arbitrary."
 
 
 def _of_nothing(inspection: Inspection) -> Iterator[str]:
     found = inspection.joint.signals
     has = ", ".join(found) if found else "no signal"
-    yield f"No fit can be made of what was recognised ({has})."
+    yield f"The recognised signals ({has}) are not sufficient for a fit."
     yield (
         "A drive log needs motor torque and the motor's angle or velocity, a quasi-static one a twist (or both "
         "angles) and the joint torque, a reduced one a dynamic error and a forcing."

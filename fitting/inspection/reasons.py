@@ -1,14 +1,14 @@
-"""What speaks for a guess, in words."""
+"""Reasons for a guess, as text."""
 
 from collections.abc import Mapping
 
 from fitting.inspection.hypotheses import Evidence
 
-_TOLD = 1.0  # log odds from which a relation is worth a word
+_TOLD = 1.0  # log odds above which a relation is mentioned
 
 
 def physical_reasons(signal: str, columns: Mapping[str, int], evidence: Evidence) -> tuple[str, ...]:
-    """The relations to other columns that speak for a guess.
+    """The relations to other columns that support a guess.
 
     Args:
         signal: of the guess.
@@ -29,7 +29,7 @@ def physical_reasons(signal: str, columns: Mapping[str, int], evidence: Evidence
         if max(told, default=0.0) > _TOLD:
             return (f"it accelerates {_called(evidence, angles[0])}",)
     if signal == "joint_torque" and evidence.held(k, motor, load, twist).odds > _TOLD:
-        return ("it follows the twist",)
+        return ("it is proportional to the twist",)
     if signal in ("forcing", "dynamic_error"):
         return _of_oscillator(columns, evidence)
     return ()
@@ -47,7 +47,7 @@ def _of_angle(signal: str, motor: int | None, load: int | None, evidence: Eviden
         return ()
     times = abs(told.slope)
     if signal == "motor_angle":
-        return (f"its numbers move {times:.4g} times as far as those of {_called(evidence, load)}",)
+        return (f"its values vary {times:.4g} times as much as those of {_called(evidence, load)}",)
     return (f"it moves with {_called(evidence, motor)}",)
 
 
@@ -58,7 +58,7 @@ def _of_oscillator(columns: Mapping[str, int], evidence: Evidence) -> tuple[str,
         if twist is None or motor is None or load is None:
             return ()
         made = evidence.told("difference", motor, load)[twist].odds > _TOLD
-        return ("it is made of both angles",) if made else ()
+        return ("it is a combination of both angles",) if made else ()
     driven = [evidence.told(r, twist)[forcing].odds for r in ("drives", "pulled_back")]
-    words = f"{_called(evidence, twist)} answers {_called(evidence, forcing)} as an oscillator does"
+    words = f"{_called(evidence, twist)} responds to {_called(evidence, forcing)} like an oscillator"
     return (words,) if max(driven) > _TOLD else ()

@@ -1,7 +1,7 @@
-"""What the channels of a log are to one another, as the equations of a drive say it, in log odds.
+"""Relations between channels of a log, by the equations of a drive, in log odds.
 
-A relation leaves a share u of a channel's variance unexplained. Where there is none, u lies anywhere below what shifted
-channels leave; where there is one, its logarithm does, down to a floor set by noise. The log odds of the two laws are
+A relation leaves a share u of a channel's variance unexplained. Without a relation, u is uniform up to the value for
+shifted channels. With one, its logarithm is uniform down to a noise floor. The log odds of the two distributions are
 the evidence.
 """
 
@@ -14,24 +14,24 @@ import numpy as np
 from fitting.inspection.windows import Scale
 
 FLOOR = 1e-4
-"""Share of a channel's variance below which sensors leave nothing to tell; assumed."""
+"""Share of a channel's variance that is below sensor noise; assumed."""
 
 _SPAN = float(np.log(1.0 / FLOOR))
-# Channels that even a shifted one explains (ramps, single sines) tell nothing.
+# Channels that even a shifted one explains (ramps, single sines) are no evidence.
 _UNTESTABLE = 0.05
 _FITS = 0.01  # unexplained share below which a relation fits
-_SHIFTS = (0.382, 0.236)  # of a log; by the golden section, no multiples of one period
+_SHIFTS = (0.382, 0.236)  # shares of a log; by the golden section, to avoid multiples of one period
 _FEWEST_ROWS_A_REGRESSOR = 3
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a relation says.
+class RelationEvidence:
+    """Evidence of a relation.
 
     Attributes:
-        odds: log odds that it holds; 0 where it can't be tested.
-        slope: of the relation, in the channels' own units.
-        unexplained: share of the variance that it leaves, where it fits best.
+        odds: log odds that it holds; 0 if it can't be tested.
+        slope: of the relation, in the channels' units.
+        unexplained: unexplained share of the variance, at the best scale.
     """
 
     odds: float
@@ -39,15 +39,15 @@ class Told:
     unexplained: float
 
 
-NOTHING = Told(0.0, 1.0, 1.0)
+NOTHING = RelationEvidence(0.0, 1.0, 1.0)
 
 
 class Relations:
-    """The relations among channels; all arguments are numbers of channels.
+    """Relations between channels; all arguments are channel numbers.
 
     Attributes:
         scales: windows of several lengths, longest first.
-        moves: which channels change at all, (channels,).
+        moves: which channels are not constant, (channels,).
     """
 
     def __init__(self, scales: Sequence[Scale], moves: np.ndarray):
@@ -61,20 +61,20 @@ class Relations:
             *_pairwise([(s.rate, s.rate) for s in self.scales], self.moves),
         )
 
-    def is_rate_of(self, velocity: int, angle: int) -> Told:
+    def is_rate_of(self, velocity: int, angle: int) -> RelationEvidence:
         """Whether one channel is the derivative of another; slope: derivative of the angle over the velocity."""
         odds, slope, share = self._pairs[:3]
-        return Told(*(float(of[angle, velocity]) for of in (odds, slope, share)))
+        return RelationEvidence(*(float(of[angle, velocity]) for of in (odds, slope, share)))
 
-    def proportional(self, one: int, other: int) -> Told:
-        """Whether one channel moves as another does; slope: the first over the second, from the slowest motion."""
+    def proportional(self, one: int, other: int) -> RelationEvidence:
+        """Whether one channel is proportional to another; slope: the first over the second, from the slowest motion."""
         odds, slope, share = self._pairs[3:]
-        return Told(*(float(of[one, other]) for of in (odds, slope, share)))
+        return RelationEvidence(*(float(of[one, other]) for of in (odds, slope, share)))
 
-    def accelerates(self, angles: Sequence[int]) -> tuple[Told, ...]:
+    def accelerates(self, angles: Sequence[int]) -> tuple[RelationEvidence, ...]:
         """Whether each channel is a torque that accelerates the first angle: T = J theta'' and what depends on angles
         and rates. Slope: J."""
-        # The other angle is nearly this one, and its twist goes with the acceleration.
+        # The other angle is nearly equal, and the twist is correlated with the acceleration.
         return self._partial(
             angles,
             lambda s: s.acceleration[:, angles[:1]],
@@ -82,43 +82,44 @@ class Relations:
             apart=len(angles) == 1,
         )
 
-    def drives(self, twist: int) -> tuple[Told, ...]:
-        """Whether each channel accelerates a twist that a bent spring holds. Slope: the inertia."""
+    def drives(self, twist: int) -> tuple[RelationEvidence, ...]:
+        """Whether each channel accelerates a twist with a nonlinear spring. Slope: the inertia."""
         return self._partial(
             (twist,),
             lambda s: s.acceleration[:, [twist]],
             lambda s: np.column_stack([s.value[:, [twist]], s.rate[:, [twist]], s.cube[:, [twist]]]),
         )
 
-    def springs(self, motor: int, load: int) -> tuple[Told, ...]:
-        """Whether each channel needs the difference of two angles, as a torque through the gear does. Slope: torque
+    def springs(self, motor: int, load: int) -> tuple[RelationEvidence, ...]:
+        """Whether each channel depends on the difference of two angles, like a torque through the gear. Slope: torque
         over the motor's angle."""
         return self._partial(
             (motor, load),
             lambda s: s.value[:, [load, motor]],
             lambda s: np.column_stack([s.rate[:, [motor, load]], s.direction[:, [motor, load]]]),
-            # A velocity that was filtered lags, and its lag goes with the acceleration.
+            # A filtered velocity lags, by a term proportional to the acceleration.
             apart=True,
         )
 
-    def holds(self, twist: int) -> tuple[Told, ...]:
-        """Whether each channel is proportional to a twist, but for its rate and direction. Slope: stiffness."""
+    def holds(self, twist: int) -> tuple[RelationEvidence, ...]:
+        """Whether each channel is proportional to a twist, apart from terms in its rate and direction. Slope:
+        stiffness."""
         return self._partial(
             (twist,),
             lambda s: s.value[:, [twist]],
             lambda s: np.column_stack([s.rate[:, [twist]], s.direction[:, [twist]]]),
         )
 
-    def pulled_back(self, angle: int) -> tuple[Told, ...]:
-        """Whether each channel, beside accelerating an angle, is held by a spring there: only a twist has one."""
+    def pulled_back(self, angle: int) -> tuple[RelationEvidence, ...]:
+        """Whether each channel accelerates an angle against a spring: only a twist has one."""
         return self._partial(
             (angle,),
             lambda s: s.value[:, [angle]],
             lambda s: np.column_stack([s.rate[:, [angle]], s.acceleration[:, [angle]], s.cube[:, [angle]]]),
         )
 
-    def difference(self, motor: int, load: int) -> tuple[Told, ...]:
-        """Whether each channel is made of both angles and of nothing else. Slope: channel over the motor's angle."""
+    def difference(self, motor: int, load: int) -> tuple[RelationEvidence, ...]:
+        """Whether each channel is a combination of both angles only. Slope: channel over the motor's angle."""
         return self._partial(
             (motor, load),
             lambda s: s.rate[:, [load, motor]],
@@ -133,15 +134,15 @@ class Relations:
 
     def _partial(
         self, own, wanted, given, *, target=lambda s: s.value, over_scales=None, apart=False
-    ) -> tuple[Told, ...]:
-        """For each channel: what the wanted regressors explain of what the given ones leave.
+    ) -> tuple[RelationEvidence, ...]:
+        """For each channel: partial regression on the wanted regressors, beside the given ones.
 
         Args:
-            own: channels that are no targets.
-            wanted, given: regressors at a scale, (windows, count). Two wanted ones must explain more than either alone.
+            own: channels that are not targets. wanted, given: regressors at a scale, (windows, count). Two wanted ones
+                must explain more than either alone.
             target: all channels at a scale, (windows, channels).
-            over_scales: what makes one of the odds, slopes and shares of all scales; that of the best where None.
-            apart: whether a channel that the given regressors explain proves little.
+            over_scales: combines odds, slopes and shares of all scales; the best scale where None.
+            apart: whether a channel that the given regressors explain is weak evidence.
         """
         channels = len(self.moves)
         if not self.moves[list(own)].all() or not self.scales:
@@ -171,17 +172,18 @@ class Relations:
             return (NOTHING,) * channels
         told = (over_scales or _best_scale)(np.array(odds), np.array(slopes), np.array(shares))
         return tuple(
-            Told(*(float(of[k]) for of in told)) if self.moves[k] and k not in own else NOTHING for k in range(channels)
+            RelationEvidence(*(float(of[k]) for of in told)) if self.moves[k] and k not in own else NOTHING
+            for k in range(channels)
         )
 
 
 def _shifted(windows: np.ndarray) -> list[np.ndarray]:
-    """The same windows at other times, where no relation is left; several, since an excitation may be periodic."""
+    """The windows shifted in time, which removes any relation; several shifts, since an excitation may be periodic."""
     return [np.roll(windows, round(share * len(windows)), axis=0) for share in _SHIFTS]
 
 
 def _left(regressors: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean square that a regression leaves of each target, and its coefficients."""
+    """Residual mean square of each target in a regression, and its coefficients."""
     size = np.sqrt(np.mean(regressors**2, axis=0))
     scaled = regressors / np.where(size > 0, size, 1.0)
     coefficients = np.linalg.lstsq(scaled, y, rcond=1e-10)[0]
@@ -196,7 +198,7 @@ def _share(left: np.ndarray, bare: np.ndarray) -> np.ndarray:
 
 
 def _odds(share: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """Log odds of a share left unexplained."""
+    """Log odds of an unexplained share."""
     tested = null > _UNTESTABLE
     null = np.where(tested, null, 1.0)
     odds = np.log(null / (_SPAN * np.maximum(share, FLOOR * null)))
@@ -204,8 +206,8 @@ def _odds(share: np.ndarray, null: np.ndarray) -> np.ndarray:
 
 
 def _best_scale(odds: np.ndarray, slopes: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Odds, slope and share where the odds are best, less what so many tries are worth: inertia shows in quick motion
-    only, and noise spoils that which is too quick."""
+    """Odds, slope and share of the best scale, corrected for the number of scales. Inertia only matters in fast motion,
+    and noise dominates at the shortest scales."""
     best = np.argmax(odds, axis=0)
     pick = (best, *np.indices(best.shape))
     tried = np.log(len(odds))
@@ -214,8 +216,8 @@ def _best_scale(odds: np.ndarray, slopes: np.ndarray, shares: np.ndarray) -> tup
 
 
 def _over_scales(odds: np.ndarray, slopes: np.ndarray, shares: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The mean odds of the better half of the scales (noise spoils the short ones, drift the long ones), and the slope
-    and share of the slowest motion in which the relation fits: filters change that of quick motion."""
+    """Mean odds of the better half of the scales (noise affects short ones, drift long ones), and slope and share of
+    the slowest motion in which the relation fits, since filters affect fast motion."""
     half = (len(odds) + 1) // 2
     fits = shares <= np.maximum(2.0 * shares.min(axis=0), _FITS)
     slowest = np.argmax(fits, axis=0)
@@ -241,7 +243,7 @@ def _pairwise(scales: Sequence[tuple[np.ndarray, np.ndarray]], moves: np.ndarray
 
 
 def _correlated(y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Share of each y that each x leaves unexplained, and the slope."""
+    """Share of each y not explained by each x, and the slope."""
     cross = y.T @ x
     own, other = np.sum(y**2, axis=0), np.sum(x**2, axis=0)
     products = own[:, None] * other[None, :]

@@ -1,4 +1,4 @@
-"""Units, signs and the reduction ratio of the signals that were found, which hang together."""
+"""Units, signs and reduction ratio of the recognised signals, determined together."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,23 +7,26 @@ from itertools import product
 import numpy as np
 
 from fitting.inspection.hypotheses import Evidence
-from fitting.inspection.relations import NOTHING, Told
+from fitting.inspection.relations import NOTHING, RelationEvidence
 from fitting.inspection.unit_evidence import UnitChoice
 from fitting.inspection.windows import Uniform
 
 SURE = 0.8
-"""Confidence from which a guess is written down; below it is said what it could be. Assumed."""
+"""Confidence above which a guess is written to the drive file; below, the possible signals are listed. Assumed."""
 
-_NOTED = 0.02  # share of a unit that is worth a word
-_SIGN_ODDS = 1.0  # of a relation, for its sign to be told
-_COPIES = ("load_angle", "motor_velocity", "load_velocity")  # that move as an angle does, or its rate
-_CORRELATED = 0.3  # unexplained share below which the sign of a plain correlation is told
-_SEEN_RATIO = 0.02  # share of the motion that may be no common motion, for the ratio to be seen
-_LARGEST_TWIST, _SOFT_TWIST = 0.02, 0.2  # rad; no gear twists more, a series elastic joint does
+_NOTED = 0.02  # least share of a unit to be mentioned
+_SIGN_ODDS = 1.0  # log odds of a relation for its sign to be used
+_COPIES = ("load_angle", "motor_velocity", "load_velocity")  # signals proportional to an angle or its rate
+_CORRELATED = 0.3  # unexplained share below which the sign of a correlation is used
+_SEEN_RATIO = 0.02  # largest share of non-common motion for the ratio to be determined
+_LARGEST_TWIST, _SOFT_TWIST = (
+    0.02,
+    0.2,
+)  # rad; larger than any gear's twist, though not than that of a series elastic joint
 _TWIST_ODDS = (0.0, -0.5, -5.0)
-_HIDDEN = 3.0  # a twist that follows the motion is no larger than so many times that which does not; assumed
-_ROUNDED = 1e-3  # of a ratio, as a twist that grows along one slow motion can hide; assumed
-_CATALOGUE = (30.0, 50.0, 80.0, 100.0, 120.0, 160.0)  # ratios that vendors' catalogues list
+_HIDDEN = 3.0  # largest ratio of the twist correlated with the motion to that which is not; assumed
+_ROUNDED = 1e-3  # relative error of a ratio due to a twist along one slow motion; assumed
+_CATALOGUE = (30.0, 50.0, 80.0, 100.0, 120.0, 160.0)  # ratios in vendors' catalogues
 
 
 @dataclass(frozen=True)
@@ -31,11 +34,11 @@ class UnitGuess:
     """The unit of one signal.
 
     Attributes:
-        unit: as a drive file states it.
+        unit: in drive-file notation.
         size: in SI.
         confidence: 0 to 1.
         reason: in words.
-        rivals: other units that it could be.
+        rivals: other possible units.
     """
 
     unit: str
@@ -50,9 +53,8 @@ class RatioGuess:
     """The reduction ratio.
 
     Attributes:
-        value: most likely; whole where a whole number fits.
-        low, high: what the angles leave open.
-        sure: whether one whole number fits, and no other.
+        value: most likely; an integer if one fits. low, high: admissible range from the angles.
+        sure: whether exactly one integer fits.
     """
 
     value: float
@@ -64,10 +66,10 @@ class RatioGuess:
 def units_of(
     columns: Mapping[str, int], evidence: Evidence, logs: Sequence[Uniform]
 ) -> tuple[dict[str, UnitGuess], float]:
-    """The units of the angles and velocities, chosen together: what is stated, the ratio, the rates and the twist.
+    """The units of angles and velocities, chosen together from stated units, ratio, rates and twist.
 
     Returns:
-        The units by signal, and how sure the factor between the units of both angles is, 0 to 1.
+        The units by signal, and the confidence in the factor between the units of both angles, 0 to 1.
     """
     motor, load = columns.get("motor_angle"), columns.get("load_angle")
     twist = _twist(logs, motor, load)
@@ -99,7 +101,7 @@ def units_of(
     guesses = {s: _marginal(s, best, combined, weights) for s in (*angles, *rates) if best.get(s) is not None}
     factors = np.array([_factor(units) for _, units in combined])
     alike = float(weights[np.isclose(factors, _factor(best), rtol=1e-6)].sum())
-    # A velocity that nothing is held against.
+    # A velocity without a related angle.
     return guesses | {s: _alone(evidence.velocity_choices[columns[s]]) for s in rates if s not in guesses}, alike
 
 
@@ -133,7 +135,7 @@ def _guess(choice: UnitChoice, shares: Mapping[str, float]) -> UnitGuess:
 
 
 def _twist(logs: Sequence[Uniform], motor: int | None, load: int | None) -> float:
-    """Range of what one angle does not share with the other, in the load's unit; 0 where there is none."""
+    """Range of the difference of both angles, in the load's unit; 0 without any."""
     if motor is None or load is None:
         return 0.0
     return max(_left_over(log.values[log.inside, motor], log.values[log.inside, load])[1] for log in logs)
@@ -150,12 +152,12 @@ def _spread(values: np.ndarray) -> float:
 
 
 def _left_over(motor: np.ndarray, load: np.ndarray) -> tuple[float, float, float]:
-    """Motor over load in common motion, the range of what is left of the load's angle, and the load's own range."""
+    """Ratio of motor and load in common motion, the range of the load angle's remainder, and the load's range."""
     m, f = motor - motor.mean(), load - load.mean()
     norms = float(m @ m), float(f @ f)
     if min(norms) == 0:
         return 0.0, 0.0, 0.0
-    # Both angles are as true as each other: the geometric mean of both regressions.
+    # Both angles have errors: the geometric mean of both regressions.
     slope = np.sign(m @ f) * np.sqrt(norms[0] / norms[1])
     return float(slope), _spread(f - m / slope), _spread(f)
 
@@ -166,11 +168,11 @@ def ratio_of(
     evidence: Evidence,
     logs: Sequence[Uniform],
 ) -> RatioGuess | None:
-    """The reduction ratio; None where there are not both angles or their common motion does not show it.
+    """The reduction ratio; None without both angles, or if their common motion does not determine it.
 
     Args:
         columns: number of the column of each signal.
-        units: as [`units_of`][] gives them.
+        units: from [`units_of`][].
         evidence: on the columns.
         logs: channels by the same numbers.
     """
@@ -180,7 +182,7 @@ def ratio_of(
     views = [log.values[log.inside] for log in logs] + [s.value for s in evidence.relations.scales]
     seen = [_left_over(view[:, motor], view[:, load]) for view in views]
     shares = [(left / span, abs(slope)) for slope, left, span in seen if span > 0]
-    # Slow motion, or far motion, shows the ratio; quick motion twists the gear.
+    # Slow or large motion determines the ratio; fast motion twists the gear.
     share, slope = min(shares, default=(np.inf, 0.0))
     if share > _SEEN_RATIO:
         return None
@@ -189,19 +191,19 @@ def ratio_of(
     margin = value * max(_HIDDEN * share, _ROUNDED)
     low, high = value - margin, value + margin
     if margin < 0.5:
-        # Strain-wave gears have whole ratios.
+        # Strain-wave gears have integer ratios.
         return RatioGuess(float(round(value)), low, high, sure=low <= round(value) <= high and alike >= SURE)
     usual = [n for n in _CATALOGUE if low <= n <= high]
     return RatioGuess(min(usual, key=lambda n: abs(n - value)) if len(usual) == 1 else value, low, high, sure=False)
 
 
 def signs_of(columns: Mapping[str, int], evidence: Evidence) -> dict[str, tuple[int, str]]:
-    """The signs that make all signals count as the motor's angle does, or else the load's, and why."""
+    """The signs of all signals relative to the motor's angle, or else the load's, with reasons."""
     motor, load, twist = (columns.get(s) for s in ("motor_angle", "load_angle", "dynamic_error"))
     signs: dict[str, tuple[int, str]] = {}
 
-    def tell(signal: str, told: Told, reference: int, words: str) -> int:
-        """The sign of a signal from a relation, 1 where it says nothing."""
+    def tell(signal: str, told: RelationEvidence, reference: int, words: str) -> int:
+        """The sign of a signal from a relation, 1 without evidence."""
         if told is NOTHING or (told.odds < _SIGN_ODDS and not (signal in _COPIES and told.unexplained < _CORRELATED)):
             return 1
         sign = int(np.sign(told.slope) * reference) or 1
@@ -211,14 +213,14 @@ def signs_of(columns: Mapping[str, int], evidence: Evidence) -> dict[str, tuple[
     of_load = 1
     if motor is not None and load is not None:
         of_load = tell(
-            "load_angle", evidence.relations.proportional(motor, load), 1, "it turns against the motor angle"
+            "load_angle", evidence.relations.proportional(motor, load), 1, "it turns opposite to the motor angle"
         )
     for signal, side, own in (("motor_velocity", motor, 1), ("load_velocity", load, of_load)):
         if signal in columns and side is not None:
             told = evidence.relations.is_rate_of(columns[signal], side)
-            tell(signal, told, own, "it counts against its angle")
+            tell(signal, told, own, "it is opposite to its angle")
     if twist is not None and motor is not None and load is not None:
-        tell("dynamic_error", evidence.told("difference", motor, load)[twist], 1, "it falls where the motor runs ahead")
+        tell("dynamic_error", evidence.told("difference", motor, load)[twist], 1, "it falls where the motor leads")
     _of_torques(columns, evidence, of_load, tell)
     return signs
 
@@ -230,10 +232,10 @@ def _of_torques(columns: Mapping[str, int], evidence: Evidence, of_load: int, te
         if signal in columns and angles:
             reference = 1 if motor is not None else of_load
             both = [evidence.accelerated(columns[signal], chosen) for chosen in (angles, angles[:1])]
-            tell(signal, max(both, key=lambda t: t.odds), reference, "it acts against the acceleration of the motor")
+            tell(signal, max(both, key=lambda t: t.odds), reference, "it is opposite to the motor's acceleration")
     if "joint_torque" in columns:
         k = columns["joint_torque"]
         tell("joint_torque", evidence.held(k, motor, load, twist), 1, "it falls where the twist rises")
     if "forcing" in columns and twist is not None:
         driven = [evidence.told(r, twist)[columns["forcing"]] for r in ("drives", "pulled_back")]
-        tell("forcing", max(driven, key=lambda t: t.odds), 1, "it acts against the motion that it makes")
+        tell("forcing", max(driven, key=lambda t: t.odds), 1, "it is opposite to the motion that it causes")

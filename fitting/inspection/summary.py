@@ -9,7 +9,7 @@ from fitting.inspection.excitation import COHERENT, Excitation
 from fitting.inspection.inspection import Inspection, JointInspection
 from fitting.logs.findings import Finding
 
-_GAP = 5.0  # median steps; a longer pause is a gap
+_GAP = 5.0  # in median steps; a longer pause is a gap
 _MOST_NAMES = 12
 
 Row = tuple[str, str, str, str, str, str]
@@ -17,7 +17,7 @@ HEAD: Row = ("column", "signal", "unit", "sign", "confidence", "why")
 
 
 def column_rows(inspection: Inspection) -> list[Row]:
-    """One row a column that was recognised, or could be something: as [`HEAD`][] says."""
+    """One row per column that is or may be a signal, with the columns of [`HEAD`][]."""
     joint, time = inspection.joint, inspection.time
     rows: list[Row] = []
     if time.column is not None:
@@ -45,24 +45,24 @@ def inspection_text(
     moved: Sequence[Excitation],
     told: Sequence[str],
 ) -> str:
-    """All that was found, for a terminal.
+    """The inspection as text for a terminal.
 
     Args:
         inspection: Columns and signals.
-        findings: Of the health gate, by log.
-        moved: How each log moves the drive.
-        told: What a fit could tell.
+        findings: Of the health check, by log.
+        moved: Excitation and response of each log.
+        told: Sentences on what a fit could determine.
     """
     lines = [_sampling(inspection, k) for k in range(len(inspection.tables))]
     lines += ["", *_table([HEAD, *column_rows(inspection)]), *_rest(inspection), *_joints(inspection)]
     if inspection.joint.ratio is not None:
         ratio = inspection.joint.ratio
-        lines += ["", f"Reduction ratio: {ratio.value:.6g} (the angles leave {ratio.low:.4g} to {ratio.high:.4g})"]
+        lines += ["", f"Reduction ratio: {ratio.value:.6g} (the angles admit {ratio.low:.4g} to {ratio.high:.4g})"]
     lines += ["", *_health(inspection, findings), "", *_excitation(inspection, moved)]
-    lines += ["", "What such a log can tell:", *(f"  {sentence}" for sentence in told)]
+    lines += ["", "What a fit of such a log can determine:", *(f"  {sentence}" for sentence in told)]
     missing = unknowns(inspection)
     if missing:
-        lines += ["", "What the drive file will need from you:", *(f"  {key}: {why}" for key, why in missing.items())]
+        lines += ["", "To fill in in the drive file:", *(f"  {key}: {why}" for key, why in missing.items())]
     return "\n".join(lines)
 
 
@@ -73,7 +73,7 @@ def _percent(share: float) -> str:
 def _sampling(inspection: Inspection, k: int) -> str:
     table, time, rate = inspection.tables[k], inspection.clocks[k].base.time, inspection.rates[k]
     if rate is None:
-        return f"{table.path}: {table.rows} rows, at a rate that is not known"
+        return f"{table.path}: {table.rows} rows, at an unknown rate"
     step = np.diff(time)
     median = float(np.median(step))
     gaps = step > _GAP * median

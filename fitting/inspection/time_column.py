@@ -1,4 +1,4 @@
-"""Which column of a log is its clock, and in which unit."""
+"""The clock column of a log, and its unit."""
 
 import re
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from fitting.logs.units import UnitError, convert
 _NAMED, _MAYBE, _ANONYMOUS, _OTHERWISE, _COUNTER = 3.0, 0.5, -1.0, -6.0, -2.0
 _UNIT_FITS, _UNIT_CONTRADICTS = 2.0, -8.0
 _EPOCH = 8.0
-# Loggers of drives sample at some hundreds of hertz, give or take a factor of ten; assumed.
+# Typical sampling rate of loggers: some hundreds of hertz, within a factor of ten; assumed.
 _USUAL_RATE, _RATE_SPREAD = 500.0, np.log(10.0)
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _EPOCHS = (0.9e9, 2.5e9)  # s since 1970, of the years 1998 to 2049
@@ -27,12 +27,12 @@ class TimeGuess:
     """The clock of a log.
 
     Attributes:
-        column: Its name; None where the channels have clocks of their own, a sample rate is stated, or there is none.
+        column: Its name; None if channels have separate clocks, a sample rate is stated, or there is none.
         unit: Of its stamps.
         confidence: Of the column, 0 to 1.
         reasons: For both.
         unit_stated: Whether the file states the unit.
-        clocks: Where a table repeats its time column: the clock of each column that has another one, by name.
+        clocks: For a table with several time columns: the clock of each column with a later one, by name.
     """
 
     column: str | None
@@ -48,8 +48,8 @@ class Clock:
     """The stamps of one log.
 
     Attributes:
-        base: Stamps [s] and the rows that have one.
-        known: Whether seconds are known; where not, a row is taken for one.
+        base: Stamps [s] and their rows.
+        known: Whether the unit of time is known; if not, a row counts as a second.
     """
 
     base: TimeBase
@@ -57,15 +57,15 @@ class Clock:
 
 
 def guess_time(table: Table) -> TimeGuess:
-    """The column of a table that is its clock."""
+    """The clock column of a table."""
     if any(column.time is not None for column in table.columns):
-        return TimeGuess(None, "s", 1.0, ("each channel has stamps of its own",))
-    # Of a time column that is repeated, the first stands for all.
+        return TimeGuess(None, "s", 1.0, ("each channel has separate stamps",))
+    # Of several equal time columns, the first represents all.
     scored = [(_log_odds(column), column) for column in table.columns if _first_name(column.name, table) is None]
     weights = np.exp(np.clip([0.0, *(score for score, _ in scored)], -30.0, 30.0))
     score, column = max(scored, key=lambda pair: pair[0], default=(-np.inf, None))
     if column is None or score <= 0.0:
-        why = "a sample rate stands beside the data" if table.sample_rate else "no column rises like a clock"
+        why = "a sample rate is stored with the data" if table.sample_rate else "no column rises like a clock"
         return TimeGuess(None, "s", 1.0 if table.sample_rate else 0.0, (why,))
     rising = _rising(column.values)[0]
     reasons = [f"rises in {100 * rising:.4g} % of its rows"]
@@ -78,13 +78,13 @@ def guess_time(table: Table) -> TimeGuess:
 
 
 def _first_name(name: str, table: Table) -> str | None:
-    """The name that a column repeats, as readers and frames number columns of one name; None where it repeats none."""
+    """The name that a numbered column repeats; None if it repeats none."""
     match = re.fullmatch(r"(.+?)(?: \([0-9]+\)|\.[0-9]+|_duplicated_[0-9]+)", name)
     return match[1] if match is not None and match[1] in table.names else None
 
 
 def _clocks(table: Table, first: str) -> dict[str, str]:
-    """The clock of each column behind a repeated time column."""
+    """The clock of each column after a repeated time column."""
     clocks, clock = {}, first
     for column in table.columns:
         if _first_name(column.name, table) == first:
@@ -95,14 +95,14 @@ def _clocks(table: Table, first: str) -> dict[str, str]:
 
 
 def own_stamps(table: Table, column: Column, guess: TimeGuess) -> np.ndarray | None:
-    """The stamps [s] of a column that has a clock of its own, NaN where blank; None where it has the table's."""
+    """The stamps [s] of a column with a separate clock, NaN where blank; None if it has the table's."""
     if column.name not in guess.clocks:
         return column.time
     return table.column(guess.clocks[column.name]).values * float(convert(np.array(1.0), guess.unit, "s"))
 
 
 def clock_of(table: Table, guess: TimeGuess) -> Clock:
-    """The stamps of a table by the column that was guessed."""
+    """The stamps of a table by the guessed clock column."""
     rows = np.arange(table.rows)
     if guess.column is not None:
         column = table.column(guess.column)
@@ -113,7 +113,7 @@ def clock_of(table: Table, guess: TimeGuess) -> Clock:
     step = 1.0 / table.sample_rate if table.sample_rate else 1.0
     stamps = [column.time for column in table.columns if column.time is not None]
     if stamps:
-        # The quickest clock has the finest grid.
+        # The fastest clock has the finest grid.
         finest = max(stamps, key=len)
         return Clock(TimeBase(np.arange(len(finest)), finest, np.zeros(0, dtype=int), ()), True)
     return Clock(TimeBase(rows, rows * step, np.zeros(0, dtype=int), ()), table.sample_rate is not None)
@@ -129,7 +129,7 @@ def _base(table: Table, column: Column, unit: str) -> TimeBase:
 
 
 def sampling_findings(table: Table, column: Column, unit: str) -> tuple[Finding, ...]:
-    """What was mended of the stamps, or why they are none."""
+    """Corrections of the stamps, or why there are none."""
     try:
         return _base(table, column, unit).findings
     except InputError as error:
@@ -137,7 +137,7 @@ def sampling_findings(table: Table, column: Column, unit: str) -> tuple[Finding,
 
 
 def _stated(column: Column) -> str | None:
-    """The stated unit where it is one of time."""
+    """The stated unit if it is one of time."""
     try:
         convert(np.array(1.0), column.unit or "", "s")
     except UnitError:
@@ -146,7 +146,7 @@ def _stated(column: Column) -> str | None:
 
 
 def _rising(values: np.ndarray) -> tuple[float, float, float]:
-    """Share of rows that rise, share that falls, and how even the rises are (their spread over their median)."""
+    """Shares of rising and falling rows, and the relative spread of the increments."""
     step = np.diff(values[np.isfinite(values)])
     if len(step) == 0 or not (step > 0).any():
         return 0.0, 1.0, np.inf
@@ -156,7 +156,7 @@ def _rising(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def _log_odds(column: Column) -> float:
-    """That the column is the clock, against that it is none."""
+    """Log odds that the column is the clock."""
     known = np.isfinite(column.values)
     if known.mean() < 1.0 - 0.2 or column.constant:
         return -np.inf
@@ -178,13 +178,13 @@ def _log_odds(column: Column) -> float:
 
 
 def _unit(column: Column) -> tuple[str, str]:
-    """Unit of a clock and why."""
+    """Unit of a clock, with the reason."""
     stated = _stated(column)
     if stated is not None:
         return stated, f"the unit '{stated}'"
     known = column.values[np.isfinite(column.values)]
     step = np.abs(np.diff(known))
-    # Stamps that repeat are coarse: the mean step says more than the typical one.
+    # Repeated stamps are coarse: the mean step is more accurate than the typical one.
     typical = float(np.ptp(known)) / max(1, len(known) - 1) if (step == 0).mean() > 0.1 else float(np.median(step))
     scores = {}
     for unit, second in _SECONDS.items():

@@ -1,4 +1,4 @@
-"""In which unit an angle or a velocity stands: what is stated, and what grids, wraps and sizes give away."""
+"""Unit of an angle or a velocity: stated, or from grids, wraps and magnitudes."""
 
 from dataclasses import dataclass
 
@@ -9,30 +9,30 @@ from fitting.logs.channels import SI
 from fitting.logs.units import UnitError, convert
 from fitting.logs.unwrapping import unwrapped_angle
 
-# Log odds, assumed: how often logs state angles in these units where they do not say it.
+# Log odds, assumed: prior frequency of unstated angle units.
 _ANGLES = {"rad": 0.0, "deg": -0.7, "rev": -2.5, "mrad": -4.0}
 _VELOCITIES = {"rad/s": 0.0, "deg/s": -0.7, "rpm": -1.0, "rev/s": -3.0}
 _USUAL_BITS = {12: -1.0, 13: -1.0, 14: -0.5, 16: -0.5, 17: 0.0, 18: -0.5, 19: 0.0, 20: 0.0, 22: -1.0, 23: -0.5, 24: 0.0}
-_OWN_NAME = 3.0  # of a column under a signal's own name, that it is in SI
-_COUNTS = 1.0  # of whole numbers that they are counts
-_WHOLE_ANGLE = -5.0  # and that they are radians or degrees all the same
+_OWN_NAME = 3.0  # that a column named like a signal is in SI
+_COUNTS = 1.0  # that integers are counts
+_WHOLE_ANGLE = -5.0  # that integers are radians or degrees
 _GRID = 4.0
 _WRAP = 6.0
 _GRID_TOLERANCE = 2e-3  # of a bit
 _MOST_BITS = 26
-# What no shaft exceeds in a log, in radians and radians per second; assumed.
+# Largest angle and speed of a shaft in a log, in radians and radians per second; assumed.
 _FASTEST, _FARTHEST = 2000.0, 1e5
 
 
 @dataclass(frozen=True)
 class UnitChoice:
-    """One unit that a channel may have.
+    """A possible unit of a channel.
 
     Attributes:
-        unit: as a drive file states it.
+        unit: in drive-file notation.
         size: of the unit in SI.
         odds: log odds against the other choices.
-        reason: what speaks for it.
+        reason: as text.
     """
 
     unit: str
@@ -57,7 +57,7 @@ def is_counts(unit: str | None) -> bool:
 
 
 def si_size(unit: str, target: str) -> float | None:
-    """Size of a unit in SI; None where it does not measure that."""
+    """Size of a unit in SI; None for another quantity."""
     try:
         return float(convert(np.array(1.0), unit, target))
     except UnitError:
@@ -65,7 +65,7 @@ def si_size(unit: str, target: str) -> float | None:
 
 
 def angle_units(column: Column) -> tuple[UnitChoice, ...]:
-    """The units that an angle may have, the likeliest first."""
+    """The possible units of an angle, the most likely first."""
     if column.unit is not None and not is_counts(column.unit):
         size = si_size(column.unit, "rad")
         if size is not None:
@@ -89,7 +89,7 @@ def angle_units(column: Column) -> tuple[UnitChoice, ...]:
 
 
 def velocity_units(column: Column) -> tuple[UnitChoice, ...]:
-    """The units that a velocity may have, the likeliest first."""
+    """The possible units of a velocity, the most likely first."""
     if column.unit is not None:
         size = si_size(column.unit, "rad/s")
         if size is not None:
@@ -107,7 +107,7 @@ def _choice(unit: str, odds: float, reason: str, target: str) -> UnitChoice:
 
 
 def _given_away(column: Column) -> dict[str, tuple[float, str]]:
-    """Units that the numbers themselves give away: a wrap at one revolution, a grid of a power of two."""
+    """Units from the values: a wrap at one revolution, a grid of a power of two."""
     found: dict[str, tuple[float, str]] = {}
     values = column.values
     for unit, revolution in (("rad", 2 * np.pi), ("deg", 360.0), ("rev", 1.0)):
@@ -128,7 +128,7 @@ def _given_away(column: Column) -> dict[str, tuple[float, str]]:
 
 
 def _grid(values: np.ndarray) -> float:
-    """The step between neighbouring levels of a channel, or 0 where it lies on no grid."""
+    """The resolution of a channel, or 0 without a grid."""
     known = values[np.isfinite(values)]
     levels = np.unique(known)
     if len(levels) < 8 or len(levels) > 0.9 * len(known):
@@ -139,7 +139,7 @@ def _grid(values: np.ndarray) -> float:
         return 0.0
     near = gaps[gaps < 1000 * step]
     counts = np.rint(near / step)
-    # The mean over many levels is exact where one gap is rounded.
+    # The mean over many levels is exact, while single gaps are rounded.
     refined = float(near.sum() / counts.sum())
     off = np.abs(near / refined - np.rint(near / refined))
     return refined if np.mean(off < 0.05) > 0.98 else 0.0

@@ -1,4 +1,4 @@
-"""Local averages of channels and of their derivatives, without differentiating anything: integrals against bumps."""
+"""Local averages of channels and of their derivatives, by test functions, without differentiation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 SHORTEST = 9
-"""Samples of the shortest window; a shorter bump is none."""
+"""Samples of the shortest window."""
 
 _FEWEST = 16
 _MOST = 400
@@ -21,8 +21,8 @@ class Uniform:
 
     Attributes:
         values: (n, channels).
-        step: between samples [s], or 1 where no clock is known.
-        inside: which samples lie in no gap, (n,).
+        step: between samples [s], or 1 without a known clock.
+        inside: which samples are not in a gap, (n,).
     """
 
     values: np.ndarray
@@ -31,7 +31,7 @@ class Uniform:
 
 
 class Scale(NamedTuple):
-    """Averages over windows of one length, those of each log less their mean, (windows, channels).
+    """Averages over windows of one length, without the mean of each log, (windows, channels).
 
     Attributes:
         seconds: length of a window.
@@ -39,7 +39,7 @@ class Scale(NamedTuple):
         rate: of their derivative [1/s].
         acceleration: of their second derivative [1/s^2].
         direction: of the sign of their derivative.
-        cube: of the third power of the channels, less their mean.
+        cube: of the third power of the channels without their mean.
     """
 
     seconds: float
@@ -55,7 +55,7 @@ def uniform(time: np.ndarray, columns: Sequence[tuple[np.ndarray, np.ndarray | N
 
     Args:
         time: Stamps of the rows [s], (n,), rising.
-        columns: Values and own stamps (None: `time`) of each channel; NaN where unknown.
+        columns: Values and stamps (None: `time`) of each channel; NaN where unknown.
     """
     step = float(np.median(np.diff(time)))
     count = min(int(round((time[-1] - time[0]) / step)) + 1, 4 * len(time))
@@ -74,7 +74,7 @@ def uniform(time: np.ndarray, columns: Sequence[tuple[np.ndarray, np.ndarray | N
 
 
 def scales(logs: Sequence[Uniform]) -> tuple[Scale, ...]:
-    """Averages over windows of several lengths, each half of the one before, all logs one after the other."""
+    """Averages over windows of several lengths, each half of the one before, concatenated over logs."""
     shortest = min(len(log.values) for log in logs)
     step = float(np.median([log.step for log in logs]))
     directed = [_directions(log.values) for log in logs]
@@ -98,12 +98,12 @@ def _directions(values: np.ndarray) -> np.ndarray:
 
 
 def _bump(length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weights over a window that average a channel, its derivative and its second derivative, per sample."""
+    """Weights over a window for averages of a channel and its first two derivatives, per sample."""
     s = np.linspace(-1.0, 1.0, length)
     value = (1 - s**2) ** 4
     rate = s * (1 - s**2) ** 3
     acceleration = (1 - s**2) ** 2 * (7 * s**2 - 1)
-    # Sums over few samples are not quite the integrals: straight lines and parabolas are made exact.
+    # Corrected so that sums over few samples are exact for lines and parabolas.
     acceleration -= acceleration.mean()
     place = np.arange(length) - (length - 1) / 2
     return value / value.sum(), rate / (rate @ place), acceleration / (0.5 * acceleration @ place**2)
@@ -121,7 +121,7 @@ def _averages(log: Uniform, direction: np.ndarray, length: int) -> tuple[np.ndar
     cube = (log.values - log.values.mean(axis=0)) ** 3
     rows = starts[:, None] + np.arange(length)
     windows = log.values[rows]
-    # The first sample is taken off: a multi-turn count has few digits left for its derivatives.
+    # Relative to the first sample, for accuracy of derivatives at large multi-turn angles.
     windows = windows - windows[:, :1]
     first = log.values[starts]
     parts = (

@@ -1,1 +1,1 @@
-"""From files to signals in SI units on one time base."""
+"""Readers: from log files to signals in SI units on one time base."""

@@ -1,4 +1,4 @@
-"""Logs as named arrays: MATLAB files of all versions, HDF5, and NumPy's own."""
+"""Logs as named arrays: MATLAB files of all versions, HDF5 and NumPy files."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ import numpy as np
 from fitting.errors import InputError
 from fitting.logs.raw_table import RawColumn, RawTable, not_numbers
 
-# Scalars that MATLAB and HDF5 users keep beside the data.
+# Names of scalar sample rates beside the data in MATLAB and HDF5 files.
 _RATE_NAMES = ("fs", "Fs", "FS", "sample_rate", "sampling_rate")
 _STEP_NAMES = ("Ts", "dt", "sample_time")
 _UNIT_NAMES = ("unit", "units", "Unit", "Units")
@@ -22,11 +22,11 @@ def read_mat(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
     """The wanted vectors of a MATLAB file.
 
     Args:
-        path: named in messages.
-        source: what is read.
+        path: for messages.
+        source: the data to read.
         wanted: names such as "T", "run.T", "logs(2).T" or "data(:,3)"; the last part alone where it is unique.
     """
-    # Imported here because they cost as much as all the rest of a CSV user's start.
+    # Imported here: they take as long as all other imports for a CSV file.
     import scipy.io
 
     if _is_hdf5(source):
@@ -50,8 +50,8 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
     """The wanted datasets of an HDF5 file.
 
     Args:
-        path: named in messages.
-        source: what is read.
+        path: for messages.
+        source: the data to read.
         wanted: paths such as "run/T", "run/table/T" (a field of a compound dataset) or "run/data(:,3)"; the last part
             alone where it is unique.
     """
@@ -61,7 +61,7 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
         held: dict[str, tuple[Any, str | None]] = {}
 
         def note(name: str, item: object) -> None:
-            # "#refs#" is where MATLAB v7.3 keeps the insides of its cells.
+            # MATLAB v7.3 stores the content of cells under "#refs#".
             if not isinstance(item, h5py.Dataset) or name.startswith("#"):
                 return
             if item.dtype.names is None:
@@ -84,11 +84,11 @@ def read_hdf5(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
 
 
 def read_numpy(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    """The wanted vectors of a file of NumPy.
+    """The wanted vectors of a NumPy file.
 
     Args:
-        path: named in messages.
-        source: what is read.
+        path: for messages.
+        source: the data to read.
         wanted: names of arrays (NPZ), of the fields of a structured array, or "data(:,3)"; in a file of one matrix
             "column 3".
     """
@@ -119,7 +119,7 @@ def _text(value: object) -> str | None:
 
 
 def _flatten(name: str, value: Any, arrays: dict[str, Any], deepest: int) -> None:
-    """Write the insides of structs as "outer.inner", and of struct arrays as "outer(1).inner"."""
+    """Name members of structs "outer.inner", and those of struct arrays "outer(1).inner"."""
     if deepest == 0:
         return
     if isinstance(value, Mapping):
@@ -148,7 +148,7 @@ def _table(
     load: Callable[[str], Any],
     unit: Callable[[str], str | None],
 ) -> RawTable:
-    """The wanted columns of named arrays, and a sample rate that stands beside one of them."""
+    """The wanted columns of named arrays, and a sample rate stored with them."""
     columns: dict[str, RawColumn] = {}
     rate: float | None = None
     for asked in wanted:
@@ -168,7 +168,7 @@ def _place(path: Path, asked: str, held: Mapping[str, Any], parting: str) -> tup
     """The array of that name, or the only one with that last name; and its column, counted from zero."""
     if asked in held:
         return asked, None
-    # Of one matrix, or of the arrays in their order.
+    # By number: of one matrix, or of the arrays in order.
     number = re.fullmatch(r"column ([0-9]{1,4})", asked)
     names = list(held)
     if number and len(names) == 1:
@@ -213,7 +213,7 @@ def _vector(path: Path, name: str, data: Any, column: int | None) -> np.ndarray:
 
 
 def _seconds(array: np.ndarray) -> np.ndarray:
-    """Dates, since 1970, and durations in seconds; any other array as it is."""
+    """Dates (since 1970) and durations in seconds; other arrays unchanged."""
     if array.dtype.kind not in "mM":
         return array
     whole = array.astype(f"{array.dtype.kind}8[ns]")

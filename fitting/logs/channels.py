@@ -26,7 +26,7 @@ SI = {
     "joint_torque": "N m",
 }
 _UNSTATED = {"dynamic_error": "rad", "forcing": "rad/s^2"}
-_FILL = 1e30  # beyond it lie the fill values of NetCDF and its like
+_FILL = 1e30  # larger values are fill values, as in NetCDF
 _MOST_TEXT = 0.05
 
 
@@ -36,8 +36,8 @@ class Channel:
 
     Attributes:
         values: in `unit`, (n,), NaN where unknown.
-        unit: SI, or what the drive file states of a reduced log.
-        findings: what was mended.
+        unit: SI, or that of the drive file for a reduced log.
+        findings: on corrections.
     """
 
     values: np.ndarray
@@ -52,11 +52,11 @@ def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *
         path: the log, for messages.
         drive_file: unit, sign and offset of the column.
         signal: its name.
-        column: as read.
+        column: raw column.
         first_row: of the column, in the file.
 
     Raises:
-        InputError: for a unit that does not fit, or a column of text.
+        InputError: a unit of another quantity, or a column of text.
     """
     place = drive_file.column_of(signal)
     findings = [*_text(path, place.column, column, first_row)]
@@ -65,7 +65,7 @@ def channel(path: Path, drive_file: DriveFile, signal: str, column: RawColumn, *
     findings += disagreement
     values, wrapped = _unwrapped(drive_file, signal, place, values, unit, first_row)
     converted, name = _convert(drive_file, signal, place, (values - place.offset) * place.sign, unit)
-    # A unit may be so small or large that nothing of the numbers is left.
+    # The conversion may overflow or underflow.
     converted = np.where(np.abs(converted) < _FILL, converted, np.nan)
     return Channel(converted, name, (*findings, *wrapped))
 
@@ -85,7 +85,7 @@ def _text(path: Path, name: str, column: RawColumn, first_row: int) -> Sequence[
 
 
 def _unit(place: ColumnMap, column: RawColumn, signal: str) -> tuple[str | None, Sequence[Finding]]:
-    """The stated unit, else the file's own."""
+    """The unit of the drive file, else of the log."""
     if place.unit is None or column.unit is None:
         return place.unit or column.unit, ()
     try:
@@ -95,7 +95,7 @@ def _unit(place: ColumnMap, column: RawColumn, signal: str) -> tuple[str | None,
     if same:
         return place.unit, ()
     what = f"the file gives the unit {column.unit[:40]!r} and the drive file {place.unit!r}"
-    return place.unit, (Finding("note", what, signal, "the drive file was followed"),)
+    return place.unit, (Finding("note", what, signal, "the unit of the drive file was used"),)
 
 
 def _unwrapped(

@@ -1,4 +1,4 @@
-"""The health gate: what is wrong with a log, and what that does to a fit."""
+"""The health check: faults of a log and their effect on a fit."""
 
 from collections.abc import Iterable, Iterator
 
@@ -12,7 +12,7 @@ from fitting.logs.log_kind import OUTPUTS
 from fitting.logs.masks import clipped, glitches
 from fitting.logs.plausibility import mix_ups
 
-# All thresholds are assumed: they part the practice logs from their mix-ups by a wide margin.
+# All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
 JITTER = 0.01
 DISTINCT_SHARE = 0.2
 COARSE_STEP = 0.1
@@ -23,10 +23,10 @@ _UNITS = {"motor_torque": "N m", "load_torque": "N m", "joint_torque": "N m", "m
 
 
 def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
-    """Everything worth saying about a log before it is fitted.
+    """All findings on a log before it is fitted.
 
     Args:
-        log: The log. Outputs after `log.outputs_until` rows are not looked at.
+        log: The log. Outputs after `log.outputs_until` rows are not used.
         drive_file: The drive that it was read with.
 
     Returns:
@@ -35,20 +35,20 @@ def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
     checks = [_jitter(log), _excitation(log), _response(log), _channels(log, drive_file)]
     if log.kind == "drive" or (log.motor_angle is not None and log.load_angle is not None):
         checks += [_wrapped(log), mix_ups(log, drive_file)]
-    # Numbers of any size may stand in a file; what overflows is no worse than what is merely wrong.
+    # Files may contain numbers of any size; overflow is handled like other wrong values.
     with np.errstate(all="ignore"):
         return (*log.findings, *(finding for check in checks for finding in check))
 
 
 def refuse_unfit(findings: Iterable[Finding], log: Log) -> None:
-    """Nothing when the log can be fitted.
+    """Raise if a log can't be fitted.
 
     Args:
-        findings: What `examine` gave.
+        findings: From `examine`.
         log: The log they are about.
 
     Raises:
-        DataError: There is a refusal among the findings; the first one is told.
+        DataError: The first refusal among the findings.
     """
     for finding in findings:
         if finding.severity == "refusal":
@@ -56,7 +56,7 @@ def refuse_unfit(findings: Iterable[Finding], log: Log) -> None:
 
 
 def _known(log: Log, signal: str) -> np.ndarray | None:
-    """The values of a signal that checks may look at."""
+    """The values of a signal that checks may use."""
     values = getattr(log, signal)
     if values is None or signal not in (*log.outputs, *OUTPUTS):
         return values
@@ -68,10 +68,10 @@ def _is_constant(values: np.ndarray | None) -> bool:
 
 
 def _jitter(log: Log) -> Iterator[Finding]:
-    # Channels with clocks of their own meet in rows at all of their stamps; those of the input say how it was sampled.
+    # Channels with separate clocks share a union of stamps; sampling is judged by the input's.
     step = np.diff(log.time if log.input_known is None else log.time[log.input_known])
     median = float(np.median(step))
-    # A gap is told by the reader and would hide how regular the rest is.
+    # The reader reports gaps, which would mask the regularity of the rest.
     spread = float(np.std(step[step <= 5 * median])) / median
     if spread > JITTER:
         yield Finding(
@@ -92,9 +92,9 @@ def _excitation(log: Log) -> Iterator[Finding]:
         "warning" if driven else "refusal",
         f"{name} is {values[0]:g} in all {len(values)} rows",
         name,
-        "only the load torque excites the drive, so that the motor side is seen poorly"
+        "only the load torque excites the drive, so that the motor side is poorly identifiable"
         if driven
-        else "a constant input excites nothing, so check the column or record another log",
+        else "a constant input does not excite the drive, so check the column or record another log",
     )
 
 
@@ -136,33 +136,33 @@ def _channels(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
 
 
 def _inputs(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Finding]:
-    """What is odd about an input; it acts in the fit as it was logged all the same."""
+    """Findings on an input, which the fit uses as logged."""
     for rows, level, count in clipped(values, None):
         yield Finding(
             "warning",
             f"{len(rows)} samples ({100 * len(rows) / len(values):.2g} %) stand exactly at {level:g} in {count} runs",
             f"{name}, first in data row {rows[0] + 1}",
-            "the channel looks clipped, which bends stiffness and damping unless the drive was at its limit",
+            "the channel looks clipped, which biases stiffness and damping unless the drive was at its limit",
         )
     spikes = glitches(values, time)
     if len(spikes):
         yield Finding(
             "note",
-            f"{len(spikes)} samples stand far out from those around",
+            f"{len(spikes)} samples are far from their neighbours",
             f"{name}, first in data row {spikes[0] + 1}",
-            "they act in the fit as they were logged, so mend them if the logger made them",
+            "the fit uses them as logged, so correct them if the logger caused them",
         )
 
 
 def _quantised(log: Log, name: str, values: np.ndarray, side: float, spread: float) -> Iterator[Finding]:
-    """A note on the step of a channel.
+    """A note on the resolution of a channel.
 
     Args:
         log: For the unit.
         name: Signal.
         values: Its values.
-        side: What divides a step of this channel to give one of the quantity that matters.
-        spread: rms of the quantity that matters.
+        side: Divisor from a step of this channel to one of the reference quantity.
+        spread: rms of the reference quantity.
     """
     levels = np.unique(values)
     if len(levels) < 3 or len(values) < FEWEST:
@@ -182,7 +182,7 @@ def _quantised(log: Log, name: str, values: np.ndarray, side: float, spread: flo
         "note",
         f"the values lie {step:.4g} {unit} apart, which is {100 * share:.2g} % {about}",
         name,
-        "steps of a sensor act like noise of a twelfth of the squared step, and not quite white",
+        "quantisation acts like noise with a variance of a twelfth of the squared step, not quite white",
     )
 
 

@@ -1,4 +1,4 @@
-"""What the name of a column says: a quantity, a side of the gear, command or measurement, joint, unit."""
+"""Meaning of a column's name: quantity, side of the gear, command or measurement, joint, unit."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -28,9 +28,9 @@ QUANTITY: dict[str, Quantity] = {
     "twist": "twist",
     "forcing": "input",
 }
-"""What each signal measures."""
+"""Quantity of each signal."""
 
-# Words of logs in English, German and the symbols of papers, by what they say. Letters alone stand in `_LETTERS`.
+# Words in English and German column names, by meaning. Single letters are in `_LETTERS`.
 _QUANTITY_WORDS: dict[Quantity, str] = {
     "time": """
         time timestamp stamp zeit zeitstempel sec secs seconds nsecs nanosec msec usec millis micros tout
@@ -71,7 +71,7 @@ _MEASURED_WORDS = """
     est estimate estimated sensor sens
 """
 _EXTERNAL_WORDS = "ext external extern disturbance brake bremse stoer hat"
-# One letter, or a letter with marks, is a symbol of a paper; upper and lower case differ.
+# A single letter, also with marks, is a symbol from the literature; upper and lower case differ.
 _LETTERS: dict[str, tuple[Quantity, ...]] = {
     "t": ("time",),
     "T": ("torque", "time", "temperature"),
@@ -135,20 +135,20 @@ _UNIT_WORDS = {
     "increments": "counts",
     "motorinc": "counts",
 }
-# Behind a quantity these say the unit: "pos_s" has none.
+# After a quantity these state the unit: "pos_s" has none.
 _TIME_SUFFIX = {"s": "s", "sec": "s", "secs": "s", "seconds": "s"}
 
 
 @dataclass(frozen=True)
 class NameSense:
-    """What a name says.
+    """Meaning of a column's name.
 
     Attributes:
         stem: the name without joint and unit.
-        quantities: what it may measure, the likeliest first; empty where the name says nothing.
+        quantities: possible quantities, the most likely first; empty where the name has no known meaning.
         side: of the gear, or None.
-        commanded: whether it is a command and no measurement.
-        external: whether it acts from outside, or is an estimate of what does.
+        commanded: whether it is a command, not a measurement.
+        external: whether it is an external action, or an estimate of one.
         joint: label of the robot's joint, or None.
         unit: as stated in the name, or None; "counts" where it counts increments.
     """
@@ -164,7 +164,7 @@ class NameSense:
 
 @cache
 def _vocabulary() -> dict[str, tuple[str, str]]:
-    """Each word with what kind of thing it says, and what it says."""
+    """Each word with its kind and meaning."""
     words: dict[str, tuple[str, str]] = {}
     for side, listed in _SIDE_WORDS.items():
         words |= dict.fromkeys(listed.split(), ("side", side))
@@ -182,7 +182,7 @@ def _long_words() -> tuple[str, ...]:
 
 
 def _tokens(name: str) -> list[str]:
-    """Words and numbers of a name, parted at marks, digits and capitals."""
+    """Words and numbers of a name, split at marks, digits and capitals."""
     parts = re.findall(r"[^\W\d_]+|[0-9]+", name)
     tokens: list[str] = []
     for part in parts:
@@ -191,7 +191,7 @@ def _tokens(name: str) -> list[str]:
 
 
 def _compound(word: str) -> list[str]:
-    """The known words of which a compound is made; the word itself where it is none."""
+    """The known words of a compound; the word itself where it is none."""
     found, rest = [], word
     while rest:
         known = next((w for w in _long_words() if rest.startswith(w)), None)
@@ -217,10 +217,10 @@ def _stated_unit(name: str) -> tuple[str, str | None]:
 
 @cache
 def sense(name: str) -> NameSense:
-    """What a column's name says.
+    """Meaning of a column's name.
 
     Args:
-        name: as the file has it.
+        name: as in the file.
     """
     plain, unit = _stated_unit(name)
     plain, bracketed = _bracketed(plain)
@@ -228,19 +228,19 @@ def sense(name: str) -> NameSense:
     side: Side | None = None
     roles: set[str] = set()
     joint, suffix, stems = bracketed, "", []
-    # The last part of a path says what it is; those before it say whose.
+    # The last part of a path states the quantity; those before it the side or joint.
     for part in reversed(re.split(r"[./]", plain)):
         label, tokens = _joint(_tokens(part)) if joint is None else (joint, _tokens(part))
         joint = joint if label is None else label
         own, own_side, own_roles, last = _read([word for token in tokens for word in _words(token)])
-        # "joint" before a path's last part is where it is kept.
+        # "joint" before a path's last part is a group name.
         own_side = None if own_side == "joint" and stems else own_side
         side = own_side if side is None or (side == "joint" and own_side) else side
         roles |= own_roles
         quantities, suffix = (quantities, suffix) if quantities else (own, last)
         stems.insert(0, "_".join(token.lower() for token in tokens))
     if side is not None:
-        # Neither time nor temperature is of a side, and a column called after a side is most often its angle.
+        # Time and temperature belong to no side, and a column named after a side is most often its angle.
         bare: tuple[Quantity, ...] = () if side == "joint" else ("angle", "velocity", "torque")
         quantities = ("torque",) if "torque" in quantities else quantities or bare
     unit = unit or _unit_of(suffix, quantities)
@@ -298,13 +298,14 @@ def _read(words: Sequence[str]) -> tuple[tuple[Quantity, ...], Side | None, set[
             quantities = ("velocity",) if quantities in ((), ("angle",)) else ("other",)
         elif word in _LETTERS and not quantities:
             quantities = _LETTERS[word]
-    # A named side says more than the joint that it belongs to.
+    # A named side takes precedence over its joint.
     side = next((s for s in sides if s != "joint"), sides[0] if sides else None)
     return quantities, cast(Side | None, side), roles, words[-1] if words else ""
 
 
 def _stronger(old: tuple[Quantity, ...], new: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
-    """What two words say together: `encoder torque` is a torque, `dynamic error` a twist, `position error` neither."""
+    """Meaning of two words together: `encoder torque` is a torque, `dynamic error` a twist, `position error`
+    neither."""
     if not old or old == new:
         return new
     if "other" in (*old, *new):
@@ -322,7 +323,7 @@ def _unit_of(word: str, quantities: tuple[Quantity, ...]) -> str | None:
 
 
 def is_likely(name: str, signal: str) -> bool:
-    """Whether a column's name says that it is, or could be, some signal."""
+    """Whether a column may be a signal, by its name."""
     found = sense(name)
     other_side = {"motor": "load", "load": "motor"}.get(signal.partition("_")[0])
     return (
@@ -333,5 +334,5 @@ def is_likely(name: str, signal: str) -> bool:
 
 
 def likely_columns(signal: str, names: Iterable[str]) -> list[str]:
-    """The columns of a file whose names say that they could be a signal."""
+    """The columns of a file that may be a signal, by their names."""
     return [name for name in names if is_likely(name, signal)]

@@ -1,4 +1,4 @@
-"""The drive file: what a log cannot say about itself."""
+"""The drive file: data of the drive, and columns, units and signs of its logs."""
 
 import math
 import tomllib
@@ -37,7 +37,7 @@ _DRIVE_UNITS = {
     "rated_torque": "N m",
     "largest_twist": "rad",
 }
-# What may be known to a tolerance, or not at all, and its symbol.
+# Parameters that may have a tolerance or be unknown, and their symbols.
 _SYMBOLS = {"motor_inertia": "J_m", "load_inertia": "J_l", "torque_constant": "k_T"}
 _KEYS = {
     "drive": ("name", *_DRIVE_UNITS),
@@ -48,16 +48,16 @@ _KEYS = {
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Where a signal stands in the log.
+    """Column of a signal in the log.
 
     Attributes:
         column: Name of the column; in HDF5 the path of the dataset; "column 3" is the third one.
-        unit: Unit of the column's numbers, or None for the file's own, or else SI.
+        unit: Unit of the column's numbers, or None for that of the file, else SI.
         sign: +1.0 or -1.0, multiplies the column.
-        offset: What is subtracted before, in the column's own numbers.
-        time: Name of the column with this channel's own stamps, in the unit of [columns] time, or None.
-        fraction: Of stamps in two columns: where the parts of a second stand, or None.
-        torque_constant: Torque of a current [N m/A], or None for what is no current.
+        offset: Subtracted before conversion, in the column's unit.
+        time: Name of the column with this channel's stamps, in the unit of [columns] time, or None.
+        fraction: Of stamps in two columns: the column with the parts of a second, or None.
+        torque_constant: Torque of a current [N m/A], or None for other signals.
     """
 
     column: str
@@ -71,21 +71,21 @@ class ColumnMap:
 
 @dataclass(frozen=True)
 class DriveFile:
-    """A drive as its owner describes it.
+    """Content of a drive file.
 
     Attributes:
-        path: The file that was read.
+        path: The file.
         name: Name of the drive; the file's stem where none is stated.
         reduction_ratio: N, motor angle over load angle, or None where not stated.
         motor_inertia: J_m [kg m^2], or None.
         load_inertia: J_l [kg m^2], or None.
-        torque_hold: What the torque does between samples, one of `HOLDS`, or None.
+        torque_hold: Inter-sample behaviour of the torque, one of `HOLDS`, or None.
         sample_rate: Samples per second [Hz] of a log without time column, or None.
-        columns: Signal name to its place in the log, only where the drive file states it.
+        columns: Column of each signal that the drive file states, by signal name.
         rated_torque: At the output [N m], or None; lost motion is defined by it.
-        largest_twist: That the joint may reach [rad], or None for what a strain-wave gear bears.
+        largest_twist: Of the joint [rad], or None for that of a strain-wave gear.
         tolerances: Relative standard deviation of each of J_m, J_l and k_T (the torque constant over its value here)
-            that is not known for sure, by its symbol; infinite for what a fit is to find.
+            with a tolerance, by its symbol; infinite for a free one.
     """
 
     path: Path
@@ -101,11 +101,11 @@ class DriveFile:
     tolerances: dict[str, float] = field(default_factory=dict)
 
     def column_of(self, signal: str) -> ColumnMap:
-        """Place of `signal` in a log: the stated one, else a column of its own name, in SI."""
+        """Column of `signal` in a log: the stated one, else the column of that name, in SI."""
         return self.columns.get(signal, ColumnMap(signal, None, 1.0))
 
     def states(self, key: str) -> bool:
-        """Whether [drive] says something of `key`: a value, a tolerance, or that a fit is to find it."""
+        """Whether [drive] states `key`: as a value, with a tolerance, or as free."""
         return getattr(self, key) is not None or _SYMBOLS.get(key) in self.tolerances
 
 
@@ -113,9 +113,9 @@ def did_you_mean(word: str, known: Iterable[str], *, cutoff: float = 0.6) -> str
     """A suggestion in brackets, or nothing when no known name is close.
 
     Args:
-        word: What was written.
-        known: Names that would have been understood.
-        cutoff: How alike they must be, 0 to 1.
+        word: The unknown word.
+        known: Known names.
+        cutoff: Least similarity, 0 to 1.
 
     Returns:
         " (did you mean 'time'?)" or "".
@@ -126,7 +126,7 @@ def did_you_mean(word: str, known: Iterable[str], *, cutoff: float = 0.6) -> str
 
 
 def read_drive_file(path: str | PathLike[str]) -> DriveFile:
-    """The drive that a TOML file describes.
+    """Read a drive file.
 
     Args:
         path: A file with the tables [drive], [signals] and [columns], all optional. Physical
@@ -136,17 +136,17 @@ def read_drive_file(path: str | PathLike[str]) -> DriveFile:
         The drive, in SI units.
 
     Raises:
-        InputError: The file is missing, is not TOML, or says something that is not understood.
+        InputError: The file is missing, is not TOML, or has unknown or wrong entries.
     """
     return drive_of(_load(Path(path)), Path(path))
 
 
 def drive_of(tables: Mapping[str, Any], path: Path) -> DriveFile:
-    """The drive that tables describe; as [`read_drive_file`][].
+    """The drive that tables describe; see [`read_drive_file`][].
 
     Args:
         tables: [drive], [signals] and [columns] by name.
-        path: Where they are from, for messages.
+        path: Their source, for messages.
     """
     _refuse_unknown(path, "table", tables, _KEYS)
     for table, known in _KEYS.items():
@@ -173,14 +173,14 @@ def drive_of(tables: Mapping[str, Any], path: Path) -> DriveFile:
 
 
 class _Stated(NamedTuple):
-    """A number as the drive file states it, and its relative standard deviation, infinite for "fit"; None if known."""
+    """A number of the drive file, and its relative standard deviation: infinite for "fit", None if exact."""
 
     value: object
     tolerance: float | None = None
 
 
 def _stated(path: Path, key: str, entry: object, where: str = "[drive] ") -> _Stated:
-    """A number, or what may be known of it to a tolerance.
+    """A number that may have a tolerance.
 
     Args:
         path: Of the drive file.
@@ -221,7 +221,7 @@ def _share(path: Path, place: str, entry: object) -> float:
 def _torque_of_current(
     path: Path, columns: Mapping[str, ColumnMap], entry: object
 ) -> tuple[dict[str, ColumnMap], _Stated]:
-    """The columns with the motor's torque in the place of its current, and what is known of the torque constant."""
+    """The columns with the motor's torque in place of its current, and the torque constant."""
     if "motor_torque" in columns:
         raise InputError(f"{path}: [columns] has both motor_torque and motor_current; keep the one that was measured")
     given = entry.get("torque_constant") if isinstance(entry, dict) else None
@@ -229,7 +229,7 @@ def _torque_of_current(
     if given is None:
         raise InputError(f"{path}: {where}needs a torque_constant in N m / A, as in {{ torque_constant = 0.12 }}")
     stated = _stated(path, "torque_constant", given, where)
-    # A constant that is free is counted from one.
+    # A free constant is relative to one.
     value = 1.0 if math.isinf(stated.tolerance or 0.0) else stated.value
     constant = _positive(path, "columns", "torque_constant", value, "N m/A")
     others = {signal: place for signal, place in columns.items() if signal != "motor_current"}
@@ -247,7 +247,7 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: the drive file is not text; save it as UTF-8 TOML") from error
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: the drive file is not valid TOML, mend it: {reason}") from error
+        raise InputError(f"{path}: the drive file is not valid TOML, correct it: {reason}") from error
 
 
 def _refuse_unknown(path: Path, kind: str, given: Iterable[str], known: Iterable[str]) -> None:
@@ -337,7 +337,7 @@ def _column_map(path: Path, signal: str, entry: object, key: str = "") -> Column
 
 
 def _column_name(path: Path, where: str, value: object) -> str:
-    """A column's name, also of one that is given by its number, counted from one."""
+    """A column's name, also for a number counted from one."""
     if isinstance(value, bool) or not isinstance(value, int):
         return _text(path, where, value)
     if not 0 < value <= _MOST_COLUMNS:

@@ -1,4 +1,4 @@
-"""Libraries of an extra, which only logs of some formats need."""
+"""Optional libraries, which only some log formats need."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,13 +9,13 @@ from fitting.errors import InputError
 
 @contextmanager
 def needing(path: Path, needs: str, extra: str, otherwise: str) -> Iterator[None]:
-    """Refuse a log where an import in the block fails.
+    """Raise an input error where an import in the block fails.
 
     Args:
         path: of the log.
-        needs: what it needs, as in "MDF files need asammdf; install it".
-        extra: that brings it.
-        otherwise: what can be done without.
+        needs: requirement, as in "MDF files need asammdf; install it".
+        extra: that installs it.
+        otherwise: alternative without it.
 
     Raises:
         InputError: The extra is not installed.

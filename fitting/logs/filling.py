@@ -1,4 +1,4 @@
-"""What is unknown of a log's signals: which rows count, and what stands in the others."""
+"""Missing values of a log's signals: valid rows, and interpolation in the others."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,16 +25,16 @@ def trusted_rows(
     *,
     own_clocks: bool,
 ) -> tuple[np.ndarray, tuple[Finding, ...]]:
-    """Rows in which all outputs are known; the others are filled, so that nothing meets a NaN.
+    """Rows in which all outputs are known; the others are filled, so that no NaN remains.
 
     Args:
         path: The log, for messages.
         drive_file: Names the columns, for messages.
-        signals: By name; outputs that are unknown are filled.
+        signals: By name; unknown outputs are filled.
         outputs: Their names.
         outputs_until: Rows in which the outputs are known, or None for all.
-        asked: How many samples of each output are wanted there, or None for all.
-        own_clocks: Whether rows are the stamps of all channels, so that each lacks those of the others.
+        asked: Required samples of each output there, or None for all.
+        own_clocks: Whether rows are the union of all channels' stamps, so that each channel has missing rows.
     """
     count = len(signals[outputs[0]])
     trusted, findings = np.ones(count, dtype=bool), []
@@ -53,7 +53,9 @@ def trusted_rows(
             seen = "was not sampled" if own_clocks else "is blank or not finite"
             what = f"{name} {seen} in {len(blank)} rows ({100 * len(blank) / until:.2g} %)"
             where = f"{drive_file.column_of(name).column}, first in row {blank[0] + 1}"
-            findings.append(Finding("note" if own_clocks else "warning", what, where, "they have no weight in the fit"))
+            findings.append(
+                Finding("note" if own_clocks else "warning", what, where, "they have weight zero in the fit")
+            )
         signals[name] = signals[name] if known.all() else np.interp(rows, rows[known], signals[name][known])
         trusted &= known
     if trusted.sum() < needed:
@@ -69,7 +71,7 @@ def input_rows(
     name: str,
     outputs_until: int | None,
 ) -> tuple[np.ndarray, tuple[tuple[int, int], ...], tuple[Finding, ...]]:
-    """In which rows the input is known, the pieces in which it is or can be bridged, and what there is to tell."""
+    """Rows in which the input is known, pieces in which it is known or can be bridged, and findings."""
     known = np.isfinite(signals[name])
     if known.sum() < _FEWEST_INPUTS:
         raise InputError(
@@ -77,7 +79,7 @@ def input_rows(
         )
     whole = outputs_until is not None
     if name == "joint_torque":
-        # No torque acts between the samples of a log without motion.
+        # A quasi-static log needs no torque between its samples.
         return known, ((0, len(known)),), ()
     spans, gaps = pieces(base.time, signals[name], known, base.restarts, name, whole=whole)
     # A sample or two at the ends may be held.
@@ -92,7 +94,7 @@ def input_rows(
 def interpolated(
     path: Path, drive_file: DriveFile, time: np.ndarray, signals: dict[str, np.ndarray]
 ) -> tuple[Finding, ...]:
-    """Fill what is unknown of the inputs; the fit looks at the main one where it was sampled only."""
+    """Fill missing values of the inputs; the fit uses the main one only where it was sampled."""
     findings = []
     for name in ("motor_torque", "forcing", "joint_torque", *OPTIONAL_SIGNALS):
         if name not in signals:

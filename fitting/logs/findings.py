@@ -1,4 +1,4 @@
-"""What the health gate has to say about a log."""
+"""Findings of the health check."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,13 +6,13 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Finding:
-    """One observation about a log and what it does to a fit.
+    """An observation on a log and its effect on a fit.
 
     Attributes:
         severity: "note" (good to know), "warning" (the fit suffers), "refusal" (no fit).
-        what: What was seen, with the numbers.
-        where: The column, and the rows or times where they matter.
-        consequence: What it does to the fit, and the remedy where there is one.
+        what: The observation, with numbers.
+        where: The column, and rows or times where relevant.
+        consequence: Its effect on the fit, and a remedy if any.
     """
 
     severity: Literal["note", "warning", "refusal"]

@@ -17,10 +17,10 @@ def table_of(path: Path, source: Any, wanted: Iterable[str]) -> RawTable:
     """The wanted columns of a table in memory.
 
     Args:
-        path: What messages call it.
+        path: Its name in messages.
         source: A frame of pandas or polars, a dataset of xarray, or arrays by name. Its columns may state their unit as
             in "torque [N m]", variables of xarray in the attribute `units`.
-        wanted: Names of columns; those that the table lacks are left out of the answer.
+        wanted: Names of columns; those that the table lacks are omitted.
 
     Raises:
         InputError: A wanted column is not a vector of numbers.

@@ -1,4 +1,4 @@
-"""Where a log's torque is known: gaps that the torque around them bridges, and pieces between those it does not."""
+"""Gaps in a log's torque: short ones are bridged by interpolation, long ones cut the log into pieces."""
 
 from collections.abc import Sequence
 
@@ -7,12 +7,12 @@ import numpy as np
 from fitting.logs.findings import Finding
 
 SHORTEST = 200
-"""Rows that a log, or a piece of one between gaps, needs to be fitted."""
+"""Least rows of a log, or of a piece between gaps, for a fit."""
 
 # All thresholds are assumed.
 _REGULAR = 0.3
-_LATE = 1.5  # typical steps; what is longer lacks a sample, where the sampling is regular
-_GAP = 5.0  # likewise, where the sampling jitters
+_LATE = 1.5  # typical steps; a longer one lacks a sample, for regular sampling
+_GAP = 5.0  # likewise, for jittering sampling
 _LONGEST_BRIDGE = 16
 _BRIDGE_ERROR = 0.02
 _ENOUGH = 0.9
@@ -24,8 +24,8 @@ class Sampling:
     Attributes:
         time: stamps at which it is known [s], (n,).
         step: the typical one [s].
-        gaps: places in `time` behind which samples are missing.
-        missing: how many are missing behind each.
+        gaps: indices in `time` after which samples are missing.
+        missing: number of missing samples in each.
     """
 
     def __init__(self, time: np.ndarray):
@@ -34,7 +34,7 @@ class Sampling:
         self.step = float(np.median(step))
         regular = np.mean(np.abs(step / self.step - 1) < _REGULAR) > 0.9
         steps = np.minimum(step / self.step, 1e9)
-        # A late stamp has a long step before it and a short one behind it; nothing is missing there.
+        # A late stamp has a long step before it and a short one after it; no sample is missing.
         around = np.pad(steps, 1, constant_values=1.0)
         lacking = np.rint(around[:-2] + around[1:-1] + around[2:]) - 3
         lacking = np.where(steps > _GAP, np.rint(steps) - 1, np.minimum(lacking, np.rint(steps) - 1))
@@ -43,11 +43,11 @@ class Sampling:
 
 
 def bridged(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An input with the samples that are missing in its gaps, by cubics through the two samples on either side.
+    """An input with its gaps filled by cubics through two samples on either side.
 
     Args:
         time: stamps at which it is known [s], (n,), rising.
-        values: its samples.
+        values: samples.
 
     Returns:
         Stamps and samples, those in gaps included.
@@ -58,7 +58,7 @@ def bridged(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
     stamps, samples = [], []
     for gap, missing in zip(sampling.gaps, sampling.missing, strict=True):
         around = np.arange(max(0, gap - 1), min(len(time), gap + 3))
-        # From the middle of the gap on, lest the powers of a late clock lose their digits.
+        # Relative to the middle of the gap, for accuracy at large times.
         middle, width = 0.5 * (time[gap] + time[gap + 1]), time[gap + 1] - time[gap]
         own = time[gap] + width * np.arange(1, missing + 1) / (missing + 1)
         stamps.append(own)
@@ -77,11 +77,11 @@ def _through(nodes: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarra
 
 
 def bridge_error(values: np.ndarray, missing: int) -> float:
-    """How wrong a bridge over some missing samples would be, as tried where none is missing.
+    """Error of bridging missing samples, measured where none is missing.
 
     Args:
         values: samples of an input, (n,).
-        missing: how many.
+        missing: number of missing samples.
 
     Returns:
         Rms error in the middle of the bridge over the input's standard deviation; infinite for a bridge too long.
@@ -107,19 +107,18 @@ def pieces(
     *,
     whole: bool = False,
 ) -> tuple[tuple[tuple[int, int], ...], tuple[Finding, ...]]:
-    """The pieces of a log in which its input is known or can be bridged.
+    """Pieces of a log in which its input is known or can be bridged.
 
     Args:
         time: stamps of the rows [s], (n,), rising.
-        values: the input, (n,); looked at where it is known.
-        known: in which rows it is.
-        restarts: rows in which a recording starts anew.
+        values: the input, (n,); used where it is known.
+        known: rows in which it is known.
+        restarts: rows in which a recording restarts.
         name: of the input.
-        whole: whether the log is wanted in one piece, so that short gaps are bridged for better or worse.
+        whole: whether the log is needed in one piece, so that short gaps are bridged in any case.
 
     Returns:
-        First row and one past the last of each piece, and what was found. No piece is left where the log is nothing
-        but gaps.
+        First row and one past the last of each piece, and findings. There are no pieces where the log is mostly gaps.
     """
     rows = np.flatnonzero(known)
     if len(rows) < 2:
@@ -131,7 +130,7 @@ def pieces(
     breaks = sampling.gaps[wide | fresh]
     spans = _between(rows, breaks)
     if whole or sum(b - a for a, b in spans) < _ENOUGH * len(time):
-        # Where samples are missing everywhere, leaving them out would leave little.
+        # Where gaps are everywhere, cutting at them would leave little.
         wide &= np.diff(sampling.time)[sampling.gaps] > _GAP * sampling.step
         breaks = sampling.gaps[wide | fresh]
         spans = _between(rows, breaks)
@@ -154,7 +153,7 @@ def _of_breaks(sampling: Sampling, rows: np.ndarray, breaks: np.ndarray, spans: 
     step = np.diff(sampling.time)[breaks]
     longest = int(np.argmax(step))
     left_out = count - sum(b - a for a, b in spans)
-    rest = f"; {left_out} rows between gaps that lie too close are left out" if left_out else ""
+    rest = f"; {left_out} rows between gaps that are too close are omitted" if left_out else ""
     return Finding(
         "warning",
         f"{len(breaks)} gaps in the time stamps, the longest {step[longest]:.4g} s where the median step is "
@@ -172,7 +171,7 @@ def _of_bridges(sampling: Sampling, rows: np.ndarray, bridges: np.ndarray, error
         "note" if known else "warning",
         f"{int(missing.sum())} samples of {name} are missing in {len(bridges)} places, up to {missing.max()} in a row",
         f"time, first in data row {rows[bridges[0] + 1] + 1}",
-        f"they were put in from their neighbours, which elsewhere is right to {100 * worst:.2g} % of its rms"
+        f"they were interpolated, with an error of {100 * worst:.2g} % of its rms elsewhere"
         if known
-        else "nothing foretells them, but leaving them out would cost too much: the torque there is a guess",
+        else "they are not predictable, but omitting them would lose too much data: the torque there is a guess",
     )

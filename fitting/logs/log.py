@@ -1,6 +1,6 @@
-"""Measured logs in SI units, checked to be whole.
+"""Measured logs in SI units.
 
-The only place, with the readers below it, that opens a log, and the only one that converts its units.
+Only this module and its readers open logs and convert units.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,12 +37,12 @@ from fitting.logs.resampling import angles_together, on_one_grid
 from fitting.logs.split_stamps import partners, with_joined_stamps
 from fitting.logs.time_stamps import TimeBase
 
-_SLOWEST = 60.0  # s between samples; no drive's resonance is that slow, but nanoseconds taken for seconds are
+_SLOWEST = 60.0  # s between samples; too slow for a drive's resonance, so that the unit of time must be wrong
 _UNTIMED = Finding(
     "note",
     "there is no time column",
     "time",
-    "the rows are taken to be in order of time, and a drift is counted per row",
+    "the rows are assumed to be in order of time, and a drift is per row",
 )
 
 
@@ -53,9 +53,9 @@ class Log:
     Attributes:
         name: Stem of the file.
         path: The file.
-        kind: "drive" (motor torque and what it moves), "reduced" (dynamic error and forcing) or "quasi-static" (twist
-            and joint torque).
-        time: Stamps [s], strictly increasing, in the file's own origin, (n,).
+        kind: "drive" (motor torque and motion), "reduced" (dynamic error and forcing) or "quasi-static" (twist and
+            joint torque).
+        time: Stamps [s], strictly increasing, from the file's origin, (n,).
         motor_angle: theta_m [rad], (n,), or None for a reduced log.
         load_angle: theta_l [rad], (n,), or None.
         motor_torque: T_m [N m], (n,), or None.
@@ -64,16 +64,16 @@ class Log:
         dynamic_error: x, (n,); theta_m/N - theta_l [rad] in a drive log, less `zero`, None where it lacks an angle.
         forcing: F, (n,), or None for a drive log.
         units: Units of `dynamic_error` and, in a reduced log, of `forcing`.
-        findings: What was seen while reading; `health.examine` adds to it.
-        motor_velocity: theta_m' [rad/s] as logged, (n,), or None; NaN where unknown and only checked against.
+        findings: Of the reader; `checks.examine` adds to them.
+        motor_velocity: theta_m' [rad/s] as logged, (n,), or None; NaN where unknown; it may be used for checks only.
         load_velocity: theta_l' [rad/s], likewise.
-        outputs_until: Rows in which the output columns are known, or None for all. Nothing may look at later outputs.
-        trusted: Rows whose outputs were measured and are believed, (n,), or None for all. Others hold something finite.
+        outputs_until: Rows in which the output columns are known, or None for all. Later outputs must not be used.
+        trusted: Rows with valid outputs, (n,), or None for all. Other rows hold finite values.
         input_known: Rows in which motor torque or forcing was sampled, (n,), or None for all.
         pieces: First row and one past the last of each stretch between gaps, or None for the whole log.
-        zero: What was taken off the dynamic error, since no torque explains it.
-        joint_torque: That the drive passes on [N m], positive where it twists the drive positively, (n,), or None.
-        rate_std: Relative standard deviation of the sample interval, as far as rounded stamps leave it open.
+        zero: Sensor offset that was subtracted from the dynamic error.
+        joint_torque: Torque behind the gear [N m], positive where it twists the drive positively, (n,), or None.
+        rate_std: Relative standard deviation of the sample interval, from the rounding of the stamps.
     """
 
     name: str
@@ -110,13 +110,13 @@ class Log:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The signals that a fit is to explain, as they were logged."""
+        """The fitted signals, as logged."""
         if self.kind != "drive":
             return ("dynamic_error",)
         return drive_outputs([name for name, value in vars(self).items() if isinstance(value, np.ndarray)])
 
     def rows(self, start: int, stop: int) -> "Log":
-        """Rows `start` to `stop` (exclusive) as a log of their own, with the stretches between gaps that lie there."""
+        """Rows `start` to `stop` (exclusive) as a log, with its stretches between gaps."""
         columns = {key: value[start:stop] for key, value in vars(self).items() if isinstance(value, np.ndarray)}
         inside = [(max(a, start) - start, min(b, stop) - start) for a, b in self.pieces or ()]
         kept = tuple((a, b) for a, b in inside if b - a >= SHORTEST)
@@ -126,23 +126,23 @@ class Log:
 def read_log(
     path: str | PathLike[str], drive_file: DriveFile, *, outputs_until: int | None = None, table: Any = None
 ) -> Log:
-    """The log that a file or a table in memory holds, in SI units.
+    """Read a log from a file or a table in memory, in SI units.
 
     Args:
-        path: File of any format of [`fitting.logs.read_table`][], or what messages call a table.
-        drive_file: Says which column is which signal, and in which unit.
-        outputs_until: The angles and the dynamic error need to be known in the first so many
-            rows only, and the input in all of them; None asks for what a fit needs.
-        table: What takes the place of the file: a frame, a dataset, or arrays by name ([`fitting.logs.frames`][]).
+        path: File of any format of [`fitting.logs.read_table`][], or a table's name in messages.
+        drive_file: States column and unit of each signal.
+        outputs_until: Number of first rows in which angles and dynamic error must be known; the input must be known in
+            all. None for the requirements of a fit.
+        table: In place of the file: a frame, a dataset, or arrays by name ([`fitting.logs.frames`][]).
 
     Returns:
-        The log; what was mended, masked or left out stands in its findings.
+        The log; its findings report corrected, masked and omitted data.
 
     Raises:
-        InputError: The file cannot be read, lacks a column, or holds no numbers where they are needed.
+        InputError: The file cannot be read, lacks a column, or has no numbers where they are needed.
         DataError: The log is too short, or has too many gaps.
     """
-    # Numbers of any size may stand in a file; what overflows is counted as blank.
+    # Files may contain numbers of any size; those that overflow count as blank.
     with np.errstate(all="ignore"):
         return _read(Path(path), drive_file, outputs_until, table)
 
@@ -168,13 +168,13 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
             column = _cut(raw[signal], start, stop, start + outputs_until if is_output and outputs_until else stop)
             channels[signal] = channel(path, drive_file, signal, column, first_row=start)
     if kind == "quasi-static" and "time" not in raw and not (drive_file.sample_rate or table.sample_rate):
-        # The curve does not depend on the rate.
+        # The torque-twist curve does not depend on the rate.
         rows = np.arange(start, stop)
         base = TimeBase(rows - start, rows.astype(float), np.zeros(0, dtype=int), (_UNTIMED,))
     else:
         base = _time(path, drive_file, table, raw.get("time"), channels, start, stop)
     if len(base.time) < SHORTEST:
-        raise DataError(f"{path}: only {len(base.time)} rows have a stamp of their own; a fit needs {SHORTEST}")
+        raise DataError(f"{path}: only {len(base.time)} rows have a valid stamp; a fit needs {SHORTEST}")
     findings = [*joined, *told, *(f for c in channels.values() for f in c.findings), *base.findings]
     signals = {name: found.values[base.rows] for name, found in channels.items()}
     findings += _put_together(path, drive_file, base.time, signals, outputs_until)
@@ -215,7 +215,7 @@ def _read(path: Path, drive_file: DriveFile, outputs_until: int | None, source: 
 def _put_together(
     path: Path, drive_file: DriveFile, time: np.ndarray, signals: dict[str, np.ndarray], outputs_until: int | None
 ) -> tuple[Finding, ...]:
-    """Put the two angles, where there are two, at the same stamps, as far as they may be looked at."""
+    """Interpolate two angles to the same stamps, in the rows that may be used."""
     if "motor_angle" not in signals or "load_angle" not in signals:
         return ()
     seen, ratio = slice(outputs_until), drive_file.reduction_ratio or 1.0
@@ -227,7 +227,7 @@ def _put_together(
 
 
 def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], outputs: Sequence[str], start: int) -> int | None:
-    """Rows in which so many samples of each output are: more than these where a channel is slower than the log."""
+    """Number of rows with a given number of samples of each output; larger where a channel is slower than the log."""
     if asked is None:
         return None
     known = [np.flatnonzero(np.isfinite(raw[s].values[start:])) for s in outputs]
@@ -235,14 +235,14 @@ def _rows_until(asked: int | None, raw: Mapping[str, RawColumn], outputs: Sequen
 
 
 def _in_memory(path: Path, source: Any, wanted: list[str]) -> RawTable:
-    # Loaded here: tables in memory need polars, which takes long to load.
+    # Imported here: tables in memory need polars, which takes long to import.
     from fitting.logs.frames import table_of
 
     return table_of(path, source, wanted)
 
 
 def _twist(path: Path, drive_file: DriveFile, kind: Kind, signals: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """The dynamic error, which in a quasi-static log is a twist; None for a drive log that lacks an angle."""
+    """The dynamic error (in a quasi-static log the twist); None for a drive log that lacks an angle."""
     if kind == "drive" and not ("motor_angle" in signals and "load_angle" in signals):
         return None
     if kind == "reduced" or "load_angle" not in signals:
@@ -280,7 +280,7 @@ def _refuse_unequal(path: Path, drive_file: DriveFile, raw: dict[str, RawColumn]
 def _inhabited(
     path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, RawColumn], required: Sequence[str]
 ) -> tuple[dict[str, RawColumn], int, int, tuple[Finding, ...]]:
-    """The columns that matter on one grid, and the first row and one past the last in which any has something."""
+    """The needed columns on one grid, and the first row and one past the last with any data."""
     used = [s for s in (*required, *OPTIONAL_SIGNALS) if s in raw]
     velocities = () if "forcing" in required else VELOCITIES
     raw = {s: raw[s] for s in (*used, *velocities, "time") if s in raw}

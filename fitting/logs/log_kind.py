@@ -1,4 +1,4 @@
-"""Which kind of log a table is, and which of its columns that kind needs."""
+"""Kind of a log, and the columns that it needs."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -26,7 +26,7 @@ _DRIVE_KEYS = ("reduction_ratio", "motor_inertia", "load_inertia")
 
 
 def refuse_repeated(path: Path, drive_file: DriveFile, table: RawTable) -> None:
-    """Refuse signals whose column's name several columns have; of time columns, each is a clock."""
+    """Refuse signals whose column name is not unique; several time columns are separate clocks."""
     for signal in SIGNALS[1:]:
         name = drive_file.column_of(signal).column
         if name in table.repeated:
@@ -50,7 +50,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
     has_angles = all(signal in raw for signal in DRIVE_SIGNALS)
     is_reduced = all(signal in raw for signal in REDUCED_SIGNALS)
     if has_angles and is_reduced:
-        # A drive log may carry a derived dynamic error; only a stated one displaces the angles.
+        # A drive log may contain a derived dynamic error; only a stated one replaces the angles.
         has_angles = not all(signal in stated for signal in REDUCED_SIGNALS)
     if "joint_torque" in raw and twist_signals(raw):
         only_stated = "joint_torque" in stated and not ("motor_torque" in stated or "forcing" in stated)
@@ -72,7 +72,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
     likely = likely_columns(missing[0], free)[:_MOST_LIKELY]
     could_be = f" ({' or '.join(repr(name[:60]) for name in likely)} could be it)" if likely else ""
     example = likely[0][:60] if likely else "..."
-    # The name of another signal is like this one's as well.
+    # The name also resembles that of another signal.
     hint = did_you_mean(missing[0], free, cutoff=_MISSPELT) or could_be
     raise InputError(
         f"{path}: no column for {', '.join(missing)}{hint}; {listing(table)}, so say which one it is in the drive "
@@ -81,7 +81,7 @@ def kind_of(path: Path, drive_file: DriveFile, table: RawTable, raw: dict[str, R
 
 
 def _missing(raw: Mapping[str, RawColumn]) -> list[str]:
-    """What a log lacks to be one that can be fitted, the most likely kind taken."""
+    """Missing signals of a log, for its most likely kind."""
     if any(s in raw for s in REDUCED_SIGNALS) and not any(s in raw for s in DRIVE_SIGNALS):
         return [s for s in REDUCED_SIGNALS if s not in raw]
     if sees_motor(raw) and "motor_torque" not in raw:
@@ -90,7 +90,7 @@ def _missing(raw: Mapping[str, RawColumn]) -> list[str]:
 
 
 def _unnamed(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]) -> list[str]:
-    """Columns that are no signal yet."""
+    """Columns that are not assigned to a signal."""
     taken = [drive_file.column_of(signal).column for signal in raw]
     return [name for name in table.names if split_unit(name)[0] not in taken]
 
@@ -98,7 +98,7 @@ def _unnamed(drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn
 def told_of_subset(
     path: Path, drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]
 ) -> tuple[Finding, ...]:
-    """What is to be said of a drive log that lacks an angle: what it is fitted to, and what may be the angle."""
+    """Finding on a drive log that lacks an angle: its fitted outputs, and columns that may be the angle."""
     seen, lacks = drive_outputs(raw), [angle for angle, _ in SIDES if angle not in raw]
     if not lacks or not seen:
         return ()
@@ -125,15 +125,15 @@ def needed_signals(kind: Kind, raw: Mapping[str, RawColumn]) -> tuple[str, ...]:
 
 
 def sees_motor(signals: Collection[str]) -> bool:
-    """Whether the motor's motion was logged, without which no drive log can be fitted."""
+    """Whether the motor's motion was logged, which every drive log needs."""
     return any(signal in signals for signal in SIDES[0])
 
 
 def drive_outputs(signals: Collection[str]) -> tuple[str, ...]:
     """The outputs that a drive log is fitted to, the principal one last.
 
-    Both angles hold all; a velocity beside the angle of its side mostly is the angle's derivative, and is only checked
-    against it.
+    Both angles suffice. A velocity beside the angle of its side is mostly the angle's derivative, and used for checks
+    only.
     """
     sides = [next((s for s in side if s in signals), None) for side in SIDES]
     if sides == ["motor_angle", "load_angle"]:
@@ -142,5 +142,5 @@ def drive_outputs(signals: Collection[str]) -> tuple[str, ...]:
 
 
 def twist_signals(raw: Mapping[str, RawColumn]) -> tuple[str, ...]:
-    """What the twist is made of in a quasi-static log; nothing where it is not there."""
+    """Signals that give the twist of a quasi-static log; empty where they are missing."""
     return next((signals for signals in TWIST_SIGNALS if all(s in raw for s in signals)), ())

@@ -1,4 +1,4 @@
-"""LabVIEW measurement files: a header of the file, then sections of a header and a table each."""
+"""LabVIEW measurement files: a file header, then sections with a header and a table each."""
 
 from fitting.logs.raw_table import split_unit
 
@@ -7,8 +7,8 @@ _END = "***End_of_Header***"
 
 
 def lvm_table(lines: list[str]) -> tuple[list[str], float | None]:
-    """The tables of all sections as one, under one line of names with their units; and the sample rate [Hz] where the
-    file states a step in place of stamps.
+    """The tables of all sections as one, with one line of names and units; and the sample rate [Hz] where the file
+    states a step instead of stamps.
 
     Args:
         lines: of the file.
@@ -24,7 +24,7 @@ def lvm_table(lines: list[str]) -> tuple[list[str], float | None]:
     delimiter = "," if comma else "\t"
     columns = about.get("X_Columns", ["One"])[0]
     section = _entries(lines[ends[0] + 1 : ends[-1]], delimiter)
-    # A file without sections has its table behind the only header.
+    # A file without sections has its table after the only header.
     starts = ends[1:] or ends
     stops = [_next_section(lines, end) for end in starts]
     names = _names(lines[starts[0] + 1].split(delimiter) if starts[0] + 1 < len(lines) else [], section, columns)
@@ -34,7 +34,7 @@ def lvm_table(lines: list[str]) -> tuple[list[str], float | None]:
 
 
 def _entries(lines: list[str], delimiter: str) -> dict[str, list[str]]:
-    """What stands behind each keyword, the first time it is there."""
+    """Value of each keyword at its first occurrence."""
     found: dict[str, list[str]] = {}
     for line in lines:
         key, *values = (cell.strip() for cell in line.split(delimiter))
@@ -43,7 +43,7 @@ def _entries(lines: list[str], delimiter: str) -> dict[str, list[str]]:
 
 
 def _next_section(lines: list[str], end: int) -> int:
-    """The line where the section behind this one begins, or the number of lines."""
+    """First line of the next section, or the number of lines."""
     return next((i for i in range(end + 1, len(lines)) if lines[i].startswith("Channels")), len(lines))
 
 

@@ -1,4 +1,4 @@
-"""Samples that the fit must not believe: spikes, dropouts, clipped and stuck stretches of a sensor."""
+"""Invalid samples of a sensor: spikes, dropouts, clipped and stuck runs."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,11 +11,11 @@ from fitting.logs.gaps import SHORTEST
 from fitting.logs.held import without_repeats
 from fitting.logs.log import Log
 
-# All thresholds are assumed: they part the practice logs from their faults by a wide margin.
-SPIKE = 12.0  # robust standard deviations of what neighbours do not foretell
-DROPOUT = 40.0  # likewise, of a step
+# All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
+SPIKE = 12.0  # robust standard deviations of the prediction error from neighbours
+DROPOUT = 40.0  # robust standard deviations of a step
 LONGEST_DROPOUT = 5
-CLIFF = 10.0  # times the steps around
+CLIFF = 10.0  # times the neighbouring steps
 PATTERN = 0.13
 EVEN = 0.1  # of a step
 CLIPPED_SHARE = 0.002
@@ -26,16 +26,15 @@ _LONE = np.array([-2 / 3, 1 / 6])
 
 
 def masked(log: Log) -> Log:
-    """The log with the samples marked that no fit should believe, and with findings that tell of them.
+    """The log with invalid samples marked, and findings on them.
 
-    The outputs of a marked row have no weight; the row's torque acts all the same. Outputs after `log.outputs_until`
-    are not looked at.
+    Outputs of a marked row have weight zero; its torque is used. Outputs after `log.outputs_until` are not checked.
 
     Args:
         log: as read.
 
     Raises:
-        DataError: Hardly an output can be believed.
+        DataError: Too few valid outputs.
     """
     log = without_repeats(log)
     wrong, findings = np.zeros(len(log), dtype=bool), []
@@ -49,19 +48,19 @@ def masked(log: Log) -> Log:
 
 
 def _where_seen(log: Log) -> Log:
-    """The log without the pieces in which hardly an output is believed."""
+    """The log without pieces that have too few valid outputs."""
     if log.trusted is None or log.outputs_until is not None:
         return log
     pieces = log.pieces or ((0, len(log)),)
     kept = tuple((a, b) for a, b in pieces if log.trusted[a:b].sum() >= SHORTEST // 2)
     if not kept:
         raise DataError(
-            f"{log.path}: only {log.trusted.sum()} of {len(log)} rows have outputs that can be believed, since "
-            f"{log.findings[-1].what}; mend the sensor or record another log"
+            f"{log.path}: only {log.trusted.sum()} of {len(log)} rows have valid outputs, since "
+            f"{log.findings[-1].what}; repair the sensor or record another log"
         )
     if len(kept) == len(pieces):
         return log
-    what = f"{len(pieces) - len(kept)} of {len(pieces)} stretches have fewer than {SHORTEST // 2} believable rows"
+    what = f"{len(pieces) - len(kept)} of {len(pieces)} stretches have fewer than {SHORTEST // 2} valid rows"
     finding = Finding("warning", what, "all outputs", "they were left out")
     return replace(log, pieces=kept, findings=(*log.findings, finding))
 
@@ -73,7 +72,7 @@ def _untrusted(log: Log) -> Iterator[tuple[np.ndarray, Finding]]:
     channels = {name: getattr(log, name)[:until] for name in log.outputs}
     for name, values in channels.items():
         others = [other for key, other in channels.items() if key != name]
-        # What moves meanwhile tells a stuck sensor from rest.
+        # Motion of another channel distinguishes a stuck sensor from rest.
         yield from _of_channel(name, values, others[0] if others else None, known, log.time[:until])
 
 
@@ -89,9 +88,9 @@ def _of_channel(
             spikes,
             Finding(
                 "warning",
-                f"{len(spikes)} samples stand out from those around by more than noise and motion allow",
+                f"{len(spikes)} samples differ from their neighbours by more than noise and motion explain",
                 f"{name}, first in data row {spikes[0] + 1}",
-                "they are taken for glitches of the sensor and have no weight in the fit",
+                "they count as glitches of the sensor and have weight zero in the fit",
             ),
         )
     calm = np.interp(np.arange(len(values)), *_without(values, spikes)) if len(spikes) else values
@@ -102,7 +101,7 @@ def _of_channel(
                 "warning",
                 _standing(rows, values, level, times),
                 f"{name}, first in data row {rows[0] + 1}",
-                "the channel looks clipped, so that these samples have no weight in the fit",
+                "the channel looks clipped, so that these samples have weight zero in the fit",
             ),
         )
     rows = frozen(calm, other) if other is not None else np.zeros(0, dtype=int)
@@ -113,7 +112,7 @@ def _of_channel(
                 "warning",
                 f"{name} holds one value for {len(rows)} rows while {mover} moves",
                 f"{name}, data rows {rows[0] + 1} to {rows[-1] + 1}",
-                "the sensor is stuck there, so that these samples have no weight in the fit",
+                "the sensor is stuck there, so that these samples have weight zero in the fit",
             ),
         )
 
@@ -128,14 +127,14 @@ def _without(values: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def glitches(values: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Rows whose value is an outlier to its neighbours, singly or a few in a row.
+    """Rows with outliers relative to their neighbours, single or a few in a row.
 
-    A smooth motion, however quick, is foretold by a cubic through the neighbours; a real impact is a kink in the angle,
-    and leaves another pattern than a lone wrong sample does.
+    A smooth motion is predicted by a cubic through the neighbours. A real impact is a kink in the angle, and has
+    another error pattern than an isolated outlier.
 
     Args:
         values: of one channel, (n,), finite.
-        time: its stamps [s], (n,); where they jitter, a lone sample is not judged.
+        time: its stamps [s], (n,); where they jitter, isolated samples are not checked.
     """
     found = np.zeros(len(values), dtype=bool)
     padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
@@ -149,8 +148,8 @@ def glitches(values: np.ndarray, time: np.ndarray) -> np.ndarray:
     for k in np.flatnonzero(size > SPIKE * scale) if scale > 0 else ():
         if not 2 <= k < len(values) - 2 or size[k] < size[k - 2 : k + 3].max():
             continue
-        # A lone sample is missed by its neighbours' cubics by -2/3 of it, and by those farther off by 1/6; another one
-        # close by spoils this on its own side only.
+        # An isolated outlier causes errors of -2/3 of its size in the cubics of its neighbours, and of 1/6 in those
+        # farther away. Another one close by changes this on its side only.
         before, behind = off[[k - 1, k - 2]] / off[k], off[[k + 1, k + 2]] / off[k]
         if min(np.max(np.abs(before - _LONE)), np.max(np.abs(behind - _LONE))) < PATTERN:
             found[k] = True
@@ -162,11 +161,11 @@ def glitches(values: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def _dropouts(values: np.ndarray, noise: float) -> Iterator[tuple[int, int]]:
-    """First row and one past the last of each few samples in a row that stand off between two cliffs."""
+    """First row and one past the last of each short run that is offset by two opposite steps."""
     change = np.diff(values)
     step = np.abs(change)
     high = step > DROPOUT * max(noise, _resolution(values))
-    # Few steps have another one behind them that takes back what they did: only there the steps around are looked at.
+    # Few steps are reversed by a later one: only there neighbouring steps are compared.
     near = np.zeros(len(step), dtype=bool)
     for behind in range(1, min(LONGEST_DROPOUT, len(step) - 1) + 1):
         down = np.flatnonzero(high[:-behind] & high[behind:])
@@ -183,14 +182,14 @@ def _dropouts(values: np.ndarray, noise: float) -> Iterator[tuple[int, int]]:
 
 
 def _returns(values: np.ndarray, change: np.ndarray, down: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Whether a later step brings back the value from before an earlier one."""
+    """Whether a later step reverses an earlier one."""
     smaller = np.minimum(np.abs(change[down]), np.abs(change[up]))
     return (change[down] * change[up] < 0) & (np.abs(values[up + 1] - values[down]) < 0.3 * smaller)
 
 
 def _spread(off: np.ndarray) -> float:
-    """Standard deviation of the body of a distribution, as if it were normal."""
-    # A few wrong samples are a large share of a short record.
+    """Robust standard deviation, as if normal."""
+    # In a short record, a few outliers are a large share.
     share, deviations = (0.95, 1.960) if len(off) > 200 else (0.8, 1.282)
     return float(np.quantile(np.abs(off), share)) / deviations
 
@@ -207,14 +206,14 @@ def runs(same: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def clipped(values: np.ndarray, other: np.ndarray | None) -> Iterator[tuple[np.ndarray, float, int]]:
-    """Rows that stand at the lowest or the highest value longer than a motion would, that value, and how many runs.
+    """Rows that stay at the lowest or highest value longer than a motion explains, that value, and the number of runs.
 
     Args:
         values: of one channel, (n,).
-        other: the other angle, which must move meanwhile, or None.
+        other: the other angle, which must move at the same time, or None.
     """
     levels, counts = np.unique(values, return_counts=True)
-    # A switched input of a few levels sits at its ends by design.
+    # A switched input of a few levels stays at its limits by design.
     if len(levels) <= 10:
         return
     for level, neighbours in ((levels[0], counts[1:3]), (levels[-1], counts[-3:-1])):
@@ -222,7 +221,7 @@ def clipped(values: np.ndarray, other: np.ndarray | None) -> Iterator[tuple[np.n
         long = stops - starts >= 3
         starts, stops = starts[long], stops[long]
         held = int(np.sum(stops - starts))
-        # Rest at zero is no clipping, nor is the turning point of a coarsely quantised signal.
+        # Rest at zero is not clipping, nor is the turning point of a coarsely quantised signal.
         if level == 0 or held < max(5, CLIPPED_SHARE * len(values)) or held < 5 * neighbours.max():
             continue
         if other is not None:
@@ -234,7 +233,7 @@ def clipped(values: np.ndarray, other: np.ndarray | None) -> Iterator[tuple[np.n
 
 
 def frozen(values: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Rows of the longest stretch in which a channel stands still while the other moves."""
+    """Rows of the longest run in which a channel is constant while the other moves."""
     starts, stops = runs(np.diff(values) == 0)
     if len(starts) == 0:
         return np.zeros(0, dtype=int)

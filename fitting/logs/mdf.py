@@ -1,4 +1,4 @@
-"""Logs of test benches and vehicles in ASAM MDF, each channel with the clock of its group."""
+"""Logs in ASAM MDF; each channel has the clock of its group."""
 
 import logging
 from io import BytesIO
@@ -24,7 +24,7 @@ def read_mdf(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
     """
     with needing(path, "MDF files need asammdf; install it", "mdf", "export the log as CSV"):
         from asammdf import MDF  # pyright: ignore[reportMissingImports]
-    # The library logs what it also raises.
+    # The library also logs the errors that it raises.
     logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
     with MDF(source) as file:
         places = {name: tuple(found) for name, found in file.channels_db.items()}

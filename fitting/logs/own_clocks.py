@@ -1,4 +1,4 @@
-"""Columns with stamps of their own: which column holds them, and what they mean."""
+"""Channels with separate stamps: their clock columns and time bases."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,7 +19,7 @@ _MOST_CLOCKS = 64
 
 
 def later_names(name: str) -> tuple[str, ...]:
-    """What the second and later columns of a name are called: by the readers of this package, by pandas, by polars.
+    """Names of the second and later columns of a name, as given by this package, pandas and polars.
 
     Args:
         name: of a column.
@@ -32,19 +32,19 @@ def later_names(name: str) -> tuple[str, ...]:
 def with_own_clocks(
     path: Path, drive_file: DriveFile, table: RawTable, raw: Mapping[str, RawColumn]
 ) -> tuple[dict[str, RawColumn], tuple[Finding, ...]]:
-    """The columns with the stamps [s] that the drive file gives them, or that stand before them in the table.
+    """The columns with their stamps [s], as stated in the drive file, or from the preceding time column.
 
     Args:
         path: The log, for messages.
         drive_file: Names the clocks.
-        table: Holds them.
+        table: With the clocks.
         raw: Columns by signal.
 
     Returns:
-        The columns, and what was mended of their stamps.
+        The columns, and findings on their stamps.
 
     Raises:
-        InputError: A clock is missing, is none, or a name stands for several columns.
+        InputError: A clock is missing or invalid, or a name is not unique.
     """
     clocks = _repeated_clocks(table, drive_file.column_of("time").column)
     found, findings = dict(raw), []
@@ -68,14 +68,14 @@ def with_own_clocks(
 
 
 def _repeated_clocks(table: RawTable, name: str) -> dict[int, str]:
-    """The time columns of a table with several, by their place; none where there is one."""
+    """The time columns of a table with several, by index; empty where there is one."""
     names = [name, *(later for later in later_names(name) if later in table.columns)]
     found = {place: asked for asked, place in places_of(names, table.names).items()}
     return found if len(found) > 1 else {}
 
 
 def _nearest(clocks: Mapping[int, str], names: tuple[str, ...], column: str) -> str | None:
-    """The clock before a column, or behind it where the table begins with a signal."""
+    """The clock before a column, or after it where the table begins with a signal."""
     place = places_of([column], names).get(column)
     if not clocks or place is None:
         return None
@@ -88,7 +88,7 @@ def _nearest(clocks: Mapping[int, str], names: tuple[str, ...], column: str) -> 
 def _stamps(
     path: Path, drive_file: DriveFile, table: RawTable, signal: str, name: str
 ) -> tuple[np.ndarray, str | None]:
-    """The clock of a signal [s], and the unit that the file states of it."""
+    """The clock of a signal [s], and its unit in the file."""
     if name not in table.columns:
         raise InputError(
             f"{path}: there is no column '{name}'{did_you_mean(name, table.names)}, which "
@@ -100,7 +100,7 @@ def _stamps(
 def _clocked(
     path: Path, drive_file: DriveFile, signal: str, column: RawColumn, stamps: np.ndarray, name: str, unit: str | None
 ) -> tuple[RawColumn, tuple[Finding, ...]]:
-    """The column with a clock that rises."""
+    """The column with a strictly rising clock."""
     if len(stamps) != len(column.values):
         raise InputError(
             f"{path}: {signal} has {len(column.values)} rows and its time column {len(stamps)}; export them with one "
@@ -111,7 +111,7 @@ def _clocked(
     last = int(filled[-1]) + 1 if len(filled) else 0
     base = mended_base(path, drive_file, stamps[:last], column.values[:last, None], name, unit)
     if len(base.restarts):
-        raise InputError(f"{path}: the column '{name}', the clock of {signal}, starts anew; cut the log there")
+        raise InputError(f"{path}: the column '{name}', the clock of {signal}, restarts; cut the log there")
     places = np.full(len(column.values), -1)
     places[base.rows] = np.arange(len(base.rows))
     text = places[column.text_rows]

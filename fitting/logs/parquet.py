@@ -23,7 +23,7 @@ def read_parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) ->
         wanted: names of columns.
 
     Raises:
-        InputError: A wanted column is no vector of numbers.
+        InputError: A wanted column is not a vector of numbers.
     """
     with _quiet():
         names = tuple(pl.read_parquet_schema(source))
@@ -34,7 +34,7 @@ def read_parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) ->
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep off the terminal what Rust writes there of corrupt bytes, before it raises."""
+    """Suppress Rust's terminal output on corrupt bytes; it raises an error as well."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
@@ -46,7 +46,7 @@ def _quiet() -> Iterator[None]:
 
 
 def column_of(path: Path, name: str, series: pl.Series) -> RawColumn:
-    """A series as numbers, in the unit that its name states where it has none of its own."""
+    """A series as numbers, in its unit, or that stated in its name."""
     column = column_from_series(path, series)
     return column if column.unit is not None else replace(column, unit=split_unit(name)[1])
 

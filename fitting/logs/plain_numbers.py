@@ -1,22 +1,22 @@
-"""Tables of nothing but plain numbers, which most logs are: read without loading a library for tables."""
+"""Fast reader for tables of plain numbers, without a library for tables."""
 
 import numpy as np
 from jaxtyping import Float
 
-# Longer texts are worth the time that a library for tables takes to load.
+# For longer texts, a library for tables is faster despite its import time.
 _MOST_CHARACTERS = 1 << 24
 
 
 def plain_columns(lines: list[str], delimiter: str, places: list[int]) -> Float[np.ndarray, "columns rows"] | None:
-    """Some columns of a table of text.
+    """Columns of a text table.
 
     Args:
         lines: rows, of which some may be blank.
-        delimiter: between cells; a blank stands for any run of blanks.
+        delimiter: between cells; a blank matches any run of blanks.
         places: which columns, counted from zero.
 
     Returns:
-        The columns; None where a cell is anything but a number with a decimal point, or a row is too short.
+        The columns; None where a cell is not a number with a decimal point, or a row is too short.
     """
     rows = [line for line in lines if line.strip()]
     if not rows or not places or sum(map(len, rows)) > _MOST_CHARACTERS:

@@ -1,4 +1,4 @@
-"""Mix-ups that the signals give away together: ratio, sides, signs, units, time base."""
+"""Plausibility checks across signals: ratio, sides, signs, units, time base."""
 
 from collections.abc import Iterator, Mapping
 
@@ -8,10 +8,10 @@ from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
 
-# All thresholds are assumed: they part the practice logs from their mix-ups by a wide margin.
+# All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
 RATIO_TOLERANCE = 0.02
-FREE_MOTION = 0.02  # rad of the output, more than any gear twists; below it a load may be locked
-LARGE_TWIST = 5e-3  # rad, more than a gear twists by within its ratings, assumed
+FREE_MOTION = 0.02  # rad of the output, more than any gear's twist; below it a load may be locked
+LARGE_TWIST = 5e-3  # rad, more than a gear's twist within its ratings, assumed
 SLOW_MODES = 8
 SLOW_SHARE = 0.5
 SLOW_CORRELATION = 0.999
@@ -20,16 +20,16 @@ MOMENTUM_CORRELATION = 0.98
 MOMENTUM_TOLERANCE = 0.15
 FEWEST = 50
 _GAP = 5.0
-# Condition number of what two columns must tell apart.
+# Largest condition number of two columns that are to be separated.
 _APART = 30.0
 
 
 def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
-    """What the signals of a drive log say against each other.
+    """Contradictions between the signals of a drive log.
 
     Args:
-        log: A drive log, or one of both angles; a log of one side says nothing of the other. Outputs after
-            `log.outputs_until` rows are not looked at.
+        log: A drive log, or one of both angles; a log of one side has no contradictions with the other. Outputs
+            after `log.outputs_until` rows are not used.
         drive_file: The drive that it was read with.
     """
     if len(log.time[: log.outputs_until]) < 4 * FEWEST:
@@ -39,7 +39,7 @@ def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     yield from found
     yield from _velocity(log, drive_file, "motor")
     yield from _velocity(log, drive_file, "load")
-    # With a wrong ratio or side the sum of momenta says nothing new.
+    # With a wrong ratio or side the sum of momenta adds no information.
     if both and not any(finding.severity == "refusal" for finding in found):
         yield from _momentum(log, drive_file)
 
@@ -47,8 +47,8 @@ def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
 def _slow(values: np.ndarray) -> tuple[np.ndarray, float]:
     """Amplitudes of the slowest cosines over the log, and their share in the variance.
 
-    A wrong ratio shows at all frequencies, but near and above the resonance the two sides of a
-    healthy drive disagree as well; in slow motion they cannot.
+    A wrong ratio has an effect at all frequencies. Near and above the resonance both sides of a healthy drive differ as
+    well; in slow motion they do not.
     """
     phase = (np.arange(len(values)) + 0.5) * (np.pi / len(values))
     centred = values - values.mean()
@@ -59,10 +59,10 @@ def _slow(values: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _at_rest(slow_motor: np.ndarray, slow_load: np.ndarray) -> float:
-    """Load angle over motor angle in motion so slow that the spring is not wound.
+    """Load angle over motor angle in motion so slow that the twist is negligible.
 
-    A spring lets the load swing out by a share that grows with the square of the frequency. Where the modes do not tell
-    the two apart, their mean ratio counts.
+    The twist is a share of the motion that grows with the square of the frequency. Where the modes do not separate the
+    two, their mean ratio is used.
     """
     squares = np.arange(1.0, SLOW_MODES + 1) ** 2
     columns = np.stack([slow_motor, squares * slow_motor], axis=1)
@@ -117,7 +117,7 @@ def _ratio(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     else:
         soft = "if its spring is so soft, state the largest_twist of the joint in [drive]"
         severity, consequence = "refusal", f"{mend}; {soft}"
-    yield Finding(severity, f"reduction_ratio says {ratio:g} but the angles say {_shown(says)}", where, consequence)
+    yield Finding(severity, f"reduction_ratio is {ratio:g} but the angles give {_shown(says)}", where, consequence)
 
 
 def _shown(ratio: float) -> str:
@@ -137,7 +137,7 @@ def _mend(says: float, ratio: float) -> str:
 
 
 def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
-    """A logged velocity, integrated over the stamps, against the angle."""
+    """Compare a logged velocity, integrated over time, with the angle."""
     name, ratio = f"{side}_velocity", drive_file.reduction_ratio or 1.0
     angle, velocity = getattr(log, f"{side}_angle"), getattr(log, name)
     if velocity is None or angle is None or np.all(angle == angle[0]):
@@ -171,7 +171,7 @@ def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
     harmless = mend is not None or abs(factor - 1) <= 0.2
     yield Finding(
         "warning" if harmless else "refusal",
-        f"the {side} angle moves {factor:.4g} times as far as {name} over time says",
+        f"the {side} angle moves {factor:.4g} times as far as the integral of {name}",
         name,
         f"{name} {mend}; it is not fitted"
         if mend
@@ -180,17 +180,17 @@ def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
 
 
 def _closest(factor: float, known: Mapping[str, float], usual: float, tolerance: float = RATIO_TOLERANCE) -> str | None:
-    """The explanation of a factor, unless it is as near to the usual one."""
+    """The explanation of a factor, unless it is as close to the default."""
     words, value = min(known.items(), key=lambda item: abs(factor / item[1] - 1))
     likely = abs(value / usual - 1) > 2 * tolerance and abs(factor / value - 1) < tolerance
     return words if likely else None
 
 
 def _momentum(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
-    """Rate of change of the momentum of both inertias against the torque from outside; the spring cancels in it.
+    """Compare the rate of change of both inertias' momenta with the external torque; the mesh torque cancels.
 
-    N J_m theta_m'' + J_l theta_l'' = N T_m + T_l, times test functions and integrated by parts, so that no angle is
-    differentiated.
+    N J_m theta_m'' + J_l theta_l'' = N T_m + T_l, multiplied by test functions and integrated by parts, so that no
+    angle is differentiated.
     """
     N, J_m, J_l = drive_file.reduction_ratio, drive_file.motor_inertia, drive_file.load_inertia
     if None in (N, J_m, J_l) or log.motor_torque is None or log.outputs_until is not None or log.pieces is not None:
@@ -211,7 +211,7 @@ def _momentum(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     if best < MOMENTUM_CORRELATION or (0.33 < gain < 3.0):
         return
     units = {
-        "motor_torque acts against the motion that it makes, so give it, or both angles, sign = -1": -1.0,
+        "motor_torque acts against the motion, so give it, or both angles, sign = -1": -1.0,
         'motor_torque looks like mN m, so give it unit = "mN m"': 1e-3,
         'motor_torque looks like kN m, so give it unit = "kN m"': 1e3,
         f'motor_torque looks like that of the output side, so give it unit = "N m / {N:g}"': 1 / N,
@@ -224,7 +224,7 @@ def _momentum(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     mend = _closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
     yield Finding(
         "refusal" if mend else "warning",
-        f"both inertias together accelerate {gain:.3g} times as much as the torque says",
+        f"both inertias together accelerate {gain:.3g} times as much as the torque explains",
         "motor_torque against motor_angle and load_angle",
         f"{mend} in [columns]"
         if mend

@@ -1,4 +1,4 @@
-"""What a log file holds, before anyone says what it means: columns of numbers in the file's own names and units."""
+"""Raw content of a log file: columns of numbers with the file's names and units."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -15,12 +15,12 @@ class RawColumn:
     """One column as numbers.
 
     Attributes:
-        values: float64, (n,), NaN where the file has nothing or text.
+        values: float64, (n,), NaN for blanks and text.
         unit: as the file states it (unit row, "name [unit]", attribute), or None.
-        time: own stamps [s], (n,), of a channel that brings its own clock; None for the table's rows.
+        time: stamps [s], (n,), of a channel with a separate clock; None for the table's rows.
         text_rows: rows that hold text where a number was expected.
-        text: of the first of them.
-        rate_std: relative standard deviation of the sample interval of `time`, as far as the stamps leave it open.
+        text: in the first of them.
+        rate_std: relative standard deviation of the sample interval of `time`, from rounding.
     """
 
     values: np.ndarray
@@ -33,13 +33,13 @@ class RawColumn:
 
 @dataclass(frozen=True, eq=False)
 class RawTable:
-    """What one file holds of what was asked for.
+    """Requested columns of a file.
 
     Attributes:
         names: All columns of the file.
-        columns: The asked columns that the file has, by the name asked for.
+        columns: The requested columns that the file has, by requested name.
         sample_rate: Hz, a scalar `fs` beside the data or a step in a header, or None.
-        repeated: Names that several columns of the file have; in `names`, a number tells them apart.
+        repeated: Names of several columns of the file; in `names`, a number distinguishes them.
     """
 
     names: tuple[str, ...]
@@ -49,17 +49,17 @@ class RawTable:
 
 
 def not_numbers(path: Path, name: str, what: str, mend: str = "save it as one") -> InputError:
-    """The refusal of a column that is no vector."""
+    """The error for a column that is not a vector."""
     return InputError(f"{path}: the column '{name}' {what}, where a plain vector of numbers is needed; {mend}")
 
 
 def numbered(number: int) -> str:
-    """The name under which a column is asked for by its number, counted from one."""
+    """The name that requests a column by its number, counted from one."""
     return f"column {number}"
 
 
 def places_of(wanted: Iterable[str], names: Sequence[str]) -> dict[str, int]:
-    """Where the wanted columns stand, counted from zero; those that are not there are left out.
+    """Indices of the wanted columns, from zero; missing ones are omitted.
 
     Args:
         wanted: Names such as "torque", which also finds "torque [N m]", or numbers such as "column 3".
@@ -74,6 +74,6 @@ def places_of(wanted: Iterable[str], names: Sequence[str]) -> dict[str, int]:
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """A header such as "torque [N m]" or "time (ms)" as name and unit; the unit is None where there is none."""
+    """A header such as "torque [N m]" or "time (ms)" as name and unit; None without a unit."""
     match = re.fullmatch(r"\s*(.+?)\s*[\[(]([^\[\]()]*[A-Za-zµ°%][^\[\]()]*)[\])]\s*", name)
     return (name.strip(), None) if match is None else (match[1], match[2].strip())

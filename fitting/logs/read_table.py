@@ -1,4 +1,4 @@
-"""The raw columns of a log file, in the file's own names and units, whatever its format."""
+"""Raw columns of a log file of any format, with the file's names and units."""
 
 import zipfile
 import zlib
@@ -14,12 +14,12 @@ from fitting.logs.ros import read_bag, read_mcap
 from fitting.logs.text import read_text
 
 SHEET_SUFFIXES = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods")
-# A packed file of more than this is no log of a drive but a mistake, or a trap.
+# Largest unpacked size; a larger file is a mistake or an attack.
 _LARGEST = 2 << 30
 
 
 def format_suffix(path: Path) -> str:
-    """The suffix that tells the format of a log, also of one that is packed by gzip."""
+    """The suffix of a log's format, also if packed by gzip."""
     return path.with_suffix("").suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
 
 
@@ -28,8 +28,8 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
 
     Args:
         path: CSV, TSV, TXT, DAT, LVM, MAT (v5 to v7.3), HDF5, Parquet, MDF4, NPY, NPZ, a spreadsheet, MCAP or a ROS
-            bag, told by the first bytes where they say it and by the suffix otherwise; also packed by gzip.
-        wanted: Names of columns; those that the file lacks are left out of the answer.
+            bag, recognised by the first bytes where possible, else by the suffix; also packed by gzip.
+        wanted: Names of columns; those that the file lacks are omitted.
 
     Returns:
         The columns as float64 vectors.
@@ -61,7 +61,7 @@ def read_table(path: Path, wanted: Iterable[str]) -> RawTable:
             raise InputError(f"{path}: the log cannot be read ({error.strerror}); check its permissions") from error
         raise _unreadable(path, kind, error) from error
     except BaseException as error:
-        # Readers of binary formats meet corrupt bytes with whatever exception is at hand; polars' is no `Exception`.
+        # Readers of binary formats raise arbitrary exceptions on corrupt bytes; that of polars is not an `Exception`.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise _unreadable(path, kind, error) from error
@@ -73,7 +73,7 @@ def _unknown(path: Path, suffix: str) -> InputError:
 
 def _unreadable(path: Path, kind: str, error: BaseException) -> InputError:
     reason = " ".join(str(error).split())[:200].rstrip(". ") or type(error).__name__
-    return InputError(f"{path}: the file cannot be read as {kind}, export it again or mend it: {reason}")
+    return InputError(f"{path}: the file cannot be read as {kind}, export it again or repair it: {reason}")
 
 
 def _head(path: Path) -> bytes:
@@ -96,7 +96,7 @@ def _text(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTab
 
 
 def _parquet(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    # Loaded here: most logs are text.
+    # Imported here: most logs are text.
     from fitting.logs.parquet import read_parquet
 
     return read_parquet(path, source, wanted)
@@ -109,7 +109,7 @@ def _sheets(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawT
 
 
 def _zip(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    """NumPy's archives and spreadsheets are zip archives."""
+    """Read a zip archive: NumPy's archive or a spreadsheet."""
     with zipfile.ZipFile(source) as archive:
         inside = archive.namelist()
     if isinstance(source, BytesIO):
@@ -155,4 +155,4 @@ _MAGIC: dict[bytes, tuple[str, Reader]] = {
     b"\xd0\xcf\x11\xe0": ("spreadsheet", _sheets),
 }
 LOG_SUFFIXES = tuple(_READERS)
-"""How the names of log files end."""
+"""Suffixes of log files."""

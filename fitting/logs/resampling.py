@@ -1,4 +1,4 @@
-"""Channels with clocks of their own, on one grid."""
+"""Resampling of channels with separate clocks onto one grid."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,24 +9,24 @@ from fitting.errors import DataError, InputError
 from fitting.logs.findings import Finding
 from fitting.logs.raw_table import RawColumn
 
-# Assumed: an interpolation error of this share of the rms twist is worth a warning, or spoils the fit.
+# Assumed: interpolation errors over the rms twist that cause a warning, and a refusal.
 _NOTICED = 0.01
 _SPOILT = 0.2
 _RESOLVED = 0.3
-_SAME = 1e-4  # of a step; so much nearer stamps move nothing that a fit sees
+_SAME = 1e-4  # of a step; stamps closer than this are equal for a fit
 
 
 def on_one_grid(columns: Mapping[str, RawColumn], required: Sequence[str], path: object) -> dict[str, RawColumn]:
-    """Columns of one length, on the union of their stamps; each is unknown where it was not sampled.
+    """Columns on the union of their stamps; each is unknown where it was not sampled.
 
     Args:
-        columns: by signal; all or none with stamps of their own, which rise.
-        required: signals that must be there at a time; nothing is kept from before or after.
+        columns: by signal; all or none with separate stamps, which rise.
+        required: signals that must be logged; rows outside their common time are dropped.
         path: the log, for messages.
 
     Raises:
-        InputError: where only some columns have stamps.
-        DataError: where the signals were not logged at the same time.
+        InputError: only some columns have stamps.
+        DataError: the signals were not logged at the same time.
     """
     clocks = {s: c.time for s, c in columns.items() if c.time is not None}
     if not clocks:
@@ -38,11 +38,11 @@ def on_one_grid(columns: Mapping[str, RawColumn], required: Sequence[str], path:
             f'give [columns] {bare[0]} time = "..." as well'
         )
     every = np.unique(np.concatenate(list(clocks.values())))
-    # Stamps that two loggers of one clock rounded differently are one.
+    # Stamps of one clock that two loggers rounded differently are equal.
     apart = _SAME * min(float(np.median(np.diff(clock))) if len(clock) > 1 else np.inf for clock in clocks.values())
     own = np.diff(every, prepend=-np.inf) > apart
     grid, number = every[own], np.cumsum(own) - 1
-    # A sample stands for the step around it.
+    # A sample is valid for half a step to either side.
     reach = {s: float(np.median(np.diff(clocks[s]))) if len(clocks[s]) > 1 else 0.0 for s in required}
     begin, end = max(clocks[s][0] - reach[s] for s in required), min(clocks[s][-1] + reach[s] for s in required)
     if begin >= end:
@@ -67,7 +67,7 @@ def on_one_grid(columns: Mapping[str, RawColumn], required: Sequence[str], path:
 def angles_together(
     time: np.ndarray, motor: np.ndarray, load: np.ndarray, ratio: float, path: object
 ) -> tuple[np.ndarray, np.ndarray, tuple[Finding, ...]]:
-    """Both angles at the stamps of the slower one, where they were sampled at different times.
+    """Both angles at the stamps of the slower one, if sampled at different times.
 
     Args:
         time: stamps [s], (n,).
@@ -77,16 +77,16 @@ def angles_together(
         path: the log, for messages.
 
     Returns:
-        Both angles, and what was done.
+        Both angles, and a finding.
 
     Raises:
-        DataError: where the twist would be little but the error of interpolation.
+        DataError: interpolation error dominates the twist.
     """
     knows_motor, knows_load = np.isfinite(motor), np.isfinite(load)
     fewest = min(knows_motor.sum(), knows_load.sum())
     if fewest < 8 or (knows_motor & knows_load).sum() >= 0.5 * fewest:
         return motor, load, ()
-    # Loaded here, and not by every log that has no use for it.
+    # Imported here: most logs do not need it.
     from scipy.interpolate import CubicSpline
 
     motor_is_quicker = knows_motor.sum() >= knows_load.sum()
@@ -97,8 +97,8 @@ def angles_together(
     inside = (at >= time[known][0]) & (at <= time[known][-1])
     moved = np.full(len(time), np.nan)
     moved[np.flatnonzero(wanted)[inside]] = spline(at[inside])
-    # Half of the samples foretell the other half; a cubic's error falls by sixteen with half the step, if it resolves
-    # the motion at all.
+    # Half of the samples predict the other half; the error of a cubic decreases sixteenfold with half the step, if the
+    # motion is resolved.
     sparse = CubicSpline(time[known][::2], quick[known][::2])
     error = float(np.std(sparse(time[known][1:-1:2]) - quick[known][1:-1:2]))
     error /= 16 if error < _RESOLVED * np.std(np.diff(quick[known])) else 1
@@ -107,13 +107,13 @@ def angles_together(
     twist = float(np.nanstd(motor / ratio - load))
     if error > _SPOILT * twist:
         raise DataError(
-            f"{path}: the two angles are sampled at different times and too slowly to put them together, since "
-            f"interpolation is uncertain by {error:.2g} rad where the twist is {twist:.2g} rad; log them with one clock"
+            f"{path}: the two angles are sampled at different times and too slowly for interpolation, whose error is "
+            f"{error:.2g} rad where the twist is {twist:.2g} rad; log them with one clock"
         )
     finding = Finding(
         "warning" if error > _NOTICED * twist else "note",
         "the two angles are sampled at different times",
         "motor_angle" if motor_is_quicker else "load_angle",
-        f"it was interpolated to the other one's stamps, uncertain by {error:.2g} rad of twist",
+        f"it was interpolated to the other one's stamps, with an error of {error:.2g} rad of twist",
     )
     return motor, load, (finding,)

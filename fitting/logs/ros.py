@@ -1,4 +1,4 @@
-"""Recordings of robots: MCAP, and bags of ROS 1 and ROS 2; each field of a topic is a column."""
+"""Robot recordings: MCAP, and bags of ROS 1 and ROS 2; each field of a topic is a column."""
 
 import json
 import re
@@ -13,13 +13,13 @@ from fitting.errors import InputError
 from fitting.logs.extras import needing
 from fitting.logs.raw_table import RawColumn, RawTable
 
-_MOST_LISTED = 32  # elements of an array
+_MOST_LISTED = 32  # most elements of an array
 _DEEPEST = 8
 _ENCODINGS = (("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg"))
 _STEP = re.compile(r"([^\[\]]+)(?:\[([^\[\]]+)\])?")
 
 Message = tuple[str, int, Any]
-"""Topic, nanoseconds at which it was received, and the message: an object with fields, or a mapping."""
+"""Topic, time of reception [ns], and message: an object with fields, or a mapping."""
 
 _EXTRA = (
     "recordings of robots need mcap and rosbags; install them",
@@ -29,7 +29,7 @@ _EXTRA = (
 
 
 def read_mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> RawTable:
-    """The wanted fields of an MCAP file, of messages in ROS 1, ROS 2 or JSON.
+    """The wanted fields of an MCAP file with messages in ROS 1, ROS 2 or JSON.
 
     Args:
         path: named in messages.
@@ -47,7 +47,7 @@ def read_mcap(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Ra
 
         def messages(topics: Iterable[str] | None) -> Iterator[Message]:
             for schema, channel, message in reader.iter_messages(topics):
-                # Where fields are listed only, those of other encodings are left out.
+                # If fields are only listed, those of other encodings are omitted.
                 if topics is None and not _is_readable(schema, channel):
                     continue
                 if channel.id not in decoders:
@@ -75,7 +75,7 @@ def read_bag(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
         from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
     if isinstance(source, BytesIO):
         raise InputError(f"{path}: a bag is read from the file itself; unpack it")
-    # Bags before ROS 2 Iron do not say what their messages look like.
+    # Bags before ROS 2 Iron do not contain message definitions.
     with AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
 
         def messages(topics: Iterable[str] | None) -> Iterator[Message]:
@@ -87,19 +87,19 @@ def read_bag(path: Path, source: Path | BytesIO, wanted: tuple[str, ...]) -> Raw
 
 
 def _is_readable(schema: Any, channel: Any) -> bool:
-    """Whether a channel's messages are in an encoding that is read here."""
+    """Whether a channel's encoding is supported."""
     form = None if schema is None else schema.encoding
     return channel.message_encoding == "json" or (channel.message_encoding, form) in _ENCODINGS
 
 
 def _decoder(path: Path, schema: Any, channel: Any) -> Callable[[bytes], Any]:
-    """What turns the bytes of a channel's messages into a message."""
+    """Decoder of a channel's messages."""
     if channel.message_encoding == "json":
         return json.loads
     if not _is_readable(schema, channel):
         raise InputError(
-            f"{path}: the messages of '{channel.topic}' are encoded as {channel.message_encoding!r}, which is not read "
-            "here; export the joint's topics as CSV"
+            f"{path}: the messages of '{channel.topic}' are encoded as {channel.message_encoding!r}, which is not "
+            "supported; export the joint's topics as CSV"
         )
     with needing(path, *_EXTRA):
         from rosbags import typesys  # pyright: ignore[reportMissingImports]
@@ -129,7 +129,7 @@ def _table(
     rows: dict[str, list[tuple[int, int, list[float]]]] = {topic: [] for topic in chosen}
     for topic, received, message in messages(chosen) if chosen else ():
         rows[topic].append((received, _stamp(message) or 0, [_value(message, field) for field in chosen[topic]]))
-    # Stamps of the sensor are the better clock, if all topics have them.
+    # Sensor stamps are preferred, if all topics have them.
     own = all(stamp > 0 for several in rows.values() for _, stamp, _ in several)
     clocks = {
         topic: np.array([stamp if own else received for received, stamp, _ in several], dtype=np.int64)
@@ -143,13 +143,13 @@ def _table(
         values = np.array([found[place] for _, _, found in rows[topic]], dtype=np.float64)
         if np.isfinite(values).any():
             columns[name] = RawColumn(values, time=(clocks[topic] - origin) * 1e-9)
-    # What the fields are called is worth a look only where one is missing, or none is wanted.
+    # Names of fields are only needed where one is missing, or none is wanted.
     names = () if columns and len(columns) == len(fields) else _names(known, messages)
     return RawTable(names or tuple(columns), columns)
 
 
 def _topic_and_field(name: str, topics: tuple[str, ...]) -> tuple[str, str] | None:
-    """The longest topic that a name begins with, and the rest."""
+    """The longest topic at the beginning of a name, and the rest."""
     found = [t for t in topics if name.strip("/").startswith(t.strip("/") + "/")]
     return (found[-1], name.strip("/")[len(found[-1].strip("/")) + 1 :]) if found else None
 
@@ -167,7 +167,7 @@ def _stamp(message: Any) -> int | None:
 
 
 def _value(message: Any, field: str) -> float:
-    """The number in a field; NaN where there is none."""
+    """The number in a field; NaN without one."""
     for step in re.split(r"[/.]", field):
         match = _STEP.fullmatch(step)
         if match is None:
@@ -188,7 +188,7 @@ def _element(values: Any, which: str, names: Any) -> Any:
 
 
 def _names(topics: tuple[str, ...], messages: Callable[[Iterable[str] | None], Iterator[Message]]) -> tuple[str, ...]:
-    """The fields of the first message of each topic that hold numbers."""
+    """The numeric fields of each topic's first message."""
     firsts: dict[str, Any] = {}
     for topic, _, message in messages(None):
         firsts.setdefault(topic, message)

@@ -1,4 +1,4 @@
-"""Logs in spreadsheets: the sheet and the rows that hold the table, and its cells in full precision."""
+"""Logs in spreadsheets: sheet and rows of the table, and its cells in full precision."""
 
 from dataclasses import replace
 from io import BytesIO
@@ -14,7 +14,7 @@ from fitting.logs.raw_table import RawColumn, RawTable, places_of
 from fitting.logs.text import Head, head_of
 from fitting.logs.text_cells import column_from_text
 
-# Rows that are searched for the head of a table.
+# Number of rows that are searched for the header of a table.
 _LOOKED_AT = 1000
 
 
@@ -58,7 +58,7 @@ def _plain(cell: str | None) -> str:
 
 
 def _column(text: pl.Series, numbers: pl.Series) -> RawColumn:
-    """A column by its cells' text, which shows fewer digits than their numbers have."""
+    """A column in full precision; the cells' text has fewer digits."""
     column = column_from_text(text, comma_parts_cells=False)
     exact = numbers.fill_null(float("nan")).to_numpy()
     # A date is a number of days.

@@ -21,10 +21,10 @@ _ENDING = re.compile(rf"(|.*[^a-zA-Z])({'|'.join(sorted((*_WHOLE, *_UNIT), key=l
 
 
 def partners(place: ColumnMap) -> tuple[str, ...]:
-    """What the column with the other half of the stamps may be called: "tv_usec" beside "tv_sec".
+    """Possible names of the column with the other half of the stamps: "tv_usec" for "tv_sec".
 
     Args:
-        place: of the time column.
+        place: the time column.
     """
     if place.fraction is not None:
         return (place.fraction.column,)
@@ -36,14 +36,14 @@ def partners(place: ColumnMap) -> tuple[str, ...]:
 
 
 def with_joined_stamps(table: RawTable, drive_file: DriveFile) -> tuple[RawTable, DriveFile, tuple[Finding, ...]]:
-    """A table whose stamps are in one column, in seconds since the first whole one.
+    """The table with stamps in one column, in seconds since the first whole one.
 
     Args:
-        table: with both columns, if there are two.
-        drive_file: says which one is the time.
+        table: with both columns, if any.
+        drive_file: states the time column.
 
     Returns:
-        Table and drive file, and what was done; both are as they were where there is nothing to join.
+        Table and drive file, and findings; both are unchanged where stamps are in one column.
     """
     place = drive_file.column_of("time")
     other = next((name for name in partners(place) if name in table.columns), None)
@@ -68,13 +68,13 @@ def with_joined_stamps(table: RawTable, drive_file: DriveFile) -> tuple[RawTable
 
 
 def _unit(name: str) -> str | None:
-    """The unit of a second's parts that a name ends in; None for one of whole seconds."""
+    """The unit of parts of a second in a name's suffix; None for whole seconds."""
     ending = _ENDING.fullmatch(name)
     return None if ending is None else _UNIT.get(ending[2].lower())
 
 
 def _joined(whole: RawColumn, part: RawColumn, unit: str | None) -> np.ndarray | None:
-    """Stamps [s] of two columns that are whole seconds and parts of one; None where they are not."""
+    """Stamps [s] from whole seconds and parts of a second; None where the columns are not."""
     try:
         parts = convert(part.values, unit or "ns", "s")
     except UnitError:

@@ -1,4 +1,4 @@
-"""The steady clock behind rounded stamps, and how well they tell its rate."""
+"""Steady sampling behind rounded stamps, and the uncertainty of its rate."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 # Points at which the density of the interval is evaluated.
 _GRID = 101
-# Room for the clock, as a share of the rounding, below which it is one that rounding alone would not leave.
+# Remaining freedom of the clock, as a share of the rounding, below which rounding alone does not explain the stamps.
 _EXACT = 1e-5
 
 
@@ -16,10 +16,10 @@ class SteadyClock:
     """Equal sample intervals that explain rounded stamps.
 
     Attributes:
-        interval: between samples [s], the mean over all that the stamps allow.
-        rate_std: standard deviation of the interval over them, relative.
+        interval: between samples [s], the mean over all admissible ones.
+        rate_std: relative standard deviation of admissible intervals.
         time: of the samples [s], (n,).
-        slack: by how much stamps lie outside their rounding [s].
+        slack: largest excess of stamps over their rounding [s].
     """
 
     interval: float
@@ -29,19 +29,19 @@ class SteadyClock:
 
 
 def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyClock | None:
-    """The clock of steady sampling that rounded stamps allow; None where they allow none.
+    """The clock of steady sampling that agrees with rounded stamps; None without one.
 
-    A stamp rounded to `quantum` confines `t_0 + i dt` to an interval of that width, so that what stamps allow of
-    `(t_0, dt)` is a polygon. All of it is equally likely: the density of `dt` is the polygon's height in `t_0`, and a
-    product of these where pauses of unknown length part the stamps. Where no steady clock explains the stamps, they are
-    taken to be wrong by up to twice the least that is needed, and a sample interval or the rounding.
+    A stamp rounded to `quantum` confines `t_0 + i dt` to an interval of that width, so that the admissible `(t_0, dt)`
+    form a polygon. The density is uniform in it: that of `dt` is the polygon's height in `t_0`. Pauses of unknown
+    length give a product of such densities. Where no steady clock agrees with the stamps, their error is assumed to be
+    up to twice the least one needed, and at most a sample interval or the rounding.
 
     Args:
-        stamps: [s], (n,), not falling.
-        run: number of the run between pauses that each is in, (n,), rising from zero.
-        quantum: to which they are rounded [s].
+        stamps: [s], (n,), not decreasing.
+        run: number of each stamp's run between pauses, (n,), rising from zero.
+        quantum: of the rounding [s].
     """
-    # Loaded here: most stamps are exact.
+    # Imported here: most stamps are exact.
     from scipy.optimize import brentq, minimize_scalar
 
     time, row = stamps - stamps[0], np.arange(len(stamps), dtype=float)
@@ -55,7 +55,7 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
     reach = 2 * quantum / (last - first)
 
     def bounds(interval: float) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest start of each run that its stamps allow."""
+        """Least and greatest admissible start of each run."""
         off = time - interval * row
         return np.maximum.reduceat(off, starts), np.minimum.reduceat(off, starts) + quantum
 
@@ -70,7 +70,7 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
         options={"xatol": 1e-6 * reach},
     )
     slack = max(0.0, 0.5 * best.fun * quantum)
-    # The least error leaves one clock only; that it is small, even none, says little of errors below a sample interval.
+    # The least error admits one clock only; even if it is zero, errors below a sample interval are possible.
     wider = 4 * slack + 2 * min(mean, quantum) if best.fun > -_EXACT else 0.0
 
     def edge(far: float) -> float:
@@ -83,13 +83,13 @@ def steady_clock(stamps: np.ndarray, run: np.ndarray, quantum: float) -> SteadyC
     if not interval > 0:
         return None
     early, late = bounds(interval)
-    # As if the stamps were rounded to the nearest: whether they were cut off moves all alike.
+    # As if rounded to nearest: truncation shifts all stamps equally.
     middle = 0.5 * (early + late) - 0.5 * quantum
     return SteadyClock(interval, spread / interval, stamps[0] + middle[run] + interval * row, slack)
 
 
 def _mean_and_spread(grid: np.ndarray, heights: np.ndarray) -> tuple[float, float]:
-    """Mean and standard deviation of a density that is the product of its factors, nil where one is not positive."""
+    """Mean and standard deviation of a density given as a product of factors, zero where one is not positive."""
     with np.errstate(divide="ignore"):
         likely = np.sum(np.log(np.maximum(heights, 0.0)), axis=1)
     if not np.isfinite(likely.max()):

@@ -1,4 +1,4 @@
-"""Logs as text, in whatever dialect: CSV, TSV and their relatives, with anything written above the table."""
+"""Text logs in any dialect: CSV, TSV and similar, with arbitrary lines above the table."""
 
 import csv
 import re
@@ -15,7 +15,7 @@ from fitting.logs.units import USUAL
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _LOOKED_AT = 400
 _LETTER = re.compile(r"[^\W\d_]")
-# Lines above the table that are worth reading; a file whose numbers begin later is no log.
+# Most lines above the table; a file whose numbers begin later is not a log.
 _PREAMBLE = 2000
 _LINES_ABOVE = 4
 _MOST_LEFT_OUT = 3
@@ -32,10 +32,10 @@ _QUANTITY = re.compile(rf"[-+\u2212]?[0-9][0-9.,]*(?:[eE][-+]?[0-9]+)?(?:[nuµμ
 
 @dataclass(frozen=True)
 class _Dialect:
-    """Where the table is in a text, and how its cells are parted.
+    """Position and delimiter of a table in a text.
 
     Attributes:
-        delimiter: between cells; a blank stands for any run of blanks.
+        delimiter: between cells; a blank matches any run of blanks.
         width: cells in a row.
         first: line of the first row of numbers.
     """
@@ -47,11 +47,11 @@ class _Dialect:
 
 @dataclass(frozen=True)
 class Head:
-    """What stands above a table.
+    """Header of a table.
 
     Attributes:
-        names: of the columns, each once; a number where the table has no name.
-        units: of the row of units, if there is one.
+        names: of the columns, made unique; a number without a name.
+        units: from the row of units, if any.
         first: the first line of the table's rows.
         delimiter: between cells.
         width: cells in a row.
@@ -64,15 +64,15 @@ class Head:
     width: int
 
     def places(self, wanted: tuple[str, ...]) -> dict[str, int]:
-        """Where the wanted columns stand."""
+        """Indices of the wanted columns."""
         return places_of(wanted, self.names)
 
     def table(self, wanted: tuple[str, ...], found: Mapping[int, RawColumn]) -> RawTable:
-        """The wanted columns, with the units that the head states.
+        """The wanted columns, with the units of the header.
 
         Args:
             wanted: names of columns.
-            found: columns by place.
+            found: columns by index.
         """
         columns = {}
         for name, place in self.places(wanted).items():
@@ -94,7 +94,7 @@ def read_text(path: Path, raw: bytes, wanted: tuple[str, ...]) -> RawTable:
             "column 3" the third column.
 
     Raises:
-        InputError: The text holds no table, or one without a header of which columns are wanted by name.
+        InputError: The text has no table, or columns are wanted by name and it has no header.
     """
     lines = _decode(path, raw).splitlines()
     if not any(line.strip() for line in lines):
@@ -109,7 +109,7 @@ def read_text(path: Path, raw: bytes, wanted: tuple[str, ...]) -> RawTable:
 
 
 def head_of(path: Path, lines: list[str], wanted: tuple[str, ...]) -> "Head | None":
-    """Where the table is in a text and what its columns are called; None where no lines are rows of numbers.
+    """Position and column names of a table in a text; None without rows of numbers.
 
     Args:
         path: named in messages.
@@ -137,7 +137,7 @@ def _decode(path: Path, raw: bytes) -> str:
             text = raw.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = raw.decode("latin-1")
-    # A logger that lost power leaves a block of zeros at the end of its last file.
+    # A logger that loses power may leave a block of zeros at the end of a file.
     text = text.rstrip("\0\x1a")
     if "\0" in text:
         raise InputError(f"{path}: the file is not text; export the log again or mend its suffix")
@@ -162,7 +162,7 @@ def _numeric_share(cells: list[str]) -> float:
 
 
 def _dialect(lines: list[str]) -> _Dialect | None:
-    """The delimiter under which the lines are rows of numbers of one width, with as many names above."""
+    """The delimiter that gives rows of numbers of equal width, with as many names above."""
     begin = next((i for i, line in enumerate(lines[:_PREAMBLE]) if re.match(r"""[\s"']*[-+.,;|\t]*[0-9]""", line)), 0)
     sample = list(enumerate(lines[: begin + _LOOKED_AT]))
     best, most = None, (False, 0.0, 0, 0)
@@ -178,7 +178,7 @@ def _dialect(lines: list[str]) -> _Dialect | None:
         fits = range(width, width + _MOST_LEFT_OUT + 1)
         run = _longest_run([(i, cells in fits and share > 0) for i, cells, share in rows])
         found = _Dialect(delimiter, width, run)
-        # A decimal comma taken for the delimiter gives cells that are no numbers, and no header.
+        # A decimal comma as delimiter gives cells that are not numbers, and no header.
         score = (width > 1 and bool(_heads(lines, found)), shares[width] if width > 1 else 0.0, width, -rank)
         if score > most:
             best, most = found, score
@@ -191,7 +191,7 @@ def _is_told(line: str) -> bool:
 
 
 def _row(line: str, delimiter: str) -> tuple[int, float]:
-    """How many cells a line has, and which share of them are numbers; 0 for a line that is no row of samples."""
+    """Number of a line's cells, and their share of numbers; 0 for a line that is not a row of samples."""
     cells = _split(line, delimiter)
     share = _numeric_share(cells)
     # A row of samples may have blanks and a word in it.
@@ -199,7 +199,7 @@ def _row(line: str, delimiter: str) -> tuple[int, float]:
 
 
 def _longest_run(rows: list[tuple[int, bool]]) -> int:
-    """The first line of the longest run of rows: above a table, a line or two may look like its rows."""
+    """The first line of the longest run of rows, since single lines above a table may resemble rows."""
     best, longest, start, length = 0, 0, 0, 0
     for index, fits in rows:
         start = index if fits and length == 0 else start
@@ -210,10 +210,10 @@ def _longest_run(rows: list[tuple[int, bool]]) -> int:
 
 
 def _heads(lines: list[str], dialect: _Dialect) -> list[tuple[int, list[str]]]:
-    """The lines shortly above the numbers that could name their columns, and their cells."""
+    """Lines shortly above the numbers that may be the header, and their cells."""
     found = []
     for index in range(dialect.first - 1, -1, -1):
-        # numpy.savetxt and its like write the header as a comment.
+        # numpy.savetxt and others write the header as a comment.
         line = lines[index].strip(" ").lstrip("#%/! ")
         if not _LETTER.search(line) or (_is_told(lines[index]) and _row(line, dialect.delimiter)[1] > 0):
             continue
@@ -226,13 +226,13 @@ def _heads(lines: list[str], dialect: _Dialect) -> list[tuple[int, list[str]]]:
 def _header(
     path: Path, lines: list[str], dialect: _Dialect, wanted: tuple[str, ...]
 ) -> tuple[list[str], list[str], int]:
-    """Names of the columns, each once; the row of units below them where there is one; the first line behind both."""
+    """Unique names of the columns, the row of units below them if any, and the first line after both."""
     rows = _heads(lines, dialect)
     if not rows:
         return _numbered(path, lines, dialect, wanted), [], dialect.first
     has_units = len(rows) > 1 and _are_units(rows[-1][1])
     units = [cell.strip("[]()") for cell in rows[-1][1]] if has_units else []
-    # A spoilt row of samples may be a word and blanks.
+    # A corrupt row of samples may be a word and blanks.
     index, names = max(reversed(rows[:-1] if has_units else rows), key=lambda row: sum(map(bool, row[1])))
     behind = range((rows[-1][0] if has_units else index) + 1, dialect.first)
     rows_begin = (i for i in behind if not _LETTER.search(lines[i]) or _row(lines[i], dialect.delimiter)[1] > 0)
@@ -256,7 +256,7 @@ def _numbered(path: Path, lines: list[str], dialect: _Dialect, wanted: tuple[str
 
 
 def _each_once(names: list[str]) -> list[str]:
-    """The names, with a number behind the second and later ones of a kind: "time (2) [s]"."""
+    """The names, with a number after repeated ones: "time (2) [s]"."""
     found: list[str] = []
     seen: dict[str, int] = {}
     last = max(i for i, name in enumerate(names) if name)
@@ -295,7 +295,7 @@ def _columns(lines: list[str], delimiter: str, width: int, places: list[int]) ->
     plain = plain_columns(lines, delimiter, places)
     if plain is not None:
         return {place: RawColumn(values) for place, values in zip(places, plain, strict=True)}
-    # Loaded here: most logs are plain numbers.
+    # Imported here: most logs are plain numbers.
     from fitting.logs.text_cells import cells, column_from_text
 
     frame = cells(lines, delimiter, width, places)

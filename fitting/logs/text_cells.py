@@ -1,4 +1,4 @@
-"""Cells of text: how polars parts them, and the numbers in a column of them, however they are spelled."""
+"""Text cells: splitting by polars, and conversion of columns to numbers in various notations."""
 
 from io import BytesIO
 
@@ -8,11 +8,11 @@ import polars as pl
 from fitting.logs.raw_table import RawColumn
 from fitting.logs.units import UnitError, convert
 
-# What loggers write where they have no number.
+# Words for missing numbers.
 _BLANKS = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "?", "nil", "missing")
 _SECONDS_A_DAY = 86400.0
 _MOST_UNITS = 8
-# Day first is the custom wherever a dot parts day and month; a slash says nothing, so such stamps are refused.
+# With dots between day and month, the day is first; slashes are ambiguous, so such stamps are refused.
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%Y%m%d")
 
 
@@ -21,14 +21,14 @@ def cells(lines: list[str], delimiter: str, width: int, places: list[int]) -> pl
     if delimiter == " ":
         lines = [" ".join(line.split()) for line in lines]
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
-    # polars looks for the columns in the first row, which may leave out the last ones, or have more.
+    # polars takes the columns from the first row, which may have fewer or more.
     source = "\n".join([delimiter.join("0" * width), *lines]).encode()
     if b'"' in source:
         try:
             found = _parsed(source, delimiter, width, places, '"')
         except pl.exceptions.PolarsError:
             found = None
-        # A quotation mark that stands alone swallows the rest of the file.
+        # A single quotation mark would include the rest of the file.
         if found is not None and found.height == len(lines):
             return found
     return _parsed(source, delimiter, width, places, None)
@@ -49,12 +49,12 @@ def _parsed(source: bytes, delimiter: str, width: int, places: list[int], quote:
 
 
 def column_from_text(text: pl.Series, *, comma_parts_cells: bool) -> RawColumn:
-    """The numbers in a column of text: any decimal sign, thousands separators where they can't be mistaken, dates.
+    """The numbers in a column of text: any decimal sign, unambiguous thousands separators, dates.
 
     Args:
         text: the cells.
-        comma_parts_cells: whether the comma is the file's delimiter, so that a comma inside a (quoted) cell with three
-            digits behind it parts thousands.
+        comma_parts_cells: whether the comma is the delimiter, so that a comma in a quoted cell before three digits
+            separates thousands.
     """
     cells = text.cast(pl.String).str.strip_chars()
     blank = (cells.is_null() | cells.str.to_lowercase().is_in(_BLANKS)).to_numpy()
@@ -82,7 +82,7 @@ def _column(cells: pl.Series, values: np.ndarray, wrong: np.ndarray, unit: str |
 def _numbers(cells: pl.Series, comma_parts_cells: bool) -> np.ndarray:
     values = cells.cast(pl.Float64, strict=False)
     if values.null_count() > cells.null_count():
-        # Minus signs, spaces and exponents that typesetters and Fortran write.
+        # Typographic minus signs and spaces, and Fortran exponents.
         plain = cells.str.replace_all(r"[\u2212\u2013]", "-").str.replace_all(r"['’\s\u00a0\u202f]", "")
         plain = plain.str.replace(r"^([-+]?[0-9.,]+)[dD]([-+]?[0-9]+)$", "${1}e${2}")
         values = _point(plain, comma_parts_cells).cast(pl.Float64, strict=False)
@@ -102,14 +102,13 @@ def _point(cells: pl.Series, comma_parts_cells: bool) -> pl.Series:
     else:
         grouped = cells.filter(comma.fill_null(value=False)).str.contains(r"^[-+]?[0-9]{1,3}(,[0-9]{3})+$")
         several = (cells.str.count_matches(",").fill_null(0) > 1).any()
-        # A lone "1,234" is a decimal comma unless commas part the cells.
+        # "1,234" has a decimal comma unless the comma is the delimiter.
         grouping = "," if grouped.all() and (several or comma_parts_cells) else "."
     return cells.str.replace_all(grouping, "", literal=True).str.replace(",", ".", literal=True)
 
 
 def _quantities(cells: pl.Series, comma_parts_cells: bool) -> tuple[np.ndarray | None, str | None]:
-    """Numbers with a unit behind each, such as "12 ms", in the first one's unit, NaN where they are none; None where
-    few are."""
+    """Numbers followed by a unit, such as "12 ms", in the first one's unit, NaN for others; None where few are."""
     parts = cells.str.extract_groups(r"^([-+\u2212]?[0-9.,]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Zµμ°%].*)$")
     number, unit = (parts.struct.field(f) for f in ("1", "2"))
     units = unit.drop_nulls().unique(maintain_order=True).to_list()
@@ -126,8 +125,8 @@ def _quantities(cells: pl.Series, comma_parts_cells: bool) -> tuple[np.ndarray |
 
 
 def _stamps(cells: pl.Series) -> np.ndarray | None:
-    """Seconds of dates, since 1970, of times of day, or of durations; None where they are neither."""
-    # Digits beyond the ninth are dropped, a zone is taken off: only differences matter.
+    """Seconds of dates (since 1970), times of day or durations; None for others."""
+    # Digits beyond the ninth and time zones are dropped: only differences matter.
     plain = cells.str.replace(",", ".", literal=True).str.replace(r"\s*(Z|UTC|[-+][0-9]{2}:?[0-9]{2})$", "")
     plain = plain.str.replace(r"^([0-9]+):([0-9]{2}\.[0-9]*)$", "0:${1}:${2}")
     parts = plain.str.extract_groups(
@@ -139,7 +138,7 @@ def _stamps(cells: pl.Series) -> np.ndarray | None:
     clock = [p.cast(pl.Float64, strict=False).fill_null(0.0).to_numpy() for p in (since, hour, minute, second)]
     seconds = clock[0] * _SECONDS_A_DAY + clock[1] * 3600.0 + clock[2] * 60.0 + clock[3]
     if date.null_count() == len(date):
-        # The clock starts anew at midnight.
+        # The clock restarts at midnight.
         return seconds + _SECONDS_A_DAY * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -0.5 * _SECONDS_A_DAY)
     for form in _DATES:
         days = date.str.to_date(form, strict=False)

@@ -1,4 +1,4 @@
-"""From logged stamps to a time base that rises: wrapped counters, doubled, swapped and coarse stamps."""
+"""Rising time base from logged stamps: corrects wrapped counters, repeated, swapped and rounded stamps."""
 
 from bisect import bisect_right
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ _COUNTERS = tuple(2.0**bits for bits in (16, 24, 31, 32, 53))
 _DAY = 86400.0
 _PARTS = (1.0, 60.0, 3600.0)  # s
 _SCALES = (1.0, 1e-3, 1e-6, 1e-9)
-_FAR = 20.0  # typical steps; as close to the counter's ends a wrap must begin and end
+_FAR = 20.0  # typical steps; largest distance of a wrap's two stamps from the counter's limits
 _NEAR = 0.1  # likewise, of the counter's span
-_DOUBLED = 0.9  # of the rows that share a stamp; more rarely alike, they are samples of their own
-_LONG = 50  # rows of a recording that starts anew, rather than of a packet that came late
+_DOUBLED = 0.9  # least share of identical rows among those with equal stamps, for them to be duplicates
+_LONG = 50  # least rows of a restarted recording, as opposed to a late packet
 _IRREGULAR = 0.3
-_WORST = 0.2  # share of rows that may be lost before the column is no clock at all
-_COARSE = 1e-4  # stamps this much finer than the step are as good as exact
+_WORST = 0.2  # largest share of lost rows for a column to be a clock
+_COARSE = 1e-4  # stamps this much finer than the step count as exact
 _MOST_STEPS = 64
-_LATEST = 1e30  # nanoseconds since the big bang are fewer; beyond are fill values
+_LATEST = 1e30  # larger values are fill values
 _FEW = 0.02
 
 
@@ -31,11 +31,11 @@ class TimeBase:
     """Stamps that rise strictly.
 
     Attributes:
-        rows: which rows of the table have one, in the order of their stamps.
+        rows: rows of the table with a stamp, in order of time.
         time: [s], like `rows`.
-        restarts: places in `rows` where a recording starts anew, with no known time since the one before.
-        findings: what was mended.
-        rate_std: relative standard deviation of the sample interval, as far as the stamps leave it open.
+        restarts: indices in `rows` where a recording restarts after a pause of unknown length.
+        findings: on corrections.
+        rate_std: relative standard deviation of the sample interval, from rounding.
     """
 
     rows: np.ndarray
@@ -46,7 +46,7 @@ class TimeBase:
 
 
 class _Mender:
-    """The stamps of one column on their way; each step keeps or drops rows and says so."""
+    """Stamps of one column under correction; each step keeps or drops rows and reports it."""
 
     def __init__(self, name: str, stamps: np.ndarray, first_row: int):
         self.name, self.first_row = name, first_row
@@ -69,7 +69,7 @@ class _Mender:
         self.rows, self.time = self.rows[kept], self.time[kept]
 
     def lose(self, lost: np.ndarray) -> None:
-        """Drop rows (a mask) that the log is poorer for."""
+        """Drop rows (a mask), counted as lost."""
         self.lost += int(lost.sum())
         self.keep(~lost)
 
@@ -77,21 +77,21 @@ class _Mender:
 def time_base(
     stamps: np.ndarray, samples: np.ndarray, *, path: object, name: str, second: float, first_row: int
 ) -> TimeBase:
-    """The time base that a column of stamps means.
+    """The time base of a column of stamps.
 
     Args:
         stamps: [s] as logged, (n,), NaN where blank.
-        samples: all other columns, (n, columns); a row that repeats them and its stamp is a doubled row.
+        samples: all other columns, (n, columns); a row that repeats them and its stamp is a duplicate.
         path: the log, for messages.
         name: the column, for messages.
-        second: how many of the column's own units make a second; counters wrap in these.
-        first_row: row of the file in which the stamps begin.
+        second: the column's units per second; counters wrap in these.
+        first_row: row of the file with the first stamp.
 
     Returns:
         The time base.
 
     Raises:
-        InputError: The column is no clock: it stands still, or too few of its rows make sense.
+        InputError: The column is not a clock: it is constant, or too few of its rows are usable.
     """
     mender = _Mender(name, stamps, first_row)
     _unwrap(mender, second)
@@ -103,7 +103,7 @@ def time_base(
     if len(mender.time) < 2 or mender.lost > _WORST * len(stamps):
         lost = mender.lost / max(1, len(stamps))
         raise InputError(
-            f"{path}: the column '{name}' is no clock, since it stands still, runs backwards or is blank in "
+            f"{path}: the column '{name}' is not a clock, since it is constant, runs backwards or is blank in "
             f"{100 * lost:.0f} % of its rows; name the right column in [columns] time, export its stamps with all "
             "their digits, or remove it and give [signals] sample_rate"
         )
@@ -111,7 +111,7 @@ def time_base(
 
 
 def _typical(time: np.ndarray) -> float:
-    """Median of the steps, whichever way they go, that are none of standing still."""
+    """Median magnitude of the nonzero steps."""
     step = np.abs(np.diff(time[np.isfinite(time)]))
     return float(np.median(step[step > 0])) if (step > 0).any() else 0.0
 
@@ -124,7 +124,7 @@ def _unwrap(mender: _Mender, second: float) -> None:
     if typical == 0 or len(back) == 0:
         return
     clocks = [c * s for c in _COUNTERS for s in _SCALES] + [_DAY * s for s in (1.0, 1e3, 1e6, 1e9)]
-    # What shows the seconds of a minute, or the parts of a second.
+    # A clock of the seconds in a minute, or the parts of a second.
     parts = [span * second for span in _PARTS]
     for span in (*clocks, *parts):
         reach = min(_FAR * typical, _NEAR * span)
@@ -136,7 +136,7 @@ def _unwrap(mender: _Mender, second: float) -> None:
             wraps = back[from_end & to_begin]
             if len(wraps) == 0 or np.nanmin(ticks) < low - 1 or np.nanmax(ticks) > low + span:
                 continue
-            # Recordings of a second each, behind one another, begin at zero, too.
+            # Consecutive recordings of a second each also begin at zero.
             if span in parts and (low < 0 or ticks[np.isfinite(ticks)][0] < reach):
                 continue
             turns = np.zeros(len(ticks))
@@ -149,12 +149,12 @@ def _unwrap(mender: _Mender, second: float) -> None:
 
 
 def _drop_doubled(mender: _Mender, samples: np.ndarray) -> None:
-    """Rows that repeat an earlier row altogether: a buffer was written twice."""
+    """Drop rows that repeat an earlier row completely: a buffer was written twice."""
     known = np.flatnonzero(np.isfinite(mender.time))
     order = known[np.argsort(mender.time[known], kind="stable")]
     same = np.diff(mender.time[order]) == 0
     alike = np.all((samples[order][1:] == samples[order][:-1]) | np.isnan(samples[order][1:]), axis=1)
-    # Stamps too coarse to tell rows apart are common to rows that differ, and to some that don't, as at rest.
+    # Coarsely rounded stamps are shared by rows that differ, and by some that are equal, as at rest.
     told = same & np.all(np.isfinite(samples[order][1:]), axis=1)
     if told.any() and np.mean(alike[told]) < _DOUBLED:
         return
@@ -172,7 +172,7 @@ def _irregular(step: np.ndarray, typical: float) -> int:
 
 
 def _order(mender: _Mender, samples: np.ndarray) -> None:
-    """Rows that came late are sorted in; a recording that starts anew is set behind the one before."""
+    """Sort late rows in; append a restarted recording to the one before."""
     known = np.flatnonzero(np.isfinite(mender.time))
     time = mender.time[known]
     step, typical = np.diff(time), _typical(time)
@@ -190,19 +190,19 @@ def _order(mender: _Mender, samples: np.ndarray) -> None:
     runs = np.diff(np.concatenate(([0], back + 1, [len(time)])))
     wild = ~_rising(time)
     if wild.mean() > _FEW and runs.min() >= _LONG:
-        # How long the pause was nobody knows; what follows is fitted as a stretch of its own.
+        # The length of the pause is unknown; the following rows are fitted as a separate stretch.
         shift = np.zeros(len(time))
         shift[back + 1] = -step[back] + 100 * typical
         mender.time[known] = time + np.cumsum(shift)
         mender.say(
             "warning",
-            f"the clock starts anew in {len(back)} places",
+            f"the clock restarts in {len(back)} places",
             int(known[back[0]]) + 1,
-            "each part is fitted as a stretch of its own, and its stamps were shifted behind those before",
+            "each part is fitted as a separate stretch, and its stamps were shifted after those before",
         )
         mender.restarts = known[back] + 1
         return
-    # Single stamps that fit nowhere: the greatest rising part is kept.
+    # Drop single stamps that are out of order: the longest rising part is kept.
     mender.time[known[wild]] = np.nan
 
 
@@ -225,7 +225,7 @@ def _rising(time: np.ndarray) -> np.ndarray:
 
 
 def _fill_blanks(mender: _Mender) -> None:
-    """Stamps that are blank or wild: what the rows around say, where the sampling is regular; else the row goes."""
+    """Interpolate blank or wild stamps where the sampling is regular; else drop the row."""
     blank = np.isnan(mender.time)
     if not blank.any() or blank.all():
         mender.lose(blank)
@@ -243,19 +243,19 @@ def _fill_blanks(mender: _Mender) -> None:
     first = int(np.flatnonzero(blank)[0])
     mender.say(
         "warning",
-        f"{int(blank.sum())} stamps are blank or fit nowhere in the order",
+        f"{int(blank.sum())} stamps are blank or out of order",
         first,
-        f"{int(fits.sum())} were put between their neighbours, the rows of the others were left out",
+        f"{int(fits.sum())} were interpolated, the rows of the others were omitted",
     )
     mender.time = np.where(fits, filled, mender.time)
     mender.lose(blank & ~fits)
 
 
 def _spread_coarse(mender: _Mender) -> None:
-    """Stamps rounded to a grid of their own, of samples that a steadier clock took: the steady clock's stamps.
+    """Replace rounded stamps by those of steady sampling that agrees with them.
 
     Stamps in milliseconds of samples at 2 kHz repeat; single-precision stamps of a long uptime step by their last bit.
-    If the sample count explains every stamp to within its rounding, the count is the better clock.
+    If equal sample intervals explain every stamp to within its rounding, they are more accurate.
     """
     time = mender.time
     step = np.diff(time)
@@ -266,14 +266,14 @@ def _spread_coarse(mender: _Mender) -> None:
     mean = float(np.mean(step[step <= np.median(step) + 2 * quantum]))
     if quantum <= as_good_as_it_gets or mean <= 0 or quantum < _COARSE * mean:
         return
-    # A pause has a length that the stamps know to their rounding only, so that the count starts anew behind it.
+    # The length of a pause is known to the rounding only, so that the count restarts after it.
     late = step > (mean + 1.2 * quantum if quantum > 0.4 * mean else 1.5 * mean)
     run = np.concatenate(([0], np.cumsum(late)))
     clock = steady_clock(time, run, quantum)
     if clock is None:
         return
     off = time - clock.time
-    # Steps of one and two quanta may also be those of an exact clock with samples missing, here and there.
+    # Steps of one and two quanta may also be those of an exact clock with a few missing samples.
     missing = (step > 0).all() and quantum > 0.75 * np.median(step)
     loosest = 0.01 if missing else 0.15
     if clock.slack > loosest * quantum or np.max(np.abs(off)) < _COARSE * clock.interval:
@@ -283,26 +283,26 @@ def _spread_coarse(mender: _Mender) -> None:
     mender.time, mender.rate_std = clock.time, clock.rate_std
     mender.say(
         "note",
-        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {clock.interval:.7g} s, which "
-        f"they tell to {100 * clock.rate_std:.1g} %",
+        f"the stamps are rounded to {quantum:.4g} s and agree with steady sampling every {clock.interval:.7g} s, "
+        f"known to {100 * clock.rate_std:.1g} %",
         None,
-        "the steady clock was used, and standard errors allow for its rate",
+        "the steady clock was used, and standard errors include its uncertainty",
     )
 
 
 def _quantum(step: np.ndarray, digits: float) -> float:
-    """The grid on which the steps lie, or 0 where they lie on none; `digits` is the worth of the stamps' last digit."""
+    """The quantum of the steps, or 0 without one; `digits` is the value of the stamps' last digit."""
     scale = float(np.median(np.abs(step))) or float(np.mean(np.abs(step)))
     if not scale > 0:
         return 0.0
-    # Differences closer than a fraction of the step are one, and the rounding of a double.
+    # Differences closer than a fraction of the step, or double rounding, are equal.
     gaps = np.diff(np.unique(step))
     gaps = gaps[gaps > max(_COARSE * scale, digits)]
     if not 1 <= len(gaps) < _MOST_STEPS:
         return 0.0
     quantum = float(gaps.min())
     count = np.rint(step / quantum)
-    # Of a very fine grid the steps say no more than how far they lie apart.
+    # A very fine grid is given by the distances of the steps.
     if quantum < 0.01 * scale:
         return quantum
     return float(step.sum() / count.sum()) if np.mean(np.abs(step / quantum - count) < 0.05) > 0.98 else 0.0

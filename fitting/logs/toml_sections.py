@@ -1,4 +1,4 @@
-"""Sections of a TOML file and their keys, refused in one sentence where they make no sense."""
+"""Sections of a TOML file and their keys, with one-sentence errors."""
 
 import tomllib
 from collections.abc import Collection, Mapping
@@ -11,7 +11,7 @@ from fitting.errors import InputError
 
 
 class Sections:
-    """A TOML file's tables, each read by name; every refusal names the file, the section and the key."""
+    """A TOML file's tables by name; errors name file, section and key."""
 
     def __init__(self, path: Path, names: Collection[str]):
         self.path = path
@@ -28,7 +28,7 @@ class Sections:
         return self.table(name, self._content.get(name, {}))
 
     def refuse(self, message: str) -> InputError:
-        """The error that says so of this file."""
+        """An error about this file."""
         return InputError(f"{self.path}: {message}")
 
     def table(self, name: str, value: object) -> dict[str, Any]:
@@ -38,11 +38,11 @@ class Sections:
         return value
 
     def known(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> None:
-        """Refuse keys that mean nothing."""
+        """Refuse unknown keys."""
         for key in table:
             if key not in names:
                 where = f"[{section}] {key}" if section else f"[{key}]"
-                raise self.refuse(f"{where} is not known here; there are {', '.join(names)}")
+                raise self.refuse(f"{where} is not known; known are {', '.join(names)}")
 
     def needs(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> None:
         """Refuse a table that lacks a key."""
@@ -57,7 +57,7 @@ class Sections:
         return float(value)
 
     def numbers(self, section: str, table: Mapping[str, Any], names: Collection[str]) -> dict[str, float]:
-        """Finite numbers under keys that mean something."""
+        """Finite numbers under known keys."""
         self.known(section, table, names)
         return {key: self.number(section, key, value) for key, value in table.items()}
 

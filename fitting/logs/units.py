@@ -1,4 +1,4 @@
-"""Unit strings as people write them, to SI numbers: the most usual ones by a table, all others by pint."""
+"""Conversion of unit strings to SI: common ones by a table, all others by pint."""
 
 import math
 import re
@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-# Coherent SI units by which a base unit is shown, where pint would spell kg m^2/(A s^3).
+# Names of coherent SI units, where pint would write kg m^2/(A s^3).
 _SHOWN = ("V", "N", "N m", "Pa", "W", "ohm", "T", "C")
-# What loggers write and pint does not know, or takes for something else.
+# Units in logs that pint does not know or misinterprets.
 _SPELLINGS = {
     "-": "1",
     "sec": "s",
@@ -25,7 +25,7 @@ _SPELLINGS = {
     "r/min": "rpm",
     "rev/min": "rpm",
 }
-# The coherent SI unit and the factor of what most logs and drive files state: pint takes as long to load as jax.
+# Coherent SI unit and factor of common units, since importing pint takes as long as jax.
 USUAL: dict[str, tuple[str, float]] = {
     "s": ("s", 1.0),
     "ms": ("s", 1e-3),
@@ -59,12 +59,12 @@ _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
 class UnitError(ValueError):
-    """A unit string that is not understood or that measures the wrong thing."""
+    """A unit string that is not understood or of the wrong quantity."""
 
 
 @cache
 def _pint() -> Any:
-    """pint, loaded where a unit needs it: with its units it takes as long as a fit."""
+    """pint, imported on demand: with its units it takes as long as a fit."""
     import pint
 
     return pint
@@ -78,7 +78,7 @@ def _registry() -> Any:
 
 
 def _usual(text: str) -> tuple[str, float] | None:
-    """SI unit and factor of a usual unit string, or None."""
+    """SI unit and factor of a common unit string, or None."""
     spelled = _SPELLINGS.get(text.strip(), text.strip())
     if spelled in USUAL:
         return USUAL[spelled]
@@ -88,7 +88,7 @@ def _usual(text: str) -> tuple[str, float] | None:
     target, factor = USUAL[found["unit"]]
     factor *= float(found["number"] or 1.0)
     counts = int(found["counts"] or 1) ** int(found["power"] or 1)
-    # pint refuses what is nothing, or beyond all numbers.
+    # pint refuses zero and infinite factors.
     return (target, factor / counts) if factor and 0 < counts < 1e15 else None
 
 
@@ -99,13 +99,13 @@ def _parse(text: str) -> Any:
     if len(text) > _LONGEST or _is_tower(spelled):
         raise UnitError(f"unit {text[:_LONGEST]!r} is not understood")
     spelled = re.sub(r"°(?![CFK])", "deg", spelled)
-    # pint reads "Nm" as the textile unit number_meter; nobody who logs a torque means that.
+    # pint reads "Nm" as the textile unit number_meter; here it is newton metre.
     spelled = re.sub(r"\b([nµμumkM]?)N(?:\s?[-.·⋅]\s?)?m\b", r"\1N m", spelled) or "1"
     try:
         quantity = _registry().Quantity(spelled)
         finite = bool(np.isfinite(float(quantity.magnitude)))
     except Exception as error:
-        # pint leaks tokenizer, syntax, arithmetic and attribute errors for malformed strings.
+        # pint raises tokenizer, syntax, arithmetic and attribute errors for malformed strings.
         raise UnitError(f"unit {text!r} is not understood") from error
     if not finite or quantity.magnitude == 0:
         raise UnitError(f"unit {text!r} is not a finite number other than zero")
@@ -113,9 +113,9 @@ def _parse(text: str) -> Any:
 
 
 def _is_tower(text: str) -> bool:
-    """Whether a text holds powers that no unit has, such as 9**9**9, which pint would work out."""
+    """Whether a text has nested powers such as 9**9**9, which pint would evaluate."""
     powers = re.findall(r"(?:\*\*|\^)", text)
-    # 2**24 counts a revolution; other powers have one digit.
+    # Counts per revolution may be 2**24; other powers have one digit.
     plain = re.sub(
         r"\b[0-9]{1,2}\s*(?:\*\*|\^)\s*[0-9]{1,2}(?![0-9.])|(?:\*\*|\^)\s*\(?[-+]?[0-9](?:\.[0-9]{1,2})?(?![0-9.])",
         " ",
@@ -162,7 +162,7 @@ def convert(values: np.ndarray, unit: str, target: str) -> np.ndarray:
 
 
 def to_base(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
-    """Values in coherent SI units, whatever they measure, and that unit's name.
+    """Values in coherent SI units, and that unit's name.
 
     Args:
         values: Numbers in `unit`, any shape.

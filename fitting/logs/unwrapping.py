@@ -1,4 +1,4 @@
-"""Channels that wrap: angles that start anew at each revolution, counters and integers that overflow."""
+"""Unwrapping of channels: angles modulo a revolution, counters and integers that overflow."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ _FINEST = 1e-9
 
 
 def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, float, np.ndarray]:
-    """An angle without its jumps.
+    """Unwrap an angle.
 
     Args:
         values: as logged, NaN where unknown, (n,).
-        revolution: in the same unit.
+        revolution: in the unit of the values.
 
     Returns:
-        The angle that runs on, the span of a jump (0 where there is none), and the rows that jump.
+        The continuous angle, the span of a jump (0 without any), and the rows that jump.
     """
     spans = [revolution]
     if _whole(values, 1.0):
@@ -34,7 +34,7 @@ def unwrapped_angle(values: np.ndarray, revolution: float) -> tuple[np.ndarray, 
 
 
 def unwrapped_overflow(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """A slow signal whose integers overflowed; arguments and returns as in [`unwrapped_angle`][]."""
+    """Unwrap a slow signal whose integers overflowed; arguments and returns as in [`unwrapped_angle`][]."""
     grid = _grid(values)
     for bits in _OVERFLOWS if grid > 0 else ():
         span = grid * 2.0**bits
@@ -44,14 +44,14 @@ def unwrapped_overflow(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarra
         step = np.abs(_step(values))
         folded = np.abs(step - span)[jumps]
         usual = np.quantile(step[~jumps], 0.99)
-        # A switched input jumps as far, but neither lands on the other end nor is smooth elsewhere.
+        # A switched input jumps as far, but does not end at the other limit, and is not smooth elsewhere.
         if usual < span / 20 and folded.max() <= 3 * usual + grid:
             return _without(values, jumps, span), span, np.flatnonzero(jumps) + 1
     return values, 0.0, np.zeros(0, dtype=int)
 
 
 def _step(values: np.ndarray) -> np.ndarray:
-    """Differences of the known values, those across unknown ones at the row that follows."""
+    """Differences of the known values; those across unknown ones at the following row."""
     known = np.flatnonzero(np.isfinite(values))
     step = np.zeros(len(values) - 1)
     step[known[1:] - 1] = np.diff(values[known])
@@ -59,7 +59,7 @@ def _step(values: np.ndarray) -> np.ndarray:
 
 
 def _jumps(values: np.ndarray, span: float) -> np.ndarray | None:
-    """Which steps are longer than half a span, where the values fit into one; None where there are none."""
+    """Steps longer than half a span, if the values are within one span; None without any."""
     known = values[np.isfinite(values)]
     if len(known) < 3 or not 0.5 * span < np.ptp(known) <= span * (1 + _FINEST):
         return None
@@ -80,7 +80,7 @@ def _whole(values: np.ndarray, grid: float) -> bool:
 
 
 def _grid(values: np.ndarray) -> float:
-    """The step between the levels of a channel that came from integers, or 0."""
+    """The resolution of a channel of integer origin, or 0."""
     levels = np.unique(values[np.isfinite(values)])
     if len(levels) < 16:
         return 0.0

@@ -1,4 +1,4 @@
-"""Where the spring is relaxed, in a log whose two sensors were not zeroed together."""
+"""Zero of the twist, in a log whose two sensors were not zeroed together."""
 
 from dataclasses import replace
 
@@ -8,26 +8,26 @@ from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
 
-LARGEST_TWIST = 0.02  # rad, more than any gear twists, assumed
+LARGEST_TWIST = 0.02  # rad, more than any gear's twist, assumed
 _OFFSET = 3.0  # standard deviations, assumed
-_NO_MEAN = 0.1  # likewise, of an input
+_NO_MEAN = 0.1  # standard deviations of an input, assumed
 _WIDTHS = (16, 32, 64, 128, 256)
 _EVEN = 0.2
 _FEWEST = 25
 
 
 def zeroed(log: Log, drive_file: DriveFile) -> Log:
-    """The log with its dynamic error counted from where the spring is relaxed.
+    """The log with its dynamic error relative to the relaxed spring.
 
-    A spring that is held away from zero needs a mean torque, and no gear twists by more than a degree; what neither
-    explains is an offset of the sensors, and is taken off. A smaller one can't be told from a load, and stays.
+    A mean twist needs a mean torque, and no gear twists by more than a degree. An offset that neither explains is due
+    to the sensors, and is subtracted. A smaller one is confounded with a load, and is kept.
 
     Args:
         log: as read and masked.
         drive_file: for the load's inertia.
 
     Returns:
-        The log, its `zero`, and a finding where there is something to tell.
+        The log with its `zero`, and a finding if it was shifted.
     """
     if log.dynamic_error is None:
         return log
@@ -47,16 +47,16 @@ def zeroed(log: Log, drive_file: DriveFile) -> Log:
     unit = log.units["dynamic_error"]
     finding = Finding(
         "note" if unexplained else "warning",
-        f"the dynamic error stands {middle:.4g} {unit} off zero, around which it moves by {spread:.3g} {unit} rms",
+        f"the dynamic error is {middle:.4g} {unit} off zero on average and varies by {spread:.3g} {unit} rms",
         "dynamic_error",
-        f"the sensors were not zeroed together, so that it is counted from {offset:.7g} {unit}"
-        + ("" if unexplained else "; a steady load looks the same, so that alpha may be the one around this point"),
+        f"the sensors were not zeroed together, so that {offset:.7g} {unit} was subtracted"
+        + ("" if unexplained else "; a constant load has the same effect, so that alpha may be that around this point"),
     )
     return replace(counted_from(log, offset), findings=(*log.findings, finding))
 
 
 def counted_from(log: Log, zero: float) -> Log:
-    """The log with its dynamic error, where it has one, counted from a zero."""
+    """The log with its dynamic error, if any, relative to a zero."""
     return log if log.dynamic_error is None else replace(log, dynamic_error=log.dynamic_error - zero, zero=zero)
 
 
@@ -64,7 +64,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
     """The twist at which the spring's torque vanishes: the root of a cubic that is fitted with the equation of motion.
 
     Weak form as for the starting values: the load's equation J_l theta_l'' = p(x) + B x', or that of the reduced drive
-    with b u on its right, times test functions and integrated by parts.
+    with b u on its right, multiplied by test functions and integrated by parts.
     """
     best, root = np.inf, middle
     x = log.twist - middle
@@ -72,7 +72,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
         windows = _windows(log, width)
         if len(windows) < _FEWEST:
             continue
-        # A short beginning of a log can't tell a cubic from a line.
+        # Few windows do not separate a cubic from a line.
         powers = 4 if log.outputs_until is None else 2
         s = (np.arange(width) + 0.5) / width * 2 - 1
         half = 0.5 * width * float(np.median(np.diff(log.time)))
@@ -105,7 +105,7 @@ def _relaxed(log: Log, torque: np.ndarray, load_inertia: float | None, middle: f
 
 
 def _windows(log: Log, width: int) -> np.ndarray:
-    """First rows of windows, overlapping by three quarters, in which sampling is even and all outputs are believed."""
+    """First rows of windows, overlapping by three quarters, with even sampling and valid outputs."""
     step = np.diff(log.time)
     good = np.concatenate((np.abs(step / np.median(step) - 1) < _EVEN, [True]))[: log.outputs_until]
     if log.trusted is not None:

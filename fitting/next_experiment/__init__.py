@@ -1,1 +1,1 @@
-"""The experiment that would decide what the logs leave open."""
+"""Design of the next experiment, to separate ties or determine alpha."""

@@ -1,8 +1,8 @@
-"""The search for the command that tells explanations apart best: sequential quadratic programming (Kraft 1988, DFVLR-FB
-88-28) with gradients through the simulator, from several commands that benches use.
+"""Search for the command that separates explanations best: sequential quadratic programming (Kraft 1988, DFVLR-FB
+88-28) with gradients through the simulator, from several typical commands.
 
-What is made as large as possible is the logarithm of the least divergence of the first explanation from any of its
-rivals, within the limits of torque, speed, travel and twist under all of them.
+The criterion is the logarithm of the least divergence of the first explanation from any rival, within the limits of
+torque, speed, travel and twist under all of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,37 +26,37 @@ from fitting.next_experiment.discrimination import (
 from fitting.next_experiment.excitation import Excitation
 from hdjax import Hold
 
-# Starts that are worth a search, and its iterations.
+# Number of starts of the search, and its iterations.
 _BEST_STARTS = 2
 _ITERATIONS = 15
-# An improvement of the logarithm by less is none.
+# Least improvement of the logarithm.
 _TOLERANCE = 1e-2
-# Parts of the command in each of which the largest torque, speed, way and twist are kept within the limits.
+# Number of parts of the command; in each, the largest torque, speed, travel and twist are constrained.
 _PARTS = 12
-# What a squared multiple of the limit above one costs where starts are compared.
+# Penalty on the squared excess over the limits when starts are compared.
 _BEYOND = 10.0
-# Below this nothing is told apart, and a logarithm would run away.
+# Least divergence, which bounds the logarithm.
 _NO_SQUARES = 1e-3
-# A command that a search leaves a little beyond a limit is made smaller, in so many steps.
+# Number of steps to scale down a command that slightly exceeds a limit.
 _SHRINKS = 10
-# Evaluations that a search remembers, of the latest and of the best.
+# Number of stored evaluations, latest and best.
 _KEPT = 2
-# Amplitudes of each start that are tried.
+# Tried amplitudes of each start.
 _SIZES = (1.0, 0.3)
 _FARTHEST = 5.0
-# Commands on which an explanation may show that it has derivatives.
+# Number of commands on which the derivatives of an explanation are checked.
 _TRIED = 2
 
 
 class Evaluation(eqx.Module):
-    """What a command tells.
+    """Responses, divergences and limits of a command.
 
     Attributes:
         coefficients: of the command.
-        own: what each explanation answers.
-        forward: each rival refitted to what the first explanation makes.
-        backward: the first explanation refitted to what each rival makes; nothing where that is not asked.
-        over: torque, speed, way and twist where they are largest in each part of the command, in units of the limits.
+        own: response of each explanation.
+        forward: each rival refitted to the first explanation's response.
+        backward: the first explanation refitted to each rival's response; empty if not needed.
+        over: largest torque, speed, travel and twist in each part of the command, in units of the limits.
         over_slopes: their derivatives by the coefficients.
     """
 
@@ -69,12 +69,12 @@ class Evaluation(eqx.Module):
 
     @property
     def usable(self) -> bool:
-        """Whether no simulation runs away."""
+        """Whether no simulation diverges."""
         return all(r.usable for r in self.own) and bool(np.isfinite(self.divergences).all())
 
     @property
     def divergences(self) -> Float[np.ndarray, " rivals"]:
-        """Of each rival: the refits' sums of squares, summed over both cases of which one is right."""
+        """Divergence of each rival: the refits' sums of squares, summed over both cases of the right model."""
         total = np.array([f.squares for f in self.forward])
         return total + np.array([f.squares for f in self.backward]) if self.backward else total
 
@@ -88,12 +88,12 @@ class Evaluation(eqx.Module):
 
     @property
     def within(self) -> bool:
-        """Whether the command keeps the limits under every explanation."""
+        """Whether the command respects the limits under every explanation."""
         return self.usable and bool(np.max(np.abs(self.over)) <= 1.0)
 
 
 class Candidate(eqx.Module):
-    """A command that was evaluated."""
+    """An evaluated command."""
 
     excitation: Excitation
     evaluation: Evaluation
@@ -105,7 +105,7 @@ class Candidate(eqx.Module):
 
     @property
     def merit(self) -> float:
-        """What a search makes large, less what is beyond the limits."""
+        """Criterion of the search minus a penalty for exceeded limits."""
         if not self.evaluation.usable:
             return -np.inf
         beyond = max(float(np.max(self.evaluation.over**2)) - 1.0, 0.0)
@@ -113,7 +113,7 @@ class Candidate(eqx.Module):
 
 
 class _Stage(eqx.Module):
-    """Explanations and the shapes of a command under the hold of each."""
+    """Explanations, and the shapes of a command under each one's hold."""
 
     explanations: tuple[Explanation, ...]
     excitation: Excitation
@@ -130,17 +130,17 @@ def search(
     both_ways: bool = True,
     progress: Callable[[str], None],
 ) -> Candidate | None:
-    """The best command that is found.
+    """The best command of the search.
 
     Args:
-        explanations: the one to start from, and its rivals.
-        starts: commands to start from.
+        explanations: the found one, then its rivals.
+        starts: starting commands.
         bench: how experiments are simulated, and their limits.
-        both_ways: whether each rival may be the right one too.
-        progress: told what is being done.
+        both_ways: whether each rival may also be the right one.
+        progress: receives messages.
 
     Returns:
-        The command, or None where none keeps the limits.
+        The command, or None where none respects the limits.
     """
     begun: list[tuple[_Stage, Candidate]] = []
     for excitation in starts:
@@ -158,13 +158,13 @@ def search(
 
 
 def is_smooth(explanation: Explanation, starts: Sequence[Excitation], bench: Bench) -> bool:
-    """Whether an explanation has derivatives that a search can use, on at least one of the first commands."""
+    """Whether an explanation has usable derivatives on at least one of the first commands."""
     stages = (_stage([explanation], excitation, bench, False) for excitation in starts[:_TRIED])
     return any(evaluate(s, s.excitation.coefficients).own[0].usable for s in stages)
 
 
 def largest_twist(of: Explanation, starts: Sequence[Excitation], bench: Bench) -> float:
-    """The largest dynamic error that an explanation makes of any of the commands [rad]."""
+    """The largest dynamic error of an explanation under any of the commands [rad]."""
     stages = (_stage([of], excitation, bench, False) for excitation in starts)
     own = (evaluate(s, s.excitation.coefficients).own[0] for s in stages)
     return max(float(np.max(np.abs(in_own_units(r.outputs, bench)[:, -1]))) for r in own)
@@ -179,7 +179,7 @@ def _stage(explanations: Sequence[Explanation], excitation: Excitation, bench: B
 
 
 def evaluate(stage: _Stage, coefficients: Float[np.ndarray, " shapes"], near: Evaluation | None = None) -> Evaluation:
-    """What a command tells; refits begin where those of an evaluation nearby have ended."""
+    """Evaluate a command; refits start from those of a similar evaluation."""
     pairs = zip(stage.explanations, stage.signals, strict=True)
     own = tuple(respond(e, start(e), coefficients, signals=s, bench=stage.bench) for e, s in pairs)
 
@@ -213,7 +213,7 @@ def evaluate(stage: _Stage, coefficients: Float[np.ndarray, " shapes"], near: Ev
 def _over(
     stage: _Stage, coefficients: Float[np.ndarray, " shapes"], own: Sequence[Response]
 ) -> tuple[Float[np.ndarray, " places"], Float[np.ndarray, "places shapes"]]:
-    """Torque, speed, way and twist where they are largest in each part of the command, and their derivatives."""
+    """Largest torque, speed, travel and twist in each part of the command, and their derivatives."""
     shapes = stage.excitation.shapes
     values = np.concatenate([(shapes @ coefficients)[:, None], *(r.motion for r in own)], axis=1)
     slopes = np.concatenate([shapes[:, None, :], *(r.motion_by_command for r in own)], axis=1)
@@ -226,7 +226,7 @@ def _over(
 
 
 def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
-    """Commands within the limits that a search from one finds."""
+    """Commands within the limits from a search that starts at one."""
     visited = [begun.evaluation]
 
     def at(point: np.ndarray) -> Evaluation:
@@ -235,7 +235,7 @@ def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
             near = min(visited, key=lambda e: float(np.sum((e.coefficients - point[:-1]) ** 2)))
             known = evaluate(stage, point[:-1].copy(), near if near.usable else None)
             visited.append(known)
-            # Derivatives of long commands are large: the latest ones and the best ones are enough.
+            # Derivatives of long commands need much memory: only the latest and the best are stored.
             best = sorted(visited[:-_KEPT], key=lambda e: -Candidate(stage.excitation, e).merit)
             visited[:-_KEPT] = best[:_KEPT]
         return known
@@ -253,7 +253,7 @@ def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
         last = np.concatenate([-np.ones(told.shape[0]), np.zeros(of_limits.shape[0])])
         return np.nan_to_num(np.concatenate([np.concatenate([told, of_limits]), last[:, None]], axis=1))
 
-    # Loaded here: only the search for a next experiment needs it.
+    # Imported here: only the search for a next experiment needs it.
     from scipy.optimize import minimize
 
     size = begun.evaluation.coefficients.size
@@ -274,7 +274,7 @@ def _improved(stage: _Stage, begun: Candidate) -> list[Candidate]:
 
 
 def _made_smaller(stage: _Stage, found: Evaluation) -> Evaluation:
-    """The command so small that it keeps the limits, where that helps."""
+    """The command scaled down to the limits, if possible."""
     for _ in range(_SHRINKS):
         if found.within or not found.usable:
             break

@@ -1,12 +1,12 @@
-"""How far an experiment tells two models apart: what stays between them once the rival has been refitted.
+"""Discrimination of two models by an experiment: their difference after the rival is refitted.
 
-If one model is right, and a rival is fitted to what it makes, the rival's sum of squares in units of the noise is twice
-the log-likelihood ratio to be expected: the T-optimality of Atkinson and Fedorov (1975, Biometrika 62, "The design of
-experiments for discriminating between two rival models"). Summed over both cases of which model is right it is the
+If one model is right, and a rival is fitted to its response, the rival's sum of squares in units of the noise is twice
+the expected log-likelihood ratio: the T-optimality of Atkinson and Fedorov (1975, Biometrika 62, "The design of
+experiments for discriminating between two rival models"). Summed over both cases of the right model it is the
 divergence of Box and Hill (1967, Technometrics 9, "Discrimination among mechanistic models").
 
-The refit's minimum has no slope, so that the derivative of the sum of squares by the command is that at fixed
-parameters (the envelope theorem).
+At the refit's minimum the gradient by parameters vanishes, so that the derivative of the sum of squares by the command
+is that at fixed parameters (envelope theorem).
 """
 
 from collections.abc import Sequence
@@ -25,17 +25,17 @@ from hdjax import Hold, Model, PiecewisePolynomial, TwoInertiaModel, sampled
 from hdjax.lanes import jit_lanes
 from hdjax.simulate import march
 
-# A refit has arrived where another step would lower its sum of squares by less than this share (or in all).
+# A refit has converged if another step would decrease its sum of squares by less than this share, or this value.
 _ARRIVED, _NOTHING = 1e-2, 1e-2
 _STEPS = 6
 _HALVINGS = 3
-# Largest step of a parameter that moves by its logarithm.
+# Largest step of a logarithmic parameter.
 _LONGEST = 1.0
-# A simulation that runs away, or whose derivatives do, is this far off in units of the noise.
+# Residual of a diverged simulation (or one with diverged derivatives), in units of the noise.
 _LOST = 1e15
-# A parameter that could change by more than a factor of twenty within the noise is not sought any further.
+# A parameter that could change by more than a factor of twenty within the noise is damped.
 _DAMPING = 0.1
-# Directions of the unknowns that the outputs hardly see.
+# Singular values below this share: weakly observable directions of the unknowns.
 _BLIND = 1e-10
 
 
@@ -43,10 +43,10 @@ class Explanation(eqx.Module):
     """A model that may be right.
 
     Attributes:
-        name: what tells it from its rivals.
+        name: that distinguishes it from its rivals.
         model: with fitted values.
-        free: what its refit may change.
-        hold: what the torque does between samples.
+        free: the free parameters of its refit.
+        hold: inter-sample behaviour of the torque.
     """
 
     name: str = eqx.field(static=True)
@@ -58,19 +58,19 @@ class Explanation(eqx.Module):
 def explanation(
     name: str, model: Model, paths: Sequence[str], *, scale: dict[str, float] | None = None, hold: Hold
 ) -> Explanation:
-    """An explanation whose refit may change the parameters at `paths`; `scale` as in
+    """An explanation with free parameters at `paths`; `scale` as in
     [`fitting.estimation.free_parameters.free_parameters`][]."""
     return Explanation(name, model, free_parameters(model, paths, scale or {}), hold)
 
 
 class Bench(eqx.Module):
-    """How an experiment is simulated.
+    """Settings of a simulated experiment.
 
     Attributes:
-        motor_angle: where the motor rests at the start [rad].
+        motor_angle: of the motor at rest at the start [rad].
         noise: covariance of the measurement noise of the outputs.
-        limits: in whose units the motion is told.
-        halo: intervals of no torque before the start, for delays.
+        limits: the units of the motion.
+        halo: intervals of zero torque before the start, for delays.
         substeps: solver steps in a sample interval.
         temperature: of the drive [K], where an effect depends on it.
     """
@@ -84,22 +84,22 @@ class Bench(eqx.Module):
 
 
 class Signals(eqx.Module):
-    """A command's shapes between the samples."""
+    """A command's shapes as functions of time."""
 
     knots: Float[Array, " knots"]
     shapes: Float[Array, "intervals powers shapes"]
 
 
 class Response(eqx.Module):
-    """What a model answers to a command, and its derivatives.
+    """A model's response to a command, and its derivatives.
 
     Attributes:
         outputs: in units of the noise.
-        by_unknown: derivative with respect to what a refit may change: free parameters, then the first motion state.
+        by_unknown: derivative with respect to the unknowns of a refit: free parameters, then initial motion state.
         by_command: derivative with respect to the command's coefficients.
-        motion: motor speed and the output's way from the start (of a drive alone), then the dynamic error; in units of
-            the limits.
-        motion_by_command: derivative likewise.
+        motion: motor speed and the output's travel (two-inertia model only), then the dynamic error; in units of the
+            limits.
+        motion_by_command: its derivative by the command's coefficients.
     """
 
     outputs: Float[np.ndarray, " rows"]
@@ -110,17 +110,17 @@ class Response(eqx.Module):
 
     @property
     def usable(self) -> bool:
-        """Whether neither the simulation nor its derivatives run away."""
+        """Whether neither the simulation nor its derivatives diverge."""
         return all(bool(np.all(np.abs(a) < _LOST)) for a in (self.outputs, self.by_unknown, self.by_command))
 
 
 class Refit(eqx.Module):
-    """A rival that was fitted to what another model makes.
+    """A rival refitted to another model's response.
 
     Attributes:
-        unknowns: the rival's free parameters and first motion state.
-        response: at these.
-        left: what stays of the difference, in units of the noise.
+        unknowns: the rival's free parameters and initial motion state.
+        response: at these unknowns.
+        left: remaining difference, in units of the noise.
     """
 
     unknowns: Float[np.ndarray, " unknowns"]
@@ -129,7 +129,7 @@ class Refit(eqx.Module):
 
     @property
     def squares(self) -> float:
-        """Its sum of squares, twice the log-likelihood ratio to be expected."""
+        """Its sum of squares, twice the expected log-likelihood ratio."""
         return float(self.left @ self.left)
 
     def slope(self, truth: Response) -> Float[np.ndarray, " shapes"]:
@@ -138,7 +138,7 @@ class Refit(eqx.Module):
 
 
 def signals(excitation: Excitation, *, hold: Hold, bench: Bench) -> Signals:
-    """A command's shapes between the samples."""
+    """A command's shapes as functions of time."""
     step = bench.limits.time_step
     time = np.arange(-bench.halo, excitation.shapes.shape[0]) * step
     made = []
@@ -150,13 +150,13 @@ def signals(excitation: Excitation, *, hold: Hold, bench: Bench) -> Signals:
 
 
 def in_own_units(white: Float[np.ndarray, " rows"], bench: Bench) -> Float[np.ndarray, "samples outputs"]:
-    """Outputs in their own units, from those in units of the noise."""
+    """Outputs in physical units, from those in units of the noise."""
     colour = np.linalg.inv(np.asarray(whitening(bench.noise)))
     return white.reshape(-1, colour.shape[0]) @ colour.T
 
 
 def start(of: Explanation) -> Float[np.ndarray, " unknowns"]:
-    """The unknowns of an explanation as it is."""
+    """The unknowns of an explanation at its current values."""
     return np.concatenate([np.asarray(of.free.pack(of.model)), np.zeros(len(of.model.motion_states))])
 
 
@@ -197,15 +197,15 @@ def respond(
 
 
 class _Setup(eqx.Module):
-    """A bench as a compiled program takes it.
+    """Settings of an experiment as arrays for the compiled program.
 
     Attributes:
         rest: motion state at the start.
         white: whitening of the outputs.
-        units: of what has limits.
+        units: of the limited quantities.
         temperature: of the drive [K].
         substeps: solver steps in a sample interval.
-        halo: intervals of no torque before the start.
+        halo: intervals of zero torque before the start.
     """
 
     rest: Array
@@ -251,15 +251,15 @@ def refit(
     bench: Bench,
     begin: Float[np.ndarray, " unknowns"] | None = None,
 ) -> Refit:
-    """Fit a rival to what another model makes, by Gauss-Newton steps.
+    """Fit a rival to another model's response, by Gauss-Newton steps.
 
     Args:
-        rival: what is fitted.
-        target: what the other model makes of the command.
+        rival: the fitted explanation.
+        target: the other model's response.
         command: the command's coefficients.
         signals: the command's shapes, under the rival's hold.
-        bench: how it is simulated.
-        begin: unknowns to start from; the rival's own where not given.
+        bench: settings of the simulation.
+        begin: starting values of the unknowns; the rival's where not given.
     """
     unknowns = start(rival) if begin is None else begin
     logarithmic = np.append(rival.free.logarithmic, np.zeros(len(rival.model.motion_states))) > 0
@@ -286,7 +286,7 @@ def refit(
 
 
 def _solved(columns: np.ndarray, error: np.ndarray, logarithmic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least-squares step, damped in what noise would hide anyway, and what stays after it."""
+    """The least-squares step, damped in directions that noise dominates, and the remaining residual."""
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-150)
     scaled = columns / size
     damping = np.where(logarithmic, _DAMPING / size**2, 0.0)

@@ -1,4 +1,4 @@
-"""Motor torques that a bench can command, as sums of shapes: where a search for a better experiment starts."""
+"""Typical motor torques of test benches, as sums of shapes: starts of the search for an experiment."""
 
 from collections.abc import Sequence
 
@@ -9,27 +9,27 @@ from jaxtyping import Float
 from fitting.estimation.experiment import Stretch
 from hdjax import Model, TwoInertiaModel
 
-# Share of the duration over which a command fades in, and out.
+# Share of the duration over which a command is faded in and out.
 _FADE = 0.02
-# The slow lines by which a command may change, and how many more there are up to the highest one.
+# Low-frequency lines that a command may contain, and number of further ones up to the highest.
 _SLOW_LINES = (1, 2, 3, 4)
 _FAST_LINES = 10
-# The highest line in natural frequencies, and in sampling frequencies at most.
+# Frequency of the highest line over the natural frequency, and its limit over the sampling frequency.
 _HIGHEST, _MOST_SAMPLED = 2.5, 0.1
-# Samples over which an encoder's angle is differenced, so that its noise does not pass for speed.
+# Samples over which an encoder's angle is differenced, to limit the noise of the speed.
 _SPEED_SPAN = 8
-# A command is refused the last bit of each limit.
+# Share of each limit that a command may use.
 _MARGIN = 0.98
 
 
 class Limits(eqx.Module):
-    """What a command may ask of the drive, and how it is sampled.
+    """Limits and sampling of a command.
 
     Attributes:
         torque: largest motor torque [N m], or forcing of a reduced drive.
         speed: largest motor speed [rad/s]; infinite for a reduced drive.
-        travel: how far the output may turn from where it starts [rad]; infinite for a reduced drive.
-        twist: largest dynamic error [rad]; infinite where nobody states one.
+        travel: largest output angle from the start [rad]; infinite for a reduced drive.
+        twist: largest dynamic error [rad]; infinite where none is stated.
         duration: of the command [s].
         time_step: sampling interval [s].
     """
@@ -51,10 +51,10 @@ class Excitation(eqx.Module):
     """A command as a sum of shapes, `torque * shapes @ coefficients`.
 
     Attributes:
-        name: of the shape that it begins with.
-        shapes: by column, over the samples; the first is the one that gives the name.
-        coefficients: where a search starts.
-        torque: the limit, in whose units the shapes are.
+        name: of its first shape.
+        shapes: by column, over the samples; the first one gives the name.
+        coefficients: starting values of the search.
+        torque: the limit, which is the unit of the shapes.
     """
 
     name: str = eqx.field(static=True)
@@ -68,7 +68,7 @@ class Excitation(eqx.Module):
 
 
 def reached(stretches: Sequence[Stretch], *, most_samples: int) -> Limits:
-    """The limits that logs have reached.
+    """The largest values in the logs, as limits.
 
     Args:
         stretches: of the logs.
@@ -99,13 +99,13 @@ def reached(stretches: Sequence[Stretch], *, most_samples: int) -> Limits:
 
 
 def excitations(limits: Limits, model: Model, *, logged: Float[np.ndarray, " n"]) -> tuple[Excitation, ...]:
-    """Typical commands, each as large as the limits let a drive without friction and loads have it, with slow and fast
-    lines beside them by which a search may change them.
+    """Typical commands, scaled to the limits for a drive without friction and loads, with further lines as degrees of
+    freedom of the search.
 
     Args:
         limits: of the command.
         model: supplies natural frequency and inertias.
-        logged: the torque of a log from its start on, which is one of the commands.
+        logged: the torque of a log from its start, which is one of the commands.
     """
     time = np.arange(limits.samples) * limits.time_step
     fade = _fade(time, limits.duration)
@@ -132,13 +132,13 @@ def _frequency(model: Model) -> float:
 
 
 def _fade(time: np.ndarray, duration: float) -> np.ndarray:
-    """Zero at both ends of a command and one in between, without a jump."""
+    """A window that is zero at both ends of a command and one in between."""
     rise = np.clip(np.minimum(time, duration - time) / (_FADE * duration), 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * rise)
 
 
 def _lines(limits: Limits, model: Model) -> list[np.ndarray]:
-    """A constant, and sines and cosines."""
+    """Lines: a constant, and sines and cosines."""
     time = np.arange(limits.samples) * limits.time_step
     highest = min(_HIGHEST * _frequency(model), _MOST_SAMPLED / limits.time_step) * limits.duration
     fast = np.geomspace(_SLOW_LINES[-1] + 1, max(highest, _SLOW_LINES[-1] + 2), _FAST_LINES)
@@ -147,13 +147,13 @@ def _lines(limits: Limits, model: Model) -> list[np.ndarray]:
 
 
 def _typical(time: np.ndarray, duration: float, frequency: float) -> dict[str, np.ndarray]:
-    """What benches command, by name, each without the mean that would make a free drive run away."""
+    """Typical bench commands by name, without the mean that would accelerate a free drive."""
     turns = time / duration
     step = time[1]
     top = min(3.0 * frequency, _MOST_SAMPLED / step)
     bottom = min(0.3 * frequency, 0.5 * top)
     lines = np.arange(max(1.0, np.ceil(bottom * duration)), np.floor(top * duration) + 1) / duration
-    # Schroeder's phases keep the peaks of a flat spectrum low (IEEE Trans. Inf. Theory 16, 1970).
+    # Schroeder's phases give a flat spectrum low peaks (IEEE Trans. Inf. Theory 16, 1970).
     order = np.arange(lines.size)
     schroeder = -np.pi * order * (order + 1) / max(lines.size, 1)
     multisine = np.zeros(time.size)
@@ -174,7 +174,7 @@ def _typical(time: np.ndarray, duration: float, frequency: float) -> dict[str, n
 
 
 def _within(shape: np.ndarray, limits: Limits, model: Model) -> np.ndarray:
-    """A shape in units of the torque limit, as large as limits let it be on a rigid drive without friction."""
+    """A shape in units of the torque limit, scaled to the limits for a rigid drive without friction."""
     peak = float(np.max(np.abs(shape)))
     if not peak:
         return shape

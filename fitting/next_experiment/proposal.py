@@ -1,7 +1,7 @@
-"""The next experiment: the motor torque that tells apart, within limits, what the logs could not.
+"""The next experiment: a motor torque within limits that separates explanations which the logs do not.
 
-Tied explanations, or a drive with a small alpha against one without: both ask which of two models is right. Beside the
-search's own criterion, the fit that real logs get says how far apart the two would be on the logs and on the proposal.
+The question is which of two models is right: tied explanations, or a small alpha against none. In addition to the
+search's criterion, the usual fit gives the expected separation on the logs and on the proposal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,32 +30,32 @@ from fitting.uncertainty.normal_law import NORMAL_95
 from hdjax import Hold, Model, TwoInertiaModel, sampled
 
 MOST_SAMPLES = 20_000
-"""Longest command that can be designed."""
+"""Samples of the longest command that can be designed."""
 
-# Longest one where the user does not ask for more.
+# Samples of the longest command by default.
 _USUAL_SAMPLES = 4096
-# A log-likelihood ratio that leaves no doubt, whatever else the logs hold.
+# Log-likelihood ratio that is decisive.
 _DECIDED = 1e3
-# Rivals that are told apart at once, the closest ones.
+# Number of rivals (the closest ones) of one experiment.
 _MOST_RIVALS = 3
-# The alpha against none: this share of the restoring torque at the largest twist of the usual commands; and the share
-# of the noise against which it is sought.
+# Size of the alpha that is tested against none, as a share of the restoring torque at the largest twist of the usual
+# commands; and the share of the noise in its search.
 _CUBIC_SHARE, _QUIET = 0.01, 0.01
-# A shape parameter is not left below this share of where its fit began.
+# Least share of a shape parameter's starting value.
 _SHARPEST = 0.03
 
 
 class Separation(eqx.Module):
-    """How far experiments tell the found explanation from a rival.
+    """Separation of the found explanation from a rival by experiments.
 
-    Each number is the log-likelihood ratio to be expected, first where the found one is right, then where the rival is.
+    Each number is the expected log-likelihood ratio, first if the found one is right, then if the rival is.
 
     Attributes:
         rival: the rival's form.
         family: its family.
-        on_logs: on the logs that were fitted; None where a free run along them diverged.
-        proposed: on the proposed experiment; None where the logs have decided, or where the rival has no derivatives.
-        gathered: the same two by column as they grow along the proposal, as the search has it; None likewise.
+        on_logs: on the fitted logs; None where a free run diverged.
+        proposed: on the proposed experiment; None where the logs are decisive, or the rival has no derivatives.
+        gathered: the two ratios by column, accumulated along the proposal by the search's criterion; None likewise.
     """
 
     rival: str = eqx.field(static=True)
@@ -66,13 +66,13 @@ class Separation(eqx.Module):
 
 
 class Precision(eqx.Module):
-    """How well an experiment knows alpha, as far as measurement noise decides.
+    """Precision of alpha in an experiment, under measurement noise alone.
 
     Attributes:
         fitted: its value in the fit.
-        on_logs: standard error on the logs that were fitted.
-        proposed: likewise on the proposed experiment, of an alpha that is small.
-        gathered: share of what the proposal knows of alpha, as it grows along it.
+        on_logs: standard error on the fitted logs.
+        proposed: standard error on the proposed experiment, for a small alpha.
+        gathered: accumulated share of the proposal's information about alpha.
         unit: of alpha.
     """
 
@@ -84,7 +84,7 @@ class Precision(eqx.Module):
 
     @property
     def visible(self) -> float:
-        """The smallest alpha that the proposal tells from zero."""
+        """The smallest alpha that would be significantly nonzero in the proposal."""
         return NORMAL_95 * self.proposed
 
 
@@ -94,13 +94,13 @@ class NextExperiment(eqx.Module):
     Attributes:
         time: of the samples [s].
         command: motor torque [N m], or the forcing of a reduced drive.
-        limits: that it keeps under each explanation.
-        begins_like: the usual command from which the search came.
-        found: name of the explanation that was found.
-        motor_angle: where the motor rests at the start [rad].
-        dynamic_error: that the found explanation predicts [rad].
+        limits: that it respects under each explanation.
+        begins_like: the typical command from which the search started.
+        found: name of the found explanation.
+        motor_angle: of the motor at rest at the start [rad].
+        dynamic_error: predicted by the found explanation [rad].
         motor_speed: likewise [rad/s]; None for a reduced drive.
-        separations: of the found explanation from each rival; none where alpha is the question.
+        separations: of the found explanation from each rival; empty where alpha is the question.
         precision: of alpha, where that is the question.
     """
 
@@ -117,7 +117,7 @@ class NextExperiment(eqx.Module):
 
 
 def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
-    """What explains selection data about as well as what was found: pairs of found and rival, the closest first."""
+    """Ties: pairs of a found effect and a rival that explains selection data about as well, the closest first."""
     names = {f.name for f in loop.findings}
     pairs = [
         (this.winner, verdict)
@@ -133,17 +133,16 @@ def tied(loop: Loop) -> tuple[tuple[Verdict, Verdict], ...]:
 def experiment_for_ties(
     loop: Loop, limits: Mapping[str, float] | None = None, *, progress: Progress = silent
 ) -> NextExperiment | None:
-    """The experiment that tells what a loop found from what is tied with it.
+    """The experiment that separates a loop's effects from their ties.
 
     Args:
         loop: the outcome.
-        limits: any of [`fitting.next_experiment.excitation.Limits`][] by name; what is missing is what the logs have
-            reached.
-        progress: told what is being done.
+        limits: any of [`fitting.next_experiment.excitation.Limits`][] by name; missing ones are those reached in the
+            logs.
+        progress: receives messages.
 
     Returns:
-        The experiment. None where nothing is tied, where a learned torque stands for what is missing, or where no
-        command keeps the limits.
+        The experiment. None without ties, with a learned torque, or where no command respects the limits.
     """
     pairs = tied(loop)
     if not pairs or loop.unknown is not None:
@@ -153,14 +152,14 @@ def experiment_for_ties(
     found = _explanation(_name(loop), own, stretches, hold=loop.hold)
     rivals = [_rival(loop, *pair) for pair in pairs]
     bench = _bench(own, stretches, limits, noise=loop.noise, halo=loop.setting.halo, substeps=loop.after_substeps)
-    progress("the next experiment: what the logs can tell")
+    progress("the next experiment: separation by the logs")
     judge = _Judge(bench, replace(loop.setting.segmentation, substeps=loop.after_substeps))
     told = [_on_logs(judge, found, r, pair) for r, pair in zip(rivals, pairs, strict=True)]
     starts = _starts(bench, own, stretches)
     smooth = [k for k, rival in enumerate(rivals) if is_smooth(rival, starts, bench)]
     if not smooth:
         return None
-    # Where the logs have decided all, short segments by which a loop judges have missed it; then all are still asked.
+    # The logs may separate all rivals, though short segments of the loop did not; then all are kept.
     open_ones = [k for k in smooth if not _is_decided(told[k])] or smooth
     best = search([found, *(rivals[k] for k in open_ones)], starts, bench, progress=progress)
     if best is None:
@@ -178,7 +177,7 @@ def experiment_for_ties(
 
 
 def _is_decided(ratios: tuple[float, float] | None) -> bool:
-    """Whether simulations as long as the logs tell two explanations apart, whichever is right."""
+    """Whether simulations as long as the logs separate two explanations, whichever is right."""
     return ratios is not None and min(ratios) > _DECIDED
 
 
@@ -189,16 +188,16 @@ def experiment_for_alpha(
     *,
     progress: Progress = silent,
 ) -> NextExperiment | None:
-    """The experiment that knows alpha best.
+    """The experiment that determines alpha best.
 
     Args:
         fitted: a fit.
         experiments: its logs.
         limits: see [`experiment_for_ties`][].
-        progress: told what is being done.
+        progress: receives messages.
 
     Returns:
-        The experiment; None where alpha is identifiable from the logs, or where no command keeps the limits.
+        The experiment; None where alpha is identifiable from the logs, or where no command respects the limits.
     """
     estimate = fitted.account.uncertainty.estimates.get("alpha")
     if estimate is None or estimate.identifiable:
@@ -206,7 +205,7 @@ def experiment_for_alpha(
     stretches = whole(experiments)
     paths = [p for p in fitted.account.uncertainty.estimates if p != "alpha"]
     without = explanation("no alpha", fitted.account.model.replace({"alpha": 0.0}), paths, hold=fitted.hold)
-    # An alpha so small that its square does not count shows against less noise; what noise does is in proportion to it.
+    # A small alpha, in the linear range, is tested with smaller noise; the effect of noise is proportional to it.
     quiet = fitted.noise * _QUIET**2
     bench = _bench(without.model, stretches, limits, noise=quiet, halo=0, substeps=fitted.goodness.substeps)
     starts = _starts(bench, without.model, stretches)
@@ -236,13 +235,13 @@ def _explanation(name: str, model: Model, stretches: Sequence[Stretch], *, hold:
 
 
 def _rival(loop: Loop, winner: Verdict, verdict: Verdict) -> Explanation:
-    """The final model with a rival in the place of what it is tied with."""
+    """The final model with a rival in place of the effect that it is tied with."""
     trial = verdict.trial
     assert trial is not None
     model, stretches = _with_slopes(trial), trial.training.stretches
     others = [e for e in loop.after.model.effects if e.name not in {winner.name, *(o.name for o in model.effects)}]
     if others:
-        # Found later, beside what is tied.
+        # Found after the tied effect.
         training = trial.training
         model = fit(
             model.with_effects(*others),
@@ -255,8 +254,8 @@ def _rival(loop: Loop, winner: Verdict, verdict: Verdict) -> Explanation:
 
 
 def _with_slopes(trial: Trial) -> Model:
-    """The fitted model, whose shapes that ran to zero are put where a motion still has derivatives by them: friction
-    that turns within no time has none."""
+    """The fitted model, with vanishing shape parameters increased so that the motion has derivatives by them; friction
+    that reverses abruptly has none."""
     begun, model = trial.training.problem.model, trial.model
     known = model.parameters()
     least = {p: _SHARPEST * float(begun.get(p)) for p in fitted_paths(model) if known[p][1].role == "shape"}
@@ -272,7 +271,7 @@ def _bench(
     halo: int,
     substeps: int,
 ) -> Bench:
-    """How the next experiment is simulated: from rest where the first log started, in the logs' mean temperature."""
+    """Settings of the next experiment: from rest at the first log's start, at the logs' mean temperature."""
     motor = stretches[0].experiment.motor_angle
     return Bench(
         motor_angle=0.0 if motor is None else float(motor[stretches[0].start]),
@@ -291,20 +290,20 @@ def _starts(bench: Bench, model: Model, stretches: Sequence[Stretch]) -> tuple[E
 
 
 class _Judge(eqx.Module):
-    """The fit that tells how far a rival stays from what another model makes, by programs that the loop has used."""
+    """The fit that measures a rival's distance from another model's response, with compiled programs of the loop."""
 
     bench: Bench
     segmentation: Segmentation = eqx.field(static=True)
 
     def ratio(self, rival: Explanation, stretches: Sequence[Stretch]) -> float:
-        """The log-likelihood ratio to be expected against a rival, where the measured outputs are another model's."""
+        """The expected log-likelihood ratio against a rival, with another model's outputs as measured ones."""
         found = self.fitted(rival, stretches)
         white = np.asarray(found.error) @ np.asarray(whitening(self.bench.noise)).T
         return 0.5 * float(np.sum(white**2))
 
     def fitted(self, model: Explanation, stretches: Sequence[Stretch], *, hold_parameters: bool = False) -> Fit:
-        """A fit of simulations as long as the stretches, under the weights of the measurement noise."""
-        # As many segments as the loop's where these are enough.
+        """A fit over horizons as long as the stretches, with the weights of the measurement noise."""
+        # The loop's number of segments, if sufficient.
         own, horizon = self.segmentation, max(len(s) for s in stretches)
         count = max(own.count or 0, segment_count(stretches, own.length or segment_length(own.horizon)))
         return fit(
@@ -320,7 +319,7 @@ class _Judge(eqx.Module):
 def _on_logs(
     judge: _Judge, found: Explanation, rival: Explanation, pair: tuple[Verdict, Verdict]
 ) -> tuple[float, float] | None:
-    """The ratios to be expected of the logs; None where a simulation along them leaves the numbers."""
+    """The expected ratios on the logs; None where a simulation diverges."""
     ratios = []
     sides = tuple(zip((found, rival), pair, strict=True))
     for (truth, of_truth), (other, of_other) in (sides, sides[::-1]):
@@ -328,7 +327,7 @@ def _on_logs(
         simulated = as_followed(judge.fitted(truth, of_truth.trial.training.stretches, hold_parameters=True))
         if not all(np.isfinite(s.experiment.measured).all() for s in simulated):
             return None
-        # The other model may see the torque under another hold.
+        # The other model may have another hold of the torque.
         logs = zip(of_other.trial.training.stretches, simulated, strict=True)
         ratios.append(judge.ratio(other, [_with_measured(s, made.experiment.measured) for s, made in logs]))
     return ratios[0], ratios[1]
@@ -341,14 +340,14 @@ def _with_measured(stretch: Stretch, measured: Float[np.ndarray, "samples output
 def _on_proposal(
     judge: _Judge, best: Candidate, found: Explanation, rival: Explanation, of_rival: Response
 ) -> tuple[float, float]:
-    """The ratios to be expected of the proposal."""
+    """The expected ratios on the proposal."""
     of_found = best.evaluation.own[0]
     one = judge.ratio(rival, [_simulated(best.command, of_found, rival.hold, judge.bench)])
     return one, judge.ratio(found, [_simulated(best.command, of_rival, found.hold, judge.bench)])
 
 
 def _simulated(command: Float[np.ndarray, " samples"], truth: Response, hold: Hold, bench: Bench) -> Stretch:
-    """The proposal as a log of what a model makes of it."""
+    """The proposal as a log of a model's response."""
     time = np.arange(command.size) * bench.limits.time_step
     outputs = in_own_units(truth.outputs, bench)
     warm = None if bench.temperature is None else sampled(time, np.full(time.size, bench.temperature), hold="linear")
@@ -365,7 +364,7 @@ def _simulated(command: Float[np.ndarray, " samples"], truth: Response, hold: Ho
 
 
 def _gathered(of: Refit, best: Candidate) -> Float[np.ndarray, " samples"]:
-    """What stays after a refit, squared and summed up to each sample."""
+    """Squared residual of a refit, accumulated up to each sample."""
     return np.cumsum(np.sum(of.left.reshape(best.command.size, -1) ** 2, axis=1))
 
 

@@ -1,5 +1,5 @@
 """Quasi-static logs: twist against slowly changing joint torque, fitted without inertia.
 
 fit:        log -> prepare -> average -> fit of each curve -> intervals -> choice by held-out stretches -> report
-close-loop: log -> prepare -> points -> straight line -> look at the catalogue -> refit, again -> strengths -> report
+close-loop: log -> prepare -> points -> straight line -> screening -> refits, repeated -> strengths -> report
 """

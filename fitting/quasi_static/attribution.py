@@ -1,4 +1,4 @@
-"""Which effect explains what the torque-twist equation leaves over: one look at the catalogue, refits, ties."""
+"""One round of attribution with the torque-twist equation: screening, refits, ties."""
 
 import math
 from collections.abc import Sequence
@@ -18,23 +18,23 @@ from fitting.quasi_static.screening import Lead, screen
 from fitting.quasi_static.stretches import folds, stretches, worse
 from fitting.quasi_static.twist_model import TwistModel, fit_twist, hold_out, strengths_of
 
-# A form that explains less than this share of what the best one does is no rival, and is not refitted.
+# A form with less than this share of the best gain is not refitted.
 _RIVAL = 0.25
-# A form of a strength that drives can show leads where it explains this share of what the best one does.
+# A form of plausible strength is preferred where it has this share of the best gain.
 _PLAUSIBLE = 0.5
-# Some times the percents of the twist that drives creep by.
+# A multiple of the few percent of creep that real drives show.
 _LARGEST_CREEP = 0.5
-# Forms of one family that are refitted.
+# Number of forms of one family that are refitted.
 _FORMS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class TwistTrial:
-    """An equation with its errors on stretches that its fit has not seen.
+    """A fitted equation with its errors on held-out stretches.
 
     Attributes:
         model: Fitted to all points.
-        held_out: Misfit of each point by fits without its fold [rad], (n,).
+        held_out: Misfit of each point in the fit without its fold [rad], (n,).
     """
 
     model: TwistModel
@@ -42,12 +42,12 @@ class TwistTrial:
 
     @property
     def mean_square(self) -> float:
-        """Of the held-out misfit [rad^2]."""
+        """Mean square of the held-out misfit [rad^2]."""
         return float(np.mean(self.held_out**2))
 
     @property
     def rmse(self) -> float:
-        """Held-out [rad]."""
+        """Rms of the held-out misfit [rad]."""
         return math.sqrt(self.mean_square)
 
     def gain_over(self, other: "TwistTrial") -> float:
@@ -55,7 +55,7 @@ class TwistTrial:
         return 0.5 * math.log(max(other.mean_square, 1e-300) / max(self.mean_square, 1e-300))
 
     def beyond(self, other: "TwistTrial") -> tuple[Form, ...]:
-        """The forms that the other one lacks."""
+        """The forms that the other trial lacks."""
         return tuple(form for form in self.model.forms if form not in other.model.forms)
 
 
@@ -65,7 +65,7 @@ TwistRound = Round[TwistTrial, TwistTrial]
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Points, and how they are parted into what a fit sees and what it doesn't.
+    """Points and their folds for cross-validation.
 
     Attributes:
         points: Of all logs.
@@ -79,8 +79,8 @@ class Held:
 
     @classmethod
     def of(cls, points: Points) -> "Held":
-        """Points parted into folds of whole stretches of the straight line's misfit."""
-        # Two stretches in each log at least, so that its zero is known where one is held out.
+        """Points in folds of whole stretches, from the straight line's misfit."""
+        # At least two stretches per log, so that its zero is determined where one is held out.
         stretch = stretches(fit_twist(points).misfit, points.log, each=2)
         return cls(points, stretch, folds(stretch))
 
@@ -90,7 +90,7 @@ class Held:
         return TwistTrial(model, hold_out(self.points, model, self.fold))
 
     def beside(self, trial: TwistTrial, terms: Terms) -> TwistTrial:
-        """The model with those of some terms that it lacks."""
+        """The model with further terms."""
         return self.attempt((*trial.model.terms, *(term for term in terms if term[0] not in trial.model.forms)))
 
     def without(self, trial: TwistTrial, forms: Sequence[Form]) -> TwistTrial:
@@ -98,7 +98,7 @@ class Held:
         return self.attempt(tuple(term for term in trial.model.terms if term[0] not in forms))
 
     def is_worse(self, one: TwistTrial, other: TwistTrial) -> bool:
-        """Whether the first predicts held-out stretches clearly worse."""
+        """Whether the first predicts held-out stretches significantly worse."""
         return worse(one.held_out, other.held_out, self.stretch, self.points.twist_noise)
 
 
@@ -111,28 +111,29 @@ def look(
     *,
     elastic: bool = True,
 ) -> TwistRound:
-    """Look for the effect that explains most of what a model leaves over.
+    """Find the effect that explains most of a model's residual.
 
     Args:
         held: The points.
         before: The current model.
         base: The model without any effect.
-        choices: Forms, or two together, to consider, the more usual ones first.
+        choices: Candidate forms, or pairs of them, the more common ones first.
         seed: Of the surrogates.
-        elastic: Whether the twist must rise with the torque; at rest, where the torque hardly changes, its noise may
-            make it fall.
+        elastic: Whether the twist must rise with the torque. At rest, where the torque hardly changes, noise may make
+            it fall.
     """
     screened = screen(held.points, before.model, choices, held.fold, seed)
     verdicts = []
     for lead in _worth_a_refit(screened):
         trial = held.beside(before, lead.terms)
         gain = trial.gain_over(before)
-        # The law of chance holds for the grid of shapes; what a search between its points gains has to count as chance.
+        # The null distribution is that of the grid of shapes; further gain by the search between grid points is not
+        # counted.
         p_value = screened.p_value(min(gain, lead.gain))
         name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
         verdicts.append(Verdict(name, family, trial, gain, p_value, True))
     if elastic:
-        # No gear twists against its torque.
+        # Physically, the twist rises with the torque.
         verdicts = [v for v in verdicts if v.trial.model.coefficients[0] > 0]
     verdicts.sort(key=lambda verdict: -verdict.gain)
     if not verdicts:
@@ -144,7 +145,7 @@ def look(
     verdicts = _simplest_first(held, verdicts, screened, before, choices)
     winner, added = verdicts[0], verdicts[0].trial.beyond(before)
     removed, earlier = before.mean_square - winner.trial.mean_square, base.mean_square - before.mean_square
-    # Of the torque's own error, too, a form that follows the torque must remove more.
+    # A form that depends on the torque must also remove more than the torque's error may cause.
     if any(form.of_torque for form in added) and removed <= torque_error(held.points, base):
         removed = 0.0
     share = math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf if removed > 0 else 0.0
@@ -158,18 +159,18 @@ def _evidence(forms: Sequence[Form], gain: float, p_value: float, removed: float
 
 
 def _is_supported(seen: EffectEvidence) -> bool:
-    """Whether an effect gains enough, more than chance, and more than earlier effects may get wrong."""
+    """Whether an effect's gain is significant, and exceeds the possible error of earlier effects' laws."""
     return all(check.holds for check in support(seen))
 
 
 def torque_error(points: Points, base: TwistTrial) -> float:
-    """Mean square of the twist that the torque's own error may account for [rad^2]; less than this shows no effect."""
-    # Stein's estimate of a single log scatters, and the error stands together at the torque's corners.
+    """Mean square of the twist that the torque's error may cause [rad^2]; a smaller gain is no evidence."""
+    # Stein's estimate of a single log scatters, and the error concentrates at the torque's corners.
     return 2.0 * float(base.model.coefficients[0] * points.torque_error) ** 2
 
 
 def _worth_a_refit(screened: Screen[Lead]) -> list[Lead]:
-    """The best forms of each family that come near the best of all, or none where that one is no more than chance."""
+    """The best forms of each family near the overall best, or none where that one is not significant."""
     best = screened.leads[0].gain if screened.leads else 0.0
     if not _is_supported(_evidence((), best, screened.p_value(best))):
         return []
@@ -184,11 +185,11 @@ def _simplest_first(
     before: TwistTrial,
     choices: Sequence[tuple[Form, ...]],
 ) -> list[TwistVerdict]:
-    """The competitors with the one first that is taken, each of the others with whether the logs tell it from the best.
+    """The candidates with the chosen one first; the others with whether the logs distinguish them from the best.
 
-    Forms are tied where the one does not predict held-out stretches clearly worse, and where the better one has nothing
-    left to explain beside it. Of tied forms the one with the fewest parameters wins; of nearly equal ones the more
-    usual. One that no drive can show stands back where another form explains half as much.
+    Forms are tied where one does not predict held-out stretches significantly worse, and where the better one explains
+    nothing beside it. Of tied forms the one with the fewest parameters is chosen; of nearly equal ones the more common.
+    An implausible one yields to a form with half its gain.
     """
     forms = {verdict.name: verdict.trial.beyond(before) for verdict in verdicts}
 
@@ -210,13 +211,13 @@ def _simplest_first(
     return [winner, *(replace(v, separable=v not in tied) for v in verdicts if v is not winner)]
 
 
-def is_told(points: Points, model: TwistModel, form: Form) -> bool:
-    """Whether the logs tell anything of a form: one of its figures at least, phases aside."""
+def is_determined(points: Points, model: TwistModel, form: Form) -> bool:
+    """Whether the logs determine at least one figure of a form other than phases."""
     figures = strengths_of(points, model, form)
     return any(one.identifiable for name, one in figures.items() if not name.startswith("phase"))
 
 
 def _is_possible(model: TwistModel) -> bool:
-    """Whether drives can show such strengths: what creeps is a part of the twist that was there at once."""
+    """Whether strengths are plausible: delayed twist is a fraction of immediate twist."""
     creeps = [model.coefficients[model.own(form)[0].start] for form in model.forms if form.family == "creep"]
     return max(map(abs, creeps), default=0.0) <= _LARGEST_CREEP * abs(model.coefficients[0])

@@ -1,6 +1,6 @@
-"""Means over short runs of rows: less noise on both axes, and few enough points for a fit in milliseconds.
+"""Block means over short runs of rows, which reduce noise on both axes and the number of points.
 
-The noise of either axis is measured in the log itself, from what third differences leave of a smooth course.
+The noise of each axis is estimated from third differences of the log.
 """
 
 import math
@@ -16,19 +16,19 @@ from fitting.quasi_static.torque_twist import Blocks
 # Assumed: fine enough to place a knee to a few per cent, coarse enough to average noise away.
 BLOCKS_PER_CYCLE = 100
 MOST_BLOCKS = 1500
-# A swing back by less than this share of the torque's range leaves the branch as it is, nearly.
+# A reversal by less than this share of the torque's range hardly changes the branch.
 _REVERSAL = 0.05
-# Blocks in a branch of which the two at its ends may be left out.
+# Least number of blocks in a branch for those at its ends to be omitted.
 _LONG_BRANCH = 6
 _MEDIAN_TO_STD = 1.4826
 _THIRD_DIFFERENCE = math.sqrt(20.0)
 
 
 def average(logs: Sequence[Log]) -> Blocks:
-    """Means over blocks so short that the torque is nearly straight, and so long that it outruns its noise.
+    """Means over blocks in which the torque is nearly linear and changes by more than its noise.
 
-    No block crosses a reversal of the torque, and the extreme that the torque reached there is kept beside the blocks:
-    the hysteresis depends on it.
+    No block crosses a torque reversal. The extreme torque there is kept with the blocks, since the hysteresis depends
+    on it.
     """
     parts = [_average(log, MOST_BLOCKS // len(logs)) for log in logs]
     sizes = [len(part["torque"]) for part in parts]
@@ -45,9 +45,9 @@ def average(logs: Sequence[Log]) -> Blocks:
         seat=whole["seat"] + before,
         names=tuple(log.name for log in logs),
         torque_noise=torque_noise,
-        # Even exact numbers have rounding; without a floor their weights would be infinite.
+        # A floor for the noise of exact data, whose weights would be infinite.
         twist_noise=max(twist_noise, 1e-7 * float(np.ptp(whole["twist"]))),
-        # The rows of a block are spread evenly over its course.
+        # The rows of a block are evenly distributed over its range.
         blur=math.hypot(torque_noise, course / math.sqrt(12.0)),
         rows=tuple(round(len(log) / size) for log, size in zip(logs, sizes, strict=True)),
         reversals=tuple(len(part["path"]) - len(part["blocks"]) for part in parts),
@@ -69,28 +69,28 @@ def _average(log: Log, most: int) -> dict[str, np.ndarray]:
     columns = {"torque": torque, "twist": log.dynamic_error, "time": log.time}
     found = {key: np.add.reduceat(values, edge[:-1]) / np.diff(edge) for key, values in columns.items()}
     firsts, blocks = np.cumsum(counts)[:-1], np.arange(len(edge) - 1)
-    # The torque between the two blocks beside a reversal, from the courses on both sides.
+    # The torque between the two blocks beside a reversal, extrapolated from both sides.
     edged = np.pad(found["torque"], 1, mode="edge")
     extremes = 0.75 * (edged[firsts] + edged[firsts + 1]) - 0.25 * (edged[firsts - 1] + edged[firsts + 2])
-    # Beside a reversal the branch changes within a block, so that its mean is not on the curve.
+    # Next to a reversal the branch changes within a block, so that its mean is not on the curve.
     kept = ~np.isin(blocks, [firsts, firsts - 1]) if np.min(counts) >= _LONG_BRANCH else blocks >= 0
     seat = blocks + np.searchsorted(firsts, blocks, side="right")
     return {key: values[kept] for key, values in (found | {"seat": seat}).items()} | {
         "path": np.insert(found["torque"], firsts, extremes),
         "blocks": blocks,
-        # Blocks of one size, whose centres are evenly spaced as third differences want them.
+        # Blocks of equal size, whose centres are evenly spaced, as third differences need.
         "noise": np.array([noise(means(values, size)) for values in (torque, log.twist)]),
     }
 
 
 def means(values: np.ndarray, size: int) -> np.ndarray:
-    """Means over runs of `size` values; a shorter rest at the end is left out."""
+    """Means over runs of `size` values; a shorter remainder at the end is omitted."""
     count = len(values) // size
     return values[: count * size].reshape(count, size).mean(axis=1)
 
 
 def noise(values: np.ndarray) -> float:
-    """Standard deviation of the noise on a smooth course, robustly from third differences."""
+    """Standard deviation of the noise on a smooth signal, robustly from third differences."""
     differences = np.abs(np.diff(values, 3))
     typical = float(np.median(differences)) * _MEDIAN_TO_STD
     # More than half of the differences of a coarsely quantised channel may be zero.
@@ -102,18 +102,18 @@ def _moves_little(torque: np.ndarray) -> bool:
 
 
 def turns(torque: np.ndarray, size: int) -> list[int]:
-    """Rows at which the torque turns back by more than its noise and a small share of its range.
+    """Rows of torque reversals that exceed the noise and a small share of the range.
 
     Args:
         torque: In order of time, (n,).
-        size: Rows over which it is averaged before one looks.
+        size: Rows over which it is averaged first.
     """
     smooth = means(torque, size)
     least = max(_REVERSAL * float(np.ptp(smooth)), 8.0 * noise(smooth))
     found = sorted((int(i), sign) for sign in (1, -1) for i in find_peaks(sign * smooth, prominence=least)[0])
     running, rows = uniform_filter1d(torque, size, mode="nearest"), []
     for (_, before), (i, sign) in zip([(0, 0), *found], found, strict=False):
-        # Of equal tops in a row, as quantised channels have them, the first one counts.
+        # Of equal maxima in a row, as in quantised channels, the first one counts.
         if sign != before:
             first = max(0, (i - 1) * size) + size // 2
             rows.append(first + int(np.argmax(sign * running[first : (i + 1) * size + size // 2 + 1])))

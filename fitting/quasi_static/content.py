@@ -1,4 +1,4 @@
-"""What a quasi-static fit found, as `report.json` has it: figures, held-out errors, and what the logs can't tell."""
+"""Content of a quasi-static fit's `report.json`: figures, held-out errors, and limits of the logs."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -25,33 +25,33 @@ from fitting.quasi_static.stretches import stretches
 from fitting.quasi_static.torque_twist import SHAPES
 from fitting.quasi_static.unseen_logs import UnseenLogs
 
-# The least of the values that vendors' tables imply.
+# Smallest value that vendors' tables imply.
 _TYPICAL_ALPHA = 1.1e5
 _SEPARATING = "Cycle the torque slowly to larger twists, past the knees, in both directions."
 _ONE_WAY = (
-    "The joint moved one way only: its friction shifts the torque by a constant that can't be told from a bias of the "
-    "sensor, friction that depends on load or position bends the curve, and nothing is known of hysteresis. Run the "
+    "The joint moved one way only: its friction shifts the torque by a constant that is confounded with a bias of "
+    "the sensor. Friction that depends on load or position bends the curve, and hysteresis is unknown. Run the "
     "same path both ways."
 )
 _BOTH_WAYS = (
-    "The joint moved both ways: friction that follows the direction of motion is contained in the width of the loop."
+    "The joint moved both ways: the width of the loop contains friction that depends on the direction of motion."
 )
 _MOVED = (
-    "While the joint moves, kinematic error and eccentric encoders move the twist as well; they count as error here, "
-    "and bend the curve where they are slow; hdjax close-loop looks for them."
+    "While the joint moves, kinematic error and eccentric encoders change the twist as well. They count as error "
+    "here, and bend the curve where they are slow; hdjax close-loop searches for them."
 )
 _WRONG_WAY = (
-    "The loop runs the wrong way round, as if the gear gave out energy: the torque column lags behind or leads the "
-    "twist, or holds friction that does not pass through the gear. The width is not one of the gear."
+    "The loop has the wrong orientation, as if the gear generated energy: the torque column lags or leads the twist, "
+    "or contains friction that does not pass through the gear. The width is not that of the gear."
 )
 _ALL_FRICTION = (
-    "The width of the loop contains all friction between the sensors: a torque measured on the motor's side, by its "
-    "current above all, counts friction of motor and bearings as hysteresis of the gear."
+    "The width of the loop contains all friction between the sensors: with a torque measured on the motor's side, "
+    "mainly by its current, friction of motor and bearings counts as hysteresis of the gear."
 )
 
 
 def plain_shape(shape: str) -> str:
-    """A shape of curve in plain words."""
+    """The name of a curve's shape for reports."""
     return "straight line" if shape == "linear" else shape
 
 
@@ -64,7 +64,7 @@ def report_dict(data: QuasiStaticData, fit: QuasiStaticFit, unseen: UnseenLogs) 
         unseen: Logs of test data.
 
     Returns:
-        The keys of every fit's report; `shapes` has each shape's own figures besides.
+        The keys of every fit's report, and `shapes` with each shape's figures.
     """
     rated, blocks = data.drive_file.rated_torque, fit.blocks
     shapes = {shape: account(fit.known[shape], fit.fits[shape].misfit, fit.held_out[shape]) for shape in SHAPES}
@@ -104,7 +104,7 @@ def _test_logs(unseen: UnseenLogs) -> list[dict[str, Any]]:
 
 
 def summary(report: Mapping[str, Any]) -> str:
-    """The result in plain words."""
+    """The result in a few sentences."""
     known, shape = report["before"]["parameters"], plain_shape(report["shape"])
     names = [n for n in ("K", "K1", "K2", "K3") if n in known and known[n]["identifiable"]]
     validation = formatting.quantity(report["before"]["rmse"]["validation"], "rad")
@@ -138,7 +138,7 @@ def _with_interval(known: Mapping[str, Any]) -> str:
 
 
 def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
-    """The figures that vendors state and the chosen curve does not have, each with the reason."""
+    """The vendors' figures that the chosen curve lacks, each with the reason."""
     chosen, memory = fit.known[fit.chosen], fit.best.curve.memory
 
     def missing(rows: Sequence[tuple[str, str, str, str]]) -> dict[str, Known]:
@@ -149,7 +149,7 @@ def _unknown(fit: QuasiStaticFit, rated: float | None) -> dict[str, Known]:
     if fit.chosen in ("linear", "two slopes"):
         bend = "second knee" if fit.chosen == "two slopes" else "knee"
         reach = formatting.quantity(float(np.max(np.abs(fit.blocks.torque))), "N m")
-        why = f"held-out stretches do not clearly show a {bend} up to {reach}"
+        why = f"held-out stretches do not significantly support a {bend} up to {reach}"
         if fit.undetermined is not None:
             why = "the curve bends more than the chosen one, but the logs do not determine where and how much"
         bent = missing(
@@ -190,12 +190,13 @@ def _alpha_reason(fit: QuasiStaticFit, alpha: Known) -> str:
     assert alpha.ci95 is not None
     visible = max(abs(alpha.ci95[0]), abs(alpha.ci95[1]))
     reason = (
-        f"held-out stretches do not clearly show a bend at twists up to {formatting.quantity(largest, 'rad')}, where "
-        f"alpha below {formatting.number(visible, 2)} rad^-2 can't be seen"
+        "held-out stretches do not significantly support a bend at twists up to "
+        f"{formatting.quantity(largest, 'rad')}, where "
+        f"alpha below {formatting.number(visible, 2)} rad^-2 can't be detected"
     )
     if visible <= _TYPICAL_ALPHA:
         return reason
-    # At the same noise the twist of the cubic term grows with the cube of the twist.
+    # The cubic term's twist grows with the cube of the twist, at the same noise.
     needed = formatting.quantity(largest * (visible / _TYPICAL_ALPHA) ** (1 / 3), "rad")
     return f"{reason}; alpha of 1.1e5, the least in vendors' tables, would need x above {needed}"
 
@@ -225,13 +226,13 @@ def _limits(report: Mapping[str, Any], data: QuasiStaticData, fit: QuasiStaticFi
         (True, ABOUT_SCALE),
         (
             softer >= 1e-3,
-            "The noise of both axes was measured and weighed; what exceeds it was ascribed to the twist. If it were an "
+            "The noise of both axes was estimated; misfit beyond it was ascribed to the twist. If it were an "
             f"error of the torque instead, the drive would be softer by up to {formatting.percent(softer)}.",
         ),
-        (not best.curve.biased, f"A bias of the torque and the zero of the twist can't be told apart{bias}."),
+        (not best.curve.biased, f"A bias of the torque and the zero of the twist are confounded{bias}."),
         (
             not best.curve.drifting,
-            "A drift of the twist with time is taken as zero: it takes two full torque cycles to tell it apart.",
+            "A drift of the twist with time is taken as zero: two full torque cycles are needed to determine it.",
         ),
         beyond_fitted(unseen.torque, fit.blocks.torque, fit.blocks.torque_noise),
         few_stretches(int(stretches(best.residual, fit.blocks.log)[-1]) + 1),
@@ -245,6 +246,6 @@ def _about_shape(report: Mapping[str, Any], fit: QuasiStaticFit) -> str:
     return (
         f"The {plain_shape(shape)} predict{'s' if shape == 'cubic' else ''} held-out stretches better "
         f"({formatting.quantity(better, 'rad')} rms, against {formatting.quantity(chosen, 'rad', like=better)}), but "
-        f"the logs do not determine all of its figures, so that the {plain_shape(fit.chosen)} stands: its stiffness is "
-        "a mean over the torque's range. Record several slow cycles over the whole range."
+        f"the logs do not determine all of its figures, so that the {plain_shape(fit.chosen)} is chosen: its "
+        "stiffness is a mean over the torque's range. Record several slow cycles over the whole range."
     )

@@ -1,4 +1,4 @@
-"""The figures that vendors state of a fitted torque-twist curve: slopes, knees, lost motion, width of the loop."""
+"""Vendors' figures of a fitted torque-twist curve: slopes, knees, lost motion, hysteresis width."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from fitting.quasi_static.stretches import correlation_length, stretches
 from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Memory, Shape, loop
 
 LOST_MOTION_SHARE = 0.04
-# Reaches that are tried for the width, over the torque's amplitude.
+# Memory lengths that are tried for the width, over the torque's amplitude.
 _REACHES = (0.02, 0.04, 0.08, 0.16, 0.32)
 _STIFFNESSES: dict[Shape, tuple[str, ...]] = {
     "linear": ("stiffness",),
@@ -30,12 +30,12 @@ def figures(fit: CurveFit, blocks: Blocks, rated_torque: float | None) -> dict[s
 
     Args:
         fit: The fit.
-        blocks: What was fitted.
+        blocks: The fitted data.
         rated_torque: [N m], or None; without it the figures that vendors define by it are unknown.
 
     Returns:
         By name: K or K1, K2, K3 with T1, T2, alpha, torque_bias, drift, hysteresis_torque, hysteresis_width,
-        hysteresis_loss, lost_motion and lost_motion_outer, as far as the curve has them.
+        hysteresis_loss, lost_motion and lost_motion_outer, where the curve has them.
     """
     found = scatter(fit.jacobian, fit.residual, stretches(fit.residual, blocks.log))
     steps = 1e-4 * ranges(blocks, fit.curve)[2]
@@ -72,7 +72,7 @@ def _shifts(curve: Curve, blocks: Blocks) -> Iterator[Figure]:
 
 
 def _loop(curve: Curve, blocks: Blocks, rated_torque: float | None) -> Iterator[Figure]:
-    """What the loop is like, and what vendors define by the rated torque."""
+    """Figures of the loop, and those that vendors define by the rated torque."""
     size, looped = blocks.amplitude, curve.memory is not None
     if looped:
         text = "friction torque behind the loop, half of its width along the torque"
@@ -103,10 +103,10 @@ def _between(curve: Curve, amplitude: float, torque: float, outer: bool, paramet
 
 
 def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:
-    """The width with an interval that holds for every law and reach of the memory that the logs do not rule out.
+    """The width with an interval valid for all laws and memory lengths that the logs do not exclude.
 
-    Without hysteresis the reach means nothing and the search has picked the one that fits noise best; the interval
-    around that one alone would miss zero too often (Davies 1987).
+    Without hysteresis the memory length is undefined, and the search selects the one that fits noise best. Its interval
+    alone would exclude zero too often (Davies 1987).
     """
     assert local.ci95 is not None
     curve, cluster = fit.curve, stretches(fit.residual, blocks.log)
@@ -127,7 +127,7 @@ def _width(fit: CurveFit, blocks: Blocks, local: Known) -> Known:
                 widths.append(_open(replace(curve, memory=memory), moved, blocks.amplitude))
     low, high = min(widths), max(widths)
     identifiable = not low <= 0.0 <= high
-    reason = "" if identifiable else f"it could be told from zero only above {max(-low, high):.2g} rad"
+    reason = "" if identifiable else f"it would be significantly nonzero only above {max(-low, high):.2g} rad"
     return replace(local, ci95=(low, high), identifiable=identifiable, reason=reason)
 
 

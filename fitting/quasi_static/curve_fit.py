@@ -1,8 +1,8 @@
 """The fit of one torque-twist curve to the blocks of quasi-static logs.
 
-Both axes are noisy, so that neither the regression of twist on torque nor the reverse is right: the first makes the
-drive too stiff, the second too soft. Each block's misfit is weighed by the noise of both axes, the torque's through the
-local slope (effective variance; York 1966, Fuller 1987 section 3.2).
+Both axes are noisy, so that both ordinary regressions are biased: twist on torque makes the drive too stiff, torque on
+twist too soft. Each block's misfit is weighted by the noise of both axes, the torque's through the local slope
+(effective variance; York 1966, Fuller 1987 section 3.2).
 """
 
 import itertools
@@ -15,24 +15,25 @@ from scipy.optimize import least_squares
 from fitting.quasi_static.differences import slopes
 from fitting.quasi_static.torque_twist import MEMORIES, Blocks, Curve, Shape, branch
 
-# Both signs of torque must reach this share of the largest before the curve's symmetry can show its centre.
+# Least share of the largest torque that both signs must reach for the curve's centre to be determined.
 _BOTH_SIGNS = 0.3
-# Full cycles before a drift with time can be told from the way there and back.
+# Least number of full cycles to separate a drift with time from hysteresis.
 _CYCLES_FOR_DRIFT = 2
-# Knees to start from, over the torque's amplitude.
+# Starting values of knees, over the torque's amplitude.
 _KNEES: dict[Shape, list[tuple[float, ...]]] = {
     "linear": [()],
     "cubic": [()],
     "two slopes": [(0.15,), (0.35,), (0.6,)],
     "three slopes": [(0.1, 0.35), (0.2, 0.6), (0.35, 0.7), (0.5, 0.8)],
 }
-# Likewise of reaches: finely, since only the few blocks after a reversal know the reach, and minima lie between them.
+# Starting values of memory lengths: finely spaced, since only the few blocks after a reversal determine it, with
+# several minima.
 _REACHES = np.geomspace(0.02, 0.45, 12)
 
 
 @dataclass(frozen=True, eq=False)
 class CurveFit:
-    """A curve with the parameters that fit best.
+    """A curve with its fitted parameters.
 
     Attributes:
         curve: Its form.
@@ -40,7 +41,7 @@ class CurveFit:
         residual: Measured less fitted twist over its noise, (n,).
         jacobian: Of the residual, (n, parameters).
         misfit: Measured less fitted twist [rad], (n,).
-        excess: Standard deviation [rad] of what noise does not explain of the misfit; part of the weights.
+        excess: Standard deviation [rad] of the misfit beyond noise; part of the weights.
     """
 
     curve: Curve
@@ -52,11 +53,11 @@ class CurveFit:
 
 
 def best_fit(blocks: Blocks, shape: Shape, hysteresis: bool) -> CurveFit:
-    """The best fit among the forms of one shape that the logs can tell something about, from several starting points.
+    """The best fit among the forms of one shape that the logs may determine, from several starts.
 
     Args:
-        blocks: To be fitted.
-        shape: Of the curve; its forms differ in their memory.
+        blocks: The data.
+        shape: Of the curve; its forms differ in their hysteresis.
         hysteresis: Whether the way there and back may differ.
     """
     low, high = float(np.min(blocks.torque)), float(np.max(blocks.torque))
@@ -69,11 +70,10 @@ def best_fit(blocks: Blocks, shape: Shape, hysteresis: bool) -> CurveFit:
 
 
 def fit_curve(blocks: Blocks, curve: Curve, start: np.ndarray) -> CurveFit:
-    """The curve of least misfit near a starting point, with weights that know how far the curve itself is off.
+    """The curve of least misfit near a starting point, with weights that include the curve's own error.
 
-    Where a curve errs by more than the noise, weights of the noise alone would favour the steepest curve, under which
-    the torque's noise excuses most. The excess is an error of the equation (Fuller 1987 section 3.1.2), ascribed to the
-    twist.
+    Where the misfit exceeds the noise, weights from noise alone would favour steep curves, under which the torque's
+    noise counts most. The excess is an error of the equation (Fuller 1987 section 3.1.2), ascribed to the twist.
     """
     fit = polish(blocks, curve, start, _excess(blocks, curve, start))
     for _ in range(3):
@@ -91,7 +91,8 @@ def _excess(blocks: Blocks, curve: Curve, parameters: np.ndarray) -> float:
 
 
 def starts(blocks: Blocks, curve: Curve) -> list[np.ndarray]:
-    """The best starting points of a grid over knees, bias and reach, no two with the same knees; the rest is linear."""
+    """The best starting points of a grid over knees, bias and memory length, with different knees; the other parameters
+    are linear."""
     size, middle = blocks.amplitude, 0.5 * float(np.max(blocks.torque) + np.min(blocks.torque))
     zeros = [(blocks.log == i).astype(float) for i in range(curve.logs)]
     zeros += [zero * blocks.centred_time for zero in zeros] if curve.drifting else []
@@ -133,18 +134,18 @@ def _parameters(
 def polish(
     blocks: Blocks, curve: Curve, start: np.ndarray, excess: float, weights: np.ndarray | None = None, *, most: int = 40
 ) -> CurveFit:
-    """The curve of least weighed misfit near a starting point.
+    """The curve of least weighted misfit near a starting point.
 
     Args:
-        blocks: To be fitted.
+        blocks: The data.
         curve: The form.
         start: Parameters.
-        excess: Standard deviation of what noise does not explain [rad].
-        weights: Of the blocks, (n,), or None for one each; zero leaves a block out, though it still moves the memory.
-        most: Evaluations.
+        excess: Standard deviation of the misfit beyond noise [rad].
+        weights: Of the blocks, (n,), or None for one each. A block of weight zero still acts on the hysteresis.
+        most: Largest number of evaluations.
 
     Returns:
-        The fit; residual and Jacobian carry the weights.
+        The fit; residual and Jacobian include the weights.
     """
     weights = np.ones_like(blocks.torque) if weights is None else weights
     twist_noise = math.hypot(blocks.twist_noise, excess)
@@ -169,9 +170,9 @@ def polish(
 
 
 def ranges(blocks: Blocks, curve: Curve) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least and largest value of each parameter, and what counts as a large change of it.
+    """Least and largest value of each parameter, and a large change of it.
 
-    Beyond lie only curves that the logs can't tell from a simpler one.
+    Curves beyond these limits are indistinguishable from simpler ones.
     """
     size, twist = blocks.amplitude, 0.5 * float(np.ptp(blocks.twist))
     step = float(np.median(np.abs(np.diff(blocks.torque)))) or 1e-3 * size
@@ -180,7 +181,7 @@ def ranges(blocks: Blocks, curve: Curve) -> tuple[np.ndarray, np.ndarray, np.nda
         "alpha": (-0.15 / twist**2, 30.0 / twist**2, 1.0 / twist**2),
         "log T1": knee,
         "log gap": knee,
-        # A branch that took longer to change would be a second stiffness.
+        # A branch that changes more slowly would act as a second stiffness.
         "log reach": (math.log(min(step, 0.1 * size)), math.log(0.5 * size), 1.0),
         "start": (-1.0 - 1e-3, 1.0 + 1e-3, 1.0),
         "offset": (-np.inf, np.inf, twist),

@@ -1,4 +1,4 @@
-"""What every report of quasi-static logs says alike: the drive, its logs and their health, versions, figures."""
+"""Common content of all quasi-static reports: the drive, its logs and their health, versions, figures."""
 
 import dataclasses
 import math
@@ -20,16 +20,16 @@ ARCMIN = math.degrees(1.0) * 60.0
 """Minutes of arc in a radian."""
 
 FEW_STRETCHES = 10
-"""Independent stretches below which intervals rest on little."""
+"""Number of independent stretches below which intervals are unreliable."""
 
 ABOUT_SCALE = (
-    "If the joint torque was not measured but computed, from gravity or a current, its errors of scale go into every "
+    "If the joint torque was not measured but computed, from gravity or a current, its scale error affects every "
     "stiffness in proportion."
 )
 
 
 def framed(data: QuasiStaticData, content: Mapping[str, Any]) -> dict[str, Any]:
-    """The content between what every report begins and ends with, with finite numbers and nulls only."""
+    """Content with the common first and last entries of a report; finite numbers and nulls only."""
     heading = {
         "schema": SCHEMA,
         "version": version("hdjax"),
@@ -71,19 +71,19 @@ def account(
 ) -> dict[str, Any]:
     """A fitted equation: figures, and rms errors by part of the data.
 
-    Folds of whole stretches select the model.
+    The model is selected by cross-validation over folds of whole stretches.
 
     Args:
         known: Figures, by name.
-        training: Misfit of what was fitted [rad], (n,).
-        selection: Likewise of the folds that were left out; schema 1 called them validation.
-        test: Likewise of test data, (m,); None where there are none.
+        training: Misfit of the fitted data [rad], (n,).
+        selection: Misfit of the held-out folds; schema 1 called them validation.
+        test: Misfit of test data, (m,); None where there are none.
     """
     return no_account() | {"parameters": estimates(known), "rmse": rmse_dict(training, selection, test)}
 
 
 def no_account() -> dict[str, Any]:
-    """Likewise where nothing was fitted."""
+    """The same where nothing was fitted."""
     return {"effects": [], "parameters": {}, "derived": {}, "rmse": rmse_dict(None, None)}
 
 
@@ -101,20 +101,20 @@ def estimates(known: Mapping[str, Known]) -> dict[str, Any]:
 
 
 def not_identifiable(names: list[str]) -> str:
-    """The beginning of a sentence that says so of some figures."""
+    """The beginning of a sentence about figures that are not identifiable."""
     return f"{formatting.words(names)} {'is' if len(names) == 1 else 'are'} not identifiable from these logs"
 
 
 def those_that_hold(notes: Sequence[tuple[Any, str]]) -> list[str]:
-    """The sentences whose condition holds."""
+    """The sentences whose condition is true."""
     return [sentence for holds, sentence in notes if holds]
 
 
 def few_stretches(count: int) -> tuple[bool, str]:
-    """What is said where the logs hold few independent stretches."""
+    """A warning where the logs hold few independent stretches."""
     return count < FEW_STRETCHES, (
-        f"What the curve leaves over is so correlated that the logs hold only {count} independent stretches: the "
-        "intervals are wide, and rest on little. Record more torque cycles."
+        f"The residual is so correlated that the logs hold only {count} independent stretches: the "
+        "intervals are wide and unreliable. Record more torque cycles."
     )
 
 

@@ -1,4 +1,4 @@
-"""All curves fitted to quasi-static logs of one drive, and the one that held-out stretches ask for."""
+"""Fits of all curves to quasi-static logs of one drive, and selection of one by cross-validation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ from fitting.quasi_static.torque_twist import SHAPES, Blocks, Shape
 
 @dataclass(frozen=True, eq=False)
 class QuasiStaticFit:
-    """The fits of all shapes, and which of them held-out stretches ask for.
+    """The fits of all shapes, and their held-out errors.
 
     Attributes:
-        blocks: What was fitted.
+        blocks: The fitted data.
         fits: By shape.
         known: Figures with intervals, by shape.
         held_out: Held-out misfit [rad] of each block, by shape.
@@ -35,10 +35,10 @@ class QuasiStaticFit:
 
     @cached_property
     def chosen(self) -> Shape:
-        """The simplest shape that predicts held-out stretches about as well as the best one, among those whose own
+        """The simplest shape that is not significantly worse than the best one on held-out stretches, among those whose
         figures the logs determine.
 
-        A shape that bends where the logs can't say how much describes their errors; the straight line always stands.
+        A bend that the logs do not determine would fit their errors; the straight line is always admissible.
         """
         able: list[Shape] = [shape for shape in SHAPES if shape == "linear" or self._is_determined(shape)]
         least = min(able, key=self._mean_square)
@@ -58,12 +58,13 @@ class QuasiStaticFit:
 
     @property
     def undetermined(self) -> Shape | None:
-        """A shape that predicts held-out stretches clearly better, but whose figures the logs do not determine."""
+        """A shape that predicts held-out stretches significantly better, but whose figures the logs do not
+        determine."""
         least = min(SHAPES, key=self._mean_square)
         return least if self.is_worse(self.chosen, least) else None
 
     def is_worse(self, one: Shape, other: Shape) -> bool:
-        """Whether the first shape predicts held-out stretches clearly worse than the second."""
+        """Whether the first shape predicts held-out stretches significantly worse than the second."""
         return worse(self.held_out[one], self.held_out[other], self.stretch, self.blocks.twist_noise)
 
 
@@ -76,8 +77,8 @@ def fit_quasi_static(
         logs: Of kind "quasi-static", checked by [`fitting.quasi_static.preparation.prepare`][]. All share the curve and
             the torque bias; each has its own twist zero and drift.
         rated_torque: [N m], or None; without it the figures that vendors define by it are unknown.
-        hysteresis: Whether the way there and back may differ; a joint that turns one way all the time shows no such
-            thing, since the direction of its friction follows the motion.
+        hysteresis: Whether loading and unloading may differ. A joint that always turns one way shows no hysteresis,
+            since the sign of its friction is constant.
 
     Returns:
         The fits.
@@ -91,9 +92,9 @@ def fit_quasi_static(
 
 
 def hold_out(blocks: Blocks, fit: CurveFit, stretch: np.ndarray) -> np.ndarray:
-    """Misfit [rad] of each block by the curve that was fitted without its stretch, (n,).
+    """Misfit [rad] of each block in the fit without its stretch, (n,).
 
-    The torque of a stretch that is held out still moves the hysteresis, since it is an input; its twist is unseen.
+    The torque of a held-out stretch still acts on the hysteresis, since it is an input; its twist is not used.
     """
     fold = folds(stretch)
     misfit = np.empty_like(blocks.twist)

@@ -1,4 +1,4 @@
-"""One form of an effect: columns beside the straight line, linear in their strengths.
+"""One form of an effect: regressors beside the straight line, linear in their strengths.
 
 twist = tau/K + zero of the log + sum of (strength times column)
 """
@@ -12,9 +12,9 @@ from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 
 START = "start"
-"""What names of initial states begin with, be they shape parameters or strengths."""
+"""Prefix of the names of initial states, whether shape parameters or strengths."""
 REST = "rest"
-"""What names of a rest's own level begin with."""
+"""Prefix of the names of a rest's level."""
 
 Columns = Callable[[Points, np.ndarray], np.ndarray]
 
@@ -26,15 +26,15 @@ class Form:
     Attributes:
         family: Name of the effect, as reports use it.
         name: Of the form.
-        columns: Columns (n, strengths) at points, for given shape parameters.
+        columns: Regressors (n, strengths) at points, for given shape parameters.
         strengths: Names of the strengths.
-        equation: What it adds to the twist.
-        figures: What a reader wants to know of it, from compliance, strengths and shape parameters in a row.
-        shapes: Values of the shape parameters to begin with, in rows of a grid, (grid, shape parameters).
+        equation: Its contribution to the twist.
+        figures: Its reported figures, as functions of compliance, strengths and shape parameters in a row.
+        shapes: Starting values of the shape parameters, in rows of a grid, (grid, shape parameters).
         shape_names: Names of the shape parameters; those that begin with "log " are logarithms.
         range: Least and largest value of each shape parameter, (2, shape parameters).
-        sign: Sign that physics asks of the first strength; zero for either.
-        of_torque: Whether its columns follow the torque, so that an error of the torque may pass for it.
+        sign: Physical sign of the first strength; zero for either.
+        of_torque: Whether its regressors depend on the torque, so that a torque error may imitate it.
     """
 
     family: str
@@ -51,12 +51,13 @@ class Form:
 
     @property
     def size(self) -> int:
-        """Number of strengths and shape parameters; where a log begins is none of them."""
+        """Number of strengths and shape parameters, without initial states."""
         return sum(not name.startswith(START) for name in (*self.strengths, *self.shape_names))
 
     @property
     def lasting(self) -> int:
-        """Number of strengths, the first ones, that hold in any log; the others are of one log's start or rest."""
+        """Number of strengths, the first ones, that are common to all logs; the others belong to one log's start or
+        rest."""
         return sum(not name.startswith((START, REST)) for name in self.strengths)
 
 

@@ -1,4 +1,4 @@
-"""Whether what a model leaves over depends on something, though on nothing that the catalogue holds."""
+"""Test for a dependence of the residual on a logged quantity, beyond the catalogue."""
 
 import math
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ _HARMONICS = 6
 
 @dataclass(frozen=True)
 class Leftover:
-    """What is left over, and on what it depends.
+    """A dependence of the residual.
 
     Attributes:
-        depends_on: The quantity.
-        explained_share: Share of the held-out mean square that a smooth function of it removes.
-        p_value: Chance that the best of the quantities does as well on noise.
+        depends_on: The quantity that it depends on.
+        explained_share: Share of the held-out mean square that a smooth function of the quantity explains.
+        p_value: Under the null distribution of the best quantity on noise.
     """
 
     depends_on: str
@@ -33,7 +33,7 @@ class Leftover:
 
 
 def leftover(held: Held, trial: TwistTrial, base: TwistTrial, seed: int) -> Leftover | None:
-    """The quantity of which a smooth function predicts the residual on unseen stretches; None where none does.
+    """The quantity of which a smooth function predicts the residual on held-out stretches; None without one.
 
     Args:
         held: The points.
@@ -72,7 +72,7 @@ def _given(columns: np.ndarray, points: Points, shape: np.ndarray) -> np.ndarray
 
 
 def _splines(values: np.ndarray) -> np.ndarray:
-    """Cubic splines with as many points between any two knots."""
+    """Cubic splines with equally many points between knots."""
     inner = np.unique(np.quantile(values, np.linspace(0, 1, _SPLINES - 2)))
     knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
     return BSpline.design_matrix(values, knots, 3).toarray()

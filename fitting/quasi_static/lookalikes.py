@@ -1,10 +1,10 @@
-"""What the torque-twist equation can't tell from a found effect whatever the fit, and the experiment that would."""
+"""Effects that the torque-twist equation can't distinguish from a found one, and the experiment that separates them."""
 
 import numpy as np
 
 from fitting.quasi_static.points import Points
 
-_CONSTANT = "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays away."
+_CONSTANT = "Hold a constant torque at a constant temperature: creep relaxes, and there is no thermal drift."
 _BOTH_WAYS = "Run the same path both ways: friction changes its sign, {} does not."
 _ALWAYS: dict[str, tuple[tuple[str, str], ...]] = {
     "kinematic_error": (
@@ -22,12 +22,12 @@ _ALWAYS: dict[str, tuple[tuple[str, str], ...]] = {
     "hysteresis": (
         (
             "motor_friction",
-            "Measure the torque at the output: friction on the motor's side is then out of the loop, hysteresis of the "
-            "gear stays.",
+            "Measure the torque at the output: the loop then contains hysteresis of the gear, but no friction on the "
+            "motor's side.",
         ),
         (
             "coulomb_friction",
-            "Cycle the torque with small loops inside large ones: hysteresis has a slope before it slides.",
+            "Cycle the torque with small loops inside large ones: hysteresis has a slope before sliding.",
         ),
     ),
     "motor_friction": (("load_friction", "Drive one side at a time, the other one uncoupled."),),
@@ -35,13 +35,13 @@ _ALWAYS: dict[str, tuple[tuple[str, str], ...]] = {
     "input_delay": (
         (
             "nonlinear_damping",
-            "Record a step of another quantity on both channels: a delay of the log is there as well, damping of the "
-            "mesh is not.",
+            "Record a step of another quantity on both channels: it shows a delay of the log, but no damping of the "
+            "mesh.",
         ),
     ),
     "temperature": (("creep", _CONSTANT),),
     "encoder_eccentricity": (
-        ("kinematic_error", "Turn the load's encoder on its shaft: its own error turns along, the gear's stays."),
+        ("kinematic_error", "Turn the load's encoder on its shaft: its own error turns along, the gear's does not."),
     ),
 }
 _ONE_WAY = {
@@ -52,8 +52,8 @@ _AT_REST = {
     "creep": (
         (
             "load_friction",
-            "Measure the torque at the output during the rest: gears creep under a constant torque, friction that "
-            "gives way slowly makes it change.",
+            "Measure the torque at the output during the rest: gears creep under a constant torque, while slowly "
+            "yielding friction changes it.",
         ),
     )
 }
@@ -61,7 +61,7 @@ _ON_POSITION = {
     "stiffness_shape": (
         (
             "encoder_eccentricity",
-            "Run the same path under another load: a bent stiffness follows the torque, an error of an encoder follows "
+            "Run the same path under another load: a nonlinear stiffness depends on the torque, an encoder error on "
             "the angle.",
         ),
     )
@@ -69,12 +69,12 @@ _ON_POSITION = {
 
 
 def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> list[tuple[str, str]]:
-    """Families whose columns are the same as a found one's on these logs, each with the experiment that separates.
+    """Families with the same regressors as a found one on these logs, each with the separating experiment.
 
     Args:
-        family: Of the effect that was found.
+        family: Of the found effect.
         points: Of the logs.
-        at_rest: Whether it was found while the joint rests.
+        at_rest: Whether it was found at rest.
     """
     told = (
         (True, _ALWAYS),
@@ -86,7 +86,7 @@ def lookalikes(family: str, points: Points, *, at_rest: bool = False) -> list[tu
 
 
 def _hangs_on_position(points: Points) -> bool:
-    """Whether the torque was a function of the load's angle, as where gravity loads a joint that moves."""
+    """Whether the torque was a function of the load's angle, as for a moving joint under gravity."""
     if points.load_angle is None:
         return False
     for own in points.logs:

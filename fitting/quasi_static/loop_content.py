@@ -1,4 +1,4 @@
-"""What the loop found on quasi-static logs, as `report.json` has it."""
+"""Content of a quasi-static loop's `report.json`."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -30,26 +30,26 @@ from fitting.quasi_static.test_part import Parted, misfit_on
 from fitting.quasi_static.twist_model import stiffness_of, strengths_of
 from fitting.report.rules import rules_dict
 
-# A residual this much larger than the noise of neighbouring points is slower than they are.
+# Ratio of residual and point-to-point noise above which the residual is slow.
 _NOISE = 2.0
-_TOLD_APART = "None is needed: the held-out stretches tell the two apart."
-_TIED = "Log more: several slow cycles at several loads, both ways, and a rest under load at the end."
+_TOLD_APART = "None is needed: the held-out stretches distinguish the two."
+_TIED = "Record more data: several slow cycles at several loads, both ways, and a rest under load at the end."
 _WRONG_WAY = (
-    "The loop runs the wrong way round, as if the gear gave out energy. Hysteresis of the gear alone can't do that; "
-    "friction on the motor's side does where the torque is a motor's current, since it bears a part of the torque that "
-    "the gear passes on, and so does a torque channel that lags behind."
+    "The loop has the wrong orientation, as if the gear generated energy. Hysteresis of the gear alone can't cause "
+    "that. Friction on the motor's side does where the torque is a motor's current, since it bears a part of the "
+    "torque that the gear transmits. So does a torque channel that lags."
 )
 _ALL_FRICTION = (
-    "The loop contains all friction between torque and twist: a torque measured on the motor's side, by its current "
-    "above all, counts friction of motor and bearings as hysteresis of the gear."
+    "The loop contains all friction between torque and twist: with a torque measured on the motor's side, mainly by "
+    "its current, friction of motor and bearings counts as hysteresis of the gear."
 )
 _SLOWER = (
-    "What is left over is slower than the twist's noise, and follows nothing that was logged, as far as held-out "
-    "stretches can tell: noise of that colour, an error of the torque, or too few cycles to tell an effect."
+    "The residual is slower than the twist's noise, and on held-out stretches depends on no logged quantity: "
+    "coloured noise, an error of the torque, or too few cycles to detect an effect."
 )
 _ONE_WAY = (
-    "The joint moved one way only: nothing is said of hysteresis, friction that is constant while it moves is a part "
-    "of the zero, and friction that depends on load or position is a part of the stiffness."
+    "The joint moved one way only: hysteresis is unknown. Friction that is constant during motion is part of the "
+    "zero, and friction that depends on load or position is part of the stiffness."
 )
 
 
@@ -58,7 +58,7 @@ def loop_report(parts: Parted, loop: QuasiStaticLoop) -> dict[str, Any]:
 
     Args:
         parts: The logs.
-        loop: On what of them may be fitted.
+        loop: On their fitted part.
     """
     points, after = loop.held.points, no_account()
     if loop.after is not loop.before:
@@ -114,7 +114,7 @@ def _account(parts: Parted, trial: TwistTrial) -> dict[str, Any]:
 
 
 def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
-    points, model, forms = loop.told_by(finding)
+    points, model, forms = loop.evidence_of(finding)
     parameters: dict[str, Any] = {}
     for form in forms:
         for name, known in estimates(strengths_of(points, model, form)).items():
@@ -138,7 +138,7 @@ def _effect(loop: QuasiStaticLoop, finding: Finding) -> dict[str, Any]:
 
 
 def _in_arcmin(name: str, known: Mapping[str, Any]) -> dict[str, Any]:
-    """The unit in which small angles are stated, beside SI; phases are not small."""
+    """Small angles in arcmin, beside SI; None for phases."""
     if known["unit"] != "rad" or known["value"] is None:
         return {}
     if name.startswith("phase"):
@@ -148,7 +148,7 @@ def _in_arcmin(name: str, known: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
-    """What the equation can't tell from an effect whatever the fit, then what was refitted in its place."""
+    """Effects that the equation can't distinguish from a found one, then those that were refitted in its place."""
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for one in loop.findings:
         for family, experiment in lookalikes(one.family, loop.held.points, at_rest=one.at_rest is not None):
@@ -161,7 +161,7 @@ def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
     for this in loop.rounds:
         if this.accepted and kept & set(this.winner.trial.beyond(this.before)):
             for rival in this.verdicts[1:]:
-                if _is_told(rival, this):
+                if _is_reported(rival, this):
                     pair, rmse = (rival.family, this.winner.name), (rival.trial.rmse, this.winner.trial.rmse)
                     experiment = _TOLD_APART if rival.separable else _TIED
                     entry = _alternative(pair, rival.name, rmse, rival.separable, experiment)
@@ -170,12 +170,12 @@ def _alternatives(loop: QuasiStaticLoop) -> list[dict[str, Any]]:
 
 
 def _slides_late(loop: QuasiStaticLoop, finding: Finding) -> bool:
-    """Whether the logs know the torque that it takes to change the branch; Coulomb friction takes none."""
+    """Whether the logs determine the torque over which the branch changes; for Coulomb friction it is zero."""
     return any(strengths_of(loop.held.points, loop.after.model, form)["reach"].identifiable for form in finding.forms)
 
 
-def _is_told(rival: TwistVerdict, this: TwistRound) -> bool:
-    """Whether a competitor is one form, and of another family than the winner or tied with it."""
+def _is_reported(rival: TwistVerdict, this: TwistRound) -> bool:
+    """Whether a candidate is a single form, and of another family than the winner or tied with it."""
     forms, taken = (verdict.trial.beyond(this.before) for verdict in (rival, this.winner))
     same = forms[0].family in {form.family for form in taken}
     return len(forms) == 1 and not (same and rival.separable)
@@ -202,7 +202,7 @@ def _unexplained(loop: QuasiStaticLoop) -> dict[str, Any]:
 
 
 def _summary(report: Mapping[str, Any]) -> str:
-    """The decision in plain words."""
+    """The decision in a few sentences."""
     effects, before = report["after"]["effects"], report["before"]["rmse"][report["judged_on"]]
     families = [one["family"].replace("_", " ") for one in effects]
     if report["decision"] == "model_sufficient":
@@ -218,12 +218,12 @@ def _summary(report: Mapping[str, Any]) -> str:
         return f"{count} found: {formatting.words(families)}.{change}"
     left = report["unexplained"]
     part = f" A part was found ({formatting.words(families)}).{change}" if families else ""
-    depends = "depends on nothing that was logged"
+    depends = "depends on no logged quantity"
     if left["depends_on"] is not None:
         share = formatting.percent(left["explained_share"])
-        depends = f"depends on the {left['depends_on']}, which accounts for {share} of it on unseen stretches"
+        depends = f"depends on the {left['depends_on']}, which explains {share} of it on held-out stretches"
     return (
-        f"Something is missing that the catalogue does not explain.{part} What is left over, "
+        f"Something is missing that the catalogue does not explain.{part} The residual, "
         f"{formatting.number(left['times_noise'])} times the twist's noise, {depends}."
     )
 
@@ -235,12 +235,12 @@ def _nothing_found(report: Mapping[str, Any], before: float) -> str:
         f"on {on} it errs by {formatting.quantity(before, 'rad')} rms "
         f"({formatting.number(before / noise)} times the twist's noise)"
     )
-    tried = f"none of the {report['forms_tried']} forms of missing physics that were tried gains more than chance would"
+    tried = f"none of the {report['forms_tried']} tried forms of missing physics has a significant gain"
     if before < _NOISE * noise:
         return f"The straight line suffices: {errs}, and {tried}."
     return (
         f"Nothing more than a straight line is supported: {errs}, but {tried}, "
-        "and what is left over depends on nothing that was logged."
+        "and the residual depends on no logged quantity."
     )
 
 
@@ -268,21 +268,19 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
         (slower, _SLOWER),
         (
             True,
-            f"The torque is still off by {formatting.quantity(points.torque_error, 'N m')} rms when its noise is taken "
-            f"off, which is {error} of twist: an effect that follows the torque and is smaller than that can't be "
-            "seen.",
+            f"After smoothing, the torque has an error of {formatting.quantity(points.torque_error, 'N m')} rms, "
+            f"which is {error} of twist: a smaller effect that depends on the torque can't be detected.",
         ),
         ("one way" in points.motion, _ONE_WAY),
         (
             own is not None,
-            "At rest the twist may as well follow the torque as logged, with a stiffness of "
-            f"{formatting.quantity(own, 'N m/rad')}, which the logs as a whole rule out. Where the stiffness of the "
-            "whole logs is none of the gear alone, since it holds friction or an encoder's error, that would be no "
-            "creep.",
+            "At rest the twist may also depend on the torque as logged, with a stiffness of "
+            f"{formatting.quantity(own, 'N m/rad')}, which the whole logs exclude. If their stiffness is not that of "
+            "the gear alone, since it contains friction or an encoder's error, there may be no creep.",
         ),
         (
             not parts.tests,
-            "The logs are too short to set test data aside: no error is stated on data that no choice has seen. Name "
+            "The logs are too short to set test data aside: no error on unused data is stated. Name "
             "another log with --test.",
         ),
         beyond_fitted(unseen, points.torque, points.torque_error),

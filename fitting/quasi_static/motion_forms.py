@@ -1,4 +1,4 @@
-"""Effects of a joint that moves: ripples in an angle, and friction on the motor's side."""
+"""Effects of a moving joint: ripples in an angle, and friction on the motor's side."""
 
 import math
 from collections.abc import Iterator
@@ -11,12 +11,12 @@ from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
 
 HIGHEST_ORDER = 12
-# Points that a period must have for its order to be seen.
+# Least number of points per period of an order.
 _POINTS_IN_PERIOD = 6
 
 
 def motion_forms(points: Points) -> Iterator[Form]:
-    """The forms that the logs can tell something about, the more usual ones first; none where no joint moved."""
+    """The forms that the logs may determine, the more common ones first; none where no joint moved."""
     if points.direction is not None:
         yield from _of_the_motor_angle(points)
         yield from _eccentricity(points)
@@ -24,7 +24,8 @@ def motion_forms(points: Points) -> Iterator[Form]:
 
 
 def orders_seen(angle: np.ndarray | None, points: Points, highest: int) -> list[int]:
-    """Orders of an angle of which the logs hold a full period, with enough points in it; none where it is unknown."""
+    """Orders of an angle with a full period and enough points per period in the logs; none where the angle is
+    unknown."""
     if angle is None:
         return []
     travel = max(float(np.ptp(angle[own])) for own in points.logs)
@@ -117,7 +118,7 @@ def _friction(points: Points) -> Iterator[Form]:
         "Coulomb friction",
         partial(_direction, False),
         ("friction", *rests),
-        "twist = (tau - F sgn(speed))/K, and at rest a level of its own",
+        "twist = (tau - F sgn(speed))/K, and at rest a free level",
         (friction,),
     )
     yield Form(
@@ -125,7 +126,7 @@ def _friction(points: Points) -> Iterator[Form]:
         "Coulomb friction that grows with the load",
         partial(_direction, True),
         ("friction", "share of load", *rests),
-        "twist = (tau - (F + m |tau|) sgn(speed))/K, and at rest a level of its own",
+        "twist = (tau - (F + m |tau|) sgn(speed))/K, and at rest a free level",
         (
             friction,
             Figure("share_of_load", lambda own: -own[2] / own[0], "1", "by which the friction grows with the torque"),

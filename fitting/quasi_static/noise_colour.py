@@ -1,7 +1,6 @@
-"""What chance might have left over instead: noise of the residual's own colour, from an autoregressive process.
+"""Surrogates of the residual: noise of the same spectrum from an autoregressive process.
 
-Surrogates with random phases return to where they began, which slow noise does not; against slow effects that would be
-too little chance.
+Surrogates with random phases are periodic, which slow noise is not; p-values of slow effects would be too small.
 """
 
 import numpy as np
@@ -11,18 +10,17 @@ from scipy.signal import lfilter
 from fitting.first_order.spectral_lines import without_lines
 
 DRAWS = 999
-"""Draws: cheap here, and with fewer a chance of one in a hundred would itself be a matter of chance."""
+"""Number of surrogates: enough to determine a p-value of 0.01 accurately."""
 
 _HIGHEST_ORDER = 30
-# Values of the process before the first that counts, over its order at most.
+# Length of the discarded start-up of the process, over its largest order.
 _WARM_UP = 2000
 
 
 def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Draws of Gaussian noise with the spectrum of a residual, (draws, n).
 
-    Lines that stand out of their surroundings are cut down first: they are no colour of noise, but what a periodic
-    effect leaves.
+    Significant spectral lines are reduced first: they are not noise, but may be caused by a periodic effect.
 
     Args:
         residual: In order of time, evenly spaced or nearly, (n,).
@@ -36,7 +34,7 @@ def noise_of_the_same_colour(residual: np.ndarray, random: np.random.Generator) 
 
 
 def autoregression(series: np.ndarray) -> tuple[np.ndarray, float]:
-    """The autoregressive process that predicts a series best, its order chosen by Akaike's criterion.
+    """The autoregressive process of a series, its order chosen by Akaike's criterion.
 
     Args:
         series: Of mean zero, (n,).

@@ -1,4 +1,4 @@
-"""Pictures of quasi-static fits and loops, as plotly figures in plain dictionaries."""
+"""Plots of quasi-static fits and loops, as plotly figures in plain dictionaries."""
 
 import numpy as np
 
@@ -19,12 +19,12 @@ _IN_TIME = ("creep", "motor_friction", "temperature")
 
 
 def fit_pictures(fit: QuasiStaticFit) -> list[Plot]:
-    """All pictures of a fit, in the order of the page."""
+    """All plots of a fit, in the order of the page."""
     return [_loops(fit), _misfit_by_torque(fit), _misfit_by_time(fit)]
 
 
 def _loops(fit: QuasiStaticFit) -> Plot:
-    """Twist against torque: the blocks, and the curve that was fitted to them."""
+    """Twist against torque: the blocks and the fitted curve."""
     blocks, best = fit.blocks, fit.best
     measured = blocks.twist - best.curve.zero(best.parameters, blocks)
     factor, label = _scaled(measured, "twist")
@@ -50,8 +50,8 @@ def _misfit_by_torque(fit: QuasiStaticFit) -> Plot:
     return Plot(
         "misfit-torque",
         "left_over",
-        "What the curve leaves over, against torque",
-        "A bend that is the same both ways belongs to the curve's shape; one that differs belongs to the hysteresis.",
+        "Residual against torque",
+        "A bend that is equal both ways is due to the curve's shape; one that differs is due to hysteresis.",
         _against(_by_direction(fit.blocks, factor * fit.best.misfit, name="misfit"), 300, "joint torque [N m]", label),
     )
 
@@ -67,21 +67,21 @@ def _misfit_by_time(fit: QuasiStaticFit) -> Plot:
     return Plot(
         "misfit-time",
         "left_over",
-        "What the curve leaves over, against time",
-        "A slope is a drift, a slow wave an effect that the curve lacks; the intervals allow for both as far as they "
-        "look like chance.",
+        "Residual against time",
+        "A slope is a drift, a slow wave an effect that the curve lacks; the intervals account for both where they "
+        "look random.",
         _against(traces, 300, "time from the start [s]", label),
     )
 
 
 def loop_pictures(loop: QuasiStaticLoop) -> list[Plot]:
-    """All pictures, in the order of the page: the curve, the errors, then one an effect."""
+    """All plots, in the order of the page: the curve, the errors, then one per effect."""
     return [_curve(loop), _errors(loop), *(_evidence(loop, one) for one in loop.findings)]
 
 
 def _curve(loop: QuasiStaticLoop) -> Plot:
     points, model = loop.held.points, loop.after.model
-    # Each log's zero is of no interest.
+    # Without each log's zero.
     zeros = slice(1, 1 + len(points.names))
     measured = points.twist - model.jacobian[:, zeros] @ model.coefficients[zeros]
     factor, label = _scaled(measured, "twist")
@@ -91,7 +91,7 @@ def _curve(loop: QuasiStaticLoop) -> Plot:
         "curve",
         "fit",
         "Twist against joint torque",
-        "Measured, and what the final equation gives along the logged torque and angles, each less the log's zero.",
+        "Measured twist, and that of the final equation for the logged torque and angles, without each log's zero.",
         _against(traces, 440, "joint torque [N m]", label),
     )
 
@@ -110,7 +110,7 @@ def _errors(loop: QuasiStaticLoop) -> Plot:
         "errors",
         "left_over",
         "Held-out errors, step by step",
-        "Measured less predicted twist; each stretch by a fit that has not seen it. Several logs stand in a row.",
+        "Measured minus predicted twist of each held-out stretch. Several logs are shown one after the other.",
         _against(traces, 340, "time [s]", label),
     )
 
@@ -118,7 +118,7 @@ def _errors(loop: QuasiStaticLoop) -> Plot:
 def _evidence(loop: QuasiStaticLoop, finding: Finding) -> Plot:
     if finding.family in _ORDERS:
         return _spectrum(loop, finding)
-    points, model, forms = loop.told_by(finding)
+    points, model, forms = loop.evidence_of(finding)
     own = contribution(model, forms)
     factor, label = _scaled(own + model.misfit, "twist")
     if finding.family in _IN_TIME:
@@ -131,7 +131,7 @@ def _evidence(loop: QuasiStaticLoop, finding: Finding) -> Plot:
         f"evidence-{finding.family}",
         "found",
         f"Evidence for {finding.family.replace('_', ' ')}",
-        "The measured twist less everything else that was fitted, and what the effect adds.",
+        "The measured twist without all other fitted terms, and the effect's contribution.",
         _against(traces + _fitted_lines(points, at, factor * own), 360, x, label),
     )
 
@@ -155,14 +155,14 @@ def _spectrum(loop: QuasiStaticLoop, finding: Finding) -> Plot:
         f"evidence-{finding.family}",
         "found",
         f"Evidence for {finding.family.replace('_', ' ')}: orders of the {side}'s angle",
-        f"Amplitude of waves in the twist that repeat so many times in a revolution of the {side}, without and with "
+        f"Amplitude of each harmonic of the {side}'s revolution in the twist, without and with "
         "the effect in the equation, while the joint moves.",
         _against(traces, 360, f"order of the {side}'s revolution", label),
     )
 
 
 def _scaled(values: np.ndarray, name: str) -> tuple[float, str]:
-    """The factor that makes angles [rad] read well, and the label of their axis."""
+    """Scale factor of angles [rad], and the label of their axis."""
     factor, unit = scaled_unit(float(np.max(np.abs(values))), "rad")
     return factor, axis_label(name, unit)
 
@@ -184,7 +184,7 @@ def _by_direction(data: Blocks | Points, values: np.ndarray, *, name: str) -> li
 
 
 def _fitted_lines(data: Blocks | Points, x: np.ndarray, values: np.ndarray) -> list[Figure]:
-    """What was fitted, log by log."""
+    """The fitted lines, log by log."""
     several = len(data.names) > 1
     return [
         _drawn(x[own], values[own], mode="lines", color=INK, name=f"fitted, {name}" if several else "fitted")

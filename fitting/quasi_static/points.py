@@ -1,9 +1,8 @@
-"""Points of a quasi-static log for the loop: every row counts, at rest or moving, and the torque without its noise.
+"""Points of a quasi-static log for the loop, at rest and moving, with smoothed torque.
 
-The rows are averaged only as far as it takes to have few thousands of them, since ripples and relaxations are fast. The
-torque's noise is taken off by local cubics instead (Savitzky and Golay 1964) whose width Stein's estimate of the risk
-chooses (Stein 1981): noise that stayed in the torque would be explained by whatever candidate smooths it. The estimate
-also says how far the torque is still off.
+Rows are averaged only down to a few thousand points, since ripples and relaxations are fast. The torque is smoothed by
+local cubics (Savitzky and Golay 1964) of a width chosen by Stein's estimate of the risk (Stein 1981). Otherwise
+candidates that smooth the torque would seem to gain. The estimate also gives the remaining error of the torque.
 """
 
 import math
@@ -20,11 +19,11 @@ from fitting.quasi_static.blocks import means, noise, turns
 from fitting.quasi_static.preparation import MOVES, Motion, speed_of, torque_of
 
 MOST_POINTS = 2000
-# Of local cubics, in rows; even the widest keeps ten of them in a log.
+# Half-widths of local cubics, in rows; a log holds ten of even the widest.
 _WIDTHS = (5, 7, 9, 13, 19, 27, 37, 53, 75, 105, 149, 211, 299)
-# A joint slower than this share of its usual speed is at rest.
+# Share of the usual speed below which a joint is at rest.
 _AT_REST = 0.05
-# Points that a rest must last to have a level of its own.
+# Least number of points in a rest with its own level.
 _SHORTEST_REST = 5
 
 
@@ -34,23 +33,23 @@ class Points:
 
     Attributes:
         torque: Joint torque without its noise [N m], (n,).
-        logged_torque: With it [N m], (n,).
+        logged_torque: With noise [N m], (n,).
         twist: [rad], less its mean in its log, (n,).
         time: From the start of its log [s], (n,).
-        log: Number of the log that a point is from, (n,), rising.
+        log: Number of each point's log, (n,), rising.
         motor_angle: theta_m [rad], (n,), or None where a log has none.
         load_angle: theta_l [rad], (n,), or None.
         direction: Sign of the joint's speed, zero at rest, (n,), or None where no joint moved.
-        rest: Number of the rest that a point belongs to, -1 while the joint moves or where no joint does, (n,).
+        rest: Number of each point's rest, -1 while the joint moves or where no joint does, (n,).
         temperature: [K], (n,), or None.
         motion: How the joint moved, by log.
         names: Of the logs.
         torque_noise: Standard deviation of the noise of one row's torque [N m].
-        torque_error: Root mean square error of `torque` [N m]: what noise is left, and what smoothing has rounded off.
+        torque_error: Rms error of `torque` [N m]: remaining noise and smoothing error.
         twist_noise: Of a point's twist [rad].
         rows: Rows in a point, by log.
         reversals: Of the torque, by log.
-        reference: Points whose middle torque and mean temperature count; its own where it is None.
+        reference: Points that supply middle torque and mean temperature; these points where None.
     """
 
     torque: np.ndarray
@@ -78,7 +77,7 @@ class Points:
         return tuple(np.flatnonzero(self.log == i) for i in range(len(self.names)))
 
     def in_each_log(self, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """What a function of the points of one log gives, over all logs, (n,)."""
+        """A function of one log's points, evaluated for all logs, (n,)."""
         return np.concatenate([of(own) for own in self.logs])
 
     @cached_property
@@ -98,7 +97,7 @@ class Points:
 
     @cached_property
     def centre(self) -> float:
-        """Torque about which bends are counted [N m]: zero where both signs occur, else the middle of the range."""
+        """Reference torque of nonlinear terms [N m]: zero where both signs occur, else the middle of the range."""
         if self.reference is not None:
             return self.reference.centre
         low, high = float(np.min(self.torque)), float(np.max(self.torque))
@@ -145,7 +144,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
         torque_error=torque_error,
         twist_noise=max(twist_noise, 1e-7 * max(float(np.ptp(part["twist"])) for part in parts)),
         rows=tuple(round(len(one) / size) for one, size in zip(logs, sizes, strict=True)),
-        # As coarse as it takes for turns to stand out of the torque's noise.
+        # Coarse enough for reversals to exceed the torque's noise.
         reversals=tuple(len(turns(torque_of(one), max(1, len(one) // 200))) for one in logs),
     )
 
@@ -172,9 +171,9 @@ def _points(log: Log, motion: Motion, ratio: float | None, most: int) -> dict[st
 
 
 def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """A course without its white noise, whose size third differences tell, and the root mean square error left.
+    """A signal without its white noise, estimated from third differences, and the remaining rms error.
 
-    Among local cubics of all widths, and the values as they are, that of the least expected square error.
+    The smoother of least expected squared error among local cubics of all widths, and no smoothing.
 
     References:
         Stein 1981, Annals of Statistics 9(6), equation 2.5; Savitzky and Golay 1964, Analytical Chemistry 36(8).
@@ -186,7 +185,7 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
             break
         smooth = np.asarray(savgol_filter(values, width, 3))
         own_share = float(savgol_coeffs(width, 3)[width // 2])
-        # The variance of what is left is a local cubic's, whatever the estimate of the rounding says.
+        # The error is at least the variance of the local cubic.
         risk = max(float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance)
         if risk < least:
             best, least = smooth, risk
@@ -194,7 +193,7 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _rests(at_rest: np.ndarray, log: np.ndarray) -> np.ndarray:
-    """Number of the rest of each point, -1 elsewhere; short ones are reversals of the motion."""
+    """Number of each point's rest, -1 elsewhere; short rests are reversals of the motion."""
     run = np.cumsum((np.diff(log, prepend=0) != 0) | np.diff(at_rest, prepend=at_rest[0]))
     lasting = np.flatnonzero(np.bincount(run, at_rest) >= _SHORTEST_REST)
     return np.where(np.isin(run, lasting), np.searchsorted(lasting, run), -1)

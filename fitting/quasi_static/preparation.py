@@ -1,4 +1,4 @@
-"""Quasi-static logs made ready for their fit: how the joint moved, which rows count, and what is refused."""
+"""Preparation of quasi-static logs: motion of the joint, valid rows, and checks that refuse a log."""
 
 import math
 from collections.abc import Sequence
@@ -21,24 +21,23 @@ from fitting.quasi_static.torque_sign import compliance
 Motion = Literal["held", "one way", "both ways", "unknown"]
 MOVES: tuple[Motion, ...] = ("one way", "both ways")
 
-# Ten times what strain-wave gears twist by at their peak torque (vendors' catalogues); springs of elastic joints twist
-# farther.
+# Ten times the twist of strain-wave gears at peak torque (vendors' catalogues); springs of elastic joints twist more.
 GEAR_TWIST = 0.1
-# No spring between motor and load is wound up by so much, unless the drive file says so.
+# Largest possible twist of a spring between motor and load, unless the drive file states another.
 _TURN = 2.0 * math.pi
-# Assumed: the part of the typical speed above which friction is that of steady motion.
+# Assumed: share of the typical speed above which the motion counts as steady.
 _STEADY = 0.7
-# Correlation of means over a hundredth of the log; even a wide loop stays above it.
+# Least correlation of means over a hundredth of the log; even a wide loop has more.
 _UNRELATED = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class QuasiStaticData:
-    """Logs of one drive, ready to be fitted.
+    """Prepared logs of one drive.
 
     Attributes:
         drive_file: The drive.
-        logs: Of the rows that count.
+        logs: With valid rows only.
         motion: How the joint moved in each log.
         findings: By name of the log.
     """
@@ -50,19 +49,19 @@ class QuasiStaticData:
 
 
 def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False) -> QuasiStaticData:
-    """Check quasi-static logs and leave out the rows in which friction has no known sign.
+    """Check quasi-static logs and omit the rows in which friction has no known sign.
 
     Args:
         logs: Of kind "quasi-static".
         drive_file: The drive that they were read with.
-        at_rest: Whether rows at rest of a joint that moved stay, for who reckons with friction of their own. What
-            depends on the angle may then hide how the twist follows the torque, too.
+        at_rest: Whether rows at rest of a moving joint are kept, for models with friction at rest. Angle-dependent
+            effects may then also mask how the twist depends on the torque.
 
     Returns:
         What can be fitted.
 
     Raises:
-        DataError: A log can't be fitted; the sentence says why.
+        DataError: A log can't be fitted; the message states why.
     """
     ready, motions, findings = [], [], {}
     for log in logs:
@@ -84,7 +83,7 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
 
 
 def believed(log: Log) -> Log:
-    """The rows in which torque and angles were measured; findings of the reader tell of the others."""
+    """The rows in which torque and angles are valid; the reader's findings report the others."""
     masks = [mask for mask in (log.trusted, log.input_known) if mask is not None]
     return replace(_rows(log, np.logical_and.reduce([np.isfinite(log.time), *masks])), trusted=None, input_known=None)
 
@@ -96,14 +95,14 @@ def torque_of(log: Log) -> np.ndarray:
 
 
 def _wide_twist(log: Log, most: float | None) -> tuple[Finding, ...]:
-    """A warning where the twist is wider than a gear's, unless the drive file says how far the joint may twist.
+    """A warning where the twist exceeds that of gears, unless the drive file states the largest twist.
 
     Args:
         log: The log.
-        most: What the drive file says [rad], or None.
+        most: Largest twist of the drive file [rad], or None.
 
     Raises:
-        DataError: The twist is wider than the drive file says.
+        DataError: The twist exceeds that of the drive file.
     """
     span = float(np.ptp(log.twist))
     if span <= (most or GEAR_TWIST):
@@ -122,22 +121,22 @@ def _wide_twist(log: Log, most: float | None) -> tuple[Finding, ...]:
     return (
         Finding(
             "warning",
-            f"the twist spans {span:.3g} rad, ten times what strain-wave gears bear",
+            f"the twist spans {span:.3g} rad, ten times the range of strain-wave gears",
             "twist",
-            f"unless its spring is so soft (state largest_twist in [drive], and this is not said again), {remedy}",
+            f"unless its spring is so soft (then state largest_twist in [drive]), {remedy}",
         ),
     )
 
 
 def _refuse_mix_ups(log: Log, speed: np.ndarray, *, moves: bool, must_follow: bool) -> tuple[Finding, ...]:
-    """Refuse a torque of the wrong sign, and a twist that does not follow the torque; a warning where the sign seems
-    wrong, but one stretch of the log decides.
+    """Refuse a torque of the wrong sign, and a twist that does not depend on the torque; warn where only one stretch of
+    the log indicates a wrong sign.
 
     Args:
-        log: Of the rows that count.
+        log: With valid rows only.
         speed: Of the joint there [rad/s].
         moves: Whether the joint moved.
-        must_follow: Whether the torque must be seen in the twist.
+        must_follow: Whether the twist must depend on the torque.
     """
     torque, twist = torque_of(log), log.twist
     slope, classical, robust = compliance(log, speed, moves=moves)
@@ -147,7 +146,7 @@ def _refuse_mix_ups(log: Log, speed: np.ndarray, *, moves: bool, must_follow: bo
         )
     size = max(1, len(log) // 100)
     with np.errstate(invalid="ignore"):
-        # Means that never change have no correlation.
+        # Constant means have no correlation.
         likeness = float(np.nan_to_num(np.corrcoef(means(torque, size), means(twist, size))[0, 1]))
     if must_follow and abs(slope) < classical and abs(likeness) < _UNRELATED:
         raise DataError(
@@ -161,14 +160,14 @@ def _refuse_mix_ups(log: Log, speed: np.ndarray, *, moves: bool, must_follow: bo
             "warning",
             f"the twist seems to fall where the joint torque rises (by {-slope:.2g} rad/(N m)), as no spring does",
             "joint_torque",
-            "the logs hold too little to be sure: unless another effect does this, give the torque or the twist sign = "
-            "-1 in [columns]",
+            "the logs are not conclusive: unless another effect causes this, give the torque or the twist sign = -1 "
+            "in [columns]",
         ),
     )
 
 
 def speed_of(log: Log, ratio: float | None) -> np.ndarray:
-    """Speed of the joint [rad/s], smoothed over a few rows; not a number where nothing tells it.
+    """Speed of the joint [rad/s], smoothed over a few rows; NaN where it is unknown.
 
     Args:
         log: The log.
@@ -194,7 +193,7 @@ def _motion(log: Log, speed: np.ndarray) -> Motion:
 
 
 def _travel(log: Log, speed: np.ndarray) -> float:
-    """How far the joint got [rad]."""
+    """Range of the joint's motion [rad]."""
     return float(np.ptp(cumulative_trapezoid(speed, log.time, initial=0)))
 
 
@@ -203,10 +202,10 @@ def _is_steady(speed: np.ndarray) -> np.ndarray:
 
 
 def _steady(log: Log, speed: np.ndarray) -> tuple[Log, tuple[Finding, ...]]:
-    """The rows of steady motion of a joint that moved.
+    """The rows of steady motion of a moving joint.
 
-    While a joint moves, friction is a torque of known sign. At rest it takes any value up to sticking, so that rows at
-    rest don't belong to the same curve.
+    While a joint moves, friction is a torque of known sign. At rest it may have any value up to the breakaway torque,
+    so that rows at rest do not lie on the same curve.
     """
     steady = _is_steady(speed)
     left_out = int(np.sum(~steady))

@@ -18,12 +18,12 @@ from fitting.report.web_page import environment
 
 
 def write_report(out: Path, report: Mapping[str, Any], shown: Sequence[Plot]) -> Path:
-    """Write `report.html` and `report.json`: both, whole, or none.
+    """Write `report.html` and `report.json`, both or neither.
 
     Args:
-        out: Folder; made where absent.
+        out: Folder; created where absent.
         report: Of a fit or of a loop.
-        shown: Its pictures.
+        shown: Its plots.
 
     Returns:
         The page's path.
@@ -35,7 +35,7 @@ def write_report(out: Path, report: Mapping[str, Any], shown: Sequence[Plot]) ->
 
 
 def report_page(report: Mapping[str, Any], shown: Sequence[Plot]) -> str:
-    """The page: self-contained, reads without a network."""
+    """The page, self-contained, without network access."""
     filters = {
         "value": _value,
         "interval": lambda k: "—" if None in k["ci95"] else formatting.interval(k["ci95"], k["std"], k["unit"]),
@@ -50,7 +50,7 @@ def report_page(report: Mapping[str, Any], shown: Sequence[Plot]) -> str:
 
 
 def _value(known: Mapping[str, Any]) -> str:
-    """A figure, and beside radians the unit in which vendors state small angles."""
+    """A figure; small angles in arcmin as well, as vendors state them."""
     if known["value"] is None:
         return "unknown"
     small = known["unit"] == "rad" and known.get("arcmin", known) is not None

@@ -1,13 +1,12 @@
-"""What the twist does while a joint rests: whether it relaxes after the stop, or follows the torque as logged.
+"""Analysis of the twist at rest: relaxation after a stop, or dependence on the logged torque.
 
-A rest is quiet: no ripple, no eccentricity, and friction holds one way. What creeps then stands far above the noise,
-though a look at the whole log, most of whose error arises while the joint moves, can't see it. So each rest is taken as
-a log of its own, with a zero of its own (friction bears any part of the torque there), and looked at as logs are.
+At rest there is no ripple or eccentricity, and friction is constant. Creep is then far above the noise, while in the
+whole log errors during motion mask it. So each rest is treated as a log with its own zero (friction may bear any part
+of the torque there).
 
-A torque whose noise hides its course leaves something over even where the twist follows it, so that a relaxation has to
-be called for whichever of the two is taken to be the noisy one: beside the torque in the twist, and beside the twist in
-the torque. There the twist may follow the torque with any stiffness that the whole logs allow. Where they allow none
-that would do, but one of the rests' own would, the two explanations stay tied.
+A noisy torque leaves a residual even where the twist depends on it. So a relaxation must be significant both beside the
+torque in the twist, and beside the twist in the torque. There the stiffness may be any that the whole logs allow. Where
+only a stiffness that they exclude explains the rests, the two explanations are tied.
 """
 
 import math
@@ -24,27 +23,27 @@ from fitting.quasi_static.points import Points
 from fitting.quasi_static.torque_forms import delay
 from fitting.quasi_static.twist_model import stiffness_of
 
-# Assumed: a stop rings for a tenth of a rest, or a quarter of a second [s] where that is less.
+# Assumed: oscillation after a stop lasts a tenth of a rest, or a quarter of a second [s] where that is less.
 _RINGING, _LONGEST_RINGING = 0.1, 0.25
-# Points that tell a relaxation from a straight line and noise.
+# Least number of points to separate a relaxation from a straight line and noise.
 _FEWEST = 50
 _MOST_RESTS = 10
 _POINTS_IN_CONSTANT, _CONSTANTS = 8, 12
-# This is a second look at the same logs.
+# Significance level of this second test on the same logs.
 _SIGNIFICANCE = 0.5 * RULES.significance
 
 
 @dataclass(frozen=True, eq=False)
-class RestLook:
-    """A look at what the twist does at rest.
+class RestAnalysis:
+    """Result of the analysis of rests.
 
     Attributes:
         points: At rest, each rest as a log.
-        round: The look at what may explain them.
-        p_value: Chance that noise asks for as much, be it the twist's or the torque's.
-        own_stiffness: Stiffness with which the twist may follow the torque at rest instead, though the whole logs rule
-            it out [N m/rad]; None where no stiffness would do.
-        terms: The effect that was found, beside the equation of the whole logs; none where nothing was.
+        round: The round of attribution at rest.
+        p_value: The larger one under noise of the twist and of the torque.
+        own_stiffness: Stiffness that explains the rests instead, though the whole logs exclude it [N m/rad]; None
+            without one.
+        terms: The accepted effect, beside the equation of the whole logs; empty without one.
     """
 
     points: Points
@@ -64,12 +63,12 @@ class RestLook:
         return 1.0 - self.after.rmse / self.round.before.rmse
 
 
-def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None:
-    """Look at the rests of joints that moved; None where no rest is long enough.
+def analyse_rests(held: Held, current: TwistTrial, seed: int) -> RestAnalysis | None:
+    """Analyse the rests of moving joints; None where no rest is long enough.
 
     Args:
         held: The points of whole logs.
-        current: Their model so far, for its compliance.
+        current: Their current model, for its compliance.
         seed: Of the surrogates.
     """
     rest, since = _settled(held.points)
@@ -91,14 +90,14 @@ def look_at_rests(held: Held, current: TwistTrial, seed: int) -> RestLook | None
             left = points.logged_torque - nearest * points.twist
             in_return = _look(replace(points, torque=np.zeros_like(left), twist=left), form, seed)
         p_value = max(p_value, _chance(in_return))
-        # Turned round, the line's compliance is the stiffness; where the torque stays as it is, that is not known.
+        # With exchanged axes, the line's compliance is the stiffness; at constant torque it is unknown.
         follows = stiffness_of(turned, free.before.model)["K"].identifiable
         own_stiffness = slope if follows and _chance(free) > _SIGNIFICANCE else None
     terms: Terms = ()
     if this.accepted and p_value <= _SIGNIFICANCE:
         ((_, shape),) = this.winner.trial.model.terms
         terms = ((_relaxation(points.step, rest, since, initial=f"{START} "), shape),)
-    return RestLook(points, this, p_value, own_stiffness, terms)
+    return RestAnalysis(points, this, p_value, own_stiffness, terms)
 
 
 def _look(points: Points, form: Form, seed: int) -> TwistRound:
@@ -108,23 +107,23 @@ def _look(points: Points, form: Form, seed: int) -> TwistRound:
 
 
 def _chance(this: TwistRound) -> float:
-    """The p-value of a relaxation; where another form does better, or none is worth a refit, there is none."""
+    """The p-value of a relaxation; one where another form is better, or none is worth a refit."""
     return this.winner.p_value if this.verdicts and this.winner.family == "creep" else 1.0
 
 
 def _relaxation(step: float, rest: np.ndarray, since: np.ndarray, initial: str = "") -> Form:
-    """The twist relaxes after a stop, in each rest from a state of its own, with one time constant.
+    """Relaxation of the twist after a stop, with one time constant and a free initial state for each rest.
 
-    At rest the torque of a gear that bears a load hardly changes, so that a standard linear solid fades exponentially;
-    how far from its end it begins hangs on what the gear bore while friction hid it. Each rest's own mean is left out:
-    the level of a rest is friction's.
+    At rest the torque on a loaded gear hardly changes, so that a standard linear solid relaxes exponentially. Its
+    initial state depends on the preceding torque, which friction hides. Each rest's mean is removed, since it depends
+    on friction.
 
     Args:
         step: Time between points [s].
         rest: Number of the rest of each point, -1 elsewhere, (n,).
         since: Time from its stop [s], (n,).
-        initial: What its parameters' names begin with: `START` where they count as initial states of the rests, which
-            the other points of a log know nothing of.
+        initial: Prefix of its parameters' names: `START` for initial states of the rests, which other points do not
+            determine.
     """
     low, high = math.log(_POINTS_IN_CONSTANT * step), math.log(float(np.max(since[rest >= 0])))
     text, numbers = "of the relaxation at the stop before rest", range(1, int(rest.max()) + 2)
@@ -150,9 +149,9 @@ def _fading(rest: np.ndarray, since: np.ndarray, points: Points, shape: np.ndarr
 
 
 def _settled(points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Of each point the number of its rest, -1 elsewhere, and the time from the stop [s].
+    """Number of each point's rest, -1 elsewhere, and the time from the stop [s].
 
-    Only the longest rests count, less the time in which their stops ring.
+    Only the longest rests are used, without the oscillation after their stops.
     """
     since, found = np.zeros(len(points.twist)), []
     for i in range(int(points.rest.max()) + 1):
@@ -167,7 +166,7 @@ def _settled(points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _as_logs(points: Points, rows: np.ndarray, compliance: float) -> Points:
-    """The points at rest, each rest as a log; the torque is a constant where its changes could not be seen."""
+    """The points at rest, each rest as a log; the torque is constant where its changes are not significant."""
     log, count = points.log[rows], int(points.log.max()) + 1
     columns = np.column_stack([points.torque, points.logged_torque, points.twist])[rows]
     for i in range(count):

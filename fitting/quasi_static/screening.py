@@ -1,7 +1,7 @@
-"""What each form of the catalogue would gain on stretches that the fit has not seen, and what chance would gain.
+"""Screening of the catalogue: held-out gain of each form, and its null distribution.
 
-Everything is linear in the strengths, so that inner products of columns, residual and surrogates, one set for each
-fold, hold all that cross-validation needs: the whole catalogue is looked at under a thousand surrogates in a second.
+The model is linear in the strengths. So cross-validation only needs inner products of regressors, residual and
+surrogates for each fold, which takes a second for the whole catalogue and a thousand surrogates.
 """
 
 import itertools
@@ -17,18 +17,18 @@ from fitting.quasi_static.points import Points
 from fitting.quasi_static.stretches import FOLDS
 from fitting.quasi_static.twist_model import TwistModel
 
-# Columns of which so little is beside those that the model has already can't be seen.
+# Columns with less than this share orthogonal to the model's are omitted.
 _BLIND = 1e-3
 _RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """One form, or two that may hide each other, at the grid point that suits best.
+    """One form, or two that may mask each other, at the best grid point.
 
     Attributes:
         terms: The form or forms, with their shape parameters.
-        gain: Half the logarithm of the held-out mean square without over that with it.
+        gain: Half the logarithm of the held-out mean square ratio without and with it.
     """
 
     terms: Terms
@@ -36,24 +36,24 @@ class Lead:
 
     @property
     def forms(self) -> tuple[Form, ...]:
-        """Without their shape parameters."""
+        """The forms without their shape parameters."""
         return tuple(form for form, _ in self.terms)
 
     @property
     def families(self) -> tuple[str, ...]:
-        """Of the forms."""
+        """Families of the forms."""
         return tuple(form.family for form in self.forms)
 
 
 def screen(
     points: Points, model: TwistModel, choices: Sequence[tuple[Form, ...]], fold: np.ndarray, seed: int
 ) -> Screen[Lead]:
-    """Look at forms beside a fitted model.
+    """Screen forms beside a fitted model.
 
     Args:
-        points: That were fitted.
-        model: Of these points; its shape parameters move along to first order.
-        choices: Forms, or several together, to look at.
+        points: The fitted points.
+        model: Of these points; its shape parameters are free to first order.
+        choices: Candidate forms, or combinations of several.
         fold: Number of the fold of each point, (n,).
         seed: Of the surrogates.
     """
@@ -75,7 +75,7 @@ def screen(
         for grid in itertools.product(*(range(len(form.shapes)) for form in choice)):
             own = [place for form, i in zip(choice, grid, strict=True) for place in places[form, i]]
             loss, strengths = products.held_out_loss([*nuisance, *own])
-            # Only forms that stand alone ask for a sign.
+            # Only the sign of single forms is constrained.
             wrong = choice[0].sign * strengths[len(nuisance)] < 0 if len(choice) == 1 else False
             gains = np.where(wrong, 0.0, 0.5 * np.log(before / np.maximum(loss, 1e-300)))
             null_gains = np.maximum(null_gains, gains[1:])
@@ -87,7 +87,7 @@ def screen(
 
 @dataclass(frozen=True, eq=False)
 class _Products:
-    """Inner products in each fold: of columns with each other, with the series, and of the series with themselves."""
+    """Inner products in each fold: of columns, of columns with series, and of series."""
 
     gram: np.ndarray
     against: np.ndarray
@@ -103,8 +103,8 @@ class _Products:
         )
 
     def held_out_loss(self, own: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Sum of squares on held-out folds of each series with some columns, (series,), and the strengths that all
-        folds together give, (columns, series)."""
+        """Sum of squares of each series on held-out folds with some columns, (series,), and the strengths from all
+        folds, (columns, series)."""
         gram, against = self.gram[:, own][:, :, own], self.against[:, own]
         without = _solve(gram.sum(axis=0) - gram, against.sum(axis=0) - against)
         loss = self.squares + np.sum(without * (gram @ without - 2.0 * against), axis=1)
@@ -122,7 +122,7 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
 
 
 def _beside(known: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Columns less what is known already, of length one; those that are known nearly wholly are zero."""
+    """Columns orthogonal to the known ones, of unit length; zero where hardly anything remains."""
     rest = columns - known @ (known.T @ columns)
     before, after = np.linalg.norm(columns, axis=0), np.linalg.norm(rest, axis=0)
     return rest * np.where(after > _BLIND * before, 1.0 / np.where(after > 0, after, 1.0), 0.0)

@@ -1,7 +1,7 @@
-"""Test data of quasi-static logs: which points they are, and by how much an equation errs there.
+"""Test data of quasi-static logs, and the error of an equation on them.
 
-They take no part in any fit, choice or noise estimate. A log's zero, and the states in which it began, hold for that
-log alone: points before the test data tell them, while all else of the equation stays as it was fitted.
+Test data are not used in any fit, selection or noise estimate. A log's zero and initial states are fitted to points
+before the test data; all other parameters of the equation are fixed.
 """
 
 import itertools
@@ -23,18 +23,18 @@ from fitting.quasi_static.preparation import QuasiStaticData, believed, prepare
 from fitting.quasi_static.twist_model import TwistModel
 from fitting.quasi_static.unseen_logs import LEAD
 
-# Of two torque cycles.
+# Reversals of two torque cycles.
 _REVERSALS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Unseen:
-    """The points of one log that holds test data.
+    """The points of one log with test data.
 
     Attributes:
         points: Of the whole log.
-        lead: Those that tell its zero and the states in which it began, (n,).
-        scored: Those that tell an error, (n,).
+        lead: Those that determine its zero and initial states, (n,).
+        scored: Those of the test error, (n,).
     """
 
     points: Points
@@ -43,12 +43,12 @@ class Unseen:
 
     @property
     def rows(self) -> int:
-        """Number of rows that tell an error."""
+        """Number of scored rows."""
         return int(np.sum(self.scored)) * self.points.rows[0]
 
     @classmethod
     def of(cls, points: Points, begins: float) -> "Unseen":
-        """Test data from a time on [s]; at rest, where friction has a level of its own, no error is told."""
+        """Test data from a time on [s], without rests, where friction has a free level."""
         later = points.time >= begins
         moving = True if points.direction is None else points.direction != 0
         return cls(points, ~later, later & moving)
@@ -56,12 +56,12 @@ class Unseen:
 
 @dataclass(frozen=True, eq=False)
 class Parted:
-    """Quasi-static logs, and what of them is test data.
+    """Quasi-static logs, divided into fitted and test data.
 
     Attributes:
-        data: What may be fitted.
+        data: Fitted data.
         points: Of these rows.
-        tests: By log; none where the logs hold too little to be parted.
+        tests: By log; empty where the logs are too short to be divided.
     """
 
     data: QuasiStaticData
@@ -70,13 +70,12 @@ class Parted:
 
 
 def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ()) -> Parted:
-    """Part quasi-static logs into what is fitted and test data.
+    """Divide quasi-static logs into fitted and test data.
 
     Args:
         logs: Of one drive.
         drive_file: Of the drive.
-        test: Logs that are test data; where there are none, the end of each log is, unless too little would be left
-            to choose a model by.
+        test: Logs of test data; without any, the end of each log is, unless too little would remain to select a model.
 
     Raises:
         DataError: A log can't be fitted.
@@ -105,8 +104,8 @@ def parted(logs: Sequence[Log], drive_file: DriveFile, test: Sequence[Log] = ())
 
 
 def _is_enough(points: Points) -> bool:
-    """Whether points without test data can still choose a model: by two torque cycles of each log, or by stretches of
-    the straight line's misfit that hardly know of each other."""
+    """Whether points without test data suffice to select a model: two torque cycles of each log, or enough nearly
+    uncorrelated stretches of the straight line's misfit."""
     return min(points.reversals) >= _REVERSALS or Held.of(points).stretch[-1] + 1 >= FEW_STRETCHES
 
 
@@ -120,7 +119,7 @@ def misfit_on(tests: Sequence[Unseen], model: TwistModel, fitted: Points) -> np.
     Args:
         tests: By log.
         model: The equation.
-        fitted: The points that it was fitted to.
+        fitted: The fitted points.
     """
     return np.concatenate([_misfit(one, model, fitted) for one in tests]) if tests else None
 
@@ -128,7 +127,7 @@ def misfit_on(tests: Sequence[Unseen], model: TwistModel, fitted: Points) -> np.
 def _misfit(test: Unseen, model: TwistModel, fitted: Points) -> np.ndarray:
     points = replace(test.points, reference=fitted)
     left = points.twist - model.coefficients[0] * (points.torque - points.centre)
-    # A form that only says how logs or rests began tells nothing of another one.
+    # A form that only has initial states of logs or rests predicts nothing for another log.
     lasting = [(form, shape) for form, shape in model.terms if form.size]
     kept = [[not name.startswith(START) for name in form.shape_names] for form, _ in lasting]
     begun = [int(not all(names)) for names in kept]
@@ -146,7 +145,7 @@ def _misfit(test: Unseen, model: TwistModel, fitted: Points) -> np.ndarray:
         grid = itertools.product((-0.9, 0.0, 0.9), repeat=sum(begun))
         first = min(grid, key=lambda at: float(np.sum(misfit(at)[test.lead] ** 2)))
         size = float(np.std(points.twist)) or 1.0
-        # The branch of a loop has kinks: steps of the derivative must reach over them.
+        # The branch of a loop has kinks: steps of difference quotients must extend over them.
         starts = least_squares(
             lambda at: misfit(at)[test.lead] / size, first, bounds=(-1.0, 1.0), diff_step=1e-3, max_nfev=25
         ).x

@@ -1,4 +1,4 @@
-"""Effects that follow the torque: loops, bends, play, creep, delay, temperature."""
+"""Effects that depend on the torque: hysteresis, nonlinear stiffness, play, creep, delay, temperature."""
 
 import math
 from collections.abc import Iterator
@@ -11,21 +11,21 @@ import numpy as np
 from fitting.quasi_static.form import Form
 from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
-from fitting.quasi_static.torque_twist import MEMORIES, Memory, remembered
+from fitting.quasi_static.torque_twist import MEMORIES, Memory, hysteresis_branch
 
-# Reaches of the hysteresis, over half the range of the torque; beyond, its branch would be a second stiffness.
+# Memory lengths of the hysteresis, over half the range of the torque; a longer one would act as a second stiffness.
 _REACHES = (0.02, 0.45)
-# Shares of the torque's values below which knees are tried.
+# Quantiles of the torque at which knees are tried.
 _KNEES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-# Time constants: more than a few points, and so short that the log shows them through (to exp(-4)).
+# Time constants: longer than a few points, and short enough to decay within the log (to exp(-4)).
 _POINTS_IN_CONSTANT, _CONSTANTS_IN_LOG = 8, 4
-# A drift can be told from the way there and back after two full cycles.
+# A drift can be separated from hysteresis after two full cycles.
 _REVERSALS_FOR_DRIFT = 4
 
 
 def torque_forms(points: Points) -> Iterator[Form]:
-    """The forms that the logs can tell something about, the more usual ones first."""
-    # Friction follows the direction of the motion: one way, or where the torque never turns, no loop is open.
+    """The forms that the logs may determine, the more common ones first."""
+    # Friction depends on the direction of motion: with one direction, or without torque reversals, there is no loop.
     if "one way" not in points.motion and max(points.reversals) > 0:
         yield from _hysteresis(points)
     yield from _stiffness_shapes(points)
@@ -36,7 +36,7 @@ def torque_forms(points: Points) -> Iterator[Form]:
 
 
 def _begun(name: str, low: float, high: float, logs: int) -> dict[str, Any]:
-    """Shape parameters of a memory: a positive number, and where each log begins."""
+    """Shape parameters of a memory: a positive number, and each log's initial state."""
     values = np.linspace(math.log(low), math.log(high), 10)
     return {
         "shapes": np.array([[at, *[start] * logs] for at in values for start in (-1.0, 0.0, 1.0)]),
@@ -66,7 +66,7 @@ def _hysteresis(points: Points) -> Iterator[Form]:
 
 def _branch(memory: Memory, points: Points, shape: np.ndarray) -> np.ndarray:
     starts = zip(points.logs, shape[1:], strict=True)
-    each = [remembered(memory, points.torque[own], math.exp(shape[0]), start) for own, start in starts]
+    each = [hysteresis_branch(memory, points.torque[own], math.exp(shape[0]), start) for own, start in starts]
     return np.concatenate(each)[:, None]
 
 
@@ -126,7 +126,7 @@ def _beyond(points: Points, shape: np.ndarray) -> np.ndarray:
 
 
 def _dead_zone(points: Points, shape: np.ndarray) -> np.ndarray:
-    # The torque's noise and its way between points blur the step.
+    # The torque's noise and its change within a point blur the step.
     width = math.hypot(points.torque_noise, float(np.median(np.abs(np.diff(points.torque)))))
     return np.tanh(points.torque / max(width, 1e-6 * points.reach))[:, None]
 
@@ -149,7 +149,7 @@ def _creep(points: Points) -> Form:
 
 
 def _lagging(points: Points, shape: np.ndarray) -> np.ndarray:
-    """The torque behind a first-order lag, which begins by a share of the torque's range off it."""
+    """The torque after a first-order lag, whose initial deviation is a share of the torque's range."""
     lags = []
     for start, own in zip(shape[1:], points.logs, strict=True):
         torque = points.torque[own]
@@ -158,7 +158,7 @@ def _lagging(points: Points, shape: np.ndarray) -> np.ndarray:
 
 
 def _lag(values: np.ndarray, steps: np.ndarray, constant: float, start: float) -> np.ndarray:
-    """T z' = values - z, with values straight between points."""
+    """Solution of T z' = values - z, with values linear between points."""
     kept = np.exp(-steps / constant)
     share = (1.0 - kept) * constant / steps
     added = (1.0 - share) * values[1:] + (share - kept) * values[:-1]
@@ -167,8 +167,8 @@ def _lag(values: np.ndarray, steps: np.ndarray, constant: float, start: float) -
 
 
 def delay() -> Form:
-    """The twist is behind the torque as logged."""
-    figure = Figure("delay", lambda own: -own[1] / own[0], "s", "by which the twist is behind the torque as logged")
+    """The twist lags the torque as logged."""
+    figure = Figure("delay", lambda own: -own[1] / own[0], "s", "by which the twist lags the torque as logged")
     return Form("input_delay", "delay", _rate, ("delay",), "twist = tau(t - d)/K, to first order in d", (figure,))
 
 

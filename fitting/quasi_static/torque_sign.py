@@ -1,8 +1,8 @@
 """Whether the twist rises with the torque: the sign of the compliance, with its interval.
 
-While a joint moves, its twist also depends on the angle (kinematic error, eccentric encoders, a ratio that is a little
-off), and friction shifts the torque by the direction. Both may outweigh what the torque does, so that the correlation
-of twist and torque has no sign to rely on; a regression with all of them has.
+While a joint moves, its twist also depends on the angle (kinematic error, eccentric encoders, a slightly wrong ratio),
+and friction shifts the torque with the direction. Both may dominate, so that the correlation of twist and torque has an
+unreliable sign. So a regression includes all of them.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from fitting.quasi_static.intervals import scatter
 from fitting.quasi_static.stretches import stretches
 from fitting.uncertainty.normal_law import NORMAL_95
 
-# Blocks of a log: enough to follow the motor's second order over tens of turns.
+# Number of blocks of a log: enough to resolve the motor's second order over tens of turns.
 _BLOCKS = 400
 _ORDERS = (1, 2)
 
@@ -25,8 +25,8 @@ class Compliance(NamedTuple):
 
     Attributes:
         value: Least squares.
-        classical: Half of its 95 % interval if what is left over were white noise.
-        robust: Likewise whatever the colour of what is left over; wide where one stretch of the log decides.
+        classical: Half of its 95 % interval for a white residual.
+        robust: Likewise for a residual of any spectrum; wide where one stretch of the log dominates.
     """
 
     value: float
@@ -35,10 +35,10 @@ class Compliance(NamedTuple):
 
 
 def compliance(log: Log, speed: np.ndarray, *, moves: bool) -> Compliance:
-    """The slope of twist against torque, beside all else that the twist follows.
+    """The slope of twist against torque, in a regression with all other dependences of the twist.
 
     Args:
-        log: Of the rows that count, in which a joint that moves does so steadily.
+        log: With valid rows only, in which a moving joint moves steadily.
         speed: Of the joint in these rows [rad/s], (n,).
         moves: Whether the joint moved.
     """
@@ -47,7 +47,7 @@ def compliance(log: Log, speed: np.ndarray, *, moves: bool) -> Compliance:
     size = max(1, len(log) // _BLOCKS)
     columns = [torque, np.ones_like(torque), *(_of_motion(log, speed) if moves else ())]
     scale = float(np.std(torque)) or 1.0
-    # Sizes of order one; a column that never changes is the constant once more.
+    # Scaled to order one; a constant column would duplicate the constant.
     matrix = np.column_stack([_scaled(means(column, size)) for column in columns])
     matrix[:, 0] = (means(torque, size) - np.mean(torque)) / scale
     solution, *_ = np.linalg.lstsq(matrix, means(twist, size), rcond=1e-9)
@@ -59,7 +59,7 @@ def compliance(log: Log, speed: np.ndarray, *, moves: bool) -> Compliance:
 
 
 def _of_motion(log: Log, speed: np.ndarray) -> list[np.ndarray]:
-    """What the twist follows beside the torque while the joint moves."""
+    """Regressors of the twist other than the torque while the joint moves."""
     angle = log.motor_angle if log.motor_angle is not None else log.load_angle
     found = [np.sign(speed)]
     if angle is not None:

@@ -1,6 +1,6 @@
-"""Torque-twist curves: what a gear twists by under a slowly changing torque, and how it remembers the way there.
+"""Torque-twist curves: twist of a gear under a slowly changing torque, with hysteresis.
 
-Plain NumPy in double precision: the curve is algebraic, so that a fit takes milliseconds and compiles nothing.
+NumPy in double precision: the curve is algebraic, so that a fit takes milliseconds without compilation.
 """
 
 import math
@@ -26,7 +26,7 @@ SHAPE_NAMES: dict[Shape, tuple[str, ...]] = {
 
 
 def positive(logarithm: np.ndarray | float) -> np.ndarray:
-    """The positive number of that logarithm, finite wherever a search may wander."""
+    """The positive number of a logarithm, limited to finite values."""
     return np.asarray(np.exp(np.clip(logarithm, -80.0, 80.0)))
 
 
@@ -41,9 +41,9 @@ def twist(
     Args:
         shape: Of the curve.
         coefficients: As `SHAPE_NAMES` lists them; K in N m/rad, alpha in rad^-2, torques in N m.
-        torque: Less the torque at the centre of the curve [N m], (n,).
-        blur: Standard deviation of the true torque around the stated one [N m]. What is expected then turns its knees
-            in a curve; straight parts stay as they are.
+        torque: Relative to the centre of the curve [N m], (n,).
+        blur: Standard deviation of the true torque around the stated one [N m]. The expected twist then has rounded
+            knees; straight parts are unchanged.
 
     Returns:
         Twist [rad] and its derivative with respect to the torque [rad/(N m)], both (n,).
@@ -61,8 +61,8 @@ def twist(
 
 
 def _beyond(torque: np.ndarray, knee: float, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """How far the torque is expected beyond a knee on either side, with its sign, and the chance that it is beyond."""
-    # Without blur the normal law is a step, to within rounding.
+    """Expected signed excess of the torque beyond a knee on either side, and the probability of an excess."""
+    # Without blur the normal distribution function is a step, to within rounding.
     blur = max(blur, 1e-14 * knee)
     above, below = (torque - knee) / blur, (-torque - knee) / blur
     chance_above, chance_below = ndtr(above), ndtr(below)
@@ -74,22 +74,22 @@ def _cubic(compliance: float, alpha: float, torque: np.ndarray) -> tuple[np.ndar
     y = compliance * torque
     scale = np.sqrt(3.0 * abs(alpha))
     if scale * np.max(np.abs(y), initial=0.0) < 1e-6:
-        # Below this the closed form loses digits that the series keeps.
+        # Below this the closed form is less accurate than the series.
         x = y - alpha * y**3
     elif alpha > 0:
         x = 2.0 / scale * np.sinh(np.arcsinh(1.5 * scale * y) / 3.0)
     else:
-        # A softening cubic bears no more than at its fold; just before it the slope is steep but finite.
+        # A softening cubic has a largest torque at its fold; just below it the slope is steep but finite.
         x = 2.0 / scale * np.sin(np.arcsin(np.clip(1.5 * scale * y, -0.999, 0.999)) / 3.0)
     return x, compliance / (1.0 + 3.0 * alpha * x**2)
 
 
-def remembered(memory: Memory, torque: np.ndarray, reach: float, start: float) -> np.ndarray:
-    """Which branch of the loop each sample is on: +1 loading, -1 unloading, between them after a reversal.
+def hysteresis_branch(memory: Memory, torque: np.ndarray, reach: float, start: float) -> np.ndarray:
+    """Branch of the loop at each sample: +1 loading, -1 unloading, in between after a reversal.
 
-    The abrupt law is a Jenkins element (play in series with the spring): the branch changes along a straight line while
-    the torque goes back by twice the reach. The gradual law is Dahl's: the distance to the new branch decays by e per
-    reach. Both depend on the torque's path only, not on time, and are exact where it is monotone between samples.
+    The abrupt law is a Jenkins element (play in series with the spring): the branch changes linearly while the torque
+    reverses by twice the reach. The gradual law is Dahl's: the distance to the new branch decays by e per reach. Both
+    depend on the torque's path only, not on time, and are exact where it is monotone between samples.
 
     Args:
         memory: The law.
@@ -109,7 +109,7 @@ def remembered(memory: Memory, torque: np.ndarray, reach: float, start: float) -
 
 def _abrupt(branch: float, step: float) -> float:
     moved = branch + step
-    # Comparisons, since a fit spends its time here and min and max take twice as long.
+    # Comparisons, since most of a fit's time is spent here, and min and max take twice as long.
     return 1.0 if moved > 1.0 else -1.0 if moved < -1.0 else moved
 
 
@@ -126,14 +126,14 @@ class Blocks:
         torque: Joint torque [N m], (n,).
         twist: [rad], (n,).
         time: [s], (n,).
-        log: Number of the log that a block is from, (n,), rising.
-        paths: Torque on the way [N m], the blocks' and, between them, the extremes at which it turned, by log.
-        seat: Where the blocks are on the paths, one behind the other, (n,).
+        log: Number of each block's log, (n,), rising.
+        paths: Torque of blocks and of reversals between them [N m], in order, by log.
+        seat: Index of each block in the concatenated paths, (n,).
         names: Of the logs.
         torque_noise: Standard deviation of the noise of a block's torque [N m].
         twist_noise: Likewise of its twist [rad].
-        blur: Standard deviation of the torque of a block's rows around its mean, noise and course together [N m].
-        rows: Rows in a block, by log, nearly.
+        blur: Standard deviation of the torque within a block, due to noise and change [N m].
+        rows: Approximate number of rows in a block, by log.
         reversals: Reversals of the torque, by log.
     """
 
@@ -165,23 +165,21 @@ class Blocks:
 
 @lru_cache(maxsize=8)
 def branch(memory: Memory, blocks: Blocks, reach: float, starts: tuple[float, ...]) -> np.ndarray:
-    """Which branch each block is on, from -1 to 1, (n,).
-
-    The last ones are kept: most parameters of a curve leave the branch as it is.
+    """Branch of each block, from -1 to 1, (n,). Cached, since most parameters of a curve do not change it.
 
     Args:
         memory: The law.
-        blocks: Where to look.
+        blocks: The data.
         reach: Torque over which the branch changes [N m].
         starts: Branch at the first block of each log, from -1 to 1.
     """
-    each = [remembered(memory, path, reach, start) for path, start in zip(blocks.paths, starts, strict=True)]
+    each = [hysteresis_branch(memory, path, reach, start) for path, start in zip(blocks.paths, starts, strict=True)]
     return np.concatenate(each)[blocks.seat]
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A form of torque-twist curve: which terms it has. Its parameters are a vector in the order of `names`.
+    """A form of torque-twist curve, by its terms. Its parameters are a vector in the order of `names`.
 
     Attributes:
         shape: Of the elastic part.
@@ -199,7 +197,7 @@ class Curve:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the parameters."""
+        """Names of the parameters."""
         each = [f"offset {i}" for i in range(self.logs)]
         each += [f"drift {i}" for i in range(self.logs) if self.drifting]
         if self.memory is not None:
@@ -212,7 +210,7 @@ class Curve:
         return {name: i for i, name in enumerate(self.names)}
 
     def value(self, name: str, parameters: np.ndarray) -> float:
-        """A parameter by name; zero where the curve has none of that name."""
+        """A parameter by name; zero if the curve lacks it."""
         return float(parameters[self.places[name]]) if name in self.places else 0.0
 
     def elastic(
@@ -222,7 +220,7 @@ class Curve:
         return twist(self.shape, parameters, torque - self.value("torque_bias", parameters), blur=blur)
 
     def branch(self, parameters: np.ndarray, blocks: Blocks) -> np.ndarray:
-        """Which branch each block is on, from -1 to 1, (n,)."""
+        """Branch of each block, from -1 to 1, (n,)."""
         if self.memory is None:
             return np.zeros_like(blocks.torque)
         starts = tuple(self.value(f"start {i}", parameters) for i in range(self.logs))
@@ -231,8 +229,8 @@ class Curve:
     def predict(self, parameters: np.ndarray, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
         """Twist [rad] and the slope of the elastic part [rad/(N m)] at each block, both (n,).
 
-        Hysteresis is a friction torque beside the spring's, as `hdjax` has it: on loading it bears its full part of the
-        torque, on unloading it works against the spring.
+        Hysteresis is a friction torque parallel to the spring, as in `hdjax`: on loading it bears part of the torque,
+        on unloading it opposes the spring.
         """
         torque = blocks.torque - self.value("friction", parameters) * self.branch(parameters, blocks)
         x, slope = self.elastic(parameters, torque, blur=blocks.blur)
@@ -245,7 +243,7 @@ class Curve:
 
 
 def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int = 200) -> tuple[np.ndarray, ...]:
-    """The closed loop that the curve runs through under torque cycles around its centre.
+    """The closed loop of the curve under torque cycles around its centre.
 
     Args:
         curve: The form.
@@ -254,15 +252,15 @@ def loop(curve: Curve, parameters: np.ndarray, amplitude: float, *, steps: int =
         steps: Points on each branch.
 
     Returns:
-        Torque less its centre [N m], twist while it rises and twist while it falls [rad], each (steps + 1,).
+        Torque relative to its centre [N m], twist while it rises and twist while it falls [rad], each (steps + 1,).
     """
     torque = np.linspace(-amplitude, amplitude, steps + 1)
     if curve.memory is None:
         elastic, _ = twist(curve.shape, parameters, torque)
         return torque, elastic, elastic
     way = np.concatenate([torque, torque[-2::-1]])
-    # After two cycles the loop has closed, wherever it began.
+    # After two cycles the loop is closed, for any initial state.
     reach = math.exp(curve.value("log reach", parameters))
-    closed = remembered(curve.memory, np.concatenate([way, way[1:], way[1:]]), reach, -1.0)[-2 * steps - 1 :]
+    closed = hysteresis_branch(curve.memory, np.concatenate([way, way[1:], way[1:]]), reach, -1.0)[-2 * steps - 1 :]
     x, _ = twist(curve.shape, parameters, way - curve.value("friction", parameters) * closed)
     return torque, x[: steps + 1], x[: steps - 1 : -1]

@@ -1,4 +1,4 @@
-"""The torque-twist equation with effects inside: its fit, its errors on unseen stretches, and its figures."""
+"""The torque-twist equation with effects: fit, held-out errors and figures."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ class TwistModel:
     """A straight line with effects, fitted.
 
     Attributes:
-        terms: The effects' forms with their shape parameters, in the order in which they were found.
+        terms: The effects' forms with their shape parameters, in order of acceptance.
         coefficients: Compliance, each log's zero, then each form's strengths.
         misfit: Measured less fitted twist [rad], (n,).
         jacobian: Of the fitted twist with respect to coefficients and shape parameters, (n, all).
@@ -31,11 +31,11 @@ class TwistModel:
 
     @property
     def forms(self) -> tuple[Form, ...]:
-        """Of the effects."""
+        """Forms of the effects."""
         return tuple(form for form, _ in self.terms)
 
     def own(self, form: Form) -> tuple[slice, slice]:
-        """Where a form's strengths and its shape parameters stand in the Jacobian."""
+        """Columns of a form's strengths and shape parameters in the Jacobian."""
         at, strengths, shapes = self.forms.index(form), *_sizes(self.terms)
         first = len(self.coefficients) - sum(strengths[at:])
         behind = len(self.coefficients) + sum(shapes[:at])
@@ -46,8 +46,8 @@ def fit_twist(points: Points, terms: Terms = ()) -> TwistModel:
     """Least squares over strengths and shape parameters together (variable projection: Golub and Pereyra 1973).
 
     Args:
-        points: To be fitted.
-        terms: Of the effects, with shape parameters to begin with.
+        points: The data.
+        terms: Of the effects, with starting values of shape parameters.
     """
     found = _polished(points, terms, np.ones(len(points.twist), dtype=bool))
     matrix = design(points, found)
@@ -59,10 +59,10 @@ def fit_twist(points: Points, terms: Terms = ()) -> TwistModel:
 
 
 def hold_out(points: Points, model: TwistModel, fold: np.ndarray) -> np.ndarray:
-    """Misfit [rad] of each point by the equation that was fitted, shapes and all, without the point's fold, (n,).
+    """Misfit [rad] of each point in the fit of all parameters without the point's fold, (n,).
 
-    Where a log or a rest begins, the branch of a loop or the state of a relaxation, is taken from the fit of all
-    points: it is an initial state, of which only the log's first stretch or the rest knows.
+    Initial branches and states of logs and rests are taken from the fit of all points, since only the log's first
+    stretch or the rest determines them.
     """
     names = [name for form in model.forms for name in form.strengths]
     line = [False] * (len(model.coefficients) - len(names))
@@ -77,10 +77,10 @@ def hold_out(points: Points, model: TwistModel, fold: np.ndarray) -> np.ndarray:
 
 
 def stiffness_of(points: Points, model: TwistModel) -> dict[str, Known]:
-    """The stiffness that stands beside the effects."""
+    """The stiffness beside the effects."""
     where = "stiffness" if points.centre == 0.0 else f"stiffness at {points.centre:.3g} N m"
     bent = any(form.family in ("stiffness_shape", "backlash") for form in model.forms)
-    text = where + (" (without what the effects add)" if bent else "")
+    text = where + (" (without the effects' contribution)" if bent else "")
     return _known(points, model, [Figure("K", lambda fitted: 1.0 / fitted[0], "N m/rad", text, True)])
 
 
@@ -93,7 +93,7 @@ def strengths_of(points: Points, model: TwistModel, form: Form) -> dict[str, Kno
 
 
 def contribution(model: TwistModel, forms: tuple[Form, ...]) -> np.ndarray:
-    """What effects add to the twist [rad], (n,), less its mean."""
+    """Contribution of effects to the twist [rad], (n,), without its mean."""
     own = [model.own(form)[0] for form in forms]
     total = np.sum([model.jacobian[:, strengths] @ model.coefficients[strengths] for strengths in own], axis=0)
     return total - np.mean(total)
@@ -102,14 +102,14 @@ def contribution(model: TwistModel, forms: tuple[Form, ...]) -> np.ndarray:
 def _known(points: Points, model: TwistModel, figures: Iterable[Figure]) -> dict[str, Known]:
     fitted = np.concatenate([model.coefficients, *(shape for _, shape in model.terms)])
     found = scatter(model.jacobian, model.misfit, stretches(model.misfit, points.log, each=2))
-    # A thousandth of each parameter's scatter; without noise nothing scatters.
+    # A thousandth of each parameter's standard deviation; with a minimum for data without noise.
     steps = 1e-3 * np.sqrt(np.maximum(np.diag(found.classical), 0.0))
     steps = np.maximum(steps, 1e-9 * np.maximum(np.abs(fitted), 1e-12))
     return {one.name: one.known(fitted, steps, found) for one in figures}
 
 
 def design(points: Points, terms: Terms) -> np.ndarray:
-    """All columns: the straight line's, then each form's, (n, coefficients)."""
+    """All regressors: the straight line's, then each form's, (n, coefficients)."""
     zeros = (points.log == i for i in range(len(points.names)))
     added = (form.columns(points, shape) for form, shape in terms)
     return np.column_stack([points.torque - points.centre, *zeros, *added])
@@ -131,7 +131,7 @@ def _moved(terms: Terms, flat: np.ndarray) -> Terms:
 
 
 def _polished(points: Points, terms: Terms, seen: np.ndarray, *, starts: bool = True) -> Terms:
-    """Shape parameters that suit the seen points best, with or without those that say where a log begins."""
+    """Shape parameters of least misfit on the fitted points, with or without initial states of logs."""
     names = [name for form, _ in terms for name in form.shape_names]
     free = np.array([starts or not name.startswith(START) for name in names], dtype=bool)
     if not free.any():
@@ -149,13 +149,13 @@ def _polished(points: Points, terms: Terms, seen: np.ndarray, *, starts: bool = 
 
     low, high = np.hstack([form.range for form, _ in terms])[:, free]
     inside = np.clip(flat[free], low + 1e-6 * (high - low), high - 1e-6 * (high - low))
-    # Kinks pass from point to point: steps of the derivative must reach over them.
+    # Kinks move from point to point: steps of difference quotients must extend over them.
     found = least_squares(residual, inside, bounds=(low, high), diff_step=1e-3, x_scale=high - low, max_nfev=25)
     return moved(found.x)
 
 
 def _solved(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Least squares with columns of one scale; what the points do not see is zero."""
+    """Least squares with scaled columns; undetermined coefficients are zero."""
     norms = np.linalg.norm(matrix, axis=0)
     scale = 1.0 / np.where(norms > 0, norms, 1.0)
     solution, *_ = np.linalg.lstsq(matrix * scale, values, rcond=1e-8)

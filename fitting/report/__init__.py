@@ -1,4 +1,4 @@
-"""What a fit or a closed loop found, told to people (page, terminal) and to programs (JSON)."""
+"""Reports of a fit or a closed loop: page, terminal text and JSON."""
 
 from fitting.report.content import report_dict as report_dict
 from fitting.report.separating import separating_experiment as separating_experiment

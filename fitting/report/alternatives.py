@@ -1,4 +1,4 @@
-"""What else was refitted inside the equations."""
+"""Other refitted explanations."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from fitting.report.separating import separating_experiment
 
 
 def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
-    """What else was refitted inside the equations: ties, and families that the data rule out."""
+    """Other refitted explanations: ties, and families that the data rule out."""
     names = {f.name for f in outcome.findings}
     families = {f.family for f in outcome.findings}
     found: dict[str, dict[str, Any]] = {}
@@ -30,7 +30,7 @@ def alternatives(outcome: Outcome) -> list[dict[str, Any]]:
 def _alternative(verdict: Verdict, trial: Trial, winner: Verdict) -> dict[str, Any]:
     experiment = separating_experiment(winner.family, verdict.family)
     if verdict.separable:
-        experiment = "None is needed: the selection data tell the two apart."
+        experiment = "None is needed: the selection data distinguish the two."
     return {
         "family": verdict.family,
         "name": verdict.name,

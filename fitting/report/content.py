@@ -1,4 +1,4 @@
-"""The report as JSON has it."""
+"""Content of `report.json`."""
 
 import dataclasses
 import platform
@@ -41,14 +41,14 @@ def report_dict(
     name: str = "drive",
     next_experiment: NextExperiment | None = None,
 ) -> dict[str, Any]:
-    """The report as JSON has it: finite numbers and nulls only.
+    """The content of `report.json`: finite numbers and nulls only.
 
     Args:
         outcome: of the loop or of a fit.
         units: of `dynamic_error` and, in a reduced log, of `forcing`; SI where not given.
-        health: what the health gate said, each finding with its log's name.
-        name: the drive's.
-        next_experiment: that would tell more.
+        health: findings of the health check, each with its log's name.
+        name: of the drive.
+        next_experiment: the proposed experiment.
     """
     units = {"dynamic_error": "rad", "forcing": "N m"} | units_of_outputs(outcome.stored) | dict(units or {})
     noise = noise_of_outputs(outcome.stored)
@@ -122,7 +122,7 @@ def _extrapolation(outcome: Outcome, units: Mapping[str, str]) -> list[dict[str,
 
 
 def _circumstances(outcome: Outcome) -> dict[str, Any]:
-    """What the outcome was computed from, and how."""
+    """Data and settings of the outcome."""
     not_machine_code = outcome.after.not_machine_code
     setting = None
     if isinstance(outcome, Loop):
@@ -146,7 +146,7 @@ def _circumstances(outcome: Outcome) -> dict[str, Any]:
 
 
 def _logs(outcome: Outcome) -> list[dict[str, Any]]:
-    """Of each log, or test log, how many samples serve what."""
+    """Number of samples of each log, or test log, by use."""
     found: dict[str, dict[str, Any]] = {}
     for part, runs in outcome.after.parts().items():
         for run in runs:

@@ -1,8 +1,8 @@
-"""Names that reports of schema 1 had: kept beside the new ones for one version, so that scripts go on."""
+"""Names of report schema 1, kept beside the new ones for one version, for compatibility."""
 
 from typing import Any
 
-# What was called held-out or validation data is now test data, or selection data where there are none.
+# Held-out or validation data are now test data, or selection data where there are none.
 _RENAMED = {
     "gain": "validation_gain",
     "selection_rmse": "validation_rmse",

@@ -1,4 +1,4 @@
-"""What only the report of a fit has: goodness, residual tests, frequency response, and what all of it means."""
+"""Content of a fit's report only: goodness, residual tests, frequency response, and their interpretation."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,9 +18,9 @@ from fitting.validation.frequency_response import (
     unexplained_band,
 )
 
-# Measured and modelled resonance that differ by less than this, or than the lines' distance, agree.
+# Measured and modelled resonance agree if they differ by less than this, or the distance of the lines.
 _AGREES = 0.03
-# Test error over training error, and error over noise, from which on it is worth a word.
+# Test error over training error, and error over noise, above which they are mentioned.
 _DRIFTED = 1.5
 _NOTHING_BUT_NOISE = 1.1
 
@@ -69,14 +69,14 @@ def fit_dict(fitted: FitOnly, noise: float) -> dict[str, Any]:
 
 
 def _parameters_from(fitted: FitOnly) -> str:
-    """What tells the parameters."""
+    """The equation that determines the parameters."""
     if fitted.by_friction:
         return "torque beside friction"
     return "load equation" if fitted.by_load else "torque"
 
 
 def meaning(report: Mapping[str, Any]) -> list[str]:
-    """What to make of a fit's report, most important first, a sentence or two each."""
+    """Interpretation of a fit's report, most important first, in a sentence or two each."""
     verdicts = {t["name"].split(" of ")[0]: t["verdict"] for t in report["residual_tests"]}
     on = report["judged_on"]
     rmse, over_noise = report["before"]["rmse"], report["goodness"]["rmse_over_noise"][on]
@@ -84,49 +84,51 @@ def meaning(report: Mapping[str, Any]) -> list[str]:
     by_load = report["parameters_from"] != "torque"
     if report["parameters_from"] == "torque beside friction":
         notes.append(
-            "The motor does not move as the logged torque says: friction or something else of that size acts on it. "
+            "The motor does not move as the logged torque predicts: friction or another torque of that size acts on "
+            "it. "
             "The parameters are therefore those of a fit with Coulomb and viscous friction on the motor. The errors "
-            "below are those of free runs without friction. `hdjax close-loop` looks for what acts on the motor."
+            "below are those of free runs without friction. `hdjax close-loop` searches for what acts on the motor."
         )
     elif by_load:
         notes.append(
-            "The motor does not move as the logged torque says: friction or something else of that size acts on it. K, "
+            "The motor does not move as the logged torque predicts: friction or another torque of that size acts on "
+            "it. K, "
             "alpha and B_sp are therefore those of the load's own equation, driven by the motor's motion as measured. "
-            "The errors below are those of free runs under the torque. `hdjax close-loop` looks for what acts on the "
-            "motor."
+            "The errors below are those of free runs under the torque. `hdjax close-loop` searches for what acts on "
+            "the motor."
         )
     for path, value in report["assumed"].items():
         notes.append(
-            f"{path} was not known, and was taken to be {formatting.number(value)} kg m^2, as the torque beside a "
-            "simple friction tells it. K and B_sp go in proportion to it, and their intervals don't hold its error."
+            f"{path} was unknown and estimated as {formatting.number(value)} kg m^2, from the torque with simple "
+            "friction. K and B_sp are proportional to it, and their intervals don't include its error."
         )
     if not report["goodness"]["converged"]:
-        notes.append("The iteration stopped before it met its tolerance: take the values as provisional.")
+        notes.append("The iteration stopped before it met its tolerance: the values are provisional.")
     missing = [n for n in ("zero mean", "whiteness", "independence") if verdicts.get(n) == "failed"]
     if over_noise is None:
-        notes.append(f"The free run diverges on {on} data: the model doesn't stand for this drive.")
+        notes.append(f"The free run diverges on {on} data: the model does not describe this drive.")
     elif missing and not by_load:
         notes.append(
-            "The residual is not white noise: the model lacks something, or the sensors' noise has a memory. What is "
-            "missing is absorbed in part by the parameters, so that the truth may lie outside the intervals. "
-            "`hdjax close-loop` looks for it."
+            "The residual is not white noise: the model lacks something, or the sensors' noise is coloured. The "
+            "parameters absorb a part of what is missing, so that true values may lie outside the intervals. `hdjax "
+            "close-loop` searches for it."
         )
         if over_noise < _DRIFTED:
-            notes.append("The estimate of the measurement noise holds a part of what is missing: don't lean on it.")
+            notes.append("The estimate of the measurement noise contains a part of what is missing: don't rely on it.")
     elif over_noise < _NOTHING_BUT_NOISE:
         notes.append("The model explains these logs down to the measurement noise.")
     if rmse["training"] is not None and rmse["test"] is not None and rmse["test"] > _DRIFTED * rmse["training"]:
         notes.append(
-            "The error is larger on test data than on the data that were fitted: the drive or its conditions "
-            "changed along the log, or the initial state is poorly known."
+            "The error is larger on test data than on the fitted data: the drive or its conditions changed along the "
+            "log, or the initial state is poorly determined."
         )
     if verdicts.get("normality") == "failed" and not missing:
         notes.append("The errors are not Gaussian: look for outliers, clipping or coarse quantisation in the plot.")
     if report["goodness"]["left_out"]:
-        notes.append(f"{report['goodness']['left_out']} samples were left out: missing, or wrong on their own.")
+        notes.append(f"{report['goodness']['left_out']} samples were omitted: missing, or outliers.")
     response = report["frequency_response"]
     if response and not response["excited"]:
-        notes.append("The log does not excite the resonance: what it says of damping rests on little.")
+        notes.append("The log does not excite the resonance: the damping is poorly determined.")
     return notes
 
 
@@ -148,13 +150,13 @@ def _response_dict(found: FrequencyResponse | None) -> dict[str, Any] | None:
 
 
 def _response_sentences(found: FrequencyResponse) -> list[str]:
-    """What the frequency response shows."""
+    """Sentences on the frequency response."""
     said, output = [], in_words(found.output)
     band = coherent_band(found)
     if band:
-        said.append(f"The {output} follows the {found.source} linearly from {_range(*band)} (coherence above 0.9).")
+        said.append(f"The {output} responds linearly to the {found.source} from {_range(*band)} (coherence above 0.9).")
     else:
-        said.append(f"Nowhere does the {output} follow the {found.source} linearly (coherence above 0.9).")
+        said.append(f"The {output} nowhere responds linearly to the {found.source} (coherence above 0.9).")
     own, seen = found.antiresonance, antiresonance_seen(found)
     if own is not None:
         said.append(_compared("antiresonance", "dip", own, seen, excites_antiresonance(found), found.resolution))

@@ -13,7 +13,7 @@ from fitting.report.proposal import next_lines
 
 _WIDTH = 100
 _INDENT = "    "
-# Beyond these a number reads better with a power of ten.
+# Beyond these a number is written with a power of ten.
 _SMALLEST, _LARGEST = 1e-4, 1e8
 _VERDICTS = {"passed": "passed", "slight": "slight", "failed": "FAILED"}
 
@@ -40,7 +40,7 @@ def fit_lines(report: Mapping[str, Any]) -> list[str]:
 
 
 def _section(head: str, lines: Sequence[str]) -> list[str]:
-    """A head and its lines; nothing where there are none."""
+    """A heading and its lines; empty without lines."""
     return [f"[{head}]", *(f"{_INDENT}{line}".rstrip() for line in lines)] if lines else []
 
 
@@ -69,14 +69,14 @@ def _derived_rows(derived: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _figures(entry: Mapping[str, Any]) -> list[str]:
-    """Value, standard error, percent and interval, to the digits that the standard error leaves."""
+    """Value, standard error, percent and interval, to the digits justified by the standard error."""
     ends = [e for e in entry["ci95"] if e is not None]
     value, std, *known = _rounded([entry["value"], entry["std"], *ends], entry["std"])
     return [value, std, plain(entry["percent"], 2), open_interval(entry["ci95"]).format(*known)]
 
 
 def _posterior(found: Mapping[str, Any] | None, parameters: Mapping[str, Any]) -> list[str]:
-    """Quantiles by parameter, and whether they may be relied on; nothing where none were drawn."""
+    """Quantiles by parameter, and whether the chains have converged; empty without draws."""
     if found is None:
         return []
     rows = [["", *(f"{100 * q:g} %" for q in QUANTILES), "R-hat", "effective", "unit"]]
@@ -120,7 +120,7 @@ def _goodness(report: Mapping[str, Any]) -> list[str]:
             "measurement noise, rms: "
             + ", ".join(f"{in_words(o)} {plain(report['noise'][o])} {report['units'][o]}" for o in outputs(report)),
             f"{report['judged_on']} samples inside the 95 % band of the free runs: {_share(g['band_coverage'])}",
-            f"left over in short simulations, in units of the noise: {left}",
+            f"residual of short simulations, in units of the noise: {left}",
             f"reduced chi-square {plain(g['reduced_chi_square'])}; log-likelihood {plain(g['log_likelihood'], 8)}, "
             f"AIC {plain(g['aic'], 8)}, BIC {plain(g['bic'], 8)}",
             f"{len(report['logs'])} log(s), {samples} samples, {test} of them test data; "
@@ -138,7 +138,7 @@ def _share(value: float | None) -> str:
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A line each, and a sentence for what did not pass."""
+    """A line per test, and a sentence for those that did not pass."""
     rows = [["test", "verdict", "p"]] + [[t["name"], _VERDICTS[t["verdict"]], p_value(t["p_value"])] for t in tests]
     return _table(rows, left=(0, 1, 2)) + _prose([t["says"] for t in tests if t["verdict"] != "passed"])
 

@@ -1,4 +1,4 @@
-"""Intervals of parameters where something is left that the model does not know."""
+"""Intervals of parameters under model discrepancy."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,24 +7,24 @@ from fitting import formatting
 from fitting.attribution.rules import RULES
 
 NOT_COVERED = "not covered"
-"""Flag of a parameter whose interval knows nothing of what is missing."""
+"""Flag of a parameter whose interval does not include model discrepancy."""
 _WITHHELD = "withheld"
 
 
 def is_withheld(estimate: Mapping[str, Any]) -> bool:
-    """Whether no interval is stated, because too much is left that has no name."""
+    """Whether no interval is stated, because a large discrepancy is not explained."""
     return estimate.get("interval") == _WITHHELD
 
 
 def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
-    """Mark the intervals of the drive's own parameters, and of derived figures, where much is left; withhold them where
-    it has no name.
+    """Mark the intervals of the drive's parameters and derived figures under a large discrepancy; withhold them where
+    that is not explained.
 
-    What is missing stands in part in the parameters, by more than any standard error tells.
+    The parameters absorb a part of what is missing, and this bias exceeds their standard errors.
 
     Args:
         report: its content so far, with finite numbers only.
-        times_noise: what the final model leaves, over the measurement noise.
+        times_noise: residual of the final model over the measurement noise.
     """
     unexplained = report["decision"] == "unexplained"
     much = times_noise >= RULES.excess
@@ -32,11 +32,11 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
         return
     names = formatting.words(list(report["before"]["parameters"]))
     left = (
-        f"What the model leaves is {formatting.number(times_noise)} times the noise"
+        f"The model's residual is {formatting.number(times_noise)} times the noise"
         if much
-        else "What is missing has no name"
+        else "The model discrepancy is not explained"
     )
-    end = "their intervals are withheld" if unexplained and much else "their intervals know nothing of that"
+    end = "their intervals are withheld" if unexplained and much else "their intervals do not include that"
     note = f"{left}: {names} may be off by more than their standard errors, and {end}."
     for account in (report["before"], report["after"]):
         for estimate in (*account["parameters"].values(), *account["derived"].values()):

@@ -1,4 +1,4 @@
-"""What the data can't tell, a sentence each."""
+"""Limits of the data, one sentence each."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,24 +11,24 @@ from fitting.uncertainty.identifiability import Identifiability
 from fitting.uncertainty.standard_errors import Estimate
 from hdjax.parameters import ParameterInfo
 
-# Beyond it two parameters are told as one combination.
+# Correlation above which the data determine a combination of two parameters.
 _CORRELATED = 0.9
 _MOST_CORRELATIONS = 8
 _DAMPING = ("B_sp", "mu")
-# A standard error above this share of the prior's is the prior's.
+# Standard error over the prior's above which the data add nothing.
 _NOTHING_NEW = 0.8
 
 NOT_TOLD_FROM_ZERO = "not told from zero"
-"""Flag of an effect's parameter whose interval holds zero."""
+"""Flag of an effect's parameter whose interval contains zero."""
 
 
 def parameter_note(estimate: Estimate, found: Identifiability, info: ParameterInfo | None = None) -> str | None:
-    """What must be said beside a parameter; None where its number speaks for itself.
+    """A note on a parameter; None where none is needed.
 
     Args:
         estimate: of the parameter.
-        found: what the logs can't tell.
-        info: what is known of the parameter; None where its unit is the log's own.
+        found: identifiability.
+        info: metadata of the parameter; None where its unit is arbitrary.
     """
     note = found.note(estimate.path)
     if note is None and estimate.path in _DAMPING and estimate.value < 0:
@@ -39,14 +39,14 @@ def parameter_note(estimate: Estimate, found: Identifiability, info: ParameterIn
     if note is None and info is not None and info.implausibly_large(estimate.value):
         most = formatting.quantity(info.plausible[1], estimate.unit)
         return (
-            f"{estimate.path} is {formatting.quantity(estimate.value, estimate.unit)}, where real drives show up to "
-            f"{most}: look at the log's units, or for what else could stand behind it."
+            f"{estimate.path} is {formatting.quantity(estimate.value, estimate.unit)}, while real drives have at most "
+            f"{most}: check the log's units, and other explanations."
         )
     return note
 
 
 def identifiability_dict(found: Identifiability, units: Mapping[str, str]) -> dict[str, Any]:
-    """What the logs can't tell of a fitted model."""
+    """Identifiability of a fitted model."""
 
     def told(sentence: str | None) -> str | None:
         return None if sentence is None else in_words_of_log(sentence, units)
@@ -65,10 +65,10 @@ def in_words_of_log(sentence: str, units: Mapping[str, str]) -> str:
 
 
 def limits(report: Mapping[str, Any]) -> list[str]:
-    """What these data can't tell, a sentence each."""
+    """Limits of the data, one sentence each."""
     final = report["after"] if report["after"]["parameters"] else report["before"]
     found = report["identifiability"]
-    # A learned torque's coefficients mean nothing one by one.
+    # Single coefficients of a learned torque have no meaning.
     learned = tuple(f"{e['name']}." for e in report["after"]["effects"] if e["family"] == "unknown")
     effects = [e["parameters"] for e in report["after"]["effects"] if e["family"] != "unknown"]
     silent = frozenset(path for effect in effects for paths in _absent(effect).values() for path in paths)
@@ -89,10 +89,10 @@ def limits(report: Mapping[str, Any]) -> list[str]:
     notes += _own_phases(report)
     if report["judged_on"] != "test":
         notes.append(
-            "The logs are too short to keep a part of them for a test: no error on data that nothing has looked at is "
-            "stated. Record longer logs, or name another one with --test."
+            "The logs are too short to reserve test data: no error on unused data is stated. Record longer logs, or "
+            "name another one with --test."
             if report["decision"] != "fit_only"
-            else "The logs are too short to keep a part of them for a test: the errors are those of the fitted data."
+            else "The logs are too short to reserve test data: the errors are those of the fitted data."
         )
     drifting = beyond_prediction(report, final["rmse"]["selection"])
     notes += [drifting] if drifting else []
@@ -101,39 +101,38 @@ def limits(report: Mapping[str, Any]) -> list[str]:
 
 
 def _unseen(report: Mapping[str, Any]) -> list[str]:
-    """What no sensor saw."""
+    """Limits due to missing sensors."""
     seen = set(report["before"]["rmse_of_outputs"])
     if "dynamic_error" in seen:
         return []
     notes = [
-        "No sensor saw the twist: it is what the model makes of what was measured. Effects in the mesh show only as "
-        "far as they move what was measured."
+        "The twist was not measured: the model computes it from the measured signals. Effects in the mesh are "
+        "visible only through these."
     ]
     if not seen & {"load_angle", "load_velocity", "joint_torque"}:
         notes.append(
-            "Nothing was measured on the load side: friction and other torques on the load are told from those on the "
-            "motor by the motor's motion alone."
+            "Nothing was measured on the load side: only the motor's motion distinguishes friction and other torques "
+            "on the load from those on the motor."
         )
     if not any(output.endswith("_angle") for output in seen):
         notes.append(
-            "Velocities tell no angle: it is integrated from them, so that effects which depend on an angle are told "
-            "poorly."
+            "Angles were integrated from velocities, so that effects that depend on an angle are poorly determined."
         )
     return notes
 
 
 def _of_prior(path: str, estimate: Mapping[str, Any]) -> str:
-    """What the logs add to what was known of a parameter."""
+    """Information of the logs beyond a parameter's prior."""
     before, after = 100.0 * estimate["prior"]["tolerance"], estimate["percent"]
     value = formatting.quantity(estimate["prior"]["value"], estimate["unit"])
-    told = f"{path} was known to be {value} to within {before:.2g} %"
+    told = f"{path} has a prior of {value} with a tolerance of {before:.2g} %"
     if after is None or after > _NOTHING_NEW * before:
-        return f"{told}, and the logs add nothing to that: standard errors contain it."
-    return f"{told}; with the logs it is known to {after:.2g} %."
+        return f"{told}, and the logs add no information: standard errors include it."
+    return f"{told}; the logs reduce it to {after:.2g} %."
 
 
 def _own_phases(report: Mapping[str, Any]) -> list[str]:
-    """What a line that begins each log in another phase leaves open."""
+    """Limit due to a line that begins each log in another phase."""
     late = [(log["name"], log["clock_put_back"]) for log in report["logs"] if log["clock_put_back"]]
     families = {e["family"] for e in report["after"]["effects"]}
     returns = "load_disturbance" in families or (report["unknown"] or {}).get("period")
@@ -141,14 +140,14 @@ def _own_phases(report: Mapping[str, Any]) -> list[str]:
         return []
     told = formatting.words([f"by {formatting.quantity(by, 's', digits=3)} in {name}" for name, by in late])
     return [
-        f"What comes back in time begins each log in another phase, for which the clock was put back {told}. In a log "
-        "that was not fitted its phase is not known: a prediction takes that of the logs whose clocks were left."
+        f"The periodic effect begins each log in another phase, for which the clock was shifted {told}. In other logs "
+        "its phase is unknown: predictions use that of the logs with unchanged clocks."
     ]
 
 
 def _absent(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Parameters of an effect, by unit, that are not told from zero beside others of the unit that are: the orders,
-    say, that a kinematic error does not have."""
+    """Insignificant parameters of an effect, by unit, beside significant ones of the same unit, such as absent orders
+    of a kinematic error."""
     fitted = {path: e for path, e in parameters.items() if not e.get("derived")}
     found: dict[str, list[str]] = {}
     for path, estimate in fitted.items():
@@ -159,7 +158,7 @@ def _absent(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]
 
 
 def _absence(parameters: Mapping[str, Mapping[str, Any]], unit: str, paths: list[str]) -> str:
-    """Such parameters in one sentence."""
+    """A sentence on insignificant parameters."""
     most = max(abs(end) for path in paths for end in parameters[path]["ci95"] if end is not None)
     others = max(abs(e["value"]) for e in parameters.values() if e["unit"] == unit and not e.get("derived"))
     bound, size = (formatting.quantity(value, unit, digits=2) for value in (most, others))
@@ -180,5 +179,5 @@ def _correlated(correlations: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def largest_twist(outcome: Outcome) -> float:
-    """The largest dynamic error on training data."""
+    """Largest dynamic error on training data."""
     return max(run.reach["twist"] for run in outcome.before.training)

@@ -1,4 +1,4 @@
-"""What a report is about: a closed loop, or a fit alone."""
+"""Subject of a report: a closed loop, or a fit alone."""
 
 from fitting.fit_drive import FitOnly
 from fitting.outcome import Loop

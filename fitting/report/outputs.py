@@ -1,4 +1,4 @@
-"""The outputs of a log as a report tells them: names, units, noise."""
+"""Outputs of a log in a report: names, units, noise."""
 
 from collections.abc import Mapping
 from typing import Any

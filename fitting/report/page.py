@@ -1,4 +1,4 @@
-"""The report as a page that reads without a network."""
+"""The report as a self-contained page."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -22,11 +22,11 @@ _SECTIONS = ("fit", "left_over", "look", "found", "next")
 
 
 def report_page(report: Mapping[str, Any], pictures: Sequence[Plot]) -> str:
-    """The page: self-contained, reads without a network.
+    """The page, self-contained, without network access.
 
     Args:
         report: from [`report_dict`][].
-        pictures: from [`fitting.report.plots.plots`][].
+        pictures: plots from [`fitting.report.plots.plots`][].
     """
     filters = {
         "percent": formatting.percent,

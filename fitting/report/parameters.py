@@ -1,4 +1,4 @@
-"""Fitted and derived quantities as a report lists them."""
+"""Fitted and derived quantities in a report."""
 
 import math
 from collections.abc import Mapping
@@ -20,26 +20,26 @@ _TOLD_CORRELATION = 0.1
 
 
 PARTS = ("training", "selection", "test")
-"""Parts of the data: what is fitted, what selects the model, and what nothing has looked at."""
+"""Parts of the data: training, selection and test data."""
 
 _NO_PARTS: dict[str, float | None] = dict.fromkeys(PARTS)
 
 
 def parts_of(report: Mapping[str, Any]) -> tuple[str, ...]:
-    """The parts of the data that a report tells of."""
+    """The parts of the data in a report."""
     return tuple(part for part in PARTS if any(log[part] for log in report["logs"]))
 
 
 def account_dict(
     account: Account, units: Mapping[str, str], x_max: float, *, start: Model | None = None
 ) -> dict[str, Any]:
-    """A fitted model: parameters, what follows from them, and errors.
+    """A fitted model: parameters, derived quantities and errors.
 
     Args:
-        account: the model's.
+        account: of the model.
         units: of `dynamic_error` and, in a reduced log, of `forcing`.
         x_max: the largest measured twist.
-        start: the model that the fit started from, where that is known.
+        start: the starting model, if known.
     """
     figures, by_output = derived(account, drive_figures, x_max), account.rmse_of_outputs
     base = [path for path in account.uncertainty.estimates if "." not in path]
@@ -55,7 +55,7 @@ def account_dict(
 
 
 def no_account() -> dict[str, Any]:
-    """Likewise where no second model was fitted."""
+    """The same where no second model was fitted."""
     empty = {"effects": [], "parameters": {}, "derived": {}, "correlations": []}
     return empty | {"rmse": dict(_NO_PARTS), "rmse_motor_angle": dict(_NO_PARTS), "rmse_of_outputs": {}}
 
@@ -84,8 +84,7 @@ def _estimate_dict(path: str, account: Account, units: Mapping[str, str], start:
 
 
 def _prior_dict(path: str, model: Model) -> dict[str, float | None] | None:
-    """What the drive file says of a parameter that is fitted, its relative standard deviation None for "fit"; None
-    where it says nothing."""
+    """The prior of a fitted parameter, its relative standard deviation None for "fit"; None without a prior."""
     known = model.drive.priors if isinstance(model.drive, Drive) else ()
     found = next((prior for prior in known if prior.path == path), None)
     if found is None:
@@ -95,13 +94,13 @@ def _prior_dict(path: str, model: Model) -> dict[str, float | None] | None:
 
 
 def _flag(path: str, estimate: Estimate, at_bound: bool) -> str | None:
-    """What must be seen beside a parameter in two or three words; None where its number speaks for itself."""
+    """A flag beside a parameter in two or three words; None where none is needed."""
     if at_bound:
         return "at bound"
     if estimate.identifiable:
         return None
     low, high = estimate.ci95
-    # Of an effect that is zero where it is absent, that much may be known very well.
+    # A strength may be accurately determined and still be insignificant.
     return NOT_TOLD_FROM_ZERO if "." in path and low <= 0.0 <= high else "not identifiable"
 
 
@@ -110,7 +109,7 @@ def _percent(value: float, std: float) -> float:
 
 
 def _correlations(uncertainty: Uncertainty) -> list[dict[str, Any]]:
-    """Pairs of parameters whose errors go together, strongest first."""
+    """Pairs of correlated parameters, strongest first."""
     names, matrix = list(uncertainty.estimates), np.asarray(uncertainty.correlation)
     pairs = [(float(matrix[i, j]), names[j], names[i]) for i in range(len(names)) for j in range(i)]
     told = sorted((p for p in pairs if abs(p[0]) > _TOLD_CORRELATION), key=lambda p: -abs(p[0]))
@@ -118,7 +117,7 @@ def _correlations(uncertainty: Uncertainty) -> list[dict[str, Any]]:
 
 
 def _unit_in_log(unit: str, path: str, model: Model, units: Mapping[str, str]) -> str:
-    """The unit of what stands at a path; a reduced drive's come from the log."""
+    """The unit of the parameter at a path; for a reduced drive from the log."""
     if not isinstance(model, ReducedModel):
         return unit
     place: formatting.Place = "drive"
@@ -153,7 +152,7 @@ def effect_dict(finding: Finding, outcome: Outcome, units: Mapping[str, str]) ->
 
 def _derived_dict(name: str, quantity: Derived) -> dict[str, Any]:
     low, high = quantity.ci95
-    # An angle may well be zero; it is known when it is known to a quarter turn.
+    # An angle may be zero; it is identifiable if determined to a quarter turn.
     is_phase = name.startswith("ph")
     known = high - low < math.pi if is_phase else not low <= 0.0 <= high
     doubt = "not identifiable" if is_phase else NOT_TOLD_FROM_ZERO

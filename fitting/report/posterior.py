@@ -1,4 +1,4 @@
-"""Draws from the posterior: their quantiles and diagnostics for the report, and the draws themselves as a table."""
+"""Draws from the posterior: quantiles and diagnostics for the report, and the draws as a table."""
 
 from io import BytesIO
 from typing import Any
@@ -8,14 +8,14 @@ import numpy as np
 from fitting.uncertainty.posterior import Posterior
 
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
-"""Levels that a report lists."""
+"""Quantile levels in a report."""
 
 DRAWS_FILE = "posterior.parquet"
-"""Holds the draws, beside the report."""
+"""File of the draws, beside the report."""
 
 
 def posterior_dict(found: Posterior | None) -> dict[str, Any] | None:
-    """Quantiles of each parameter and how far the draws may be relied on; None where none were made."""
+    """Quantiles of each parameter and diagnostics of the draws; None without draws."""
     if found is None:
         return None
     chains, draws, _ = found.values.shape
@@ -44,12 +44,12 @@ def _says(found: Posterior) -> str:
     made = f"{draws} draws from each of {chains} chains, {found.divergences} divergent transitions"
     if found.settled:
         return f"{made}: the chains agree."
-    return f"{made}: the chains have NOT settled (R-hat above 1.01 or divergences); don't rely on these quantiles."
+    return f"{made}: the chains have NOT converged (R-hat above 1.01 or divergences); don't rely on these quantiles."
 
 
 def draws_table(found: Posterior) -> bytes:
     """The draws as a Parquet file: `chain`, `draw`, and each parameter in the unit of the report."""
-    # Loaded here: few fits draw from the posterior.
+    # Imported here: few fits draw from the posterior.
     import polars as pl
 
     chains, draws, _ = found.values.shape

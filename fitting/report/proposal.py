@@ -1,4 +1,4 @@
-"""The next experiment in a report: what it tells, within which limits, and the command as a table."""
+"""The next experiment in a report: its information, its limits, and the command as a table."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,11 +10,11 @@ from fitting.next_experiment.proposal import NextExperiment, Precision, Separati
 from fitting.report.limits import in_words_of_log
 
 COMMAND_FILE = "next_experiment.csv"
-"""Where the command is written."""
+"""File of the command."""
 
-# Expected log-likelihood ratios: below the first nothing shows, from the second on the odds leave no doubt.
+# Expected log-likelihood ratios: not informative below the first, decisive above the second.
 _NOTHING, _DECISIVE = 0.05, 10.0
-# Beyond it only that it is.
+# Largest ratio that is stated as a number.
 _LARGEST_TOLD = 1e6
 
 
@@ -27,7 +27,7 @@ def command_table(found: NextExperiment) -> str:
 def proposal_dict(
     found: NextExperiment | None, units: Mapping[str, str], *, logs_reach: float
 ) -> dict[str, Any] | None:
-    """What a report says of the next experiment; None where there is none.
+    """The next experiment in a report; None without one.
 
     Args:
         found: the experiment.
@@ -70,7 +70,7 @@ def proposal_dict(
 
 
 def next_lines(report: Mapping[str, Any]) -> list[str]:
-    """The next experiment in plain sentences, or how to come by it; nothing where nothing is open.
+    """Sentences on the next experiment, or how to request one; empty where none is needed.
 
     Args:
         report: from [`fitting.report.report_dict`][].
@@ -80,9 +80,9 @@ def next_lines(report: Mapping[str, Any]) -> list[str]:
         return [*proposed["says"], f"The command is in {proposed['file']}."]
     if report["decision"] == "fit_only":
         known = report["before"]["parameters"]["alpha"]["identifiable"]
-        return [] if known else ["--next-experiment looks for a command that would tell alpha."]
+        return [] if known else ["--next-experiment searches for a command that determines alpha."]
     tie = report["decision"] == "effect_found" and any(not other["separable"] for other in report["alternatives"])
-    return ["--next-experiment looks for a command that would tell the tied explanations apart."] if tie else []
+    return ["--next-experiment searches for a command that separates the tied explanations."] if tie else []
 
 
 def _input(found: NextExperiment) -> str:
@@ -110,9 +110,9 @@ def _tie_says(found: str, separation: Separation) -> str:
     rival, logs, proposed = separation.rival, separation.on_logs, separation.proposed
     if proposed is None:
         if logs is None:
-            return f"{rival} is too abrupt for a search that follows derivatives: no command was sought against it."
+            return f"{rival} is not smooth enough for a gradient search: no command was searched against it."
         return (
-            f"Simulations as long as the logs tell {found} and {rival} apart already, with expected log-likelihood "
+            f"Simulations as long as the logs already separate {found} and {rival}, with expected log-likelihood "
             f"ratios of {_ratio(logs[0])} and {_ratio(logs[1])}: no new experiment is needed."
         )
     cases = zip((found, rival), logs or (None, None), proposed, strict=True)
@@ -124,11 +124,11 @@ def _tie_says(found: str, separation: Separation) -> str:
     sentence = f"Between {found} and {rival}: {sentence}."
     for name, other, new in ((found, rival, proposed[0]), (rival, found, proposed[1])):
         if new < _NOTHING:
-            sentence += f" With its parameters free, {other} can imitate {name}; the reverse would show."
+            sentence += f" With its parameters free, {other} can imitate {name}, but not the reverse."
     if max(proposed) < _DECISIVE:
         more = _DECISIVE / max(max(proposed), 1e-300)
         needs = f"about {formatting.number(more, 2)} times the duration" if more < 1e4 else "wider limits"
-        sentence += f" That does not decide: it would take {needs}, or less noise."
+        sentence += f" That is not decisive: it would need {needs}, or less noise."
     return sentence
 
 
@@ -143,17 +143,17 @@ def _of_alpha(found: NextExperiment, precision: Precision, units: Mapping[str, s
     unit = precision.unit
     sentence = (
         f"The standard error of alpha falls from {precision.on_logs:.2g} {unit} on the logs to "
-        f"{precision.proposed:.2g} {unit}, as far as noise decides: an alpha above {visible:.2g} {unit} could be told "
-        "from zero."
+        f"{precision.proposed:.2g} {unit}, under noise alone: an alpha above {visible:.2g} {unit} would be "
+        "significantly nonzero."
     )
     needed = None
     if fitted and fitted < visible:
-        # The cubic torque grows with the third power of the twist, and the twist with the torque.
+        # The cubic torque grows with the third power of the twist, and thus of the torque.
         needed = found.limits.torque * float(np.cbrt(visible / fitted))
         torque = f"{formatting.number(needed, 2)} {'N m' if found.motor_speed is not None else units['forcing']}"
         sentence += (
-            f" No excitation within the limits tells the fitted value of {precision.fitted:.2g} {unit} from zero: that "
-            f"would need a torque of about {torque}, or less noise."
+            f" No excitation within the limits distinguishes the fitted value of {precision.fitted:.2g} {unit} from "
+            f"zero: that would need a torque of about {torque}, or less noise."
         )
     return {
         "fitted": precision.fitted,

@@ -1,4 +1,4 @@
-"""Why a decision came out as it did: every rule with its statistic and its threshold."""
+"""Reasons of a decision: every rule with its statistic and threshold."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,12 +6,12 @@ from typing import Any
 from fitting.attribution.decisions import Check
 from fitting.attribution.rules import rules_table
 
-# The one threshold that each form has for itself, in the code of the effect.
-_OF_LAWS = {"unit": "share of rms", "meaning": "of what earlier effects removed that their laws may get wrong"}
+# The only threshold per form, in the code of the effect.
+_OF_LAWS = {"unit": "share of rms", "meaning": "possible error of earlier effects' laws, relative to what they removed"}
 
 
 def rules_dict(checks: Sequence[Check]) -> list[dict[str, Any]]:
-    """The rules as they were applied, in the order of the loop.
+    """The applied rules, in the order of the loop.
 
     Args:
         checks: of a decision.
@@ -42,7 +42,7 @@ def rules_page() -> str:
         [
             "# Rules of decision",
             "",
-            "Every threshold that decides what a loop says (`fitting/attribution/rules.py`). A report has each",
+            "Thresholds of all decisions of a loop (`fitting/attribution/rules.py`). A report has each",
             "rule with its statistic and its outcome, under `rules` and in the section *Why this decision*. The page",
             "is what `fitting.report.rules.rules_page()` gives.",
             "",

@@ -1,12 +1,12 @@
-"""Which experiment tells two families of effects apart."""
+"""Experiments that separate two families of effects."""
 
 _PLAIN_FAMILY = {"torque_sensor": "torque sensor error", "unknown": "unknown term"}
 
 
-# Which experiment separates two families; symmetric. Restates the look-alike column of EFFECTS.md.
+# Experiment that separates two families; symmetric.
 _SEPARATING = {
     ("kinematic_error", "cogging"): "Run at two constant speeds: the force behind a geometric error grows with the "
-    "square of the speed, a cogging torque stays the same.",
+    "square of the speed, a cogging torque does not.",
     ("kinematic_error", "encoder_eccentricity"): "Pass slowly through the speed at which the order meets the natural "
     "frequency: a kinematic error is amplified there, an encoder's error is not.",
     ("kinematic_error", "position_dependent_stiffness"): "Step the mean torque at one speed: a ripple of the stiffness "
@@ -23,21 +23,21 @@ _SEPARATING = {
     "cogging does not.",
     ("stiffness_shape", "stiffness_shape"): "Drive to larger twists, past the knee of the stiffness, in both "
     "directions.",
-    ("stiffness_shape", "backlash"): "Repeat with a preload: a dead zone disappears, a bent stiffness stays.",
-    ("stiffness_shape", "hysteresis"): "Cycle the torque slowly at several amplitudes: hysteresis opens a loop, a bent "
-    "stiffness retraces its curve.",
+    ("stiffness_shape", "backlash"): "Repeat with a preload: a dead zone disappears, a nonlinear stiffness does not.",
+    ("stiffness_shape", "hysteresis"): "Cycle the torque slowly at several amplitudes: hysteresis opens a loop, a "
+    "nonlinear stiffness does not.",
     ("stiffness_shape", "nonlinear_damping"): "Cycle the torque slowly: damping vanishes with the rate, stiffness does "
     "not.",
-    ("backlash", "hysteresis"): "Repeat with a preload: a dead zone disappears, hysteresis stays.",
-    ("backlash", "coulomb_friction"): "Repeat with a preload: a dead zone disappears, friction stays.",
+    ("backlash", "hysteresis"): "Repeat with a preload: a dead zone disappears, hysteresis does not.",
+    ("backlash", "coulomb_friction"): "Repeat with a preload: a dead zone disappears, friction does not.",
     ("hysteresis", "coulomb_friction"): "Cycle the torque as a slow triangle at three rates, with small loops inside "
-    "large ones: hysteresis has a slope before it slides and remembers its reversals.",
-    ("hysteresis", "nonlinear_damping"): "Repeat the same twist at three rates: the area of a hysteresis loop stays, "
-    "that of a damping loop grows with the rate.",
-    ("hysteresis", "motor_friction"): "Lock the output and cycle the torque slowly: what the motor's own friction "
-    "takes does not reach the twist, hysteresis shows in torque against twist.",
-    ("hysteresis", "creep"): "Stop under load and wait: creep goes on for minutes, hysteresis does not.",
-    ("coulomb_friction", "motor_friction"): "Turn the motor at constant speed, unloaded: its friction takes torque, "
+    "large ones: hysteresis has a slope before sliding, and depends on earlier reversals.",
+    ("hysteresis", "nonlinear_damping"): "Repeat the same twist at three rates: the area of a hysteresis loop is "
+    "constant, that of a damping loop grows with the rate.",
+    ("hysteresis", "motor_friction"): "Lock the output and cycle the torque slowly: friction of the motor does not "
+    "affect the twist, hysteresis appears in torque against twist.",
+    ("hysteresis", "creep"): "Stop under load and wait: creep continues for minutes, hysteresis does not.",
+    ("coulomb_friction", "motor_friction"): "Turn the motor at constant speed, unloaded: its friction needs torque, "
     "friction between the mesh's sides does not.",
     ("coulomb_friction", "load_friction"): "Drive one side at a time, the other one locked.",
     ("coulomb_friction", "nonlinear_damping"): "Excite at several levels: the loss per cycle grows more slowly than "
@@ -46,7 +46,7 @@ _SEPARATING = {
     ("motor_friction", "load_friction"): "Drive one side at a time, the other one locked or uncoupled.",
     ("motor_friction", "torque_sensor"): "Run the same path in both directions: friction changes its sign, a bias does "
     "not.",
-    ("motor_friction", "nonlinear_damping"): "Turn at several constant speeds: motor friction takes torque, damping of "
+    ("motor_friction", "nonlinear_damping"): "Turn at several constant speeds: motor friction needs torque, damping of "
     "the mesh does not.",
     ("motor_friction", "position_dependent_friction"): "Turn slowly over several revolutions: a ripple that repeats "
     "with the angle belongs to the position.",
@@ -61,21 +61,21 @@ _SEPARATING = {
     "needs the one and moves with the other.",
     ("temperature", "creep"): "Hold a constant torque at a constant temperature: creep relaxes, a thermal drift stays "
     "away.",
-    ("temperature", "hysteresis"): "Cool down and repeat: thermal drift goes back to where it was.",
-    ("torque_sensor", "torque_sensor"): "Rest without load, then apply a known torque: bias shows in the one, gain in "
-    "the other.",
+    ("temperature", "hysteresis"): "Cool down and repeat: thermal drift is reversible.",
+    ("torque_sensor", "torque_sensor"): "Rest without load, then apply a known torque: the first shows a bias, the "
+    "second a gain error.",
     ("input_delay", "nonlinear_damping"): "Excite up to several times the natural frequency: the phase of a delay "
     "keeps growing, that of damping saturates.",
-    ("kinematic_error", "kinematic_error"): "Turn the output by several whole revolutions at constant speed: sidebands "
-    "come and go with the output's revolution.",
-    ("cogging", "cogging"): "Turn slowly at constant speed for many motor revolutions: the orders then part.",
+    ("kinematic_error", "kinematic_error"): "Turn the output by several whole revolutions at constant speed: "
+    "sidebands vary with the output's revolution.",
+    ("cogging", "cogging"): "Turn slowly at constant speed for many motor revolutions: this separates the orders.",
     ("cogging", "gravity_load"): "Turn the mount: gravity keeps to the vertical, cogging to the motor.",
     ("hysteresis", "hysteresis"): "Cycle the torque slowly with small loops inside large ones, up to several times the "
-    "yield: the laws differ in how they leave a reversal and in whether small loops close.",
-    ("coulomb_friction", "coulomb_friction"): "Repeat under a preload: one friction grows with the torque that the "
-    "mesh passes on, the other stays.",
+    "yield: the laws differ after a reversal, and in whether small loops close.",
+    ("coulomb_friction", "coulomb_friction"): "Repeat under a preload: one friction grows with the transmitted "
+    "torque, the other does not.",
     ("nonlinear_damping", "nonlinear_damping"): "Excite at the natural frequency at several levels, with and without "
-    "a preload: the powers of rate and twist then part.",
+    "a preload: this separates the powers of rate and twist.",
     ("coulomb_friction", "position_dependent_friction"): "Turn slowly over several revolutions: a ripple that repeats "
     "with the angle belongs to the position.",
     ("position_dependent_friction", "position_dependent_friction"): "Turn the motor at constant speed, unloaded: "
@@ -88,22 +88,21 @@ _SEPARATING = {
     "motor's sensor does not.",
     ("load_disturbance", "load_friction"): "Run the same path in both directions: friction changes its sign, a "
     "constant torque does not.",
-    ("load_disturbance", "load_disturbance"): "Log longer: lines that are close together then part.",
+    ("load_disturbance", "load_disturbance"): "Record a longer log, which resolves close lines.",
     ("load_disturbance", "encoder_eccentricity"): "Change the speed: an encoder's error moves with it, a disturbance "
     "stays at its frequency.",
     ("gravity_load", "load_friction"): "Hold several poses and approach each from both sides: friction depends on the "
     "side, gravity on the pose.",
     ("load_friction", "load_friction"): "Turn the load at several constant speeds in both directions.",
-    ("extra_resonance", "input_delay"): "Excite up to several times the natural frequency: a second resonance turns "
-    "the phase and back within a band, a delay ever more.",
-    ("extra_resonance", "nonlinear_damping"): "Repeat at another level: a second resonance stays where it is.",
-    ("extra_resonance", "stiffness_shape"): "Repeat at another level: a second resonance stays where it is, a bent "
-    "stiffness moves the natural frequency.",
-    ("extra_resonance", "creep"): "Stop under load and wait: creep goes on, a second resonance rings down.",
+    ("extra_resonance", "input_delay"): "Excite up to several times the natural frequency: a second resonance "
+    "changes the phase within a band, a delay increasingly with frequency.",
+    ("extra_resonance", "nonlinear_damping"): "Repeat at another level: a second resonance does not move.",
+    ("extra_resonance", "stiffness_shape"): "Repeat at another level: a second resonance does not move, a nonlinear "
+    "stiffness changes the natural frequency.",
+    ("extra_resonance", "creep"): "Stop under load and wait: creep continues, a second resonance decays.",
     ("creep", "nonlinear_damping"): "Excite at the natural frequency at several levels, then stop under load and wait: "
     "creep is linear in the level and slow, nonlinear damping neither.",
-    ("temperature", "motor_friction"): "Repeat the same path cold and warm: what depends on temperature changes, the "
-    "rest stays.",
+    ("temperature", "motor_friction"): "Repeat the same path cold and warm: only effects of temperature change.",
     ("temperature", "stiffness_shape"): "Repeat the same torque cycle cold and warm, with the same twists.",
     ("temperature", "temperature"): "Ring the drive down freely, cold and warm, and turn the motor unloaded: the "
     "frequency shows the stiffness, the decay the damping, the torque the friction.",
@@ -116,13 +115,16 @@ _SEPARATING = {
         "sensor_delay",
     ): "Excite both sides at several times the natural frequency, where the two inertias move differently.",
     ("sensor_delay", "nonlinear_damping"): "Repeat at another level: a delay does not depend on it.",
-    ("sensor_delay", "input_delay"): "Drive the load by hand: a delay of an encoder stays, one of the torque does not.",
+    (
+        "sensor_delay",
+        "input_delay",
+    ): "Drive the load by hand: a delay of an encoder remains, one of the torque does not.",
     ("input_delay", "input_delay"): "Excite up to several times the natural frequency, log the torque faster, and "
     "state its hold in the drive file: a lag also weakens fast torques, a delay does not.",
 }
 
 
-# Where the pair is not in the table: what brings out one family.
+# Experiment that reveals one family, for pairs that are not in the table.
 _REVEALING = {
     "kinematic_error": "repeat at two speeds and look for amplification at the natural frequency",
     "stiffness_shape": "cycle the torque slowly to larger twists",
@@ -148,7 +150,7 @@ _REVEALING = {
 
 
 def separating_experiment(one: str, other: str) -> str:
-    """The experiment that tells two families apart."""
+    """The experiment that separates two families."""
     known = _SEPARATING.get((one, other)) or _SEPARATING.get((other, one))
     if known:
         return known
@@ -160,10 +162,10 @@ def separating_experiment(one: str, other: str) -> str:
 
 
 def look_alikes(family: str) -> dict[str, str]:
-    """The families that leave a similar residual, each with the experiment that tells them apart.
+    """The families with a similar residual, each with the separating experiment.
 
     Args:
-        family: of effects; it is its own look-alike where its forms are hard to tell apart.
+        family: of effects; it is its own look-alike where its forms are hard to separate.
     """
     pairs = {other: experiment for pair, experiment in _SEPARATING.items() for other in _other(pair, family)}
     return dict(sorted(pairs.items()))

@@ -1,4 +1,4 @@
-"""What each step of the loop did to the error on selection data, over times so short that little can pile up."""
+"""Error on selection data after each step of the loop, over short segments where errors hardly accumulate."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +9,7 @@ from fitting.outcome import Loop
 from fitting.report.outcome import Outcome
 from fitting.report.outputs import principal
 
-# In units of the measurement noise: what leaves nothing but noise, and what a free run may be off without a word.
+# In units of the measurement noise: largest error that counts as noise, and largest free-run error without a remark.
 _NOISE, _OFF = 1.2, 3.0
 
 
@@ -33,7 +33,7 @@ def _step(added: str | None, trial: Trial, seconds: float) -> dict[str, Any]:
 
 
 def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | None:
-    """What must be said where a model leaves nothing but noise over short times, and much over long ones.
+    """A remark where only noise is left on short segments, and much more in long free runs.
 
     Args:
         report: the report's content so far.
@@ -48,6 +48,6 @@ def beyond_prediction(report: Mapping[str, Any], free: float | None) -> str | No
     return (
         f"Over {formatting.quantity(last['segment_seconds'], 's')} at a time the model errs by "
         f"{formatting.quantity(short, unit)} rms ({formatting.number(short / noise)} times the noise) on selection "
-        "data. Its longer free runs leave the data all the same: along this motion small errors of the initial state "
-        "and of the parameters grow (as behind a dead zone), or something slow acts that the log does not show."
+        "data. Its longer free runs deviate nevertheless: along this motion small errors of initial state and "
+        "parameters grow (as with a dead zone), or something slow acts that was not logged."
     )

@@ -1,4 +1,4 @@
-"""The decision in plain words."""
+"""The decision in a few sentences."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,14 +9,14 @@ from fitting.report.outputs import principal
 from fitting.report.separating import plain_family
 from fitting.report.unknown import place_and_variables
 
-# What changes the error by less than this share hardly shows in it.
+# Smallest relative change of the error that is stated.
 _HARDLY = 0.1
 
 _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
 
 
 def summary(report: Mapping[str, Any]) -> str:
-    """The decision in plain words, and whether test data ask more of the model than was fitted."""
+    """The decision in a few sentences, and the extrapolation of test data."""
     return _decision(report) + _extrapolating(report)
 
 
@@ -32,7 +32,7 @@ def _decision(report: Mapping[str, Any]) -> str:
     if decision == "model_sufficient":
         return (
             f"The model suffices: on {on} data it errs by {_against_noise(before, noise, unit)}, and none of the "
-            f"{report['forms_tried']} forms of missing physics that were tried gains more than chance would."
+            f"{report['forms_tried']} tried forms of missing physics has a significant gain."
             + _remembering(report)
             + _noisy_torque(report)
         )
@@ -44,10 +44,10 @@ def _decision(report: Mapping[str, Any]) -> str:
         )
         rest = ""
         if report["unknown"]:
-            rest = f" Something unknown is missing beside it: a learned {_learned(report)}, stands for it."
+            rest = f" Something unknown is also missing: a learned {_learned(report)}, represents it."
         elif report["times_noise"] >= RULES.excess:
             left = formatting.number(report["times_noise"])
-            rest = f" Something unknown is missing beside it: {left} times the noise is left."
+            rest = f" Something unknown is also missing: the residual is {left} times the noise."
         several = bool(report["unknown"]) or len(families) > 1
         change = _change("Together they" if several else "It", report, several=several)
         return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
@@ -60,19 +60,18 @@ def _decision(report: Mapping[str, Any]) -> str:
     beyond = left["free_runs_times_expected"]
     if beyond is not None:
         return (
-            f"{opening} Short segments, each of which may start anew, show little of it: free runs of whole "
-            f"stretches err by {_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and "
+            f"{opening} Short segments hardly show it: free runs of whole stretches err by "
+            f"{_against_noise(after, noise, unit)}, {formatting.number(beyond)} times what noise and "
             "uncertainty allow."
         )
     return (
-        f"{opening} What is left over is {formatting.number(left['times_noise'])} times the measurement noise, and "
-        f"depends most on the {left['depends_on']} (which accounts for "
-        f"{formatting.percent(left['explained_share'])} of it)."
+        f"{opening} The residual is {formatting.number(left['times_noise'])} times the measurement noise, and depends "
+        f"most on the {left['depends_on']} (which explains {formatting.percent(left['explained_share'])} of it)."
     )
 
 
 def _extrapolating(report: Mapping[str, Any]) -> str:
-    """How far test data go beyond what was fitted; empty where they don't."""
+    """A sentence on test data beyond the fitted range; empty without any."""
     beyond = [
         f"{one['quantity']} up to {formatting.quantity(one['test'], one['unit'])} (fitted up to "
         f"{formatting.quantity(one['fitted'], one['unit'], like=one['test'])})"
@@ -84,25 +83,25 @@ def _extrapolating(report: Mapping[str, Any]) -> str:
 
 
 def _remembering(report: Mapping[str, Any]) -> str:
-    """What it rests on that the noise is as large as it is said to be; empty where short pieces tell it."""
+    """The assumption behind a large noise estimate; empty where short pieces determine the noise."""
     memory = report["noise"]["memory"]
     if memory is None:
         return ""
     return (
-        f" What is left over remembers itself for about {formatting.quantity(memory, 's', digits=2)}, and was taken "
-        "for noise of the sensors: beside such noise nothing is left that could be predicted. Something as slow that "
-        "nothing tried here can follow would look the same."
+        f" The residual has a correlation time of about {formatting.quantity(memory, 's', digits=2)}, and is "
+        "attributed to noise of the sensors: with such noise the innovations are white. An untried effect that is as "
+        "slow would look the same."
     )
 
 
 def _noisy_torque(report: Mapping[str, Any]) -> str:
-    """That the torque channel is noisy; empty where it is not."""
+    """A sentence on a noisy torque channel; empty without one."""
     std = report["noise"]["torque"]
     if std is None:
         return ""
     return (
         f" The torque channel is noisy by {formatting.quantity(std, report['units']['forcing'], digits=2)} rms. The "
-        "drive answers to it, so that free runs leave more than the sensors' noise, and no model follows them closer."
+        "drive responds to it, so that free-run errors exceed the sensors' noise for any model."
     )
 
 
@@ -112,7 +111,7 @@ def _learned(report: Mapping[str, Any]) -> str:
 
 
 def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -> str:
-    """What became of the error by what was found."""
+    """Change of the error by the accepted effects."""
     on = report["judged_on"]
     before, after = (report[stage]["rmse"][on] for stage in ("before", "after"))
     (output, unit, noise), s = principal(report), "" if several else "s"
@@ -121,8 +120,8 @@ def _change(subject: str, report: Mapping[str, Any], *, several: bool = False) -
     if not _falls(before, after) and _falls(*motor):
         first, last = (_rmse(value, "rad", motor[0]) for value in motor)
         return (
-            f"{subject} show{s} in the motor's angle, whose error on {on} data falls by {_removed(*motor)}, from "
-            f"{first} to {last}. Hardly in the {output}, which is off by {then} before and {now} after."
+            f"{subject} affect{s} the motor's angle, whose error on {on} data falls by {_removed(*motor)}, from "
+            f"{first} to {last}. The {output} is hardly affected, with an error of {then} before and {now} after."
         )
     if before is not None and (after is None or after > before):
         where = f"short segments alone; over whole stretches of {on} data the error rises"
@@ -145,7 +144,7 @@ def _against_noise(value: float | None, noise: float, unit: str, like: float | N
 
 
 def _falls(before: float | None, after: float | None) -> bool:
-    """Whether an error falls by more than hardly."""
+    """Whether an error decreases noticeably."""
     return after is not None and (before is None or after < (1.0 - _HARDLY) * before)
 
 
@@ -156,7 +155,7 @@ def _removed(before: float | None, after: float | None) -> str:
 
 
 def chance(effect: Mapping[str, Any], report: Mapping[str, Any]) -> str:
-    """The p-value, with a sign where fewer draws than it would take were made."""
+    """The p-value, as a bound where the number of draws limits it."""
     p = effect["p_value"]
     smallest = 1.0 / (1 + report["surrogates"])
     if p is None:

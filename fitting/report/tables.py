@@ -13,11 +13,11 @@ FIGURES = {
     "nonlinear_share": ("α x²", "cubic share of the restoring torque at the largest measured twist"),
     "stiffness_at_full_twist": ("K(1 + 3 α x²)", "stiffness at the largest measured twist"),
 }
-"""Symbol and meaning of what follows from a drive's parameters."""
+"""Symbol and meaning of quantities derived from a drive's parameters."""
 
 
 def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The drive's parameters and what follows from them, each with the unit in which its numbers read well."""
+    """The drive's parameters and derived quantities, each in a suitable unit."""
     rows = []
     entries = [(p, p, e["description"], "parameters", e) for p, e in final["parameters"].items()]
     entries += [(k, *FIGURES[k], "derived", e) for k, e in final["derived"].items()]
@@ -41,7 +41,7 @@ def parameter_rows(report: Mapping[str, Any], final: Mapping[str, Any]) -> list[
 
 
 def changes(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The drive's parameters without and with what was found."""
+    """The drive's parameters without and with the accepted effects."""
     if not report["after"]["effects"]:
         return []
     rows = []

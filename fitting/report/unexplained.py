@@ -1,4 +1,4 @@
-"""How much a model leaves over, and on what it depends most."""
+"""Size of a model's residual, and the quantity that it depends on most."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from fitting.validation.residual_diagnostics import Dependence, diagnose
 
 
 def unexplained(outcome: Outcome, noise: float) -> dict[str, Any] | None:
-    """How much is left over, and on what it depends most; None where that is not the decision."""
+    """Size of the residual, and the quantity that it depends on most; None for other decisions."""
     if not isinstance(outcome, Loop) or outcome.decision != "unexplained":
         return None
     residual = outcome.residual_after if outcome.unknown is None else diagnose(outcome.unknown.before.training)
@@ -28,7 +28,7 @@ def unexplained(outcome: Outcome, noise: float) -> dict[str, Any] | None:
 
 
 def explained_share(dependence: Dependence, rms: float) -> float:
-    """Share of the residual's mean square that its mean over bins of a quantity accounts for."""
-    # Means of bins scatter even where nothing depends on anything; that is taken off.
+    """Share of the residual's mean square explained by its mean over bins of a quantity."""
+    # Corrected for the scatter of bin means without any dependence.
     square = np.mean(dependence.mean**2 - dependence.standard_error**2)
     return float(np.clip(square / rms**2, 0.0, 1.0)) if rms > 0 else 0.0

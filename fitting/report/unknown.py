@@ -1,4 +1,4 @@
-"""What was learned, where the catalogue does not explain what is missing."""
+"""Learned terms in a report, where the catalogue does not explain the discrepancy."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,13 +33,13 @@ _WORDS = {
 _QUANTITIES = {"torque": "N m", "error": "rad"}
 _MEMORIES = {"lags": "lags behind", "yields": "yields to"}
 _TOLD = 6
-# What lags and is damped by so much does not swing.
+# Damping ratio above which a lag does not oscillate.
 _CREEPS = 0.5
 
 
 def curve_of(loop: Loop) -> LearnedCurve | LearnedResponse | None:
-    """The learned function of a loop with its final values, or the response of a torque that lags; None where there is
-    neither. (What a torque does that yields is drawn like an effect.)"""
+    """The learned function of a loop with its final values, or the response of a lagging torque; None without either.
+    (Hysteresis is plotted like an effect.)"""
     if loop.unknown is None:
         return None
     effect = loop.after.model.effect(loop.unknown.chosen.form.name)
@@ -51,7 +51,7 @@ def curve_of(loop: Loop) -> LearnedCurve | LearnedResponse | None:
 
 
 def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] | None:
-    """What was learned: what it depends on, what it is worth, and what it looks like; None where there is nothing."""
+    """A learned term: variables, gain and resemblance; None without one."""
     if not isinstance(outcome, Loop) or outcome.unknown is None:
         return None
     finding = next(f for f in outcome.findings if f.name == outcome.unknown.chosen.form.name)
@@ -76,7 +76,7 @@ def unknown_dict(outcome: Outcome, units: Mapping[str, str]) -> dict[str, Any] |
 
 
 def _of_function(loop: Loop) -> dict[str, Any]:
-    """What is told of a function of the present motion."""
+    """Content on a function of the present motion."""
     curve = curve_of(loop)
     assert isinstance(curve, LearnedCurve) and loop.unknown is not None
     effect = loop.after.model.effect(loop.unknown.chosen.form.name)
@@ -96,17 +96,17 @@ def _of_function(loop: Loop) -> dict[str, Any]:
 
 
 def _of_memory(effect: LearnedMemory, loop: Loop) -> dict[str, Any]:
-    """What is told of a torque with a memory."""
+    """Content on a torque with memory."""
     form = place_of(effect)
     assert form is not None
     place, memory = PLACES[form.name], "lags" if isinstance(effect, Lagging) else "yields"
     where = place_and_variables(place, [effect.angle], None, memory)
-    said = [f"A learned {where}, stands for what is missing. It depends on the past: it has a memory of its own."]
+    said = [f"A learned {where}, represents what is missing. It depends on the past: it has memory."]
     family = _remembers(effect, place)
     if isinstance(effect, Lagging):
         hertz = formatting.quantity(float(effect.omega) / (2 * np.pi), "Hz", digits=3)
-        said.append(f"What lags has a natural frequency of {hertz} and a damping ratio of {effect.zeta:.2g}.")
-    said.append(f"Of the catalogue, {plain_family(family)} looks like it.")
+        said.append(f"The lag has a natural frequency of {hertz} and a damping ratio of {effect.zeta:.2g}.")
+    said.append(f"Of the catalogue, {plain_family(family)} resembles it.")
     said += _doubted(loop.doubted)
     return {
         "place": place,
@@ -122,21 +122,21 @@ def _of_memory(effect: LearnedMemory, loop: Loop) -> dict[str, Any]:
 
 
 def _remembers(effect: LearnedMemory, place: str) -> str:
-    """The family of the catalogue that looks like a torque with memory."""
+    """The family of the catalogue that resembles a torque with memory."""
     if isinstance(effect, Lagging):
         return "creep" if place == "mesh" and effect.zeta >= _CREEPS else "extra_resonance"
     return {"mesh": "hysteresis", "motor": "motor_friction", "load": "load_friction"}[place]
 
 
 def _formula(effect: LearnedMemory) -> str:
-    """A torque with memory in a formula, against the angle that it is of."""
+    """Formula of a torque with memory as a function of its angle."""
     u = effect.angle
     if isinstance(effect, Lagging):
         spring, damper = float(effect.omega) ** 2, 2 * float(effect.zeta) * float(effect.omega)
         beside, inertia = "", ""
         if isinstance(effect, LaggingShaftTorque):
             beside = f" {effect.drag:+.4g} {u}'"
-            inertia = f", and {effect.share:.3g} of the shaft's inertia is not on it"
+            inertia = f", and {effect.share:.3g} of the shaft's inertia is not coupled to it"
         return (
             f"{effect.k:.4g} ({u} - y) {effect.b:+.4g} ({u}' - y'){beside} where y'' = {spring:.4g} ({u} - y) "
             f"{damper:+.4g} ({u}' - y'){inertia}"
@@ -150,18 +150,18 @@ def _formula(effect: LearnedMemory) -> str:
 
 
 def unit_in_log(unit: str, loop: Loop, units: Mapping[str, str]) -> str:
-    """A unit of the learned function or of what it depends on; a reduced drive's come from the log."""
+    """A unit of the learned function or its variables; for a reduced drive from the log."""
     if not isinstance(loop.after.model, ReducedModel):
         return unit
     return formatting.in_log_units(unit, response=units["dynamic_error"], forcing=units["forcing"])
 
 
 def place_and_variables(place: str, variables: list[str], period: float | None, memory: str | None) -> str:
-    """Where something learned acts and what it depends on, in words."""
+    """Place and variables of a learned term, in words."""
     if memory is not None:
         return f"{WORDS[place]}, which {_MEMORIES[memory]} the {_WORDS[variables[0]]}"
     if period is not None:
-        return f"{WORDS[place]}, which comes back {formatting.number(1.0 / period)} times a second"
+        return f"{WORDS[place]}, which repeats {formatting.number(1.0 / period)} times a second"
     return f"{WORDS[place]}, a function of the {' and the '.join(_WORDS[v] for v in variables)}"
 
 
@@ -170,28 +170,28 @@ def _shape_dict(shape: Shape) -> dict[str, Any]:
 
 
 def _sentence(curve: LearnedCurve, closest: tuple[Shape, ...], doubted: tuple[str, ...], *, in_step: bool) -> str:
-    """What was learned, and what it resembles; `in_step` with the logs as they begin."""
+    """A sentence on a learned function and its resemblance; `in_step`: equal phase at the start of all logs."""
     where = place_and_variables(curve.place, list(curve.variables), curve.period, None)
-    said = [f"A learned {where}, stands for what is missing."]
+    said = [f"A learned {where}, represents what is missing."]
     if curve.period is not None:
         phase = "with the same phase at the start of every log" if in_step else "begins each log in another phase"
-        said.append(f"It comes back whatever the drive does, and {phase}.")
+        said.append(f"It is periodic in time, independently of the drive, and {phase}.")
     if closest:
         best = closest[0]
         like = " and ".join(plain_family(f) for f in best.families)
         named = f", as of {like}," if like else ""
         said.append(
-            f"Of the simple forms `{best.expression}`{named} is closest: it accounts for "
+            f"Of the simple forms `{best.expression}`{named} is closest: it explains "
             f"{formatting.percent(best.explained)} of its mean square over the data."
         )
     return " ".join([*said, *_doubted(doubted)])
 
 
 def _doubted(names: tuple[str, ...]) -> list[str]:
-    """What is said of names that what was learned contradicts."""
+    """A sentence on names that the learned function contradicts."""
     if not names:
         return []
     return [
-        f"{formatting.words(list(names))} explained a part, but what was learned explains more and does not look like "
+        f"{formatting.words(list(names))} explained a part, but the learned function explains more and differs from "
         "it: the name would be wrong."
     ]

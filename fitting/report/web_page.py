@@ -1,4 +1,4 @@
-"""How templates become pages that read without a network."""
+"""Rendering of templates as self-contained pages."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,10 +10,10 @@ from fitting.files import finite
 
 
 def environment(filters: Mapping[str, Callable[..., Any]]) -> Environment:
-    """The templates' environment: it escapes every name, and an unknown one is an error.
+    """The templates' environment: values are escaped, and unknown names are errors.
 
     Args:
-        filters: of the page, besides those for quantities, numbers and units.
+        filters: of the page, in addition to those for quantities, numbers and units.
     """
     found = Environment(
         loader=PackageLoader("fitting.report", "templates"),
@@ -28,7 +28,7 @@ def environment(filters: Mapping[str, Callable[..., Any]]) -> Environment:
         "quantity": formatting.quantity,
         "number": formatting.number,
         "unit": formatting.pretty_unit,
-        # What is no number leaves a gap in a figure.
+        # NaN gives a gap in a figure.
         "finite": finite,
     }
     found.filters |= filters

@@ -1,4 +1,4 @@
-"""Reports on disk: all files, whole, or none."""
+"""Reports on disk: all files are written, or none."""
 
 import json
 import os
@@ -35,13 +35,13 @@ from hdjax.effects.learned_axes import UNITS
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What is told of an outcome: the same content as text, as a page, and as files.
+    """Report of an outcome: the same content as text, page and files.
 
     Attributes:
         outcome: of the loop or of a fit.
-        content: what `report.json` holds.
-        pictures: in the order of the page.
-        next_experiment: that would tell more.
+        content: of `report.json`.
+        pictures: plots in the order of the page.
+        next_experiment: the proposed experiment.
     """
 
     outcome: Outcome
@@ -51,11 +51,11 @@ class Report:
 
     @classmethod
     def of(cls, outcome: Outcome, *, next_experiment: NextExperiment | None = None, **told: Any) -> "Report":
-        """Tell an outcome.
+        """Make the report of an outcome.
 
         Args:
             outcome: of the loop or of a fit.
-            next_experiment: that would tell more.
+            next_experiment: the proposed experiment.
             told: units, health findings and name of the drive, see [`report_dict`][].
         """
         content = report_dict(outcome, next_experiment=next_experiment, **told)
@@ -63,22 +63,22 @@ class Report:
 
     @classmethod
     def of_rig(cls, outcome: Outcome, rig: Rig, *, next_experiment: NextExperiment | None = None) -> "Report":
-        """Tell an outcome of a rig's logs."""
+        """Make the report of an outcome of a rig's logs."""
         health = [(log, finding) for log, found in rig.findings.items() for finding in found]
         told = {"units": rig.logs[0].units, "health": health, "name": rig.name}
         return cls.of(outcome, next_experiment=next_experiment, **told)
 
     @property
     def text(self) -> str:
-        """For a terminal."""
+        """Text for a terminal."""
         return report_text(self.content)
 
     def write(self, folder: str | os.PathLike[str]) -> dict[str, Path]:
         """Write `report.html`, `report.json` and `model.json`, `posterior.parquet` where draws were made, and
-        `next_experiment.csv` where one is proposed: all of them, whole, or none.
+        `next_experiment.csv` where one is proposed: all of them or none.
 
         Args:
-            folder: made where absent.
+            folder: created where absent.
 
         Returns:
             The files' paths, by name.

@@ -1,1 +1,1 @@
-"""How well parameters and predictions are known, and the noise behind them."""
+"""Uncertainty of parameters and predictions, identifiability, and noise models."""

@@ -1,4 +1,4 @@
-"""What a log can't tell, and why: directions it does not see, parameters too small for it, values taken for granted."""
+"""Identifiability: undetermined directions, insignificant parameters, and the influence of fixed values."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,32 +19,32 @@ from fitting.uncertainty.standard_errors import Estimate, Uncertainty
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.parameters import ParameterInfo
 
-# Two standard errors along a direction that are more than 40 % leave it open.
+# A direction is not determined if two standard errors along it exceed 40 %.
 _WEAK = 0.2
-# Parameters with less than this share of a direction are no part of it.
+# Parameters with less than this share of a direction are omitted.
 _SHARE = 0.2
-# What a drive file states and no log of angles and torque can check: 1 % of it is the unit of its error.
+# Values of the drive file that no log of angles and torque can verify; their errors are in units of 1 %.
 _HELD = ("J_m", "J_l")
 _PERCENT = 0.01
-# Relative changes of a parameter beyond this are no longer told by derivatives.
+# Relative changes of a parameter beyond the reach of the linearisation.
 _MOST_LINEAR = 0.3
-# Relative step of the central differences by what is held; their error is its square.
+# Relative step of the central differences by fixed values; their error is its square.
 _STEP = 1e-4
-# A positive parameter below this share of its start has run to zero.
+# A positive parameter below this share of its starting value has ended at zero.
 _VANISHED = 1e-3
-# Next to a bound: within this share of it.
+# Relative distance within which a value is at a bound.
 _AT_BOUND = 0.01
 
 
 class Direction(eqx.Module):
-    """A combination of the free parameters that the logs know independently of all others.
+    """A principal direction of the free parameters, whose estimate is uncorrelated with all others.
 
     Attributes:
-        weights: entries of a unit vector by path. A positive parameter counts by its logarithm, any other in `units`.
-        members: the paths that have more than a small share of it.
-        units: what one is of each parameter: 1 for a logarithm, else in SI units.
+        weights: entries of a unit vector by path. A positive parameter enters by its logarithm, any other in `units`.
+        members: the paths with more than a small share of it.
+        units: unit of each parameter: 1 for a logarithm, else in SI units.
         std: standard error along the direction.
-        sentence: what is not determined; None where the direction is.
+        sentence: states what is not determined; None where the direction is determined.
     """
 
     weights: dict[str, float]
@@ -55,14 +55,14 @@ class Direction(eqx.Module):
 
 
 class Held(eqx.Module):
-    """A value that the drive file states, and what an error of it does.
+    """A fixed value of the drive file, and the influence of an error in it.
 
     Attributes:
         path: dotted path.
         value: in SI units.
-        changes: relative change of each free parameter for a value that is 1 % larger, at the fit's weights.
+        changes: relative change of each free parameter if the value is 1 % larger, at the fit's weights.
         std_if_free: relative standard error of each free parameter if this value were fitted as well.
-        sentence: the same in words.
+        sentence: a sentence on this influence.
     """
 
     path: str = eqx.field(static=True)
@@ -73,13 +73,13 @@ class Held(eqx.Module):
 
 
 class Identifiability(eqx.Module):
-    """What the logs of a fit can't tell.
+    """What the logs of a fit do not determine.
 
     Attributes:
-        reasons: by path of each parameter that is not identifiable, a sentence that says why and what would help.
-        directions: of the free parameters, the least determined first.
-        held: what was taken from the drive file.
-        bounds: by path of each parameter that ended at a bound, a sentence that says so.
+        reasons: by path of each parameter that is not identifiable, a sentence with reason and remedy.
+        directions: principal directions of the free parameters, the least determined first.
+        held: fixed values of the drive file.
+        bounds: by path of each parameter that ended at a bound, a sentence about it.
     """
 
     reasons: dict[str, str]
@@ -88,12 +88,12 @@ class Identifiability(eqx.Module):
     bounds: dict[str, str]
 
     def note(self, path: str) -> str | None:
-        """Why a parameter's number can't be relied on; None where it can."""
+        """The reason why a parameter's value is not reliable; None where it is."""
         return self.bounds.get(path) or self.reasons.get(path)
 
 
 def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
-    """Look for what the logs of a fit can't tell.
+    """Find what the logs of a fit do not determine.
 
     Args:
         fit: the fit.
@@ -118,25 +118,25 @@ def identifiability(fit: Fit, found: Uncertainty) -> Identifiability:
 
 
 def needed_twist(alpha: Estimate, size: float, *, x_max: float) -> float:
-    """Largest twist that a log of the same kind needs to tell an alpha of a given size from zero.
+    """Largest twist that a similar log needs for an alpha of a given size to be significantly nonzero.
 
-    The cubic torque grows with the third power of the twist, and the standard error of alpha falls with it.
+    The standard error of alpha is inversely proportional to the cubic torque, and so to the third power of the twist.
 
     Args:
         alpha: its estimate.
-        size: of the alpha to be seen, in the estimate's unit.
+        size: of the alpha to be detected, in the estimate's unit.
         x_max: largest twist in the fitted logs.
     """
     return x_max * np.cbrt(_reach(alpha) / abs(size)) if size else np.inf
 
 
 def needed_samples(estimate: Estimate, size: float) -> float:
-    """How many times the samples would tell a parameter of a given size from zero."""
+    """Factor of the sample count at which a parameter of a given size is significantly nonzero."""
     return (_reach(estimate) / abs(size)) ** 2 if size else np.inf
 
 
 def reason(estimate: Estimate, *, x_max: float, x_unit: str) -> str:
-    """Why a parameter is not identifiable, and what would help.
+    """The reason why a parameter is not identifiable, and a remedy.
 
     Args:
         estimate: of the parameter.
@@ -148,7 +148,7 @@ def reason(estimate: Estimate, *, x_max: float, x_unit: str) -> str:
     largest = max(abs(low), abs(high))
     opening = f"{path} is not identifiable from these logs"
     if low >= 0 or high <= 0 or not np.isfinite(largest):
-        known = f"they leave it open {_between(low, high, unit)}"
+        known = f"it may lie {_between(low, high, unit)}"
     elif path == "alpha":
         known = (
             f"|alpha| is at most {largest:.2g}{unit}, so that alpha x^2 is at most {largest * x_max**2:.2g} at their "
@@ -161,15 +161,15 @@ def reason(estimate: Estimate, *, x_max: float, x_unit: str) -> str:
         return f"{opening}: {known}."
     twist = f"a twist above {needed_twist(estimate, estimate.value, x_max=x_max):.2g} {x_unit}, or "
     return (
-        f"{opening}: {known}. To tell {estimate.value:.2g}{unit} from zero they would need "
+        f"{opening}: {known}. For {estimate.value:.2g}{unit} to differ from zero they would need "
         f"{twist if path == 'alpha' else ''}{samples:.2g} times the samples."
     )
 
 
 def _between(low: float, high: float, unit: str) -> str:
-    """An interval in words, whose ends may be infinite."""
+    """An interval in words; its ends may be infinite."""
     if not np.isfinite([low, high]).any():
-        return "on both sides"
+        return "anywhere"
     if not np.isfinite(high):
         return f"above {low:.2g}{unit}"
     return f"between {low:.2g} and {high:.2g}{unit}" if np.isfinite(low) else f"below {high:.2g}{unit}"
@@ -202,12 +202,12 @@ def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, flo
 
     Args:
         fit: the fit.
-        part: weights of those that have a share of it, the largest of size one.
-        units: what one is of each parameter.
+        part: weights of its members, the largest of size one.
+        units: of each parameter.
     """
     logarithmic = dict(zip(fit.free.paths, fit.free.logarithmic, strict=True))
     values = {p: float(fit.model.get(p)) for p in part}
-    # Relative changes are what an engineer thinks in; near zero there are none.
+    # Relative changes are easier to read; near zero they do not exist.
     relative = {
         p: w if logarithmic[p] else w * units[p] / values[p]
         for p, w in part.items()
@@ -218,10 +218,10 @@ def _not_determined(fit: Fit, part: Mapping[str, float], units: Mapping[str, flo
         for p, w in part.items()
     ]
     names = list(part)
-    sentence = f"The logs can't tell {words(names)} apart: {words(moves)} together hardly change the simulation"
+    sentence = f"The logs do not separate {words(names)}: {words(moves)} together hardly change the simulation"
     if len(relative) < len(part):
         return f"{sentence}."
-    # The gentlest mover makes the others' products with its powers stand still.
+    # Products of the other parameters with powers of the least changed one are constant along the direction.
     still = min(relative, key=lambda p: abs(relative[p]))
     known = [f"{p} {_power(still, -relative[p] / relative[still])}" for p in names if p != still]
     return f"{sentence}. They determine {words(known)}, but no factor alone."
@@ -232,8 +232,8 @@ def _power(path: str, exponent: float) -> str:
 
 
 def _in_units_of(model: Model, info: ParameterInfo) -> ParameterInfo:
-    """What is known of a parameter of a model. The units of a reduced log are its own, so that of bounds in SI units no
-    more is left than a sign."""
+    """Metadata of a model's parameter. A reduced log has arbitrary units, so that only signs remain of bounds in SI
+    units."""
     if isinstance(model.drive, Drive) or info.unit == "1":
         return info
     low, high = info.bounds
@@ -247,24 +247,24 @@ def at_bound(path: str, value: float, info: ParameterInfo, *, start: float) -> s
         path: of the parameter.
         value: fitted.
         info: of the parameter.
-        start: what the fit started from.
+        start: starting value.
     """
     if info.positive and value < _VANISHED * start:
         return (
-            f"{path} ran from {start:.2g} to {value:.2g} {info.unit}, towards its bound at zero: the logs want none, "
-            "and its standard error means nothing."
+            f"{path} went from {start:.2g} to {value:.2g} {info.unit}, its bound at zero: the logs do not support "
+            "it, and its standard error has no meaning."
         )
     bound = reached_bound(value, info)
     if bound is None:
         return None
     return (
-        f"{path} ended at its bound of {bound:.3g} {info.unit}: the logs want it beyond what makes sense, and its "
-        "standard error means nothing."
+        f"{path} ended at its bound of {bound:.3g} {info.unit}: the fit would leave the physical range, and its "
+        "standard error has no meaning."
     )
 
 
 def reached_bound(value: float, info: ParameterInfo) -> float | None:
-    """The bound of its domain, zero apart, at which a parameter ended or that it passed; None where there is none.
+    """The nonzero bound that a parameter has reached or passed; None without one.
 
     Args:
         value: fitted.
@@ -278,8 +278,8 @@ def reached_bound(value: float, info: ParameterInfo) -> float | None:
 
 
 def parameters_at_bounds(model: Model, name: str) -> list[str]:
-    """The paths of an effect's parameters that ended at a bound of their domain; a shape that went to zero has become
-    another law, and is none.
+    """The paths of an effect's parameters that ended at a bound of their domain. A shape that ended at zero does not
+    count: it gives another law.
 
     Args:
         model: with fitted values.
@@ -289,10 +289,10 @@ def parameters_at_bounds(model: Model, name: str) -> list[str]:
     return [p for p, (v, info) in known.items() if reached_bound(float(v), _in_units_of(model, info)) is not None]
 
 
-# What the logs do not see at all has no bounds.
+# Parameters without any information are not at a bound.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
-    """What the drive file states and the fit takes for granted."""
+    """Fixed values of the drive file that the fit relies on."""
     if not isinstance(fit.model, TwoInertiaModel):
         return ()
     held = tuple(p for p in _HELD if p not in fit.free.paths)
@@ -301,7 +301,7 @@ def _held(fit: Fit, found: Uncertainty) -> tuple[Held, ...]:
     products = np.asarray(_products(fit, held))
     count = len(fit.free.paths)
     information, coupling = products[:count, :count], products[:count, count:]
-    # The optimum follows where the gradient stays zero: (J^T J) dp + J^T dr/dJ dJ = 0.
+    # The optimum moves so that the gradient remains zero: (J^T J) dp + J^T dr/dJ dJ = 0.
     response = -np.linalg.lstsq(information, coupling, rcond=None)[0]
     values = np.array([e.value for e in found.estimates.values()])
     relative = np.abs(np.asarray(fit.free.slopes(fit.model)) / np.where(values == 0, np.inf, values))
@@ -328,12 +328,12 @@ def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[
     own = {p: c for p, c in changes.items() if "." not in p and p != "alpha"}
     sentence = f"{path} is taken from the drive file"
     if any(abs(c) > _MOST_LINEAR for c in own.values()):
-        sentence += f", and has to be right there: an error of 1 % is more than {words(list(own))} could make up for."
+        sentence += f", and must be correct there: {words(list(own))} can't compensate an error of 1 %."
     elif own:
         moved = words([f"{p} by {100 * c:+.2g} %" for p, c in own.items()])
         sentence += (
-            ", since a log of angles and torque knows inertia and stiffness only in proportion to the torque: if it is "
-            f"1 % too large there, that moves {moved}."
+            ", since a log of angles and torque determines inertia and stiffness only relative to the torque: if it is "
+            f"1 % too large there, that changes {moved}."
         )
     else:
         sentence += "."
@@ -341,9 +341,9 @@ def _held_one(fit: Fit, path: str, changes: dict[str, float], std_if_free: dict[
 
 
 def _products(fit: Fit, held: tuple[str, ...]) -> Float[np.ndarray, "all all"]:
-    """J^T J of the free parameters and the logarithms of what is held, without the initial states.
+    """J^T J of the free parameters and the logarithms of fixed values, without the initial states.
 
-    By central differences through the program that the fit runs anyway.
+    By central differences with the fit's compiled program.
     """
     problem = fit.at_solution
     found = linearise(problem, fit.unknowns)

@@ -1,10 +1,10 @@
-"""Standard errors under noise of the logged torque: a colour that the drive itself gives.
+"""Standard errors under noise of the logged torque, which the drive's dynamics colour.
 
-What acts and what was logged differ by noise; the drive answers it, so that the residual is white noise of the
-encoders plus a little motion of the drive's own. Where that describes the residual's spectrum, two or three numbers
-stand for all of its colour, and standard errors follow from few periods, where a free spectrum has little to go by.
-The variances come from the periodogram (Whittle 1953), the estimates' covariance from how each torque sample moves
-them, by one pass against time.
+The acting torque differs from the logged one by noise. So the residual is white encoder noise plus the drive's response
+to torque noise. Where this describes the residual's spectrum, two or three variances determine it. Standard errors then
+need only a few periods of data, where a nonparametric spectrum would be poorly determined. The variances are estimated
+from the periodogram (Whittle 1953). The estimates' covariance follows from their sensitivity to each torque sample, by
+one adjoint pass.
 """
 
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ from hdjax import Model
 from hdjax.effects import Conditions
 from hdjax.engine.pointwise import slopes_at_instants
 
-# Draws of torque noise whose mean periodogram stands for its expectation.
+# Draws of torque noise whose mean periodogram approximates its expectation.
 _DRAWS = 16
 _REWEIGHTINGS = 6
-# A spectrum that the data refuse at this level is not the residual's.
+# Significance level at which the spectrum is rejected.
 _REFUSED = 0.01
 
 
@@ -42,7 +42,7 @@ def torque_noise_covariance(
         inverse: (J^T J)^-1.
 
     Returns:
-        The covariance; None where the residual has another colour.
+        The covariance; None where the residual has another spectrum.
     """
     problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
@@ -57,7 +57,7 @@ def torque_noise_covariance(
     *encoders, torque = variances
     slopes = _by_segment(records, fit)
     middle = torque * _torque_scores(problem, followed, slopes)
-    # Noise of the motor's encoder is in both outputs.
+    # Noise of the motor's encoder enters both outputs.
     together = _covariance([r.residual[..., None] for r in records]) - torque * _covariance(in_time)
     together[np.diag_indices(len(encoders))] = encoders
     for record in records:
@@ -82,7 +82,7 @@ def _covariance(series: Sequence[np.ndarray]) -> np.ndarray:
 def _variances(
     records: Sequence[Record], answers: Sequence[np.ndarray], inverse: np.ndarray
 ) -> Float[np.ndarray, " sources"] | None:
-    """Variance of each output's white noise and of the torque's, or None where they don't give the spectrum."""
+    """Variances of each output's white noise and of torque noise; None where they do not describe the spectrum."""
     measured, expected = [], []
     for record, answer in zip(records, answers, strict=True):
         count, outputs = record.residual.shape
@@ -100,7 +100,7 @@ def _variances(
     for _ in range(_REWEIGHTINGS):
         found = nonnegative(shapes / level[:, None], power / level)
         level = np.maximum(shapes @ found, 1e-6 * power.mean())
-    # Of the right spectrum, the periodogram is an exponential variable.
+    # Under the right spectrum, the periodogram is exponentially distributed.
     adequate = uniformity(1.0 - np.exp(-power / level)) > _REFUSED
     return found if adequate and found[-1] > 0.0 else None
 
@@ -108,18 +108,18 @@ def _variances(
 def nonnegative(
     shapes: Float[np.ndarray, "lines sources"], power: Float[np.ndarray, " lines"]
 ) -> Float[np.ndarray, " sources"]:
-    """Least squares with coefficients that are not negative, by trying each set of the two or three sources.
+    """Nonnegative least squares, by trying each subset of the two or three sources.
 
-    It stands for `scipy.optimize.nnls`: with what that module imports it takes as long as the rest of a fit's imports.
+    Replaces `scipy.optimize.nnls`, whose import takes as long as all other imports of a fit.
     """
-    # Answers to torque noise may be many orders of magnitude larger than those to noise of an encoder.
+    # Responses to torque noise may be orders of magnitude larger than those to encoder noise.
     scale = np.maximum(np.linalg.norm(shapes, axis=0), np.finfo(float).tiny)
     gram, moment = (shapes / scale).T @ (shapes / scale), (shapes / scale).T @ power
     best, most = np.zeros(moment.size), 0.0
     for size in range(1, moment.size + 1):
         for chosen in map(list, combinations(range(moment.size), size)):
             found = np.linalg.lstsq(gram[np.ix_(chosen, chosen)], moment[chosen])[0]
-            # What the sum of squares falls by.
+            # Decrease of the sum of squares.
             gain = float(moment[chosen] @ found)
             if (found >= 0.0).all() and gain > most:
                 best, most = np.zeros(moment.size), gain
@@ -130,7 +130,7 @@ def nonnegative(
 def uniformity(values: Float[np.ndarray, " n"]) -> float:
     """p-value of Kolmogorov's test for the uniform law from 0 to 1, with Stephens's correction for few values.
 
-    It stands for `scipy.stats.kstest`, whose module takes as long to load as jax.
+    Replaces `scipy.stats.kstest`, whose import takes as long as that of jax.
 
     References:
         Stephens, M. A. (1970), Journal of the Royal Statistical Society B 32, 115-122.
@@ -150,7 +150,7 @@ def _unit(record: Record, output: int) -> Float[np.ndarray, "n outputs draws"]:
 
 
 def _left_over(record: Record, drawn: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """What a fit would leave of a disturbance: without what initial states and parameters take up."""
+    """Residual of a disturbance after a fit of initial states and parameters."""
     left = drawn - np.einsum("nop,pq,mrq,mrd->nod", record.slopes, inverse, record.slopes, drawn, optimize=True)
     for start, basis in record.bases():
         own, flat = slice(start, start + len(basis)), basis.reshape(-1, basis.shape[2])
@@ -164,7 +164,7 @@ def _power(series: np.ndarray) -> np.ndarray:
 
 
 def torque_pushes(model: Model, followed: Followed) -> Float[np.ndarray, "segments samples states"]:
-    """What a unit of torque through a sample interval adds to the state at its end.
+    """Change of the state at a sample interval's end by a unit of torque held through it.
 
     Args:
         model: the equations.
@@ -176,7 +176,7 @@ def torque_pushes(model: Model, followed: Followed) -> Float[np.ndarray, "segmen
 
 
 def _rates(torque: Array, model: Model, state: Array) -> Array:
-    # The same at any time and temperature.
+    # Independent of time and temperature.
     zero = jnp.zeros_like(torque[0])
     return model.rates(state, torque[0], zero, Conditions(time=zero, temperature=zero))
 
@@ -184,7 +184,7 @@ def _rates(torque: Array, model: Model, state: Array) -> Array:
 def _answers(
     problem: Problem, followed: Followed, noise: Float[np.ndarray, "segments samples draws"]
 ) -> Float[np.ndarray, "segments samples outputs draws"]:
-    """Whitened residual that torque noise leaves; it does not stop where a segment goes on where another one ends."""
+    """Whitened residual due to torque noise, carried on across joined segments."""
     forces = Forces(torque_pushes(problem.model, followed)[..., None], noise[:, :, None, :])
     joined = np.asarray(problem.segments.joined)
     before = np.roll(respond(followed, forces)[1], 1, axis=0), np.roll(_across(followed), 1, axis=0)
@@ -194,7 +194,7 @@ def _answers(
 
 
 def _across(followed: Followed) -> Float[np.ndarray, "segments states states"]:
-    """What a deviation of the state at each segment's start is at its end."""
+    """Transition matrix of the state across each segment."""
     states = followed.states.shape[-1]
     found = np.broadcast_to(np.eye(states), (len(followed.states), states, states))
     for transition in np.swapaxes(followed.transition, 0, 1):
@@ -211,7 +211,7 @@ def _torque_scores(
     read = -np.swapaxes(white, 2, 3) @ slopes * np.asarray(problem.segments.weight)[:, :, None, None]
 
     def back(costate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Costates where segments start, from those where they end, and scores."""
+        """Costates at segment starts, from those at segment ends, and scores."""
         scores = np.zeros((*read.shape[:2], read.shape[-1]))
         for i in reversed(range(read.shape[1])):
             scores[:, i] = (pushes[:, i, None, :] @ costate)[:, 0]

@@ -1,4 +1,4 @@
-"""The noise of the measured outputs, whatever the model lacks."""
+"""Measurement noise of the outputs, independent of model discrepancy."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,29 +14,29 @@ from fitting.estimation.scales import of_twist, scales
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
 from fitting.estimation.weighing import Shown, weighed
 
-# So many samples tell the noise to 2 %, and a covariance that changes by no more between two passes has settled.
+# This many samples determine the noise to 2 %; a covariance that changes less between two passes has converged.
 _SAMPLES = 2500
 _SETTLED = 0.02
 _STEPS = 30
-# A few steps that together take less than this share off the squares are not worth another.
+# Least relative decrease of the sum of squares over a few steps.
 _LEAST_PROGRESS = 1e-3
-# Powers of time that forces beyond the model's add to a piece, whose initial state gives it the constant and the slope.
+# Powers of time that describe unmodelled forces within a piece; its initial state gives the constant and the slope.
 _POWERS = (2, 3)
-# These take at most 1.4 times off the rms of noise of any colour up to a random walk; where more goes, it was motion.
+# They reduce the rms of noise up to a random walk at most 1.4 times; a larger reduction is due to motion.
 _MOTION = 1.5
-# Share of the twist's swing to which a simulation is exact, or better (see `STEP_ANGLE`); encoders are noisier by far.
+# Upper bound of the relative solver error (see `STEP_ANGLE`); encoder noise is far larger.
 _EXACT = 1e-6
-# Where pieces are so short that fewer of their numbers are left to tell the noise, powers of time are not taken off.
+# Least share of residual degrees of freedom for powers of time to be removed.
 _LEAST_LEFT = 0.25
 
 
 class _Pieces(eqx.Module):
-    """What the pieces of some segments leave over.
+    """Residual of the pieces of some segments.
 
     Attributes:
-        squares: of the outputs' errors, added up.
-        samples: how many.
-        freedom: how many numbers were fitted to them.
+        squares: sum over the outputs' squared errors.
+        samples: their number.
+        freedom: number of fitted values.
     """
 
     squares: Float[np.ndarray, "outputs outputs"]
@@ -49,31 +49,31 @@ class _Pieces(eqx.Module):
 
     @property
     def left(self) -> float:
-        """Share of the measured numbers that tell the noise, beyond those that were fitted; zero without samples."""
+        """Residual degrees of freedom over the number of measured values; zero without samples."""
         rows = self.samples * len(self.squares)
         return 1.0 - self.freedom / rows if rows else 0.0
 
     @property
     def covariance(self) -> Float[np.ndarray, "outputs outputs"]:
-        """Corrected for what was fitted."""
+        """Covariance of the noise, corrected for the fitted values."""
         return self.squares / self.samples / self.left
 
 
 class MeasurementNoise(eqx.Module):
-    """The noise of the measured outputs, as the fit sees it that leaves the least.
+    """The noise of the measured outputs, from the fit with the smallest residual.
 
-    Each fit of the same data leaves the noise at least; one that goes astray leaves more.
+    Each fit's residual contains at least the noise; a poor fit's is larger.
 
     Attributes:
         covariance: of the outputs.
-        asked: the fits that were asked; asking takes as long as a fit.
+        asked: the fits that were used; each estimate takes as long as a fit.
     """
 
     covariance: Float[Array, "outputs outputs"]
     asked: tuple[Fit, ...]
 
     def and_beside(self, found: Fit) -> "MeasurementNoise":
-        """The same, where one more fit is asked."""
+        """The same with an estimate from one more fit."""
         if any(found is fit for fit in self.asked):
             return self
         other = _noise_beside(found)
@@ -82,30 +82,31 @@ class MeasurementNoise(eqx.Module):
 
 
 def measurement_noise(found: Fit) -> MeasurementNoise:
-    """The noise as one fit sees it."""
+    """The noise estimated from one fit."""
     return MeasurementNoise(_noise_beside(found), (found,))
 
 
 def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
-    """Covariance of the outputs' measurement noise: what stays when each short piece of the log may start anew.
+    """Covariance of the outputs' measurement noise: the residual when each short piece of the log has a free initial
+    state.
 
     Within half a period an initial state explains most smooth motion, missing physics included, so that little but
-    noise is left; what a strong force that is missing does within a piece is a low power of time, and is taken off as
-    well where it is more than noise could be. Corrected for what was fitted.
+    noise remains. A strong missing force causes low powers of time within a piece. They are removed as well where they
+    exceed what noise explains. Corrected for the number of fitted values.
 
     Args:
-        found: a fit; its parameters are held, and its compiled program does the work.
+        found: a fit; its parameters are fixed, and its compiled program is used.
     """
     count, length = found.problem.segments.weight.shape
     half_period = np.pi / natural_frequency(found.model, found.stretches) / found.stretches[0].experiment.time_step
-    # In samples that count: a slow channel leaves few rows in which all outputs were measured.
+    # In valid samples: a slow channel leaves few rows in which all outputs were measured.
     every = 1.0 / np.mean(np.concatenate([s.weight for s in found.stretches]))
     piece = min(length, int(np.round(np.clip(half_period, 6 * every, 24 * every))))
     held = eqx.tree_at(lambda p: p.active, found.problem, zeros_like(found.problem.active))
     swing = float(scales(found.stretches, found.model).x)
     shown = Shown.of(found.problem.model, swing * of_twist(found.model)[-1])
     anew = smoothed = _Pieces(np.zeros(found.covariance.shape))
-    # A piece is the head of a segment; segments that begin later have other heads.
+    # A piece is the first part of a segment; other cuts of the data give other pieces.
     for offset in range(0, length - piece + 1, piece):
         shifted = [Stretch(s.experiment, s.start + offset, s.stop) for s in found.stretches if len(s) >= offset + piece]
         if not shifted or anew.samples >= _SAMPLES:
@@ -130,7 +131,7 @@ def _noise_beside(found: Fit) -> Float[Array, "outputs outputs"]:
         seen = linearise(part, unknowns)
         anew = anew.and_more(covariance * head.sum(), float(head.sum()), _states_freedom(part, seen))
         smoothed = smoothed.and_more(*_smoothed(part, seen, piece))
-    # Logs that were simulated without noise show the solver's error.
+    # The residual of logs simulated without noise is the solver's error.
     return jnp.asarray(_of_both(anew, smoothed) + np.diag((_EXACT * swing * of_twist(found.model)) ** 2))
 
 
@@ -142,7 +143,7 @@ def _of_both(anew: _Pieces, smoothed: _Pieces) -> Float[np.ndarray, "outputs out
 
 
 def _states_freedom(problem: Problem, seen: Blocks) -> float:
-    """How many numbers the initial states have fitted to the outputs; a state that its prior holds counts in part."""
+    """Effective number of fitted initial-state entries; an entry that its prior constrains counts partly."""
     by_state = np.asarray(seen.by_state)
     outputs = by_state[:, : problem.segments.measured[0].size]
     measured, all_rows = (np.einsum("sri,srj->sij", rows, rows) for rows in (outputs, by_state))
@@ -154,8 +155,8 @@ def _states_freedom(problem: Problem, seen: Blocks) -> float:
 
 
 def _smoothed(problem: Problem, seen: Blocks, piece: int) -> tuple[Float[np.ndarray, "outputs outputs"], float, float]:
-    """What pieces leave over where each output may also move by a few powers of time: squares, samples, and numbers
-    fitted. Pieces whose simulation runs away tell nothing."""
+    """Residual of pieces after fitting a few powers of time to each output: squares, samples, and number of fitted
+    values. Pieces whose simulation diverges are omitted."""
     outputs = problem.segments.measured.shape[2]
     rows = np.asarray(seen.residual)[:, : piece * outputs]
     weight = np.asarray(problem.segments.weight)[:, :piece]

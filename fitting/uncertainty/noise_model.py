@@ -1,8 +1,8 @@
-"""A model of the noise: of the sensors, each with a memory where it has one, and of the logged torque.
+"""Noise model: white or exponentially correlated noise of the sensors, and noise of the logged torque.
 
-What acts and what was logged differ by noise; the drive answers it, so that simulations leave more than the sensors'
-noise although no effect is missing. Along a fitted motion the deviation from it is linear and driven by that noise.
-Under the right variances the innovations of a Kalman filter are white, and their likelihood is largest.
+The acting torque differs from the logged one by noise. The drive responds to it, so that residuals exceed the sensors'
+noise although no effect is missing. The deviation from a fitted motion is linear and driven by that noise. Under the
+right variances the innovations of a Kalman filter are white, and their likelihood is largest.
 """
 
 from collections.abc import Callable
@@ -19,38 +19,37 @@ from fitting.estimation.residual import Problem, Unknowns
 from fitting.uncertainty.input_noise import torque_pushes
 from hdjax import Model, TwoInertiaModel
 
-# Standard deviations, in units of what simulations leave, by which a segment's first state may be off.
+# Prior standard deviation of a segment's initial state, in units of the residual.
 _FREE = 10.0
-# Samples of a segment in which the filter finds that state.
+# Lead-in samples of a segment in which the filter converges.
 _LEAD = 12
-# Shares of the torque's rms where the search for its noise begins: the smallest, up to one, and how many.
+# Starting values of torque noise, as shares of the torque's rms: the smallest (up to one), and their number.
 _LEAST, _SHARES = 1e-5, 11
-# Logs that are asked at most, and segments of each, evenly spread: some thousand samples know a variance to a few
-# percent. A memory of the sensors' noise is told from fewer in all.
+# Most logs that are used, and segments of each, evenly spaced: some thousand samples determine a variance to a few
+# percent. Correlated sensor noise is estimated from fewer.
 _LOGS, _SEGMENTS, _SEGMENTS_OF_MEMORY = 4, 24, 24
-# Lags over which innovations are tested for whiteness.
+# Lags of the whiteness test of innovations.
 _LAGS = 20
-# Where the search for the sensors' noise begins: nine tenths of what short pieces tell (log odds); halves with and
-# without memory, one of five samples.
+# Starting values of the sensors' noise: nine tenths of the estimate from short pieces (log odds); half of it white,
+# half with a correlation time of five samples.
 _MOST_OF_IT, _HALF, _FIVE_SAMPLES = 2.2, np.log(0.5), 1.5
-# Share of that variance below which it does not fall: rounding would leave the filter's variances negative.
+# Least share of that estimate: below it, rounding would make variances of the filter negative.
 _LEAST_OF_IT = 1e-6
-# Step of its differences, the slope of the likelihood at which it ends [nats a sample], and iterations at most: where
-# noise is what is left, it ends after ten.
+# Step of its differences, gradient of the likelihood at which it ends [nats per sample], and most iterations; where
+# only noise is left, about ten suffice.
 _STEP, _FLAT, _ITERATIONS = 1e-4, 1e-4, 15
 
 
 class SensorNoise(eqx.Module):
-    """Noise of the outputs, in combinations of them whose noise is independent.
+    """Noise of the outputs, in combinations with independent noise.
 
-    Each is the sum of a white part and of a slow one, whose correlation decays by a constant share from sample to
-    sample.
+    Each is the sum of a white part and an exponentially correlated (slow) part.
 
     Attributes:
-        combined: the outputs by independent ones of unit variance.
+        combined: the outputs as combinations of independent ones of unit variance.
         white: variance of each one's white part.
-        slow: likewise of the other part.
-        correlation: of neighbouring samples of that part.
+        slow: variance of each one's slow part.
+        correlation: of neighbouring samples of the slow part.
     """
 
     combined: Float[np.ndarray, "outputs outputs"]
@@ -60,35 +59,34 @@ class SensorNoise(eqx.Module):
 
     @property
     def covariance(self) -> Float[np.ndarray, "outputs outputs"]:
-        """Of the outputs."""
+        """Covariance of the outputs' noise."""
         return self.combined @ np.diag(self.white + self.slow) @ self.combined.T
 
     def memory(self, time_step: float) -> float | None:
-        """Time [s] after which the slow part of the last output's noise has forgotten all but 1/e; None where it has
-        no slow part."""
+        """Correlation time [s] of the slow part of the last output's noise; None without one."""
         slow = self.combined[-1] ** 2 * self.slow
         return -time_step / float(np.log(slow @ self.correlation / slow.sum())) if slow.any() else None
 
 
 def white_noise(covariance: Float[np.ndarray, "outputs outputs"]) -> SensorNoise:
-    """Noise of the outputs without memory."""
+    """White noise of the outputs."""
     one = np.ones(len(covariance))
     return SensorNoise(np.linalg.cholesky(covariance), one, 0.0 * one, 0.0 * one)
 
 
 class NoiseModel(eqx.Module):
-    """Noise of the torque beside that of the sensors.
+    """Fitted noise of torque and sensors.
 
     Attributes:
-        std: of one sample of the torque, held through its interval [N m], or in the forcing's unit; rms over the logs.
-        share: the same over the rms of the torque.
+        std: of a torque sample that is held through its interval [N m], or in the forcing's unit; rms over the logs.
+        share: `std` over the rms of the torque.
         sensors: noise of the outputs.
-        size: rms of each output's innovations in units of what the filter expects; the largest.
-        predictable: share of the innovations' variance that earlier ones predict, of the output and the log where it is
-            largest: none where the noise is white.
-        likelihood: log likelihood of the innovations, but for a constant.
-        without: likewise without noise of the torque.
-        count: how many there are.
+        size: largest rms of an output's innovations over its expected value.
+        predictable: share of the innovations' variance that earlier ones predict, of the output and log where it is
+            largest; zero for white innovations.
+        likelihood: log likelihood of the innovations, up to a constant.
+        without: log likelihood without torque noise.
+        count: number of innovations.
     """
 
     std: float
@@ -102,18 +100,18 @@ class NoiseModel(eqx.Module):
 
 
 class _Steps(eqx.Module):
-    """The linearised motion, a sample after the other, of several segments at once.
+    """The linearised motion of several segments, sample by sample.
 
     Attributes:
-        transition: of a deviation of the state through a sample interval.
-        push: what a unit of torque adds to it.
+        transition: of the state's deviation over a sample interval.
+        push: its change by a unit of torque.
         readout: of the outputs.
         error: of the outputs, and its derivatives by the free parameters.
-        counts: whether a sample has weight.
-        log: to which each segment belongs.
-        prior: covariance of the first states.
-        torque: its rms in each log.
-        lead: samples in which the filter finds the first state, which the likelihood leaves out.
+        counts: whether a sample is valid.
+        log: of each segment.
+        prior: covariance of the initial states.
+        torque: rms torque of each log.
+        lead: lead-in samples of the filter, which the likelihood omits.
     """
 
     transition: Float[np.ndarray, "samples segments states states"]
@@ -127,7 +125,7 @@ class _Steps(eqx.Module):
     lead: int = eqx.field(static=True, default=_LEAD)
 
     def fewer(self, segments: int) -> "_Steps":
-        """Of so many segments at most, evenly spread."""
+        """The same for at most so many segments, evenly spaced."""
         chosen = _spread(self.log.size, segments)
         places = (self.transition, self.push, self.readout, self.error, self.counts)
         fewer = (*(place[:, chosen] for place in places), self.log[chosen])
@@ -135,16 +133,16 @@ class _Steps(eqx.Module):
 
 
 def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float) -> NoiseModel:
-    """The noise that a fit's residual shows.
+    """Estimate the noise model of a fit's residual.
 
-    Each log has noise of the torque of its own, since its torque sensor may have been set to another range. The
-    sensors' white noise is at most what short pieces tell, in which noise of the torque counts as theirs. It has a
-    memory only where innovations can be predicted without one.
+    Each log has its own torque noise, since its torque sensor may have another range. The sensors' white noise is at
+    most the estimate from short pieces, which includes torque noise. Correlated sensor noise is added only where
+    innovations are predictable without it.
 
     Args:
-        fit: of a model from which nothing is thought to be missing, over short horizons.
-        outputs: covariance of the measurement noise, as short pieces tell it.
-        predictable: share of the innovations' variance that counts as none.
+        fit: of a model that is assumed complete, over short horizons.
+        outputs: covariance of the measurement noise, estimated from short pieces.
+        predictable: share of the innovations' variance that is negligible.
 
     References:
         Ljung (1999), System Identification, 2nd edition, sections 7.3 and 16.6.
@@ -170,7 +168,7 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
 
 
 def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoise) -> NoiseModel:
-    """What is left under noise of given size."""
+    """Innovation statistics under noise of given size."""
     innovations, logarithms = _filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
     std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
     each = [_size_and_colour(innovations[0, steps.log == log]) for log in range(shares.size)]
@@ -181,7 +179,7 @@ def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNo
 
 
 def _first_shares(steps: _Steps, sensors: SensorNoise) -> Float[np.ndarray, " logs"]:
-    """The likeliest of some shares of the torque, for each log."""
+    """The most likely starting value of torque noise for each log."""
     shares = np.geomspace(_LEAST, 1.0, _SHARES)
     innovations, logarithms = _filtered(steps, shares[:, None] * steps.torque, sensors)
     unlikely = np.sum(0.5 * innovations**2 + logarithms, axis=(2, 3))
@@ -195,16 +193,16 @@ def _likeliest(
     noise: Callable[[np.ndarray], SensorNoise],
     first: Float[np.ndarray, " unknowns"],
 ) -> tuple[Float[np.ndarray, " logs"], SensorNoise]:
-    """Noise of the torque of each log, and of the sensors, that make the innovations likeliest: by the method of
-    scoring (Ljung 1999, section 10.2), with the information of Gaussian innovations.
+    """Maximum-likelihood noise of each log's torque and of the sensors: by scoring (Ljung 1999, section 10.2), with the
+    Fisher information of Gaussian innovations.
 
     Args:
-        steps: the motion.
-        shares: where the search begins, of the torque.
-        noise: of the sensors, from unknowns.
-        first: where they begin.
+        steps: the linearised motion.
+        shares: starting values of the torque noise.
+        noise: sensor noise as a function of unknowns.
+        first: their starting values.
     """
-    # Loaded here: it takes as long as jax, and only what nothing else explains needs it.
+    # Imported here: it takes as long as jax, and is rarely needed.
     from scipy.optimize import minimize
 
     logs = shares.size
@@ -214,7 +212,7 @@ def _likeliest(
         return np.exp(unknowns[..., :logs]), noise(unknowns[..., logs:])
 
     def seen(unknowns: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        # A segment is of one log: the shares of all of them are varied at once.
+        # Each segment belongs to one log, so the shares of all logs are varied together.
         together = np.concatenate([np.ones((1, logs)), np.zeros((first.size, logs))])
         apart = np.concatenate([np.zeros((1, first.size)), np.eye(first.size)])
         varied = unknowns + _STEP * np.concatenate([0.0 * unknowns[None], np.hstack([together, apart])])
@@ -279,8 +277,8 @@ def _steps(fit: Fit) -> _Steps:
 
 
 def _by_parameter(fit: Fit) -> Float[np.ndarray, "segments samples outputs parameters"]:
-    """Derivatives of the error. Simulations of a motion that the noise drives know parameters less well than the
-    filter does, so that it takes a step of its own."""
+    """Derivatives of the error by the parameters. Under process noise the filter determines parameters better than
+    simulations, so that it takes a step of its own."""
     found = linearise(fit.problem, fit.unknowns)
     segments, samples, outputs = fit.error.shape
     rows = np.asarray(found.by_parameter)[:, : samples * outputs].reshape(segments, samples, outputs, -1)
@@ -302,7 +300,7 @@ def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray
 
 
 def _spread(count: int, most: int) -> np.ndarray:
-    """So many numbers below a count at most, evenly spread."""
+    """At most so many indices below a count, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 
 
@@ -311,11 +309,11 @@ def _filtered(
 ) -> tuple[
     Float[np.ndarray, "settings segments samples outputs"], Float[np.ndarray, "settings segments samples outputs"]
 ]:
-    """Standardised innovations after the lead, at the parameters that suit them best, and logarithms of what
-    standardised them, for several settings of the noise at once.
+    """Standardised innovations after the lead-in, at the parameters that minimise them, and logarithms of their
+    standard deviations, for several noise settings at once.
 
-    Outputs whose noise is independent are taken one after the other (Anderson and Moore 1979, section 6.4); the slow
-    part of each one's noise is a further state.
+    Outputs with independent noise are processed sequentially (Anderson and Moore 1979, section 6.4). The slow part of
+    each one's noise is a further state.
     """
     variance = np.square(std)[:, steps.log, None, None]
     white, slow, correlation = (np.atleast_2d(v) for v in (sensors.white, sensors.slow, sensors.correlation))
@@ -364,7 +362,7 @@ def _filtered(
 
 
 def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:
-    """Rms of the output where it is largest; and the sum of squared autocorrelations, less what chance makes of it."""
+    """Largest rms of an output; and the sum of squared autocorrelations minus its expectation for white noise."""
     square, lags = np.sum(innovations**2, axis=(0, 1)), min(_LAGS, innovations.shape[1] - 1)
     correlation = [
         np.sum(innovations[:, lag:] * innovations[:, :-lag], axis=(0, 1)) / square for lag in range(1, lags + 1)
@@ -375,11 +373,11 @@ def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"])
 
 
 def spread_by_torque(problem: Problem, unknowns: Unknowns, std: float) -> Float[np.ndarray, "segments samples"]:
-    """Standard deviation of the last output that noise of the torque makes along each segment, from its start on.
+    """Standard deviation of the last output due to torque noise along each segment.
 
     Args:
         problem: the segments.
-        unknowns: where they start.
+        unknowns: supply their initial states.
         std: of the noise of one sample.
     """
     followed = follow(problem, unknowns)

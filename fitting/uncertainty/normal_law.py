@@ -1,4 +1,4 @@
-"""The normal law's one number that intervals need."""
+"""Quantile of the normal distribution for intervals."""
 
 NORMAL_95 = 1.959963984540054
-"""Standard errors to either side that hold 95 % of a normal law."""
+"""Half-width of the 95 % interval of a normal distribution, in standard deviations."""

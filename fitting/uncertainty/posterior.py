@@ -1,9 +1,8 @@
 """Draws from the posterior of a fit's parameters by the no-U-turn sampler (Hoffman and Gelman 2014) of blackjax.
 
-The log density is minus half the sum of squares with the initial states fitted anew at each draw, so that the sampler
-moves in the few shared parameters only. Its gradient is the projected one: what the initial states do to it is zero
-where they are optimal. The prior is flat in the free vector: in the logarithm of a positive parameter, in the value of
-any other.
+The log density is minus half the sum of squares with the initial states refitted at each draw, so that only the few
+shared parameters are sampled. Its gradient is the projected one: at optimal initial states, their contribution
+vanishes. The prior is flat in the free vector: in the logarithm of a positive parameter, in the value of any other.
 """
 
 from typing import Any
@@ -21,9 +20,9 @@ from fitting.estimation.residual import Problem, Products, Unknowns
 from fitting.uncertainty.standard_errors import Uncertainty
 from hdjax.where import where
 
-# Gauss-Newton steps that bring the initial states from the fit's to those of a draw.
+# Gauss-Newton steps from the fit's initial states to those of a draw.
 _STATE_STEPS = 2
-# Draws whose chains disagree by more than this have not settled (Vehtari et al. 2021).
+# Largest R-hat of converged chains (Vehtari et al. 2021).
 _SETTLED = 1.01
 
 
@@ -36,7 +35,7 @@ class Posterior(eqx.Module):
         values: the same in SI units.
         r_hat: potential scale reduction by parameter; 1 where the chains agree.
         effective_samples: by parameter.
-        divergences: transitions that left the region where the integrator can be trusted; more than a few cast doubt.
+        divergences: divergent transitions of the integrator; more than a few make draws unreliable.
     """
 
     paths: tuple[str, ...] = eqx.field(static=True)
@@ -48,7 +47,7 @@ class Posterior(eqx.Module):
 
     @property
     def settled(self) -> bool:
-        """Whether the draws may be relied on."""
+        """Whether the chains have converged."""
         return bool((self.r_hat < _SETTLED).all()) and self.divergences == 0
 
     def quantiles(self, *levels: float) -> dict[str, np.ndarray]:
@@ -73,15 +72,15 @@ def posterior(
         fit: the fit.
         found: its uncertainty, which sets the sampler's scales.
         seed: of the random numbers.
-        chains: sampled side by side.
-        draws: kept of each chain.
-        warmup: spent on adaptation.
-        coloured: whether draws are stretched about the optimum by what the residual's colour adds to the covariance
-            (the open-faced sandwich of Shaby 2014); else the residual is taken for white.
+        chains: number of parallel chains.
+        draws: number kept of each chain.
+        warmup: number of adaptation steps.
+        coloured: whether draws are rescaled about the optimum to the robust covariance (the open-faced sandwich of
+            Shaby 2014); else the residual is assumed white.
 
     Raises:
-        ImportError: where blackjax is not installed.
-        ValueError: where nothing is free.
+        ImportError: blackjax is not installed.
+        ValueError: no parameter is free.
     """
     if not fit.free.paths:
         raise ValueError("`fit` must have free parameters, but has none")
@@ -89,11 +88,11 @@ def posterior(
     problem = fit.at_solution
     root = np.linalg.cholesky(found.unit_covariance)
     keys = jax.random.split(jax.random.key(seed), chains)
-    # The library mixes types and ranks, which a strict user forbids.
+    # The library mixes dtypes and ranks, which strict settings forbid.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         drawn, divergent, r_hat, effective = _sample(problem, fit.unknowns, jnp.asarray(root), keys, warmup, draws)
     centre = np.asarray(fit.unknowns.parameters)
-    # In whitened entries, a robust covariance is a stretch along fixed axes.
+    # For whitened entries, the robust covariance is a linear rescaling.
     stretch = _root(np.linalg.solve(root, np.linalg.solve(root, found.covariance).T)) if coloured else np.eye(len(root))
     vectors = centre + np.asarray(drawn) @ (root @ stretch).T
     return Posterior(
@@ -107,10 +106,10 @@ def posterior(
 
 
 def sampler() -> Any:
-    """The library that samples.
+    """The sampling library.
 
     Raises:
-        ImportError: where it is not installed.
+        ImportError: it is not installed.
     """
     try:
         import blackjax  # pyright: ignore[reportMissingImports]
@@ -166,7 +165,7 @@ def _sample(
 
 @eqx.filter_custom_jvp
 def _log_density(change: Float[Array, " parameters"], given: tuple[Problem, Unknowns]) -> Float[Array, ""]:
-    """Log density, up to a constant, where the parameters differ by `change` from the optimum."""
+    """Log density, up to a constant, at parameters that differ by `change` from the optimum."""
     return _density_and_gradient(change, given)[0]
 
 
@@ -194,7 +193,7 @@ def _density_and_gradient(change: Array, given: tuple[Problem, Unknowns]) -> tup
         step = normal_equations(Products.of(held), joined).step(jnp.zeros(()))
         return states + step.states, value, gradient
 
-    # The last pass only looks.
+    # The last pass only evaluates.
     start = (optimum.states, jnp.zeros(()), jnp.zeros_like(parameters))
     _, value, gradient = jax.lax.fori_loop(0, _STATE_STEPS + 1, refine, start)
     fine = jnp.isfinite(value) & jnp.isfinite(gradient).all()

@@ -1,4 +1,4 @@
-"""How far a free run may be off: what parameters, initial state and encoder leave open."""
+"""Prediction bands of free runs, from the uncertainty of parameters and initial state, and noise."""
 
 from collections.abc import Sequence
 
@@ -19,18 +19,18 @@ from fitting.uncertainty.standard_errors import Uncertainty
 
 
 class PredictionBand(eqx.Module):
-    """A free run and how well it is known, to first order.
+    """A free run and its uncertainty, to first order.
 
-    What the model lacks is not in it: where a fit leaves more than measurement noise, so will its predictions. A run
-    that is found to begin at rest is known better than this.
+    Model discrepancy is not included: where a fit's residual exceeds the noise, so do prediction errors. For a run that
+    begins at rest the band is too wide.
 
     Attributes:
         run: the free run.
-        std_parameters: what the parameters' covariance does to the predicted dynamic error [rad]. The initial state
-            follows the parameters, as it does in the window that it is taken from.
-        std_state: what the noise in that window does [rad].
+        std_parameters: of the predicted dynamic error, due to the parameters' covariance [rad]. The initial state is
+            refitted to its window for each parameter value.
+        std_state: due to the noise in that window [rad].
         std_noise: of the measured dynamic error [rad].
-        std_torque: of the predicted one, by noise of the torque [rad].
+        std_torque: of the predicted one, due to torque noise [rad].
     """
 
     run: FreeRun
@@ -51,19 +51,19 @@ class PredictionBand(eqx.Module):
 
     @property
     def band95(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Where 95 % of the measured samples are expected."""
+        """Limits that contain 95 % of the measured samples."""
         reach = NORMAL_95 * self.std_measured
         return self.run.predicted - reach, self.run.predicted + reach
 
     @property
     def inside(self) -> Bool[np.ndarray, " n"]:
-        """Which measured samples are in the band; none is where the run left the numbers."""
+        """Which measured samples are in the band; none where the run diverged."""
         low, high = self.band95
         return (low <= self.run.measured) & (self.run.measured <= high)
 
 
 def coverage(bands: Sequence[PredictionBand]) -> float:
-    """Share of the measured samples of several runs that lie in their bands; NaN where a band is not known."""
+    """Share of the measured samples of several runs in their bands; NaN where a band is unknown."""
     if not all(np.isfinite(b.std_predicted).all() for b in bands):
         return np.nan
     return float(np.mean(np.concatenate([b.inside for b in bands])))
@@ -84,11 +84,10 @@ def prediction_bands(
     Args:
         fitted: the fitted model.
         found: its uncertainty.
-        stretches: where to run; no other logs than the fit's are needed, and outputs beyond the window that
-            tells the initial state are not used.
+        stretches: to simulate; outputs beyond the initial-state window are not used.
         noise: covariance of the outputs' measurement noise.
         halo: intervals of torque before the start, for delays.
-        runs: the free runs along the stretches, where they are at hand.
+        runs: the free runs along the stretches, if already computed.
         torque_noise: standard deviation of the noise of a torque sample [N m].
     """
     substeps = fitted.substeps
@@ -130,8 +129,7 @@ def _band(
     covariance: np.ndarray,
     window: int,
 ) -> PredictionBand:
-    """The band of one run, from the derivatives of its outputs, and what noise of the torque drives; it has no width
-    where they left the numbers."""
+    """The band of one run, from the derivatives of its outputs and torque noise; NaN where they diverge."""
     variance = np.linalg.inv(white)
     std_noise = float(np.sqrt((variance @ variance.T)[-1, -1]))
     if not (np.isfinite(by_parameter).all() and np.isfinite(by_state).all()):
@@ -139,7 +137,8 @@ def _band(
         return PredictionBand(run, unknown, unknown, std_noise, driven)
     seen = np.einsum("ij,njs->nis", white, by_state[:window]).reshape(-1, by_state.shape[2])
     moved = np.einsum("ij,njp->nip", white, by_parameter[:window]).reshape(-1, by_parameter.shape[2])
-    # Scaled, since angles and rates differ by orders; a hidden state that the window does not see stays where it is.
+    # Scaled, since angles and rates differ by orders of magnitude; a hidden state that the window does not determine is
+    # fixed.
     size = np.linalg.norm(seen, axis=0)
     size = np.where(size > 0, size, 1.0)
     inverse = np.linalg.pinv(seen / size, rcond=1e-10) / size[:, None]

@@ -1,8 +1,8 @@
-"""Intervals from the likelihood itself, where a parabola at the optimum does not tell its shape.
+"""Intervals from the profile likelihood, where a quadratic approximation at the optimum is inaccurate.
 
-Each point of a profile is a fit of everything else with one parameter held (Venzon and Moolgavkar 1988). All points
-are lanes of one program. The rise of the sum of squares that belongs to 95 % is scaled by what the residual's colour
-does to the parameter's variance (Kent 1982), and Student's t stands where a normal law would.
+Each point of a profile is a fit of all other parameters with one fixed (Venzon and Moolgavkar 1988). All points are
+computed in parallel by one program. The increase of the sum of squares for 95 % is scaled by the ratio of robust and
+classical variance (Kent 1982), with Student's t in place of a normal distribution.
 """
 
 import dataclasses
@@ -22,36 +22,37 @@ from fitting.estimation.residual import Problem, Unknowns
 from fitting.uncertainty.standard_errors import Uncertainty
 from hdjax.where import where
 
-# Points on each side, in units of the interval that the parabola gives; further rounds reach this much further.
+# Points on each side, in units of the interval of the quadratic approximation; further rounds extend by this factor.
 _GRID = np.array([0.5, 0.9, 1.1, 2.0])
 _FURTHER = 5.0
 _ROUNDS = 6
-# Then so many rounds divide what lies between the last point inside and the first one outside.
+# Rounds that subdivide between the last point inside the interval and the first one outside.
 _REFINEMENTS = 2
 _INNER = np.array([0.2, 0.4, 0.6, 0.8])
-# Roots beyond this are too far out for a straight line.
+# Roots beyond this are too far out for linear interpolation.
 _FAR = 2.0
-# Lanes take at most this many steps from where their neighbours are, with this damping at first.
+# Most steps of each point from its neighbour's solution, and initial damping.
 _STEPS = 20
 _DAMPING = 1e-6
-# The first points lie at most this far from the optimum; a logarithm of 1 is a factor of e.
+# Largest distance of the first points from the optimum; a logarithm of 1 is a factor of e.
 _FARTHEST_FIRST = 1.0
-# An interval that reaches further than this share of the way to zero may be anything but a parabola's.
+# An interval that extends further than this share of the way to zero may be far from that of the quadratic
+# approximation.
 _DOUBTFUL = 0.5
-# Nor is a parabola one whose sides differ by more than this share.
+# Relative difference of an interval's sides above which the quadratic approximation is inaccurate.
 _ASYMMETRIC = 0.1
 
 
 class Profile(eqx.Module):
-    """What the best fit costs where one parameter is held.
+    """The profile likelihood of one parameter.
 
     Attributes:
         path: dotted path.
         value: at the optimum, in SI units.
-        values: where it was held, rising.
-        rise: of the sum of squares there, in units of what 95 % allows: the interval is where it is below one. Large
-            where no simulation reached the end of the log.
-        ci95: interval; infinite where nothing within reach is excluded.
+        values: at which it was fixed, in rising order.
+        rise: increase of the sum of squares there, over the increase for 95 %: below one inside the interval. Large
+            where simulations diverge.
+        ci95: interval; infinite where no value in the search range is excluded.
     """
 
     path: str = eqx.field(static=True)
@@ -62,7 +63,7 @@ class Profile(eqx.Module):
 
 
 def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
-    """The likelihood's profile of one free parameter.
+    """The profile likelihood of one free parameter.
 
     Args:
         fit: the fit.
@@ -70,13 +71,13 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
         found: its uncertainty.
 
     Raises:
-        ValueError: where the parameter is not free.
+        ValueError: the parameter is not free.
     """
     if path not in fit.free.paths:
         raise ValueError(f"`path` must be one of {fit.free.paths}, but is {path!r}")
     index = fit.free.paths.index(path)
     estimate = found.estimates[path]
-    # How much the parameter's variance exceeds that of a white residual of unit variance, times t squared.
+    # Ratio of the parameter's variance to that of a white residual of unit variance, times t squared.
     allowed = stdtrit(estimate.degrees_of_freedom, 0.975) ** 2 * _inflation(fit, found, index)
     reach = np.sqrt(allowed * found.unit_covariance[index, index])
     reach = min(float(reach), _FARTHEST_FIRST)
@@ -87,13 +88,13 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
     walk = _Walk.start(fit.unknowns, index, floor, float(allowed))
     for turn in range(_ROUNDS):
         steps = reach * _FURTHER**turn * _GRID
-        # Both sides are always walked, so that all rounds share one program.
+        # Both sides are always extended, so that all rounds share one program.
         walk = walk.extended(problem, np.concatenate([-steps, steps]))
         if all(np.isfinite(walk.bracket(side)).all() for side in (-1.0, 1.0)):
             break
     for _ in range(_REFINEMENTS):
         brackets = [walk.bracket(side) for side in (-1.0, 1.0)]
-        # A side without an end has nothing to divide: its points stand for nothing.
+        # A side without a limit has nothing to subdivide: its points are placeholders.
         inner = [a + _INNER * (b - a) if np.isfinite([a, b]).all() else reach * _INNER for a, b in brackets]
         walk = walk.extended(problem, np.concatenate(inner))
     offsets, roots = walk.offsets, walk.roots
@@ -110,10 +111,10 @@ def profile(fit: Fit, path: str, found: Uncertainty) -> Profile:
 
 
 def with_profiles(fit: Fit, found: Uncertainty) -> Uncertainty:
-    """The same uncertainty, with intervals from profiles where those of the parabola are in doubt.
+    """The same uncertainty, with profile likelihood intervals where the quadratic approximation may be inaccurate.
 
-    A parameter is looked at where it is not identifiable or nearly so. Its interval is replaced where the sides of the
-    profile's differ by more than a tenth, or from the parabola's.
+    Profiles are computed for parameters that are not or hardly identifiable. An interval is replaced where the sides of
+    the profile's differ by more than a tenth, or from the quadratic approximation.
     """
     estimates = dict(found.estimates)
     for path, estimate in found.estimates.items():
@@ -138,14 +139,14 @@ def _inflation(fit: Fit, found: Uncertainty, index: int) -> float:
 
 
 class _Walk(eqx.Module):
-    """Points of a profile found so far, by rising offset of the held entry, and the fits there.
+    """Points of a profile so far, by rising offset of the fixed entry, and the fits there.
 
     Attributes:
-        index: of the held entry.
+        index: of the fixed entry.
         floor: sum of squares at the optimum.
-        allowed: its rise that belongs to 95 %.
+        allowed: its increase for 95 %.
         offsets: from the optimum.
-        roots: square roots of the rise, in units of what is allowed; a parabola makes them straight lines.
+        roots: square roots of the increase over the allowed one; linear for a quadratic.
         vectors: free vectors.
         states: initial states.
     """
@@ -164,7 +165,7 @@ class _Walk(eqx.Module):
         return _Walk(index, floor, allowed, np.zeros(1), np.zeros(1), vectors, states)
 
     def extended(self, problem: Problem, steps: np.ndarray) -> "_Walk":
-        """The walk with further points, each fitted from what its nearest neighbour found."""
+        """The profile with further points, each fitted from its nearest neighbour's solution."""
         settled = np.flatnonzero(np.isfinite(self.roots))
         nearest = settled[np.argmin(np.abs(self.offsets[settled][None, :] - steps[:, None]), axis=1)]
         start = self.vectors[nearest]
@@ -184,7 +185,7 @@ class _Walk(eqx.Module):
         return (offsets, roots) if side > 0 else (offsets[::-1], roots[::-1])
 
     def bracket(self, side: float) -> tuple[float, float]:
-        """The last offset inside the interval and the first one outside; infinite where there is none."""
+        """The last offset inside the interval and the first one outside; infinite without one."""
         offsets, roots = self._side(side)
         outside = np.flatnonzero(roots > 1.0)
         if not outside.size:
@@ -192,7 +193,7 @@ class _Walk(eqx.Module):
         return float(offsets[outside[0] - 1]), float(offsets[outside[0]])
 
     def crossing(self, side: float) -> float:
-        """Where the interval ends."""
+        """The limit of the interval."""
         a, b = self.bracket(side)
         if not np.isfinite(b):
             return b
@@ -202,7 +203,7 @@ class _Walk(eqx.Module):
 
 
 def _physical(fit: Fit, index: int, entry: float) -> float:
-    """The value that an entry of the free vector stands for."""
+    """The physical value of an entry of the free vector."""
     if fit.free.logarithmic[index]:
         with np.errstate(over="ignore"):
             return float(np.exp(entry))
@@ -223,7 +224,7 @@ def _evaluate(problem: Problem, unknowns: Unknowns) -> Array:
 def _solve_lanes(
     problem: Problem, parameters: Float[Array, "lanes parameters"], states: Float[Array, "lanes segments states"]
 ) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes segments states"], Float[Array, " lanes"]]:
-    """Fit what is active from each start; parameters, states and sums of squares."""
+    """Fit the active parameters from each start; returns parameters, states and sums of squares."""
 
     def one(parameters: Array, states: Array) -> tuple[Array, Array, Array]:
         solver = ArrowLevenbergMarquardt(

@@ -1,4 +1,4 @@
-"""The same fit to other data: hundreds of refits for the price of a few fits."""
+"""Fast refits of a model to many data sets, as in a bootstrap."""
 
 import equinox as eqx
 import jax
@@ -11,9 +11,9 @@ from fitting.estimation.levenberg_marquardt import normal_equations
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns
 from hdjax.lanes import jit_lanes
 
-# Data that run side by side; more would not fit into the processor's cache.
+# Data sets in parallel; more would exceed the processor's cache.
 _BATCH = 8
-# Standard errors by which the last step moves the parameters at most.
+# Tolerance of the last step, in standard errors of the parameters.
 _CLOSE = 1e-3
 
 
@@ -22,20 +22,19 @@ def refits(
 ) -> tuple[Float[Array, "draws parameters"], Float[Array, " draws"]]:
     """Fit the model of a fit to other data on the same segments, under the same weights.
 
-    For data that differ by noise, as in a bootstrap. The parameters then move by some standard errors, over which the
-    sensitivities hardly change: they are computed once, at the fit, and each refit takes a few Gauss-Newton steps with
-    them (the chord method). A step costs one simulation without sensitivities.
+    For data that differ by noise, as in a bootstrap. The parameters then change by a few standard errors, over which
+    the sensitivities are nearly constant. They are computed once, at the fit, and each refit takes a few Gauss-Newton
+    steps with them (the chord method). A step costs one simulation without sensitivities.
 
     Args:
         found: the fit, with its segments and weights.
         measured: the outputs in place of those of `found.problem.segments`.
-        steps: Gauss-Newton steps at most. Each removes all but a share of the error that is about as small as the
-            parameters' relative change, so that after one that moved them by a thousandth of a standard error nothing
-            is left to do.
+        steps: most Gauss-Newton steps. Each reduces the error by about the parameters' relative change, so that the
+            iteration ends after a step of a thousandth of a standard error.
 
     Returns:
-        The free vector (see [`fitting.estimation.free_parameters.FreeParameters`][]) by draw, and how far the last step
-        still moved it, in standard errors of the joint estimate.
+        The free vector (see [`fitting.estimation.free_parameters.FreeParameters`][]) by draw, and the size of the last
+        step, in standard errors of the joint estimate.
     """
     problem = with_engine(found.at_solution, values=True)
     return _refits(problem, found.unknowns, linearise(problem, found.unknowns), jnp.asarray(measured), steps)

@@ -1,11 +1,11 @@
-"""Covariance of least-squares estimates whose residual has a colour of its own.
+"""Covariance of least-squares estimates with coloured residuals.
 
-Noise that is stationary, whatever its colour, is uncorrelated from one Fourier frequency to the next. Least squares on
-a stretch's Fourier coefficients is therefore a regression with independent errors of unequal variance, and the
-sandwich for that case (White 1980) with each squared residual divided by one minus its leverage (MacKinnon and White
-1985, HC2) needs neither a bandwidth nor a model of the noise (Robinson 1998, Econometrica 66, "Inference without
-smoothing in the presence of nonparametric autocorrelation"). Where leverage is high, as at the line of a single sine,
-residuals are pooled with those of neighbouring frequencies.
+Stationary noise of any spectrum is uncorrelated between Fourier frequencies. Least squares on a stretch's Fourier
+coefficients is therefore a regression with independent errors of unequal variance, and the sandwich for that case
+(White 1980) with each squared residual divided by one minus its leverage (MacKinnon and White 1985, HC2) needs neither
+a bandwidth nor a model of the noise (Robinson 1998, Econometrica 66, "Inference without smoothing in the presence of
+nonparametric autocorrelation"). Where leverage is high, as at the line of a single sine, residuals are pooled with
+those of neighbouring frequencies.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,30 +21,29 @@ from fitting.estimation.estimate import Fit
 from fitting.estimation.problem import natural_frequency
 from fitting.estimation.projection import FirstStates
 
-# Simulations that start anew so often are many independent ones; their number is then all that has to be assumed.
+# Number of simulations above which they are treated as independent clusters.
 _MANY_CHAINS = 20
-# Chunks of time against which stationary noise is checked, and natural periods in each at least.
+# Number of time chunks to test noise for stationarity, and least natural periods in each.
 _CHUNKS = 64
 _CHUNK_PERIODS = 2.0
-# The chunks overrule the spectrum where the two differ by more than chance gives in one case of a hundred.
+# Significance level at which the estimate from chunks replaces that from the spectrum.
 _OVERRULE = 0.99
-# A frequency's residual stands for its noise where at least this share of the noise is left in it.
+# Least share of noise left in a frequency's residual for it to represent its noise.
 _LEAST_LEFT = 0.5
-# Nor is a cluster's residual enlarged beyond what this share of it would need.
+# Least remaining share that a cluster's residual is corrected for.
 _LEAST_CLUSTER = 0.05
-# Eigenvalues of the scaled information below this are directions that the data do not see at all.
+# Eigenvalues of the scaled information below this are directions without information.
 _BLIND = 1e-12
 
 
 class Record(eqx.Module):
-    """The residual of one stretch in the order of time, and what was fitted to it.
+    """The residual of one stretch in order of time, and its derivatives.
 
     Attributes:
         residual: whitened output error; zero at missing samples.
-        slopes: its derivative with respect to the free vector (with the sign of the simulated outputs turned, as in
-            the residual), without what the initial states could do as well.
+        slopes: its derivative with respect to the free vector, projected orthogonal to the initial states.
         states: first sample and derivative with respect to the initial state of each simulation in the stretch.
-        present: share of the samples that are not missing.
+        present: share of valid samples.
     """
 
     residual: Float[np.ndarray, "n outputs"]
@@ -53,7 +52,7 @@ class Record(eqx.Module):
     present: float
 
     def bases(self) -> Iterator[tuple[int, Float[np.ndarray, "samples outputs directions"]]]:
-        """First sample of each simulation, and orthonormal directions of what its initial state can do."""
+        """First sample of each simulation, and an orthonormal basis of its initial state's effect."""
         for start, columns in self.states:
             flat = columns.reshape(-1, columns.shape[2])
             length = np.linalg.norm(flat, axis=0)
@@ -66,9 +65,9 @@ class Linearised(eqx.Module):
 
     Attributes:
         records: by stretch.
-        information: J^T J of the free vector after the initial states are eliminated.
-        prior: the part of it that comes from the priors of hidden states and of parameters.
-        chunk: samples in a chunk of time that holds the memory of what is estimated.
+        information: J^T J of the free vector after elimination of the initial states.
+        prior: the part of it due to priors of hidden states and parameters.
+        chunk: samples in a time chunk, longer than the correlation of the estimates' scores.
     """
 
     records: tuple[Record, ...]
@@ -83,7 +82,7 @@ class Linearised(eqx.Module):
 
     @property
     def fitted(self) -> int:
-        """Number of fitted values, initial states included."""
+        """Number of fitted values, including initial states."""
         return self.information.shape[0] + sum(c.shape[2] for r in self.records for _, c in r.states)
 
 
@@ -91,9 +90,9 @@ class Covariance(eqx.Module):
     """Covariance of the free vector.
 
     Attributes:
-        robust: whatever the colour of the residual.
+        robust: for a residual of any spectrum.
         classical: for a white residual.
-        unit: for a white residual of the variance that weighs the outputs, (J^T J)^-1.
+        unit: for a white residual of the variance used as weight, (J^T J)^-1.
         degrees_of_freedom: of the robust variances, as in Student's t.
     """
 
@@ -104,13 +103,13 @@ class Covariance(eqx.Module):
 
 
 def linearised(fit: Fit) -> Linearised:
-    """The regression that a fit is at its solution."""
+    """A fit as a linear regression at its solution."""
     problem = fit.at_solution
     found = linearise(problem, fit.unknowns)
     states = FirstStates.of(found, problem.segments.joined)
     residual, projected = np.asarray(found.residual), states.parameters_without(found)
     with np.errstate(over="ignore", invalid="ignore"):
-        # Derivatives that leave the numbers, as over corners that the solver's steps do not resolve, tell nothing.
+        # Derivatives that overflow, as at nonlinearities that solver steps do not resolve, carry no information.
         projected = np.where(np.isfinite(np.sum(projected**2, axis=(0, 1))), projected, 0.0)
     samples = problem.segments.measured.shape[1] * problem.segments.measured.shape[2]
     prior = projected[:, samples:]
@@ -131,13 +130,13 @@ def with_further(
     columns: Float[np.ndarray, "segments rows further"],
     prior: Float[np.ndarray, " further"],
 ) -> Linearised:
-    """The regression with further unknowns behind the free vector.
+    """The regression with further unknowns appended to the free vector.
 
     Args:
         fit: the fit.
         found: its regression.
-        columns: derivative of the residual by them, without what the initial states could do as well.
-        prior: information about each beside the data.
+        columns: derivative of the residual by them, projected orthogonal to the initial states.
+        prior: prior information about each.
     """
     _, samples, outputs = fit.problem.segments.measured.shape
     rows = columns[:, : samples * outputs].reshape(len(columns), samples, outputs, -1)
@@ -159,11 +158,11 @@ def with_further(
 def covariance(found: Linearised) -> Covariance:
     """Classical and robust covariance of a fit's free vector.
 
-    Simulations that start anew many times are clusters (Liang and Zeger 1986). Fewer and longer ones are judged by
-    their spectrum. Noise that comes and goes with what is estimated is not stationary: chunks of time then show more
-    scatter than the spectrum promises, and overrule it.
+    Many short simulations are clusters (Liang and Zeger 1986). Fewer and longer ones use the residual's spectrum. Noise
+    that is correlated with the regressors' amplitude is not stationary. Scores of time chunks then scatter more than
+    the spectrum predicts, and replace it.
     """
-    # Each parameter in units of what the data tell of it: powers of what is hardly told would leave the numbers.
+    # Each parameter in units of its standard error: powers of poorly determined ones would overflow.
     diagonal = np.diag(found.information)
     unit = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     both = np.outer(unit, unit)
@@ -196,10 +195,9 @@ def directions(found: Float[np.ndarray, "parameters parameters"]) -> list[tuple[
 def _clustered(
     records: Sequence[Record], borders: Sequence[Sequence[int]], inverse: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance from sums of scores between borders, which are taken for independent; and its degrees of freedom.
+    """Covariance from sums of scores between borders, assumed independent; and its degrees of freedom.
 
-    What a cluster's own share of the information has taken from its residual is put back (CR2 of Bell and McCaffrey
-    2002).
+    Each cluster's residual is corrected for its leverage (CR2 of Bell and McCaffrey 2002).
     """
     sums, shares = [], []
     for record, starts in zip(records, borders, strict=True):
@@ -213,7 +211,7 @@ def _clustered(
     white = np.concatenate(sums) @ root
     turned = np.einsum("cpk,cp->ck", axes, white) / np.sqrt(np.maximum(left, _LEAST_CLUSTER))
     found = np.einsum("cpk,ck->cp", axes, turned) @ root
-    # A normal score's fourth power is three times the square of its variance.
+    # The fourth moment of a normal score is three times its squared variance.
     square, fourth = np.sum(found**2, axis=0), np.sum(found**4, axis=0)
     freedom = 3.0 * square**2 / np.maximum(fourth, 1e-300)
     return found.T @ found, np.clip(freedom, 1.0, max(found.shape[0] - 1, 1))
@@ -222,7 +220,7 @@ def _clustered(
 def _overruled(
     robust: np.ndarray, freedom: np.ndarray, other: np.ndarray, other_freedom: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The robust covariance with larger variances where another estimate is larger by more than chance."""
+    """The robust covariance with larger variances where another estimate is significantly larger."""
     own, rival = np.diag(robust), np.diag(other)
     ratio = np.where(own > 0, rival / np.where(own > 0, own, 1.0), 1.0)
     larger = ratio > fdtri(other_freedom, freedom, _OVERRULE)
@@ -239,7 +237,7 @@ def _spectral(records: Sequence[Record], inverse: np.ndarray) -> tuple[np.ndarra
         influence = _spectrum(record.slopes @ inverse)
         error = _spectrum(record.residual) / np.sqrt(record.present)
         left = 1.0 - _leverage(record, inverse)
-        # Frequencies stand for their mirror images as well, but the first, and the last of an even count.
+        # Each frequency also represents its negative, except the first, and the last of an even count.
         images = np.full(error.shape[0], 2.0)
         images[0] = 1.0
         if count % 2 == 0:
@@ -252,14 +250,14 @@ def _spectral(records: Sequence[Record], inverse: np.ndarray) -> tuple[np.ndarra
             np.add.at(own, near, images[place][:, None] * np.abs(part) ** 2)
         square += np.sum(own**2, axis=0)
     variance = np.diag(total)
-    # Half of what independent frequencies would have: a record of finite length couples neighbours.
+    # Half the degrees of freedom of independent frequencies: finite records correlate neighbours.
     return total, np.maximum(2.0 * variance**2 / np.maximum(square, 1e-300), 1.0)
 
 
 def _neighbourhoods(left: np.ndarray):
-    """For each offset of a neighbour: frequencies, their neighbours, and the noise left in all of the neighbourhood.
+    """For each offset of a neighbour: frequencies, their neighbours, and the noise left in the whole neighbourhood.
 
-    A neighbourhood grows by doubling until enough noise is left in it.
+    A neighbourhood is doubled until enough noise is left in it.
 
     Args:
         left: share of the noise that is left at each frequency (row) of each output.
@@ -282,7 +280,7 @@ def _neighbourhoods(left: np.ndarray):
 
 
 def _leverage(record: Record, inverse: np.ndarray) -> np.ndarray:
-    """Share of white noise that the fit takes up, by frequency and output."""
+    """Leverage: share of white noise that the fit absorbs, by frequency and output."""
     count, outputs = record.residual.shape
     values, vectors = np.linalg.eigh(inverse)
     found = _power(record.slopes @ (vectors * np.sqrt(np.maximum(values, 0.0))))
@@ -302,7 +300,7 @@ def _spectrum(series: np.ndarray) -> np.ndarray:
 
 
 def _records(fit: Fit, residual: np.ndarray, projected: np.ndarray, by_first: np.ndarray) -> tuple[Record, ...]:
-    """Segments put together again as stretches."""
+    """Residuals of segments, joined into stretches."""
     segments = fit.problem.segments
     _, samples, outputs = segments.measured.shape
 
@@ -324,8 +322,8 @@ def _records(fit: Fit, residual: np.ndarray, projected: np.ndarray, by_first: np
 
 
 def _inverse(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of an information of unit diagonal, and the part of it that comes from directions that the data do not
-    see; they get a huge variance."""
+    """Inverse of an information of unit diagonal, and the part of it due to directions without information, which get a
+    huge variance."""
     values, vectors = np.linalg.eigh(information)
     blind = values < _BLIND
     values = np.maximum(values, _BLIND)

@@ -1,4 +1,4 @@
-"""How well the data determine each parameter, also where the model is not quite right."""
+"""Standard errors and intervals of parameters, robust against model discrepancy."""
 
 from dataclasses import replace
 from typing import Literal
@@ -25,13 +25,13 @@ class Estimate(eqx.Module):
         path: dotted path.
         value: in SI units.
         std: standard error, robust against coloured residuals (sandwich), and no less than the classical one.
-        std_classical: standard error from J^T J alone, which takes the residual for white noise.
-        ci95: 95 % interval; wider than 1.96 standard errors where those rest on few data.
+        std_classical: standard error from J^T J alone, for a white residual.
+        ci95: 95 % interval; wider than 1.96 standard errors for few degrees of freedom.
         unit: SI unit.
-        identifiable: whether the data tell the parameter from zero; of a positive parameter, whether its interval
-            stays within a factor of e to either side.
+        identifiable: whether the parameter is significantly nonzero; for a positive one, whether its interval is within
+            a factor of e to either side.
         degrees_of_freedom: of Student's t behind the interval.
-        interval: whether `ci95` is from the curvature at the optimum or from the likelihood's profile.
+        interval: whether `ci95` is from the curvature at the optimum or from the profile likelihood.
     """
 
     path: str = eqx.field(static=True)
@@ -46,13 +46,13 @@ class Estimate(eqx.Module):
 
 
 class Uncertainty(eqx.Module):
-    """Standard errors of all free parameters, and how they go together.
+    """Standard errors and correlations of all free parameters.
 
     Attributes:
         estimates: by dotted path.
         correlation: of the free parameters, in the order of `estimates`.
         covariance: robust, of the free vector (logarithms, or units of the parameters' scales).
-        unit_covariance: the same for white noise of the variance that weighs the outputs, (J^T J)^-1.
+        unit_covariance: the same for white noise of the variance used as weight, (J^T J)^-1.
     """
 
     estimates: dict[str, Estimate]
@@ -60,15 +60,15 @@ class Uncertainty(eqx.Module):
     covariance: Float[np.ndarray, "parameters parameters"]
     unit_covariance: Float[np.ndarray, "parameters parameters"]
 
-    def in_units_of(self, fit: Fit, told_by: Fit) -> "Uncertainty":
+    def in_units_of(self, fit: Fit, source: Fit) -> "Uncertainty":
         """The same for the parameters and the free vector of another fit.
 
         Args:
-            fit: the other fit; its parameters are among those that are known here.
-            told_by: the fit whose uncertainty this is.
+            fit: the other fit; its parameters are a subset of these.
+            source: the fit whose uncertainty this is.
         """
-        own = [told_by.free.paths.index(path) for path in fit.free.paths]
-        ratio = np.asarray(told_by.free.slopes(told_by.model))[own] / np.asarray(fit.free.slopes(fit.model))
+        own = [source.free.paths.index(path) for path in fit.free.paths]
+        ratio = np.asarray(source.free.slopes(source.model))[own] / np.asarray(fit.free.slopes(fit.model))
         kept, both = np.ix_(own, own), np.outer(ratio, ratio)
         return Uncertainty(
             {path: self.estimates[path] for path in fit.free.paths},
@@ -89,15 +89,15 @@ class Uncertainty(eqx.Module):
 def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise: bool = True) -> Uncertainty:
     """Standard errors and intervals of a fit.
 
-    The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times what is left over.
-    The robust one holds whatever the colour of the residual, see [`fitting.uncertainty.sandwich`][]. Its own
-    uncertainty enters the intervals as Student's t. Where noise of the torque describes the residual's colour, that
-    gives a third one ([`fitting.uncertainty.input_noise`][]). The largest counts.
+    The classical covariance is (J^T J)^-1 after each segment's initial state is eliminated, times the residual
+    variance. The robust one holds for residuals of any spectrum, see [`fitting.uncertainty.sandwich`][]. Its own
+    uncertainty enters the intervals by Student's t. Where torque noise describes the residual's spectrum, that gives a
+    third one ([`fitting.uncertainty.input_noise`][]). The largest counts.
 
     Args:
         fit: the fit.
-        regression: the fit as a linear regression, where it is at hand.
-        torque_noise: whether to look for noise of the torque; that compiles a program for each form of a model.
+        regression: the fit as a linear regression, if already computed.
+        torque_noise: whether to consider torque noise; that compiles a program for each form of a model.
     """
     free = fit.free
     if not free.paths:
@@ -118,7 +118,7 @@ def uncertainty(fit: Fit, *, regression: Linearised | None = None, torque_noise:
 
 
 def _beside_rates(fit: Fit, regression: Linearised) -> Covariance:
-    """The covariance of the free vector, whatever the sample rates are that rounded stamps leave open."""
+    """The covariance of the free vector, including uncertain sample rates."""
     rates = rate_columns(fit)
     if rates is None:
         return covariance(regression)
@@ -129,12 +129,11 @@ def _beside_rates(fit: Fit, regression: Linearised) -> Covariance:
 
 
 def _described(found: Covariance, other: Float[np.ndarray, "parameters parameters"] | None) -> Covariance:
-    """The covariance with longer intervals where noise of the torque, of which two or three numbers are known, makes
-    them so."""
+    """The covariance with larger variances where the torque noise model gives longer intervals."""
     if other is None:
         return found
     reach = stdtrit(found.degrees_of_freedom, 0.975) * np.sqrt(np.diag(found.robust))
-    # Of what only a prior tells, rounding may leave less than nothing.
+    # Where only a prior gives information, rounding may make the data's part negative.
     variance = np.maximum(np.diag(other), 0.0)
     longer = NORMAL_95 * np.sqrt(variance) > reach
     stretch = np.where(longer, np.sqrt(variance / np.diag(found.robust)), 1.0)
@@ -150,7 +149,7 @@ def _estimate(
 ) -> Estimate:
     freedom = float(found.degrees_of_freedom[i])
     robust, classical = float(np.sqrt(found.robust[i, i])), float(np.sqrt(found.classical[i, i]))
-    # In short or narrow-band logs the residual's own spectrum may come out too small by chance.
+    # In short or narrow-band logs the estimated spectrum may be too small by chance.
     error = max(robust, classical)
     reach = max(float(stdtrit(freedom, 0.975)) * robust, NORMAL_95 * classical)
     if logarithmic:
@@ -159,7 +158,7 @@ def _estimate(
         identifiable = reach < 1.0
     else:
         interval = (value - slope * reach, value + slope * reach)
-        # Damping below zero would be energy from nowhere: that a log tells it from zero does not make it known.
+        # Negative damping is not physical: significantly nonzero does not mean identifiable.
         identifiable = interval[0] > 0.0 if path in _DISSIPATIVE else not interval[0] <= 0.0 <= interval[1]
     return Estimate(
         path=path,

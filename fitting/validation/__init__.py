@@ -1,1 +1,1 @@
-"""Free runs, before and after, and tests of residuals."""
+"""Free runs before and after attribution, and residual tests."""

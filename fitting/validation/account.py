@@ -1,4 +1,4 @@
-"""Before against after: free runs along the same logs, on each part of the data."""
+"""Free runs of a fitted model on each part of the data, to compare models before and after attribution."""
 
 from collections.abc import Sequence
 
@@ -17,17 +17,17 @@ from hdjax import Model
 
 
 class Account(eqx.Module):
-    """What one fitted model is worth.
+    """Free runs and uncertainty of one fitted model.
 
     Attributes:
         model: with fitted values.
-        uncertainty: of what was fitted.
-        training: free runs along the stretches that candidates are fitted to.
-        selection: free runs along the stretches by which one of them was selected, by the model as it was fitted
-            without them; none where nothing was to be selected.
-        test: free runs along data that nothing has looked at; none where there are too few.
-        identifiability: what the logs can't tell of it.
-        not_machine_code: why XLA evaluates its residual; None where machine code does.
+        uncertainty: of the fitted parameters.
+        training: free runs along the training stretches.
+        selection: free runs along the selection stretches, by the model as fitted without them; none where nothing was
+            selected.
+        test: free runs along the test data; none where there are too few.
+        identifiability: which parameters the logs don't determine.
+        not_machine_code: reason why XLA evaluates its residual; None where machine code does.
     """
 
     model: Model
@@ -39,7 +39,7 @@ class Account(eqx.Module):
     not_machine_code: str | None = eqx.field(static=True, default=None)
 
     def parts(self) -> dict[str, tuple[FreeRun, ...]]:
-        """The free runs of each part of the data that there is, by its name."""
+        """The free runs of each part of the data, by its name."""
         named = {"training": self.training, "selection": self.selection, "test": self.test}
         return {name: runs for name, runs in named.items() if runs}
 
@@ -50,13 +50,13 @@ class Account(eqx.Module):
 
     @property
     def rmse_of_outputs(self) -> dict[str, dict[str, float]]:
-        """Likewise of each output, by its name in the log."""
+        """Rms error of each output on each part of the data, by its name in the log."""
         outputs = next(iter(self.parts().values()))[0].outputs
         return {o: {name: rms_error(runs, o) for name, runs in self.parts().items()} for o in outputs}
 
     @property
     def judged(self) -> tuple[FreeRun, ...]:
-        """The free runs that tell best how good the model is: of test data, or else of what selected it."""
+        """The free runs by which the model is judged: on test data, else on selection data."""
         return self.test or self.selection or self.training
 
 
@@ -69,30 +69,29 @@ def account(
     halo: int,
     selection: tuple[FreeRun, ...] = (),
     profiles: bool = False,
-    told_by: Fit | None = None,
+    std_from: Fit | None = None,
 ) -> Account:
-    """Free runs and standard errors of a fit, and what it can't tell.
+    """Free runs, standard errors and identifiability of a fit.
 
     Args:
         fit: the fitted model.
-        training: stretches along which it runs.
-        test: likewise, that it has not seen.
+        training: training stretches.
+        test: test stretches.
         noise: covariance of the measurement noise.
         halo: intervals of torque before a stretch.
-        selection: free runs along the stretches by which it was selected.
-        profiles: whether doubtful intervals are taken from the likelihood's profile, which compiles a program of its
-            own.
-        told_by: a fit of the same parameters that their standard errors are taken from, where it is another one.
+        selection: free runs along the selection stretches.
+        profiles: whether profile likelihood replaces inaccurate intervals, which compiles a further program.
+        std_from: another fit of the same parameters that supplies their standard errors.
     """
-    # Apart, so that test data do not even share the scale of a window.
+    # Separate runs, so that test data do not share the scale of a window.
     seen, unseen = (free_runs(fit, part, noise=noise, halo=halo) for part in (training, test))
-    judged = fit if told_by is None else told_by
+    judged = fit if std_from is None else std_from
     found = uncertainty(judged)
     if profiles:
         found = with_profiles(judged, found)
     told = identifiability(judged, found)
-    if told_by is not None:
-        found = found.in_units_of(fit, told_by)
+    if std_from is not None:
+        found = found.in_units_of(fit, std_from)
     return Account(fit.model, found, seen, selection, unseen, told, why_not(fit.problem))
 
 
@@ -106,5 +105,5 @@ def free_runs(
 
 
 def excess(fit: Fit, noise: Float[Array, "outputs outputs"]) -> Float[np.ndarray, " outputs"]:
-    """What a fit leaves over of each output, in units of the measurement noise; 1 is nothing but noise."""
+    """Rms residual of each output over its measurement noise; 1 for pure noise."""
     return np.sqrt(np.diag(np.asarray(fit.covariance)) / np.diag(np.asarray(noise)))

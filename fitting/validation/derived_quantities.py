@@ -1,4 +1,4 @@
-"""Quantities that follow from fitted ones, with standard errors propagated to first order."""
+"""Quantities derived from fitted ones, with standard errors propagated to first order."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ Quantities = Mapping[str, tuple[Array, str]]
 
 
 class Derived(eqx.Module):
-    """A quantity that follows from fitted ones.
+    """A quantity derived from fitted ones.
 
     Attributes:
         value: in `unit`.
@@ -46,7 +46,7 @@ def derived(account: Account, quantities: Callable[..., Quantities], *given: flo
 
     Args:
         account: the fitted model's.
-        quantities: value and unit of each, as a function of the model and of what is given besides.
+        quantities: function of the model and `given` that returns value and unit of each.
         given: further arguments of that function.
     """
     estimates = account.uncertainty.estimates
@@ -98,18 +98,18 @@ def _degrees_of_freedom(
 ) -> Float[np.ndarray, " quantities"]:
     """Degrees of freedom of each quantity's variance, from the parameters' own and what they contribute to the error.
 
-    The harmonic mean, weighed by the parameters' shares of the sum of squared contributions: exact for one parameter
-    or where all have the same, and fewer than Satterthwaite's where errors are independent.
+    The harmonic mean, weighted by the parameters' shares of the sum of squared contributions. Exact for one parameter
+    or equal degrees, and below Satterthwaite's for independent errors.
     """
     with np.errstate(all="ignore"):
         shares = scaled**2 / np.sum(scaled**2, axis=1, keepdims=True)
         freedom = 1.0 / (shares @ (1.0 / own))
-    # A quantity that follows from no fitted parameter is certain.
+    # A quantity that depends on no fitted parameter is certain.
     return np.where(np.isnan(freedom), np.inf, freedom)
 
 
 def effect_figures(model: Model, name: str) -> Quantities:
-    """What an effect says of itself beside its parameters.
+    """Derived quantities of an effect.
 
     Args:
         model: with the effect.
@@ -119,7 +119,7 @@ def effect_figures(model: Model, name: str) -> Quantities:
 
 
 def drive_figures(model: Model, x_max: float | Array) -> dict[str, tuple[Array, str]]:
-    """What engineers use of a drive beside its parameters.
+    """Derived quantities of a drive.
 
     Args:
         model: the drive.
@@ -127,8 +127,8 @@ def drive_figures(model: Model, x_max: float | Array) -> dict[str, tuple[Array, 
 
     Returns:
         Natural frequency (`omega_0` in rad/s, `natural_frequency` in Hz), `mu`, damping ratio `zeta`, the nonlinear
-        share of the restoring torque at full twist alpha x_max^2, and the slope of the restoring torque there. What
-        is a parameter of the model itself is left out.
+        share of the restoring torque at full twist alpha x_max^2, and the slope of the restoring torque there.
+        Parameters of the model itself are omitted.
     """
     drive = model.drive
     full = drive.alpha * x_max**2

@@ -1,5 +1,5 @@
-"""Whether what explains short segments explains whole stretches too: each segment may start anew, and what drifts apart
-from one to the next shows in free runs alone."""
+"""Check of free runs along whole stretches against their prediction bands: slow errors do not show on short
+segments."""
 
 from collections.abc import Sequence
 
@@ -23,19 +23,19 @@ def surprise(
     halo: int,
     torque_noise: float = 0.0,
 ) -> float | None:
-    """Rms by which free runs of held-out stretches are off, over the rms that their bands allow: what short segments
-    leave, and what it leaves open of parameters and initial state.
+    """Rms error of free runs along held-out stretches, over the rms of their prediction bands. Bands contain the
+    residual of short segments, and the uncertainty of parameters and initial state.
 
-    Near one where the model is right, a chaotic one as well: its bands grow as its errors do. None where the model
-    explains the free runs' error (no form is exact, and bands know nothing of that), or where its bands leave the
-    numbers, since nothing was promised then.
+    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where the model explains most
+    of the free runs' error (bands do not contain inexact laws), or where its bands diverge.
 
     Args:
         final: the model with its effects.
         before: free runs of the base model along the held-out stretches.
         after: likewise of the final model.
-        held_out: the final model on short segments of the held-out stretches, which show noise with a memory whole.
-        noise: covariance of the measurement noise, as shorter pieces tell it.
+        held_out: the final model on short segments of the held-out stretches, whose residual contains all coloured
+            noise.
+        noise: covariance of the measurement noise, estimated from shorter pieces.
         halo: intervals of torque before a stretch.
         torque_noise: standard deviation of the noise of a torque sample [N m].
     """
@@ -57,7 +57,7 @@ def surprise(
 
 
 def over_bands(bands: Sequence[PredictionBand]) -> float | None:
-    """Rms error of several runs over the rms that their bands allow; None where these left the numbers."""
+    """Rms error of several runs over the rms of their prediction bands; None where these diverge."""
     allowed = np.concatenate([band.std_measured[band.run.counts] ** 2 for band in bands])
     seen = np.concatenate([band.run.squared_error for band in bands])
     ratio = np.sqrt(np.sum(seen) / np.sum(allowed))

@@ -1,4 +1,4 @@
-"""The frequency response from torque to dynamic error: as the log shows it, and as the fitted model has it."""
+"""Frequency response from torque to dynamic error: estimate from the log, and that of the fitted model."""
 
 import math
 from collections.abc import Sequence
@@ -14,28 +14,28 @@ from fitting.estimation.linear_drive import over_a_step, rates_of, readings
 from fitting.validation.welch import cross_density, density
 from hdjax import Drive, Hold, Model, TwoInertiaModel
 
-# Averages that a coherence needs to mean something, and the window that they leave at least.
+# Number of averages for a meaningful coherence, and smallest window.
 _AVERAGES = 8
 _SHORTEST, _LONGEST = 128, 1 << 15
-# How many times the drive as a whole integrates the torque into an output.
+# Number of rigid-body integrations from torque to each output.
 _ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1, "load_velocity": 1}
 _OF_MOTOR = ("motor_angle", "motor_velocity")
 # Lines across the width of the resonance.
 _LINES = 8
-# Deviation of a sample from its place on the grid, as a share of the step, that is no matter.
+# Negligible deviation of a sample from the grid, as a share of the step.
 _JITTER = 0.01
-# Power, relative to the strongest line, from which on the input counts as strong.
+# Power, relative to the strongest line, above which the input counts as strong.
 _STRONG = 1e-2
 HIGH_COHERENCE, LOW_COHERENCE = 0.9, 0.6
-# Share of the strong lines that must lack coherence to be worth a word.
+# Least share of incoherent strong lines to be reported.
 _WORTH_A_WORD = 0.05
-# Above it there is no peak to see.
+# Damping ratio above which there is no peak.
 _OVERDAMPED = 0.6
 # Lines to either side of a sharp peak that a Hann window mixes with it: its main lobe (Harris 1978).
 _LOBE = 2.0
-# Lines that a band may lack.
+# Largest gap within a band, in lines.
 _GAP = 3
-# Where a peak of the log counts as the model's, as a factor of frequency.
+# Largest ratio of the log's and the model's peak frequency.
 _NEAR = 2.0
 
 
@@ -47,14 +47,14 @@ class FrequencyResponse(eqx.Module):
         measured: H1 estimate, cross-spectrum over input spectrum.
         coherence: share of the output's power that follows linearly from the input.
         input_density: power spectral density of the input.
-        noise_coherence: what the coherence would be if measurement noise were all that disturbs it.
+        noise_coherence: expected coherence with measurement noise as the only disturbance.
         model: of the fitted drive, linearised, with the hold of the torque.
         resonance: natural frequency of the linearised drive [Hz].
         width: of its peak at half power [Hz].
-        averages: windows behind the estimate.
-        source: what the input is called.
-        output: what was measured, the model's principal output.
-        order: how many times the drive as a whole integrates the torque into it.
+        averages: number of windows.
+        source: name of the input.
+        output: name of the principal output.
+        order: number of rigid-body integrations from torque to output.
         antiresonance: frequency at which load and spring hold the motor still [Hz], where the output is the motor's
             motion; else None.
     """
@@ -82,19 +82,19 @@ class FrequencyResponse(eqx.Module):
 def frequency_response(
     model: Model, experiments: Sequence[Experiment], *, hold: Hold, noise: float
 ) -> FrequencyResponse | None:
-    """Estimate the frequency response of the logs, with the model's beside it.
+    """Estimate the frequency response of the logs, and compute that of the model.
 
     Welch's method with Hann windows that overlap by half; a log with irregular stamps is interpolated linearly onto a
-    grid, for this view only. Constant parts are taken off window by window.
+    grid, for this estimate only. The mean of each window is removed.
 
     Args:
         model: fitted; its stiffness is linearised as its mean slope over the measured twist.
         experiments: the logs.
-        hold: what the torque does between samples.
+        hold: inter-sample behaviour of the torque.
         noise: rms measurement noise of the output.
 
     Returns:
-        The responses; None where the logs are too short, or the input does not move.
+        The responses; None where the logs are too short, or the input is constant.
     """
     step = max(e.time_step for e in experiments)
     output = model.measured[-1]
@@ -116,7 +116,7 @@ def frequency_response(
     kept = slice(1, -1 if window % 2 == 0 else None)
     frequency, S_uu, S_xx, S_ux = frequency[kept], S_uu[kept], S_xx[kept], S_ux[kept]
     tiny = np.finfo(float).tiny
-    # Of a side that turns freely, accelerations: what drifts would hide the resonance.
+    # Accelerations of a freely turning side: rigid-body motion would mask the resonance.
     differences = (np.exp(2j * np.pi * frequency * step) - 1.0) ** order
     noise_density = 2.0 * step * noise**2 * np.abs(differences) ** 2
     return FrequencyResponse(
@@ -152,7 +152,7 @@ def _on_grid(experiment: Experiment, step: float) -> tuple[np.ndarray, np.ndarra
 
 
 def _window(samples: Sequence[int], step: float, width: float) -> int:
-    """Samples in a window: as many as resolve the resonance, as few as leave enough to average over."""
+    """Samples in a window: enough to resolve the resonance, and few enough for averaging."""
     wanted = _LINES / (width * step) if width > 0 else math.inf
     averaged = 2.0 * sum(samples) / (_AVERAGES + len(samples))
     allowed = min(max(wanted, 1024.0), averaged, max(samples), _LONGEST)
@@ -160,7 +160,7 @@ def _window(samples: Sequence[int], step: float, width: float) -> int:
 
 
 def _mean_slope(model: Model, experiments: Sequence[Experiment]) -> float:
-    """Square of the natural frequency, of the stiffness averaged over the measured twist."""
+    """Square of the natural frequency for the stiffness averaged over the measured twist."""
     x = np.concatenate([twist(Stretch(e, 0, len(e)), model) for e in experiments])
     hardening = max(1.0 + 3.0 * float(model.drive.alpha) * float(np.mean(x**2)), 0.0)
     return float(model.drive.omega_0) ** 2 * hardening
@@ -203,7 +203,7 @@ def _linear_response(
     """Response of `x'' + mu x' + slope x = gain u` to a sampled input, from sample to sample."""
     s = 2j * np.pi * frequency
     if hold not in ("zero-order", "linear"):
-        # Smooth between samples: what is sampled is what acts.
+        # For a smooth input the sampled response equals the continuous one.
         return gain / (s**2 + mu * s + slope)
     # One step of x, v, u and the change of u, which a zero-order hold ignores (Franklin, Powell and Workman 1998, 6.3).
     rates = np.zeros((4, 4))
@@ -216,7 +216,7 @@ def _linear_response(
 
 
 def strong_lines(found: FrequencyResponse) -> np.ndarray:
-    """Which lines the input excites."""
+    """Which lines the input excites strongly."""
     return found.input_density > _STRONG * np.max(found.input_density)
 
 
@@ -258,7 +258,7 @@ def _extreme(found: FrequencyResponse, frequency: float, width: float, *, dip: b
     """Frequency of the measured peak or dip [Hz] near one of the model's, which is so wide."""
     if width > 2 * _OVERDAMPED * frequency:
         return None
-    # A line beyond the excited ones is coherent by chance now and then; what holds the resonance is in one piece.
+    # Lines outside the excited band may be coherent by chance; the band of the resonance is contiguous.
     near = (found.coherence > LOW_COHERENCE) & (np.abs(np.log(found.frequency / frequency)) < math.log(_NEAR))
     if not near.any():
         return None
@@ -274,8 +274,8 @@ def coherent_band(found: FrequencyResponse) -> tuple[float, float] | None:
 
 
 def unexplained_band(found: FrequencyResponse) -> tuple[float, float] | None:
-    """The widest band where the input is strong and the coherence low though noise would not make it so [Hz]; None
-    where there are few such lines."""
+    """The widest band of strong input where noise does not explain the low coherence [Hz]; None where there are few
+    such lines."""
     strong = strong_lines(found)
     lacking = strong & (found.coherence < LOW_COHERENCE) & (found.noise_coherence > HIGH_COHERENCE)
     lacking &= ~_blurred(found)
@@ -299,7 +299,7 @@ def is_blurred(found: FrequencyResponse, width: float) -> bool:
 
 
 def _widest(found: FrequencyResponse, chosen: np.ndarray) -> tuple[float, float] | None:
-    """Ends of the band of most lines."""
+    """Limits of the band with the most lines."""
     if not chosen.any():
         return None
     longest = max(_bands(chosen), key=len)

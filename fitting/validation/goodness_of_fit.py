@@ -1,4 +1,4 @@
-"""How good a fit is, in the figures that fitters and system identification toolboxes use."""
+"""Figures of merit of a fit, as system identification toolboxes report them."""
 
 import math
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ class Goodness(eqx.Module):
     Attributes:
         fit_percent: `100 (1 - |y - yhat| / |y - mean(y)|)` of the free runs on each part of the data.
         data: measured numbers that were fitted (samples times outputs).
-        left_out: samples without weight: put in, not believed by the health gate, or wrong on their own.
+        left_out: samples with weight zero: inserted, found invalid by the health check, or outliers.
         parameters: free parameters.
         states: fitted entries of initial states.
-        error_over_noise: rms of what short simulations leave of each output, in units of its measurement noise.
-        reduced_chi_square: mean square of the error in units of the measurement noise, per degree of freedom; of all
+        error_over_noise: rms residual of short simulations of each output, over its measurement noise.
+        reduced_chi_square: mean square of the error over that of the measurement noise, per degree of freedom; of all
             outputs.
-        log_likelihood: of Gaussian white errors with the covariance that is left over.
+        log_likelihood: of Gaussian white errors with the residual's covariance.
         aic: information criterion of Akaike; parameters, initial states and covariance are counted.
         bic: likewise, of Schwarz.
         iterations: of the last fit.

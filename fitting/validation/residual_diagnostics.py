@@ -1,4 +1,4 @@
-"""What a residual looks like: its colour in time and in motor angle, its memory, and what it depends on."""
+"""Residual diagnostics: spectrum, orders of the motor angle, autocorrelation, dependence on other quantities."""
 
 import equinox as eqx
 import numpy as np
@@ -29,7 +29,7 @@ class Dependence(eqx.Module):
 
 
 class ResidualDiagnostics(eqx.Module):
-    """Diagnostics of the dynamic error that a fit leaves over.
+    """Diagnostics of a fit's residual dynamic error.
 
     Attributes:
         frequency: of the spectrum [Hz].
@@ -66,7 +66,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     if isinstance(fit.model, TwoInertiaModel):
         theta_m = _simulated(fit, "motor_turn", simulated, weight) * float(fit.model.drive.N)
         speed = np.gradient(theta_m, step)
-        # Segment borders are jumps of the simulated motion, not motion.
+        # The simulated motion jumps at segment borders.
         speed = np.clip(speed, *np.quantile(speed, [0.001, 0.999]))
         quantities |= {"motor angle": np.mod(theta_m, 2 * np.pi), "motor speed": speed}
         if np.ptp(theta_m) > 4 * np.pi:
@@ -85,7 +85,7 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
 
 
 def _simulated(fit: Fit, output: str, simulated: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """What a fit's model makes of an output, whether it was measured or not, of samples with weight."""
+    """Simulated values of an output, measured or not, at valid samples."""
     model = fit.model
     if output in model.measured:
         return simulated[:, model.measured.index(output)]
@@ -111,7 +111,7 @@ def order_amplitude(residual: np.ndarray, angle: np.ndarray, orders: np.ndarray)
 
 
 def _dependence(residual: np.ndarray, quantity: np.ndarray) -> Dependence:
-    """Mean residual in bins that hold equally many samples."""
+    """Mean residual in bins of equal sample count."""
     edges = np.unique(np.quantile(quantity, np.linspace(0, 1, _BINS + 1)))
     bins = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, max(edges.size - 2, 0))
     count = np.bincount(bins)

@@ -1,7 +1,6 @@
-"""Tests of what a fit leaves over: has it a mean, is it white, is it free of the input, is it Gaussian.
+"""Residual tests: zero mean, whiteness, independence of the input, normality.
 
-With many samples a test sees correlations that no one would mind, so each verdict looks at the size as well as at the
-chance.
+With many samples, tests detect negligible correlations, so each verdict also considers the size.
 """
 
 from typing import Literal
@@ -21,15 +20,15 @@ from hdjax import TwoInertiaModel
 Verdict = Literal["passed", "slight", "failed"]
 
 LAGS = 25
-"""Lags that the tests look at, as system identification toolboxes do."""
+"""Number of lags in the tests, as in system identification toolboxes."""
 
 _LEVEL = 0.01
-# Correlations below this are told as slight, however certain they are.
+# Correlations below this are reported as slight, however significant.
 _SLIGHT_CORRELATION = 0.1
 _SLIGHT_SKEWNESS, _SLIGHT_KURTOSIS = 0.2, 0.5
-# Directions in which the input hardly moves say nothing, and would be divided by.
+# Singular values of the input's covariance below this share are cut off.
 _BLIND = 1e-3
-# Beyond so many lags the product of two autocorrelations is only noise.
+# Beyond this lag the product of two autocorrelations is only noise.
 _MEMORY = 500
 
 
@@ -38,10 +37,10 @@ class ResidualTest(eqx.Module):
 
     Attributes:
         name: "zero mean", "whiteness", "independence of ..." or "normality".
-        statistic: chi-squared distributed if all is well.
+        statistic: chi-squared distributed under the null hypothesis.
         degrees: its degrees of freedom.
-        p_value: chance of so large a statistic if all is well.
-        verdict: "slight" where a deviation is certain, but small.
+        p_value: chance of so large a statistic under the null hypothesis.
+        verdict: "slight" for a significant but small deviation.
         says: the verdict in plain words.
     """
 
@@ -58,9 +57,9 @@ class InputCorrelation(eqx.Module):
 
     Attributes:
         name: of the input.
-        lag: samples by which the residual comes after the input; negative where it comes before.
+        lag: of the residual behind the input, in samples.
         correlation: at each lag.
-        limit: 95 % limit of each, if residual and input have nothing to do with each other.
+        limit: 95 % limit of each for a residual independent of the input.
     """
 
     name: str = eqx.field(static=True)
@@ -74,7 +73,7 @@ class ResidualTests(eqx.Module):
 
     Attributes:
         tests: in the order in which they matter.
-        inputs: correlation with each input that moves.
+        inputs: correlation with each input that is not constant.
     """
 
     tests: tuple[ResidualTest, ...]
@@ -82,7 +81,7 @@ class ResidualTests(eqx.Module):
 
 
 def residual_tests(fit: Fit, diagnostics: ResidualDiagnostics) -> ResidualTests:
-    """Test the dynamic error that a fit leaves over.
+    """Test the residual dynamic error of a fit.
 
     Args:
         fit: the fit.
@@ -102,11 +101,11 @@ def residual_tests(fit: Fit, diagnostics: ResidualDiagnostics) -> ResidualTests:
 
 
 def zero_mean(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarray, " lags"]) -> ResidualTest:
-    """Whether the residual's mean is zero, with a memory allowed for.
+    """Test whether the residual's mean is zero, corrected for autocorrelation.
 
     Args:
-        residual: as it is.
-        autocorrelation: its own, at lags 0, 1, 2, ...
+        residual: of the fit.
+        autocorrelation: of the residual, at lags 0, 1, 2, ... ...
     """
     n, mean, spread = residual.size, float(residual.mean()), float(residual.std()) or 1.0
     statistic = n * (mean / spread) ** 2 / _memory(autocorrelation, n, power=1)
@@ -114,17 +113,17 @@ def zero_mean(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarr
     share = mean / float(np.sqrt(np.mean(residual**2)) or 1.0)
     verdict = _verdict(p_value, abs(share) < _SLIGHT_CORRELATION)
     says = {
-        "passed": "Its mean is zero within chance.",
-        "slight": f"Its mean is small, but not zero ({100 * share:+.2g} % of its rms).",
+        "passed": "Its mean is not significantly nonzero.",
+        "slight": f"Its mean is small, but significantly nonzero ({100 * share:+.2g} % of its rms).",
         "failed": f"Its mean is not zero ({100 * share:+.2g} % of its rms): an offset of a sensor or of the torque.",
     }[verdict]
     return ResidualTest("zero mean", float(statistic), 1, p_value, verdict, says)
 
 
 def _memory(autocorrelation: np.ndarray, samples: int, *, power: int) -> float:
-    """By how much a memory inflates the variance of a mean of powers."""
+    """Variance inflation of a mean of powers by autocorrelation."""
     r = autocorrelation[1:]
-    # What is within chance of zero would only add up.
+    # Insignificant correlations would only add noise.
     r = np.where(np.abs(r) > NORMAL_95 / np.sqrt(samples), r, 0.0)
     return max(1.0 + 2.0 * float(np.sum(r**power)), 1.0)
 
@@ -134,7 +133,7 @@ def whiteness(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> Resi
 
     Args:
         autocorrelation: at lags 0, 1, 2, ...
-        samples: that it was estimated from.
+        samples: number of samples of the estimate.
     """
     r = autocorrelation[1 : min(LAGS, samples - 1) + 1]
     statistic, p_value = ljung_box(r, samples)
@@ -142,9 +141,9 @@ def whiteness(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> Resi
     seen = f"autocorrelation {r[worst]:+.2g} at lag {worst + 1}" if r.size else ""
     verdict = _verdict(p_value, bool(np.max(np.abs(r), initial=0.0) < _SLIGHT_CORRELATION))
     says = {
-        "passed": "White: no memory beyond chance.",
-        "slight": f"Nearly white: a memory that is certain, but small ({seen}).",
-        "failed": f"Not white ({seen}): what is left over has a memory that noise has not.",
+        "passed": "White: no significant autocorrelation.",
+        "slight": f"Nearly white: a significant, but small autocorrelation ({seen}).",
+        "failed": f"Not white ({seen}): the residual is autocorrelated, unlike white noise.",
     }[verdict]
     return ResidualTest("whiteness", statistic, int(r.size), p_value, verdict, says)
 
@@ -152,15 +151,15 @@ def whiteness(autocorrelation: Float[np.ndarray, " lags"], samples: int) -> Resi
 def independence(
     residual: Float[np.ndarray, " n"], signal: Float[np.ndarray, " n"], *, name: str, step: float
 ) -> tuple[InputCorrelation, ResidualTest]:
-    """Whether the residual has anything to do with an input, now or up to [`LAGS`][] samples ago.
+    """Test whether the residual is independent of an input at lags from 0 to [`LAGS`][].
 
-    The law of the correlations takes the colour of both into account (Bartlett 1946; Soderstrom and Stoica 1989,
-    section 11.2).
+    The distribution of the correlations accounts for the autocorrelation of both (Bartlett 1946; Soderstrom and Stoica
+    1989, section 11.2).
 
     Args:
         residual: with mean zero.
         signal: the input, with mean zero.
-        name: the input's.
+        name: of the input.
         step: sampling interval [s].
     """
     n = residual.size
@@ -181,9 +180,9 @@ def independence(
     behind = "at once" if worst == 0 else f"{1e3 * worst * step:.2g} ms later"
     told = f"correlation {causal[worst]:+.2g} {behind}"
     says = {
-        "passed": f"What is left over has nothing to do with the {name}.",
-        "slight": f"What is left over follows the {name} a little ({told}).",
-        "failed": f"What is left over follows the {name} ({told}): the model misses a part of the response to it.",
+        "passed": f"The residual is independent of the {name}.",
+        "slight": f"The residual is slightly correlated with the {name} ({told}).",
+        "failed": f"The residual is correlated with the {name} ({told}): the model lacks a part of the response to it.",
     }[verdict]
     limit = NORMAL_95 * float(np.sqrt(max(law[0], 0.0) / n))
     test = ResidualTest(f"independence of {name}", statistic, degrees, p_value, verdict, says)
@@ -191,11 +190,11 @@ def independence(
 
 
 def normality(residual: Float[np.ndarray, " n"], autocorrelation: Float[np.ndarray, " lags"]) -> ResidualTest:
-    """Skewness and kurtosis against those of a Gaussian law, with a memory allowed for (Lobato and Velasco 2004).
+    """Skewness and kurtosis against those of a Gaussian law, corrected for autocorrelation (Lobato and Velasco 2004).
 
     Args:
         residual: with mean zero.
-        autocorrelation: its own, at lags 0, 1, 2, ...
+        autocorrelation: of the residual, at lags 0, 1, 2, ... ...
     """
     n = residual.size
     standard = residual / np.sqrt(np.mean(residual**2))
@@ -223,7 +222,7 @@ def _verdict(p_value: float, small: bool) -> Verdict:
 
 
 def _inputs(fit: Fit) -> dict[str, np.ndarray]:
-    """What drives the model and moves, sample by sample like the residual."""
+    """Inputs of the model that are not constant, at the samples of the residual."""
     segments = fit.problem.segments
     weight = np.asarray(segments.weight) > 0
     first = "motor torque" if isinstance(fit.model, TwoInertiaModel) else "forcing"
@@ -234,7 +233,8 @@ def _inputs(fit: Fit) -> dict[str, np.ndarray]:
 
 
 def _joint_law(residual: np.ndarray, signal: np.ndarray, most: int) -> np.ndarray:
-    """Covariance of two independent signals' correlations at lags that differ by 0, 1, ..., times the samples."""
+    """Covariance of two independent signals' correlations at lags that differ by 0, 1, ..., times the number of
+    samples."""
     reach = min(_MEMORY, residual.size - most - 1)
     one = autocovariance(residual, reach)
     other = autocovariance(signal, reach + most)

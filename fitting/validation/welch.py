@@ -1,4 +1,4 @@
-"""Welch's spectral densities in numpy: scipy.signal takes longer to load than a log takes to be looked at."""
+"""Welch's spectral densities in numpy, since importing scipy.signal takes too long."""
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -7,12 +7,12 @@ from jaxtyping import Complex, Float
 def cross_density(
     one: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"], *, step: float, window: int
 ) -> tuple[Float[np.ndarray, " lines"], Complex[np.ndarray, " lines"]]:
-    """One-sided cross spectral density of two series (Welch 1967), with Hann windows that overlap by half and lose
-    their mean.
+    """One-sided cross spectral density of two series (Welch 1967), with Hann windows that overlap by half and are
+    detrended by their mean.
 
     Args:
         one: its spectrum is conjugated.
-        other: sampled together with it; the density of a series with itself is real.
+        other: sampled together with `one`; the density of a series with itself is real.
         step: sampling interval [s].
         window: samples in a window, at most `n`.
 
@@ -27,7 +27,7 @@ def cross_density(
         return np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * hann, axis=1)
 
     density = np.mean(np.conj(spectra(one)) * spectra(other), axis=0) * (2.0 * step / np.sum(hann**2))
-    # Lines without a mirror image.
+    # Lines without a negative counterpart.
     density[0] *= 0.5
     if window % 2 == 0:
         density[-1] *= 0.5

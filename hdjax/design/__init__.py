@@ -1,4 +1,4 @@
-"""Design studies by gradient: objectives and constraints of a drive, its best design, and the proof by brute force."""
+"""Design studies by gradient: objectives and constraints of a drive, its optimum, and confirmation by a sweep."""
 
 from hdjax.design.case import Case, Excitation
 from hdjax.design.catalogue_gear import CatalogueGear

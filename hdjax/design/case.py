@@ -1,4 +1,4 @@
-"""What a design is judged on: a drive and what excites it."""
+"""Case of a design study: a drive and its excitation."""
 
 from collections.abc import Mapping
 
@@ -32,10 +32,10 @@ class Excitation(eqx.Module):
 
 
 class Case(eqx.Module):
-    """A drive and what excites it.
+    """A drive and its excitation.
 
     Attributes:
-        model: the equations; a reduced model has no inertias and no ratio, on which most designs turn.
+        model: the equations; a reduced model lacks inertias and ratio, which most designs need.
         excitation: torques.
     """
 
@@ -44,11 +44,12 @@ class Case(eqx.Module):
 
     @property
     def drive(self) -> Drive:
-        """The drive's own parameters."""
+        """The drive's parameters."""
         return self.model.drive
 
     def parameters(self) -> dict[str, tuple[Array, ParameterInfo]]:
-        """All that a design can choose by dotted path: the model's parameters, and the torques' as `forcing.symbol`."""
+        """Possible design variables by dotted path: the model's parameters, and those of the torques as
+        `forcing.symbol`."""
         own = {f"{FORCING}.{n}": (getattr(self.excitation, n), i) for n, i in own_parameters(self.excitation)}
         return self.model.parameters() | own
 
@@ -56,7 +57,7 @@ class Case(eqx.Module):
         """The same case with other values at the given dotted paths.
 
         Raises:
-            ValueError: where a path is none of [`Case.parameters`][].
+            ValueError: a path is not one of [`Case.parameters`][].
         """
         known = self.parameters()
         for path in values:

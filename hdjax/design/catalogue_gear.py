@@ -1,4 +1,4 @@
-"""The size of a catalogue's gear as a variable."""
+"""Size of a catalogue gear as a design variable."""
 
 from collections.abc import Mapping
 
@@ -12,10 +12,9 @@ SIZE = "size"
 
 
 class CatalogueGear(Maker):
-    """A chosen `size` sets K and alpha as the vendor's table has them; the other variables set themselves.
+    """The variable `size` sets K and alpha from the vendor's table; other variables are set as usual.
 
-    Where B_sp is not chosen, the damping is kept as a share of the critical, which mounted gears have in common
-    (assumed).
+    If B_sp is not a variable, the damping ratio is constant, as for mounted gears (assumed).
     """
 
     def __call__(self, case: Case, chosen: Mapping[str, Array]) -> Case:

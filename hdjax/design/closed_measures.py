@@ -17,7 +17,8 @@ _STEPS = 40
 
 
 class StaticTwist(Measure):
-    """Twist under a steady torque, the root of `K f(x) = torque` [rad]; NaN where a softening drive gives way."""
+    """Twist under a steady torque, the root of `K f(x) = torque` [rad]; NaN where a softening drive has no
+    equilibrium."""
 
     name: ClassVar[str] = "static_twist"
     unit: ClassVar[str] = "rad"
@@ -36,7 +37,8 @@ def static_twist(drive: Drive, torque: Scalar) -> Array:
         slope = still.K * (1.0 + 3.0 * still.alpha * x**2)
         return x - (still.K * restoring(x, still.alpha) - torque) / slope
 
-    # From zero, Newton's steps overshoot for a hardening spring once and then come down; a softening one's climb.
+    # From zero, Newton's method overshoots once for a hardening spring and then decreases; for a softening one it
+    # increases.
     x = jax.lax.fori_loop(0, _STEPS, step, jnp.zeros_like(still.K))
     slope = still.K * (1.0 + 3.0 * still.alpha * x**2)
     left = drive.K * restoring(x, drive.alpha) - torque
@@ -71,8 +73,8 @@ class MotorSpeed(Measure):
 
 
 class ResonanceDistance(SpeedRange):
-    """How far the natural frequency is from `order` times every speed of a range, `|log|` of the ratio; negative where
-    a speed of the range excites it.
+    """Distance of the natural frequency from `order` times a range of speeds, `|log|` of the ratio; negative where a
+    speed of the range excites it.
 
     Over the load's speed where `at_load` is set: the motor, and its orders, then turn N times as fast.
     """
@@ -88,7 +90,7 @@ class ResonanceDistance(SpeedRange):
 
     def __call__(self, case: Case) -> Array:
         d = case.drive
-        # A motor that a servo holds stiffly leaves the load swinging on the spring.
+        # With a stiff servo on the motor, the load oscillates on the spring.
         own = jnp.sqrt(d.K / d.J_l) if self.held else d.omega_0
         return outside(own / self.order / (d.N if self.at_load else 1.0), self.slow, self.fast)
 

@@ -1,4 +1,4 @@
-"""An optimum confirmed without gradients: by a sweep around it, and its gradient by differences."""
+"""Confirmation of an optimum by a sweep around it, and of its gradient by difference quotients."""
 
 import itertools
 
@@ -21,13 +21,13 @@ class Confirmation(eqx.Module):
     """A sweep around an optimum.
 
     Attributes:
-        shares: the designs that were tried, as shares of the ranges; the grid's axes vary fastest to the last.
+        shares: the evaluated designs, as shares of the ranges; the grid's last axis varies fastest.
         objective: of each; infinite where a measure does not exist.
-        feasible: which keep all limits.
-        shape: points along each variable where they are a grid, and nothing where they are a sample.
-        best: the best that keeps all limits, by path; nothing where none does.
-        best_objective: its objective; infinite where none does.
-        gain: by how much it is better than the optimum, relative to the objective's size; negative where it is worse.
+        feasible: which meet all limits.
+        shape: points along each variable for a grid, empty for a sample.
+        best: the best feasible design, by path; empty without one.
+        best_objective: its objective; infinite without one.
+        gain: its improvement over the optimum, relative to the objective's size; negative where it is worse.
         gradient_error: largest difference between gradients and differences, of the objective and of each limit,
             relative to the row's largest slope, at the optimum and at a design beside it.
     """
@@ -45,7 +45,7 @@ class Confirmation(eqx.Module):
         """Whether no design of the sweep is better, and the gradients agree.
 
         Args:
-            tolerance: of the gain: limits are kept to 1e-6 of themselves, and a multiplier makes that visible.
+            tolerance: of the gain: limits are met to a relative 1e-6, which a multiplier amplifies.
             gradient_tolerance: of the gradient's error.
         """
         return self.gain <= tolerance and self.gradient_error <= gradient_tolerance
@@ -64,7 +64,7 @@ def confirm(
         width: half the width of the swept box, as a share of each range; bounds cut it.
         points: along each variable; of an odd number the middle is the optimum.
         seed: of the sample.
-        lanes: designs that are worked out side by side.
+        lanes: designs that are evaluated in parallel.
     """
     low, high = np.clip(optimum.shares - width, 0.0, 1.0), np.clip(optimum.shares + width, 0.0, 1.0)
     count = len(study.variables)
@@ -96,12 +96,12 @@ def confirm(
 def gradient_error(study: Study, shares: Float[np.ndarray, " variables"], *, lanes: int = LANES) -> float:
     """Largest difference between gradients and differences of fourth order, relative to the row's largest slope.
 
-    At a design, and at one beside it: at an optimum a gradient may be zero, and agree for that reason.
+    At a design and a neighbouring one, since at an optimum a gradient may be zero and agree for that reason.
 
     Args:
         study: gives the rows: objective and limits.
         shares: of the variables' ranges.
-        lanes: designs that are worked out side by side.
+        lanes: designs that are evaluated in parallel.
     """
     inside = np.clip(shares, 3 * _STEP, 1.0 - 3 * _STEP)
     beside = np.clip(np.where(shares < 0.5, inside + 0.05, inside - 0.05), 3 * _STEP, 1.0 - 3 * _STEP)

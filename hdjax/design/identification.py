@@ -1,7 +1,8 @@
-"""What a log would tell of a parameter, before it is taken.
+"""Precision of a parameter in a planned log.
 
-The standard error of one parameter follows from the sensitivities of the dynamic error: what the other parameters and
-the initial state can imitate is projected out (the Schur complement of Fisher's information; Ljung 1999, chapter 13).
+The standard error of one parameter follows from the sensitivities of the dynamic error: the influence of the other
+parameters and the initial state is projected out (the Schur complement of Fisher's information; Ljung 1999, chapter
+13).
 """
 
 from typing import ClassVar
@@ -25,7 +26,7 @@ OTHERS = ("alpha", "K", "B_sp")
 
 
 class PlannedLog(eqx.Module):
-    """A log that starts at rest under the case's motor torque, held between samples.
+    """A log that starts at rest under the case's motor torque, with zero-order hold.
 
     Attributes:
         rate: samples a second [Hz].
@@ -39,7 +40,7 @@ class PlannedLog(eqx.Module):
 
     @property
     def samples(self) -> int:
-        """How many there are."""
+        """Number of samples."""
         return max(round(self.rate * self.duration), 8)
 
     def errors(self, case: Case, start: Float[Array, "2"]) -> Float[Array, " samples"]:
@@ -84,8 +85,8 @@ class LargestTwist(LogMeasure):
 
     def __call__(self, case: Case) -> Array:
         sizes = jnp.abs(self.log.errors(case, jnp.zeros(2)))
-        # The top of the parabola through the largest sample and its neighbours: it passes from one sample to the next
-        # without a kink.
+        # The maximum of the parabola through the largest sample and its neighbours, which is smooth from sample to
+        # sample.
         k = jnp.clip(jnp.argmax(sizes), 1, sizes.size - 2)
         before, top, after = sizes[k - 1], sizes[k], sizes[k + 1]
         bend = before - 2.0 * top + after
@@ -93,18 +94,18 @@ class LargestTwist(LogMeasure):
 
 
 class IdentificationTime(LogMeasure):
-    """Length of the shortest log from which `alpha` is known to a relative standard error [s].
+    """Length of the shortest log that determines `alpha` to a relative standard error [s].
 
-    The noise of the dynamic error is white. K, B_sp and the initial state are fitted beside alpha: K and B_sp are taken
-    to be known to a factor of e beforehand, the initial state to the size of the motion, so that no time is too short
-    to be worked out. Where the planned log does not suffice, its end is carried on as a steady motion, whose standard
-    error falls with the root of time.
+    The noise of the dynamic error is white. K, B_sp and the initial state are fitted together with alpha. K and B_sp
+    have priors of a factor of e, the initial state one of the motion's size, so that short times are possible. Where
+    the planned log does not suffice, its end is extended as a steady motion, whose standard error decreases with the
+    root of time.
 
     Attributes:
         rate: samples a second [Hz].
         duration: length of the log that is simulated [s].
         noise: rms noise of the dynamic error [rad].
-        relative_error: standard error of alpha over alpha that is asked for.
+        relative_error: required standard error of alpha over alpha.
     """
 
     name: ClassVar[str] = "identification_time"
@@ -146,14 +147,14 @@ class IdentificationTime(LogMeasure):
         imitable = information[:, 1:, 1:] + jnp.eye(len(OTHERS) + 1)[None]
         shared = information[:, 1:, 0]
         own = information[:, 0, 0] - jnp.sum(shared * _solved(imitable, shared), axis=1)
-        # Before the motion bends nothing is known of alpha, and rounding may leave less than nothing.
+        # Before the nonlinearity matters there is no information on alpha, and rounding may make it negative.
         return 1.0 / jnp.sqrt(jnp.maximum(own, 1e-12))
 
 
 def first_below_zero(values: Float[Array, " n"], below: Bool[Array, " n"]) -> Float[Array, ""]:
     """Where a sampled function first falls below zero, in samples, by cubic interpolation.
 
-    Straight lines would give a slope that jumps from sample to sample, and with it the gradient.
+    Linear interpolation would give a gradient that jumps from sample to sample.
 
     Args:
         values: at the samples.

@@ -1,7 +1,7 @@
-"""Searches side by side, whose questions are answered as lanes of one program.
+"""Parallel searches, whose points are evaluated as lanes of one program.
 
-Each search runs in a thread of its own and asks for one point at a time. When all that still run have asked, the points
-are worked out together.
+Each search runs in its own thread and requests one point at a time. When all running searches have a request, their
+points are evaluated together.
 """
 
 import threading
@@ -21,9 +21,9 @@ def in_lockstep(
     """Run searches until all have ended.
 
     Args:
-        searches: how many.
+        searches: number of searches.
         search: from its number and a function that answers one point, to its result.
-        answers: works out points by row.
+        answers: evaluates points by row.
 
     Raises:
         Exception: whatever a search or `answers` raised first.

@@ -1,4 +1,4 @@
-"""What a design is measured by: a number of a case, with gradients."""
+"""Measures of a design: differentiable functions of a case."""
 
 import abc
 from typing import Any
@@ -11,16 +11,16 @@ from hdjax.parameters import Scalar, as_scalar
 
 
 def number(default: float | None = None) -> Any:
-    """Declare a number of a measure. It is data: another number needs no other program."""
+    """Declare a numeric field of a measure. It is data: another value needs no compilation."""
     if default is None:
         return eqx.field(converter=as_scalar)
     return eqx.field(converter=as_scalar, default=default)
 
 
 class Measure(eqx.Module):
-    """A pure, differentiable function of a [`Case`][]; its fields say where it looks.
+    """A pure, differentiable function of a [`Case`][]; its fields are its settings.
 
-    A case that has no such number (no steady motion is found, say) gives NaN: a search turns back from there.
+    If it does not exist (for example without a steady motion), it is NaN, and a search avoids the design.
     """
 
     name: eqx.AbstractClassVar[str]
@@ -29,13 +29,13 @@ class Measure(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, case: Case) -> Float[Array, ""]:
-        """The number, in `unit`."""
+        """The value, in `unit`."""
 
     def refuse(self, case: Case) -> None:  # noqa: B027 (most measures take any case)
-        """Say why a case can't be measured.
+        """Refuse a case that can't be measured.
 
         Raises:
-            ValueError: where it can't.
+            ValueError: states the reason.
         """
 
 

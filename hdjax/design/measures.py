@@ -23,4 +23,4 @@ MEASURES: dict[str, type[Measure]] = {
         LargestTwist,
     )
 }
-"""The measures by the names that a design file uses."""
+"""The measures by their names in a design file."""

@@ -1,9 +1,9 @@
 """The best design of a study, from several starts.
 
-Sequential quadratic programming (Kraft 1988, SciPy's SLSQP): it keeps bounds and smooth constraints exactly, needs some
-ten gradients where an augmented Lagrangian needs ten minimisations, and optimistix has no solver with constraints. The
-starts ask for their values and gradients side by side, as lanes of one program. Whether an end is an optimum is judged
-afterwards, by the conditions of Karush, Kuhn and Tucker alone.
+Sequential quadratic programming (Kraft 1988, SciPy's SLSQP): it meets bounds and smooth constraints exactly, needs some
+ten gradients where an augmented Lagrangian needs ten minimisations, and optimistix has no solver with constraints.
+Values and gradients of all starts are evaluated as lanes of one program. Results are checked afterwards by the
+conditions of Karush, Kuhn and Tucker.
 """
 
 import enum
@@ -21,14 +21,14 @@ from hdjax.design.study import LANES, Study, appraise
 from hdjax.design.variables import values
 
 KEPT = 1e-6
-"""Excess over a limit, relative to it, that still counts as kept."""
+"""Relative excess over a limit that still counts as met."""
 
 _AT_BOUND = 1e-6
 _ACTIVE = 1e-4
 _STATIONARY = 1e-3
 _TOLERANCE = 1e-10
 _STEPS = 100
-# Objective and constraint of a design that has none, where 1 is the size of those that have.
+# Objective and constraint of a design without one, in units of typical values.
 _BAD = 1e3
 
 
@@ -48,16 +48,16 @@ class Optimum(eqx.Module):
         outcome: how it ended.
         shares: of the variables' ranges.
         values: of the variables, by path.
-        objective: there; infinite where lost.
-        excess: over each limit, by label, relative to it; positive where it is not kept.
-        measures: value of each measure by label; where there are draws, their mean.
-        draws: value of each measure in each draw, by label; of one where nothing is drawn.
+        objective: its value; infinite if a measure does not exist.
+        excess: over each limit, by label, relative to it; positive where it is not met.
+        measures: value of each measure by label; the mean over draws, if any.
+        draws: value of each measure in each draw, by label; one value without draws.
         at_bound: the variables that lie at a bound, by path: `"low"` or `"high"`.
-        bound_multipliers: of those, how much the objective would fall for one unit of the variable beyond the bound.
-        multipliers: by label of the limits that hold it, how much the objective would fall for one unit more.
-        gradient: size of what bounds and limits leave of the objective's gradient, by shares of the ranges, relative to
-            the gradient or, where that is larger, the objective.
-        asked: designs that were appraised on the way.
+        bound_multipliers: of those, decrease of the objective per unit of the variable beyond the bound.
+        multipliers: by label of the active limits, decrease of the objective per unit of relaxation.
+        gradient: size of the projected gradient of the objective, by shares of the ranges, relative to the gradient or,
+            where that is larger, the objective.
+        asked: number of evaluated designs.
     """
 
     outcome: Outcome
@@ -75,7 +75,7 @@ class Optimum(eqx.Module):
 
     @property
     def feasible(self) -> bool:
-        """Whether all limits are kept."""
+        """Whether all limits are met."""
         return self.outcome in (Outcome.optimum, Outcome.stalled)
 
 
@@ -83,9 +83,9 @@ class Optimised(eqx.Module):
     """What a search found.
 
     Attributes:
-        best: the best end that keeps all limits; where none does, the one that misses them least.
-        ends: of each start.
-        starts: shares of the ranges where they began.
+        best: the best feasible result; without one, that of the smallest violation.
+        ends: result of each start.
+        starts: as shares of the ranges.
     """
 
     best: Optimum
@@ -111,17 +111,17 @@ def optimise(
     lanes: int = LANES,
     progress: Callable[[int], None] = _silent,
 ) -> Optimised:
-    """The design with the smallest objective that keeps all limits.
+    """Find the design with the smallest objective that meets all limits.
 
     Args:
-        study: what is asked.
-        starts: how many, or shares of the ranges to start from.
+        study: the design study.
+        starts: their number, or shares of the ranges to start from.
         seed: of the starts.
         lanes: designs that are worked out side by side.
-        progress: told how many designs have been appraised.
+        progress: receives the number of evaluated designs.
 
     Raises:
-        ValueError: where the study can't be done, or no start has an objective.
+        ValueError: the study is not valid, or no start has an objective.
     """
     study.refuse()
     begin = drawn_starts(len(study.variables), starts, seed) if isinstance(starts, int) else starts
@@ -129,7 +129,7 @@ def optimise(
     exist = np.all(np.isfinite(first.rows), axis=1) & np.all(np.isfinite(first.slopes), axis=(1, 2))
     if not exist.any():
         raise ValueError("at no start do all measures exist: no steady motion is found there, or no equilibrium")
-    # Not the median: where half of the starts are hopeless it would make every slope look small.
+    # Not the median, which bad starts would make too large.
     scale = float(np.quantile(np.abs(first.rows[exist, 0]), 0.25)) or 1.0
     asked = [len(begin)]
 
@@ -159,11 +159,11 @@ def optimise(
 
 
 class _Lost(Exception):
-    """A search stands where a measure has no gradient."""
+    """A search has reached a point where a measure has no gradient."""
 
 
 def _search(start: np.ndarray, ask: Callable, scale: float) -> tuple[np.ndarray, int]:
-    """The end of one search, and how many points it asked for."""
+    """The result of one search, and its number of evaluated points."""
     known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     kept: list[tuple[float, float, np.ndarray]] = []
 
@@ -205,7 +205,7 @@ def _search(start: np.ndarray, ask: Callable, scale: float) -> tuple[np.ndarray,
         )
     except _Lost:
         pass
-    # The best of all points asked for: where a kink stops the search its last is not the best.
+    # The best of all evaluated points: at a kink the last one is not the best.
     return min(kept, key=lambda k: k[:2])[2], len(known)
 
 
@@ -218,7 +218,7 @@ def _existing(slopes: np.ndarray) -> np.ndarray:
 def _judged(
     study: Study, shares: np.ndarray, rows: np.ndarray, slopes: np.ndarray, parts: np.ndarray, asked: int, scale: float
 ) -> Optimum:
-    """An end with all that can be said of it."""
+    """A result with all its diagnostics."""
     chosen = {path: float(v) for path, v in values(study.variables, jnp.asarray(shares)).items()}
     labels = [part.label for part in (*study.terms, *study.limits)]
     if not (np.isfinite(rows).all() and np.isfinite(slopes).all()):
@@ -229,13 +229,13 @@ def _judged(
     excess = {limit.label: float(rows[1 + i]) for i, limit in enumerate(study.limits)}
     low, high = shares <= _AT_BOUND, shares >= 1.0 - _AT_BOUND
     active = rows[1:] > -_ACTIVE
-    # A step must not lead out of the box, nor over an active limit: what is left of the gradient must be a sum of these
-    # directions, with multipliers that are not negative.
+    # A step must not violate bounds or active limits: the gradient must be a sum of their gradients, with nonnegative
+    # multipliers.
     box = np.eye(shares.size)
     out = np.concatenate([-box[low], box[high], slopes[1:][active]])
     multipliers, _ = nnls(out.T, -slopes[0]) if len(out) else (np.zeros(0), 0.0)
     left = slopes[0] + multipliers @ out if len(out) else slopes[0]
-    # An objective may be zero where it is least; what it is elsewhere tells a small slope from a large one.
+    # An objective may be zero at its minimum; its values elsewhere supply the scale of slopes.
     size = max(float(np.linalg.norm(slopes[0])) if len(out) else 0.0, abs(float(rows[0])), 1e-2 * scale)
     gradient = float(np.linalg.norm(left)) / size
     if max(excess.values(), default=0.0) > KEPT:
@@ -268,5 +268,5 @@ def _judged(
 
 
 def _unit(study: Study, path: str, shares: np.ndarray) -> float:
-    """How fast a variable changes with its share at a design."""
+    """Derivative of a variable by its share at a design."""
     return next(float(v.rate(jnp.asarray(shares[i]))) for i, v in enumerate(study.variables) if v.path == path)

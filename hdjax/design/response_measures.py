@@ -28,7 +28,7 @@ class ResponseMeasure(SpeedRange):
 
     @property
     def looked_at(self) -> Range:
-        """Where motions are searched for."""
+        """Range in which motions are searched."""
         return Range(self.slow, self.fast)
 
     @abc.abstractmethod
@@ -66,10 +66,10 @@ def responses(case: Case, measures: Sequence[ResponseMeasure]) -> list[Array]:
 
 
 class PeakError(ResponseMeasure):
-    """Largest swing of the dynamic error about its mean over a range of speeds [rad].
+    """Largest deviation of the dynamic error from its mean over a range of speeds [rad].
 
-    All motions found from either end of the range count, so that a design is safe whichever the drive settles to.
-    Detached branches are not found.
+    All motions found from either end of the range count, so that a design is safe for each of them. Detached branches
+    are not found.
     """
 
     name: ClassVar[str] = "peak_error"
@@ -98,10 +98,10 @@ class MeshTorque(ResponseMeasure):
 
 
 class Loss(ResponseMeasure):
-    """Mean power that the drive takes up between slow and fast, over speeds evenly spread [W].
+    """Mean dissipated power between slow and fast, over evenly spaced speeds [W].
 
-    In a steady motion all power that goes in is lost, so that it is counted where it enters. Of motions that coexist
-    the largest counts.
+    In a steady motion all input power is dissipated, so the input power is computed. Of coexisting motions the largest
+    counts.
     """
 
     name: ClassVar[str] = "loss"
@@ -118,7 +118,7 @@ class Loss(ResponseMeasure):
         motions, found = motions_at(system, branches, at)
         power = jax.vmap(lambda m: power_in(case, m, rotating=self.rotating))(motions)
         mean = jnp.sum(where(found, power, 0.0)) / jnp.maximum(jnp.sum(where(found, 1.0, 0.0)), 1.0)
-        # A speed next to a fold may lack its motion; a range of which half lacks them is not known.
+        # A speed next to a fold may lack its motion; if half of a range lacks them, the loss is unknown.
         return where(jnp.mean(where(found, 1.0, 0.0)) > 0.5, mean, jnp.nan)
 
 
@@ -136,7 +136,7 @@ def power_in(case: Case, motion: SteadyState, *, rotating: bool) -> Array:
 
 
 class FoldDistance(ResponseMeasure):
-    """How far the folds, at which the response jumps, are from the range of speeds: `|log(fold/speed)|` of the nearest.
+    """Distance of the folds, at which the response jumps, from the range of speeds: `|log(fold/speed)|` of the nearest.
 
     Negative inside the range, zero at its ends. Where the branches have no fold within `reach` times the range it is
     `log(reach)`, with no gradient.

@@ -1,9 +1,9 @@
-"""One number for a measure that is uncertain: its expected value, or the mean of its worst share.
+"""Criteria of an uncertain measure: its expected value, or the mean of its worst share.
 
-The mean of the worst share is the conditional value at risk (Rockafellar and Uryasev 2000),
-`min over t of t + E[max(f - t, 0)]/share`, convex in f. Where it is at most a limit, the limit is kept with a
-probability of at least `1 - share`. Of so many draws it is the mean of the worst few, with a kink wherever draws change
-places; `max` is therefore rounded over a hundredth of the draws' standard deviation.
+The mean of the worst share is the conditional value at risk (Rockafellar and Uryasev 2000), `min over t of t + E[max(f
+- t, 0)]/share`, convex in f. If it is at most a limit, the limit is met with a probability of at least `1 - share`. For
+draws it is the mean of the worst few, with a kink wherever their order changes; `max` is therefore smoothed over a
+hundredth of the draws' standard deviation.
 """
 
 from typing import Literal, get_args
@@ -22,7 +22,7 @@ _BISECTIONS = 60
 
 
 class Draws(eqx.Module):
-    """Parameters that are not known exactly, as equally probable lanes.
+    """Uncertain parameters, as equally probable draws.
 
     Attributes:
         paths: dotted paths of the parameters.
@@ -38,7 +38,7 @@ class Draws(eqx.Module):
 
 
 def worst_share(values: Float[Array, " draws"], share: float) -> Float[Array, ""]:
-    """Mean of the largest `share` of equally probable values, rounded where they change places; differentiable."""
+    """Mean of the largest `share` of equally probable values, smoothed where their order changes; differentiable."""
     mean = jnp.mean(values)
     spread = jnp.sqrt(jnp.mean((values - mean) ** 2) + (1e-9 * mean) ** 2 + 1e-300)
     scaled = (values - mean) / spread
@@ -50,7 +50,7 @@ def worst_share(values: Float[Array, " draws"], share: float) -> Float[Array, ""
         too_low = jnp.mean(jax.nn.sigmoid((still - middle) / _ROUNDED)) > share
         return jnp.where(too_low, middle, low), jnp.where(too_low, high, middle)
 
-    # The slope by t is zero there, so that how t moves does not matter.
+    # The derivative by t is zero there, so that of t does not matter.
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halved, (jnp.min(still) - 1.0, jnp.max(still) + 1.0))
     t = 0.5 * (low + high)
     above = _ROUNDED * jax.nn.softplus((scaled - t) / _ROUNDED)

@@ -1,4 +1,4 @@
-"""How long a drive swings after a torque lets go."""
+"""Settling time of a drive after the release of a torque."""
 
 from typing import ClassVar
 
@@ -23,17 +23,18 @@ _NOTHING = 1e-12
 
 
 class SettlingTime(Measure):
-    """Time from the release of a steady mesh torque until the swing stays below a band [s].
+    """Time from the release of a constant mesh torque until the oscillation stays below a band [s].
 
-    The energy of the twist, `v^2/(2 c) + K (x^2/2 + alpha x^4/4)`, only falls, and a swing stays below the band once it
-    is below the energy of a still twist as large. It falls in steps, flat where the drive turns back, so that the
-    instant at which it crosses has no useful gradient; the mean over a softened crossing has: `integral of
-    sigmoid((log E - log E_band)/s) dt`, which is that instant exactly where E decays exponentially.
+    The energy of the twist, `v^2/(2 c) + K (x^2/2 + alpha x^4/4)`, decreases monotonically, and the oscillation stays
+    below the band once it is below the energy of a static twist of the band's size. It decreases in steps, with
+    plateaus at turning points, so that the crossing instant has no useful gradient. The mean over a smoothed crossing
+    has one: `integral of sigmoid((log E - log E_band)/s) dt`, which is that instant exactly where E decays
+    exponentially.
 
     Attributes:
-        torque: that lets go at the start [N m].
+        torque: released at the start [N m].
         band: of the dynamic error [rad].
-        turns: natural periods that are simulated; what settles later is extrapolated at the mean rate.
+        turns: simulated natural periods; later settling is extrapolated at the mean rate.
     """
 
     name: ClassVar[str] = "settling_time"
@@ -68,7 +69,7 @@ class SettlingTime(Measure):
         inside = jax.nn.sigmoid(above / _SOFTNESS)
         settled = jnp.sum(0.5 * (inside[1:] + inside[:-1])) * (time[1] - time[0])
         later = duration * above[0] / (above[0] - above[-1])
-        # Three softenings below the band the integral has all but ended.
+        # Three smoothing widths below the band the integral has practically ended.
         found = where(above[-1] < -3.0 * _SOFTNESS, settled, later)
         return where(above[-1] < above[0], found, jnp.nan)
 

@@ -1,10 +1,10 @@
-"""Steady motions over a range of speeds: all that are found from either end, and the worst of them.
+"""Steady motions over a range of speeds, followed from both ends, and the largest of them.
 
-The search for motions is not differentiated. What it found is solved for once more by a Newton step of the live
-equations, which has their first derivatives exactly (the implicit function theorem); the peak comes from
-[`hdjax.response.resonance.peak`][]. The largest value over a range has the gradient of the place where it is largest
-(Danskin 1967), whether that is inside or at an end. A smooth maximum would be larger than the largest value by an
-amount that depends on how many speeds are looked at, and would not see a peak between two of them.
+The search for motions is not differentiated. Its result is refined by a Newton step of the differentiable equations,
+which has exact first derivatives (implicit function theorem); the peak comes from [`hdjax.response.resonance.peak`][].
+The largest value over a range has the gradient of the place where it is largest (Danskin 1967), whether that is inside
+or at an end. A smooth maximum would exceed the largest value by an amount that depends on the number of speeds, and
+would miss a peak between two of them.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class Range(eqx.Module):
     Attributes:
         slow: lowest [rad/s].
         fast: highest [rad/s].
-        rows: motions looked at along the branch.
+        rows: number of motions along the branch.
         steps: of the continuation, at most.
     """
 
@@ -52,7 +52,8 @@ def balanced(case: Case, *, rotating: bool, harmonics: int = HARMONICS) -> Balan
 
     Args:
         case: drive and torques.
-        rotating: the motor turns at the speeds looked at and its kinematic error excites it; the torques are left out.
+        rotating: the motor turns at the speeds of the range and its kinematic error excites it; the torques are not
+            used.
         harmonics: of the motion.
     """
     torque, load = case.excitation.amplitude, case.excitation.load_amplitude
@@ -69,7 +70,7 @@ def balanced(case: Case, *, rotating: bool, harmonics: int = HARMONICS) -> Balan
 def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
     """For each range the branches from its slow end and from its fast end, as two lanes.
 
-    All are lanes of one search: it is what takes longest to compile.
+    All are lanes of one search, which takes longest to compile.
     """
     still = jax.lax.stop_gradient(system)
 
@@ -87,7 +88,7 @@ def followed(system: BalancedMotion, ranges: Sequence[Range]) -> list[Branch]:
 
 
 def with_system(branch: Branch, system: BalancedMotion) -> Branch:
-    """A branch whose motions depend on the live system."""
+    """A branch whose motions depend on the differentiable system."""
     return eqx.tree_at(lambda b: b.system, branch, system)
 
 
@@ -97,7 +98,7 @@ def swing(x: FourierSeries) -> Float[Array, ""]:
 
 
 def solved_once_more(system: BalancedMotion, unknowns: Array, omega: Array) -> SteadyState:
-    """The motion near a solution, with gradients in all that the system is made of."""
+    """The motion near a solution, with gradients by all parts of the system."""
     u = jax.lax.stop_gradient(unknowns)
     slope = jax.jacfwd(jax.lax.stop_gradient(system).residual)(u, omega)
     left = system.residual(u, omega)
@@ -124,8 +125,8 @@ def largest_swing(system: BalancedMotion, looked_at: Range, branches: Branch) ->
         at_rows = jax.vmap(lambda i: solved_once_more(system, branch.unknowns[i], branch.omega[i]))(picked)
         motions = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), top.steady_state, at_rows)
         sizes = jax.vmap(lambda m: swing(m.x))(motions)
-        # The largest row stands in where the peak was not located, or is another one's: the peak is that of the mean
-        # square. Near the same peak it is a hair smaller, and passes from row to row.
+        # The largest row is used where the peak was not located, or is another one: the peak is that of the mean
+        # square. Near the same peak it is slightly smaller, and jumps from row to row.
         same = within & (picked[0] > 0) & (picked[0] < last) & (sizes[1] < (1.0 + _ANOTHER) * sizes[0])
         usable = jnp.stack([within, ~same, jnp.asarray(True), jnp.asarray(True)])
         return where(usable & branch.valid[picked[0]], sizes, -1.0), motions

@@ -1,4 +1,4 @@
-"""A design study: what may be chosen, what is to be small, what must be kept, and what is not known exactly."""
+"""A design study: variables, objective, limits and uncertain parameters."""
 
 import abc
 import dataclasses
@@ -19,30 +19,30 @@ from hdjax.parameters import Scalar
 from hdjax.where import where
 
 LANES = 4
-"""Designs that are worked out side by side by default: always as many, so that one program serves all."""
+"""Default number of designs evaluated in parallel: constant, so that one program serves all."""
 
 
 class Maker(eqx.Module):
-    """Makes the case that a design means."""
+    """Creates the case of a design."""
 
     @abc.abstractmethod
     def __call__(self, case: Case, chosen: Mapping[str, Array]) -> Case:
-        """A case with the chosen values, from one with the drawn ones."""
+        """A case with the design's values, from one with drawn values."""
 
 
 class Replaced(Maker):
-    """The case with the chosen values in place of its own."""
+    """The case with the design's values in place of its own."""
 
     def __call__(self, case: Case, chosen: Mapping[str, Array]) -> Case:
         return case.replace(chosen)
 
 
 class Term(eqx.Module):
-    """A part of the objective, `weight` times a measure; a negative weight makes it large.
+    """A part of the objective, `weight` times a measure; a negative weight maximises it.
 
     Attributes:
         label: name of the part.
-        measure: what is measured.
+        measure: of the case.
         weight: price of one unit of the measure.
     """
 
@@ -56,7 +56,7 @@ class Limit(eqx.Module):
 
     Attributes:
         label: name of the constraint.
-        measure: what is measured.
+        measure: of the case.
         bound: in the measure's unit.
         least: whether the bound is the least rather than the most.
     """
@@ -72,7 +72,7 @@ class Limit(eqx.Module):
         return where(self.bound == 0.0, 1.0, jnp.abs(self.bound))
 
     def excess(self, value: Array) -> Array:
-        """How far a value is beyond the bound, in units of `scale`; positive where it is not kept."""
+        """Excess of a value over the bound, in units of `scale`; positive where the limit is violated."""
         return (self.bound - value if self.least else value - self.bound) / self.scale
 
 
@@ -80,14 +80,15 @@ class Study(eqx.Module):
     """A design study.
 
     Attributes:
-        case: what is not chosen.
-        variables: what is.
-        terms: of the objective, which is to be small.
+        case: supplies all that is not a variable.
+        variables: of the design.
+        terms: of the objective, which is minimised.
         limits: constraints.
-        draws: of what is not known exactly; a parameter that is chosen too takes the chosen value. None: all is known.
-        criterion: what counts of objective and constraints over the draws.
+        draws: of uncertain parameters; a parameter that is also a variable takes the design's value. None for no
+            uncertainty.
+        criterion: for objective and constraints over the draws.
         share: of the draws that make up the worst.
-        maker: makes a case from the chosen values.
+        maker: creates a case from the design's values.
     """
 
     case: Case
@@ -113,10 +114,10 @@ class Study(eqx.Module):
             raise ValueError(f"`share` must be between 0 and 1, but is {self.share}")
 
     def refuse(self) -> None:
-        """Say why the study can't be done, before minutes of work.
+        """Refuse a study that is not valid, before the computation.
 
         Raises:
-            ValueError: where a path, a range, a draw or a measure does not fit the drive.
+            ValueError: a path, a range, a draw or a measure does not suit the drive.
         """
         known = self.case.parameters()
         for v in self.variables:
@@ -135,7 +136,7 @@ class Study(eqx.Module):
         return self.maker(case, values(self.variables, shares))
 
     def measured(self, case: Case) -> Float[Array, " parts"]:
-        """All measures of a case: the terms', then the limits'."""
+        """All measures of a case: those of terms, then of limits."""
         measures = [part.measure for part in (*self.terms, *self.limits)]
         steady = [m for m in measures if isinstance(m, ResponseMeasure)]
         found = iter(responses(case, steady))
@@ -148,7 +149,7 @@ class Study(eqx.Module):
         return jnp.stack([jnp.asarray(objective), *excess])
 
     def judged(self, shares: Float[Array, " variables"]) -> tuple[Array, tuple[Array, Array]]:
-        """Rows by the criterion; beside them the rows again and the measures of every draw."""
+        """Rows by the criterion; also the rows and the measures of every draw."""
         if self.draws is None:
             parts = self.measured(self.made(shares))[None]
         else:
@@ -163,12 +164,12 @@ class Study(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Appraisals:
-    """Designs appraised, as lanes.
+    """Evaluations of designs.
 
     Attributes:
         rows: objective, then the excess over each limit, by design; NaN where a measure does not exist.
         slopes: of the rows by the shares of the variables' ranges.
-        parts: each measure of each draw (of one, where nothing is drawn).
+        parts: each measure of each draw (one draw without uncertainty).
     """
 
     rows: Float[np.ndarray, "designs rows"]
@@ -177,7 +178,7 @@ class Appraisals:
 
 
 def appraise(study: Study, shares: Float[np.ndarray, "designs variables"], *, lanes: int = LANES) -> Appraisals:
-    """Objective, constraints and their gradients of many designs, `lanes` of them at a time by one program."""
+    """Objective, constraints and their gradients of many designs, in batches of `lanes` by one program."""
     found = []
     for start in range(0, len(shares), lanes):
         block = shares[start : start + lanes]

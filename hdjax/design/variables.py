@@ -1,4 +1,4 @@
-"""What a design may choose, each between two bounds."""
+"""Design variables, each between two bounds."""
 
 from collections.abc import Sequence
 from typing import Literal, get_args
@@ -15,14 +15,14 @@ SPACINGS: tuple[Spacing, ...] = get_args(Spacing)
 
 
 class Variable(eqx.Module):
-    """One number that a design may choose.
+    """A design variable.
 
     Attributes:
         path: of the parameter that it sets, such as `"B_sp"`, `"kinematic_error.cos_2"` or `"forcing.omega"`; any name
-            that the study's maker knows.
+            that the study's maker supports.
         low: lower bound.
         high: upper bound.
-        spacing: the scale on which it is searched, which is a matter of the search and not of the answer.
+        spacing: scale of the search, which does not affect the optimum.
     """
 
     path: str = eqx.field(static=True)
@@ -52,7 +52,7 @@ class Variable(eqx.Module):
         return (value - self.low) / (self.high - self.low)
 
     def rate(self, share: Array) -> Array:
-        """How fast the value changes with the share."""
+        """Derivative of the value by the share."""
         return self.value(share) * jnp.log(self.high / self.low) if self.spacing == "log" else self.high - self.low
 
 

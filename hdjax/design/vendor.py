@@ -1,7 +1,7 @@
-"""Gears from a vendor's table: which size means which stiffness, as a smooth function of the size.
+"""Gears from a vendor's table: stiffness as a smooth function of size.
 
 Harmonic Drive's CSF, CSG and HFUC catalogues give the torsional stiffness of each size in three slopes, K1 up to the
-torque T1, K2 up to T2, and K3. Higher ratios than 50 are stiffer there; the table of ratio 50 errs to the safe side.
+torque T1, K2 up to T2, and K3. Higher ratios than 50 are stiffer there; the table of ratio 50 is conservative.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ _T1 = np.array([2.0, 3.9, 7.0, 14.0, 29.0, 54.0, 108.0, 235.0])
 _T2 = np.array([6.9, 12.0, 25.0, 48.0, 108.0, 196.0, 382.0, 843.0])
 _K1 = 1e4 * np.array([0.34, 0.81, 1.3, 2.5, 5.4, 10.0, 20.0, 44.0])
 _K2 = 1e4 * np.array([0.47, 1.1, 1.8, 3.4, 7.8, 14.0, 28.0, 61.0])
-# What slopes mean for the cubic: the torque at T2 is met, K1 being the slope at zero.
+# Cubic from the slopes: K1 is the slope at zero, and the torque at T2 is equal.
 _TWIST_2 = _T1 / _K1 + (_T2 - _T1) / _K2
 _ALPHA = (_T2 / (_K1 * _TWIST_2) - 1.0) / _TWIST_2**2
 
@@ -30,7 +30,7 @@ class Gear(NamedTuple):
     Attributes:
         K: stiffness at zero twist, the table's K1 [N m/rad].
         alpha: cubic coefficient with which the torque at T2 is met [rad^-2].
-        rated: T2, up to where the cubic stands for the table [N m].
+        rated: T2, up to which the cubic represents the table [N m].
     """
 
     K: Array
@@ -41,7 +41,7 @@ class Gear(NamedTuple):
 def gear(size: ArrayLike) -> Gear:
     """The gear of a size; between sizes, and beyond the last, by straight lines of logarithms.
 
-    A size between two of the table is not for sale: it stands for the direction in which to look.
+    A size between two of the table is not for sale: it only indicates a direction.
 
     Args:
         size: nominal size, 14 to 65.

@@ -1,4 +1,4 @@
-"""Physical effects that a harmonic drive's log can hide, each inside the equations of motion."""
+"""Physical effects of harmonic drives, each inside the equations of motion."""
 
 from hdjax.effects.actuation import InputDelay, InputLag, TorqueBias, TorqueGain
 from hdjax.effects.backlash import Backlash, UndampedBacklash

@@ -1,4 +1,4 @@
-"""What happens to the logged torque on its way to the drive: sensor gain and bias, delay, lag."""
+"""Effects between the logged and the acting torque: sensor gain and bias, delay, lag."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from hdjax.signals import PiecewisePolynomial
 
 
 class TorqueBias(ActuatorEffect):
-    """The torque sensor's zero is off: `T = T_logged + bias`."""
+    """The torque sensor has a zero offset: `T = T_logged + bias`."""
 
     family: ClassVar[str] = "torque_sensor"
     name: ClassVar[str] = "torque_bias"
@@ -32,9 +32,9 @@ class TorqueBias(ActuatorEffect):
 
 
 class TorqueGain(ActuatorEffect):
-    """The torque sensor's scale is off: `T = (1 + gain_error) T_logged`.
+    """The torque sensor has a scale error: `T = (1 + gain_error) T_logged`.
 
-    A reduced drive's own gain already is this factor, so there it does not apply.
+    A reduced drive's gain already is this factor, so there it does not apply.
     """
 
     family: ClassVar[str] = "torque_sensor"
@@ -85,7 +85,7 @@ class InputDelay(ActuatorEffect):
 
 
 class InputLag(ActuatorEffect):
-    """The torque follows what was logged with a first-order lag: `lag T' + T = T_logged`, as a current loop does."""
+    """The torque follows the logged one with a first-order lag: `lag T' + T = T_logged`, as a current loop does."""
 
     family: ClassVar[str] = "input_delay"
     name: ClassVar[str] = "input_lag"

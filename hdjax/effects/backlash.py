@@ -10,10 +10,10 @@ from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.parameters import Scalar, parameter
 
-# Share of the half-width over which damping sets in beyond the edge; and what divides where there is no zone.
+# Share of the half-width over which damping sets in beyond the edge; and the divisor without a zone.
 _ONSET, _NOTHING = 0.02, 1e-30
-# A spring with more than this for alpha x^2 at the largest twist, four times as stiff there as in the middle, is none:
-# vendors' tables give 1.2 to 1.6 times.
+# Implausible alpha x^2 at the largest twist, where the spring is four times as stiff as in the middle: vendors' tables
+# give 1.2 to 1.6 times.
 _HARDEST = 1.0
 
 
@@ -39,8 +39,7 @@ class Backlash(MeshTorqueEffect):
 
     @classmethod
     def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], Effect], ...]:
-        """The dead zone beyond which a straight spring has the torque and the slope of one that hardens from nearly
-        nothing."""
+        """The dead zone beyond which a linear spring has the torque and slope of a strongly hardening one."""
         if not float(drive.alpha) * scales.x_max**2 > _HARDEST:
             return ()
         found = []

@@ -1,10 +1,10 @@
-"""Bristles that follow a motion and slip: the states behind Dahl, LuGre and Maxwell slip.
+"""Bristles that follow a motion and slip: the hidden states of Dahl, LuGre and Maxwell slip.
 
 A bristle forgets the past within a path of its yield length: at a speed v it relaxes at the rate |v| / length, which no
 explicit step of fixed size can follow where the length is short. So the rate is bounded by 1 / settling, with a
 sampling interval for `settling`: steps up to three times that long stay stable, and those of a fit are accurate. A
-bristle that yields within the path of one interval then is Coulomb friction that turns its sign within `settling`,
-which is all that such a log can tell; a stiffness beyond it is not identifiable and makes no difference.
+bristle that yields within the path of one interval is then Coulomb friction that reverses within `settling`, which is
+all that such a log determines. A larger stiffness is not identifiable and has no effect.
 """
 
 import jax

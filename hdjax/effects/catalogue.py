@@ -1,4 +1,4 @@
-"""The catalogue: every form of every effect that the loop may find, one line each."""
+"""The catalogue: all forms of effects, one line each."""
 
 from collections.abc import Sequence
 
@@ -94,7 +94,7 @@ CATALOGUE: tuple[type[Effect], ...] = (
     LoadEncoderEccentricity,
 )
 
-"""Every form. Of two that gain the same, the earlier one comes first."""
+"""All forms. Of two with equal gain, the earlier one is preferred."""
 
 BY_NAME: dict[str, type[Effect]] = {form.name: form for form in CATALOGUE}
 """The forms by their names."""
@@ -105,15 +105,15 @@ FAMILIES: tuple[str, ...] = tuple(dict.fromkeys(form.family for form in CATALOGU
 def applicable(
     catalogue: Sequence[type[Effect]], scales: Scales, *, has_motor: bool
 ) -> dict[type[Effect], tuple[Effect, ...]]:
-    """The forms that logs of these scales can show, each with its proposals.
+    """The forms that are observable in logs of these scales, each with its proposals.
 
-    Left out is what needs the motor's motion on a reduced drive, a temperature that changes where there is none, or a
-    line in the residual where there is none.
+    Omitted are forms that need the motor's motion on a reduced drive, a changing temperature, or a line in the
+    residual, where these are missing.
 
     Args:
         catalogue: forms to choose from.
         scales: of the measured motion.
-        has_motor: whether the model has the motor's and load's own motion, a reduced one has not.
+        has_motor: whether the model has the motion of motor and load, unlike a reduced one.
     """
     found = {form: form.proposals(scales) for form in catalogue if has_motor or not form.needs_motor}
     return {form: proposals for form, proposals in found.items() if proposals}

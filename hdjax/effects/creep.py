@@ -1,4 +1,4 @@
-"""Creep: a part of the stiffness that relaxes."""
+"""Creep: relaxation of a part of the stiffness."""
 
 from typing import ClassVar
 
@@ -13,9 +13,9 @@ from hdjax.parameters import Scalar, parameter
 class Creep(MeshTorqueEffect):
     """Torque `k (x - z)` with `tau z' = x - z`: the standard linear solid.
 
-    K is the stiffness after a long time, `K + k` that at once. After a step of the torque the twist goes its last
-    `k / (K + k)` with the time constant `tau (1 + k / K)`. With k as a share of K, the product of both would make the
-    well-known sum K + k a curved valley, which a fit follows in small steps.
+    K is the stiffness after a long time, `K + k` that at once. After a step of the torque the twist goes its last `k /
+    (K + k)` with the time constant `tau (1 + k / K)`. With k as a share of K, the well-determined sum K + k would be a
+    curved valley, which a fit follows in small steps.
     """
 
     family: ClassVar[str] = "creep"

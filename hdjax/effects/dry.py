@@ -1,4 +1,4 @@
-"""Dry friction, with a law that has a gradient and a sign that a solver's steps can bear."""
+"""Dry friction, with a differentiable law and a sign that is stable in a solver's steps."""
 
 import abc
 from typing import ClassVar
@@ -11,27 +11,27 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.effects.effect import Effect, LoadSideEffect, MeshTorqueEffect, Motion, MotorSideEffect
 from hdjax.parameters import Scalar
 
-# Where the corner is this share of how far the rate may turn in a step (its reach), half of the sign is the mean. What
-# the stages see of such a damper turns the rate by at most 2.1 times itself in a step; RK4 bears 2.78.
+# Corner over reach (the change of the rate in a step) at which half of the sign is its mean. The stages then see a
+# damper with at most 2.1 in a step; the stability limit of RK4 is 2.78.
 _RESOLVED = 1.0 / 3.0
-# No stage of a step sees a corner sharper than this share of the reach.
+# Smallest corner in a stage, as a share of the reach.
 _SHARPEST = 1.0 / 16.0
 
 
 class DryFriction(Effect):
     """The dry part of an effect: friction `level tanh(rate / corner)` against a rate.
 
-    Near rest this is a damper that brings the rate down within `corner / (level mobility)`, and an explicit solver with
-    longer steps would rattle to and fro. In such steps the friction is the level times the sign's mean over the step,
-    which is known at its start (see `hdjax.rubbing`): with it a drive stops within a step, sticks, or turns back,
-    and all else keeps the solver's order. Shorter steps follow the law at each of their stages.
+    Near rest this is a damper with the time constant `corner / (level mobility)`, and an explicit solver with longer
+    steps would be unstable. In such steps the friction is the level times the sign's mean over the step, which is known
+    at its start (see `hdjax.rubbing`): with it a drive stops within a step, sticks, or turns back, and all else keeps
+    the solver's order. Shorter steps follow the law at each of their stages.
 
     Attributes:
         opposes: the rate, a field of [`Motion`][].
     """
 
     opposes: ClassVar[str]
-    # How the sign turns near rest is nowhere laid down: a hyperbolic tangent is one way of many.
+    # The reversal of the sign near rest is not specified: a hyperbolic tangent is one of many laws.
     imperfection: ClassVar[float] = 1e-2
 
     @property
@@ -41,7 +41,7 @@ class DryFriction(Effect):
 
     @abc.abstractmethod
     def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
-        """Of the torque far from rest [N m]."""
+        """Magnitude of the torque far from rest [N m]."""
 
     def dry(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         """The torque that opposes the rate [N m]."""
@@ -103,12 +103,12 @@ class DryLoadFriction(DryFriction, LoadSideEffect):
 
 
 def load_rate(motion: Motion) -> Array:
-    """The load's own rate, which a reduced drive lacks."""
+    """The load's rate, which a reduced drive lacks."""
     assert motion.omega_l is not None
     return motion.omega_l
 
 
 def motor_rate(motion: Motion) -> Array:
-    """The motor's own rate, which a reduced drive lacks."""
+    """The motor's rate, which a reduced drive lacks."""
     assert motion.omega_m is not None
     return motion.omega_m

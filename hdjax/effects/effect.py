@@ -1,4 +1,4 @@
-"""What an effect is: extra physics that enters the equations of motion at exactly one place."""
+"""Base classes of effects: additional physics at exactly one place of the equations of motion."""
 
 import abc
 from typing import ClassVar
@@ -12,11 +12,11 @@ from hdjax.signals import PiecewisePolynomial
 
 
 class Rubbing(eqx.Module):
-    """How dry friction acts on a rate during one step of an explicit solver.
+    """Dry friction against a rate during one step of an explicit solver.
 
     Attributes:
         sign: of the rate, averaged over the step [1].
-        reach: by how much the friction and all else can change the rate in the step [rad/s].
+        reach: possible change of the rate in the step, by friction and all else [rad/s].
     """
 
     sign: Array
@@ -24,12 +24,12 @@ class Rubbing(eqx.Module):
 
 
 class Motion(eqx.Module):
-    """The instantaneous motion that an effect may look at.
+    """The instantaneous motion, as the input of effects.
 
-    A reduced drive has no motor and no load of its own: there the angles and rates are None.
+    A reduced drive has no separate motor and load: there the angles and rates are None.
 
     Attributes:
-        x: twist that the mesh sees [rad], `theta_m/N + e(theta_m) - theta_l`.
+        x: mesh twist [rad], `theta_m/N + e(theta_m) - theta_l`.
         v: its rate [rad/s].
         theta_m: motor angle [rad].
         omega_m: motor rate [rad/s].
@@ -37,9 +37,9 @@ class Motion(eqx.Module):
         omega_l: load rate [rad/s].
         time: since the log's start [s], or None where it is not known.
         temperature: of the drive [K], or None where it is not known.
-        rubbing: how dry friction acts on each rate that it opposes, by the rate's name here; None where it follows its
-            law at every instant.
-        T_m: torque that comes in at the motor [N m], or None where it is not known.
+        rubbing: dry friction over a step against each rate, by the rate's name here; None to use the law at every
+            instant.
+        T_m: incoming motor torque [N m], or None where it is not known.
     """
 
     x: Array
@@ -55,13 +55,13 @@ class Motion(eqx.Module):
 
 
 class Conditions(eqx.Module):
-    """What surrounds a drive: it acts on the effects that ask for it.
+    """External conditions of a drive, for effects that depend on them.
 
     Attributes:
         time: since the log's start [s]; the clock of the torque's signal.
         temperature: of the drive [K].
         rubbing: see [`Motion`][].
-        T_m: likewise; the equations of a drive with a motor fill in the torque that they are given.
+        T_m: likewise; the equations of a drive with a motor set it to their torque.
     """
 
     time: Array | None = None
@@ -71,7 +71,7 @@ class Conditions(eqx.Module):
 
 
 class Scales(eqx.Module):
-    """Orders of magnitude of a measured motion, from which an effect proposes its shape parameters.
+    """Orders of magnitude of a measured motion, for proposals of shape parameters.
 
     Attributes:
         x: rms twist [rad].
@@ -85,7 +85,7 @@ class Scales(eqx.Module):
         omega_0: natural frequency of the dynamic error [rad/s]; from the motion where None.
         temperature: mean temperature of the first log [K], or None where a log has no such channel.
         temperature_change: rms distance from it over all logs [K].
-        residual_frequencies: strongest lines of what the current model leaves over [rad/s], strongest first.
+        residual_frequencies: strongest lines of the current model's residual [rad/s], strongest first.
     """
 
     x: float
@@ -108,19 +108,18 @@ class Scales(eqx.Module):
 
 
 class Effect(eqx.Module):
-    """Extra physics with its own parameters and, where it has memory, its own states.
+    """Additional physics with its own parameters and, if it has memory, hidden states.
 
     Attributes:
-        family: the name that reports use, from the catalogue.
-        name: the form's own name, prefix of its parameters' dotted paths.
-        states: names of its internal states.
-        needs_motor: whether it needs the motor's and load's own motion, which a reduced log lacks.
-        named_for: the strengths that its name speaks of, where it has others as well: without them it is something
-            else.
-        drawn_against: the quantity, a field of [`Motion`][], that what it does is best drawn against; None where no
-            single one shows it.
-        one_shape_of: the quantity that it is a function of, where another function of that would be something else.
-        imperfection: share (rms) of what it removes of an error that its law may get wrong itself: no form is exact.
+        family: name in reports, from the catalogue.
+        name: of the form, prefix of its parameters' dotted paths.
+        states: names of its hidden states.
+        needs_motor: whether it needs the motion of motor and load, which a reduced log lacks.
+        named_for: the strengths that its name refers to, if it has others as well: without them it is another effect.
+        drawn_against: the quantity, a field of [`Motion`][], that it is plotted over; None where no single one is
+            suitable.
+        one_shape_of: the quantity that it is a specific function of; another function would be another effect.
+        imperfection: possible rms error of its law, as a share of the error that it removes: no form is exact.
     """
 
     family: ClassVar[str]
@@ -135,24 +134,23 @@ class Effect(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def proposals(cls, scales: Scales) -> "tuple[Effect, ...]":
-        """The effect at zero strength, with shape parameters that suit a motion of these scales.
+        """The effect at zero strength, with shape parameters for a motion of these scales.
 
-        Several proposals are starting points of the same form; none where a log of these scales can't show it.
+        Several proposals are starting points of the same form; none where it is not observable in such a log.
         """
 
     @classmethod
     def typical(cls, scales: Scales) -> tuple["Effect", ...]:
-        """The effect as catalogues describe it, at strengths off zero: further starting points of a fit.
+        """The effect at typical nonzero strengths: further starting points of a fit.
 
-        For forms whose shape decides so much that the first-order view from zero strength can mislead.
+        For forms for which the first-order estimate from zero strength can mislead.
         """
         return ()
 
     @classmethod
     def imitated(cls, drive: Drive | ReducedDrive, scales: Scales) -> tuple[tuple[dict[str, Array], "Effect"], ...]:
-        """What a drive whose parameters no real one has may stand for: the effect, with values of those parameters
-        that go with it. Further starting points of a fit, from which the first-order view is far off; none where the
-        drive is plausible.
+        """The effect that a drive with implausible parameters may imitate, with matching values of those parameters.
+        Further starting points of a fit, far from the first-order estimate; none where the drive is plausible.
         """
         return ()
 
@@ -162,19 +160,19 @@ class Effect(eqx.Module):
         return False
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
-        """Further quantities that a reader expects, as name -> (value, unit)."""
+        """Derived quantities for reports, as name -> (value, unit)."""
         return {}
 
     def initial_state(self, motion: Motion | None = None) -> Float[Array, " states"]:
-        """Internal states of a drive that has long moved like this; that has rested unloaded where None."""
+        """Hidden states in steady state with a motion; after long unloaded rest where None."""
         raise ValueError(f"`{self.name}` has no internal states")
 
     def state_rates(self, motion: Motion, state: Array) -> Array:
-        """Rates of the internal states."""
+        """Rates of the hidden states."""
         raise ValueError(f"`{self.name}` has no internal states")
 
     def state_scale(self) -> Array:
-        """How far each internal state can be from its initial value: the prior of an unknown initial state."""
+        """Standard deviation of each hidden initial state: its prior."""
         raise ValueError(f"`{self.name}` has no internal states")
 
 
@@ -188,7 +186,7 @@ class ShaftEffect(Effect):
         """Torque on the shaft, along its positive direction [N m]."""
 
     def inertia_taken(self, drive: Drive) -> Array:
-        """Inertia that is not on the shaft, although the drive's J_m or J_l counts it [kg m^2]."""
+        """Part of the drive's J_m or J_l that is not rigidly on the shaft [kg m^2]."""
         return jnp.zeros_like(drive.J_l)
 
     @classmethod
@@ -222,8 +220,8 @@ class MeshTorqueEffect(Effect):
         """Torque to add to `K f(x) + B_sp v` [N m]."""
 
     def reaction(self, motion: Motion, drive: Drive) -> Array:
-        """Torque on the motor, along +theta_m, beside the mesh torque over N [N m]: what a spring whose energy depends
-        on the motor's angle puts there."""
+        """Further torque on the motor, along +theta_m, beside the mesh torque over N [N m]: from a spring whose energy
+        depends on the motor's angle."""
         return jnp.zeros_like(motion.x)
 
     @classmethod
@@ -233,7 +231,7 @@ class MeshTorqueEffect(Effect):
 
 
 class MeshGeometryEffect(Effect):
-    """Makes the mesh see `x_s = x + e(theta_m)` while the encoders see x, and loads the motor through e'."""
+    """Changes the mesh twist to `x_s = x + e(theta_m)` while the encoders measure x, and loads the motor through e'."""
 
     needs_motor: ClassVar[bool] = True
 
@@ -247,13 +245,13 @@ class MeshGeometryEffect(Effect):
 
 
 class SensorEffect(Effect):
-    """Changes what the encoders read, and no force."""
+    """Changes the encoders' readings, and no force."""
 
     needs_motor: ClassVar[bool] = True
 
     @abc.abstractmethod
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
-        """What the motor's and the load's encoder read [rad] at the true angles [rad] and rates [rad/s]."""
+        """Readings of the motor's and the load's encoder [rad] at the true angles [rad] and rates [rad/s]."""
 
     def load_delay(self) -> Array | None:
         """Time by which the load's sensors are read later than the motor's [s]; None where they are read together."""
@@ -265,4 +263,4 @@ class ActuatorEffect(Effect):
 
     @abc.abstractmethod
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
-        """The torque that acts, from the torque that was logged."""
+        """The acting torque, from the logged torque."""

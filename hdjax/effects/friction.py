@@ -38,7 +38,7 @@ class CoulombFriction(DryMeshFriction):
 
 
 class LoadDependentFriction(DryMeshFriction):
-    """Torque `(T_c + share |K f(x)|) sgn(v)`: friction that grows with the torque that the mesh passes on.
+    """Torque `(T_c + share |K f(x)|) sgn(v)`: friction that grows with the transmitted torque.
 
     In the literature's `T_c (1 + k |tau|)` k is `share / T_c`.
     """
@@ -127,7 +127,7 @@ class StribeckMotorFriction(DryMotorFriction):
         bounds=(0.0, 1e3),
         role="strength",
     )
-    # Not negative: friction that falls towards standstill below zero would drive.
+    # Not negative: friction below zero near standstill would supply energy.
     T_excess: Scalar = parameter(
         0.0,
         unit="N m",

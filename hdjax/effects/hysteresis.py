@@ -15,7 +15,7 @@ SOURCE = "Dhaouadi, Ghorbel, Gandhi 2003; Ruderman"
 SLIP = "Tjahjowidodo, Al-Bender, Van Brussel 2013: slip at 1e-4 to 1e-3 rad"
 
 
-# Beyond so many memory twists z is on its way back; with n > 1 a long step would throw it ever further.
+# Limit of z in memory twists: beyond it z returns, and with n > 1 a long step would diverge.
 _FAR = 3.0
 
 

@@ -24,7 +24,7 @@ PLAUSIBLE = (0.0, 2.9e-4)
 class KinematicError(MeshGeometryEffect):
     """`e(theta_m) = sum over n = 1, 2, 4 of cos_n cos(n theta_m) + sin_n sin(n theta_m)`.
 
-    Two cycles per motor revolution lead, since the wave generator has two lobes.
+    Two cycles per motor revolution dominate, since the wave generator has two lobes.
     """
 
     family: ClassVar[str] = "kinematic_error"

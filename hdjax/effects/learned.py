@@ -1,5 +1,4 @@
-"""An effect that no formula is known for: a torque, or an error of an angle, that is some function of one or two
-quantities.
+"""Nonparametric terms: a torque, or an error of an angle, as a learned function of one or two quantities.
 
 The function is linear in its coefficients, so that all coefficients at zero are the base model exactly.
 """
@@ -39,11 +38,11 @@ def _coefficients(unit: str) -> Any:
 
 
 class Learned(Effect):
-    """A learned function, somewhere.
+    """A learned function at some place.
 
     Attributes:
-        axes: what it depends on.
-        mixing: which combination of the axes' functions each coefficient multiplies.
+        axes: its variables.
+        mixing: combination of the axes' functions for each coefficient.
         c: coefficients.
     """
 
@@ -55,7 +54,7 @@ class Learned(Effect):
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        """None: what it may depend on is for the data to say."""
+        """None: its variables are selected from data."""
         return ()
 
     @classmethod
@@ -128,7 +127,7 @@ class LearnedLoadTorque(LearnedTorque, LoadSideEffect):
 class LearnedFriction(LearnedTorque, DryFriction):
     """A learned torque that jumps where the rate at its place changes its sign. Its first axis is a `SignAxis`.
 
-    How far it jumps may depend on the other axes.
+    The size of the jump may depend on the other axes.
 
     Attributes:
         transition: rate over which the sign turns [rad/s].
@@ -169,7 +168,7 @@ class LearnedFriction(LearnedTorque, DryFriction):
 
     @property
     def _jumps(self) -> int:
-        """How many of the functions, the first ones, have the sign in them."""
+        """Number of functions, the first ones, with the sign."""
         return math.prod(axis.count for axis in self.axes[1:])
 
 
@@ -193,7 +192,7 @@ class LearnedLoadFriction(LearnedFriction, LearnedLoadTorque):
 
 
 class LearnedPeriodic(LearnedTorque):
-    """A learned torque that comes back after a time of its own, whatever the drive does. Its axis is a `PeriodicAxis`.
+    """A learned torque that is periodic in time, independently of the drive. Its axis is a `PeriodicAxis`.
 
     The time counts from each log's start, as in [`hdjax.effects.load.LoadDisturbance`][].
 
@@ -210,22 +209,22 @@ class LearnedPeriodic(LearnedTorque):
         return super().torque(self._in_step(motion), drive, state)
 
     def _in_step(self, motion: Motion) -> Motion:
-        """The motion, with the time that it would be at the frequency of the axis."""
+        """The motion, with time scaled to the frequency of the axis."""
         (axis,) = self.axes
         assert isinstance(axis, PeriodicAxis) and motion.time is not None
         return replace(motion, time=motion.time * (self.omega / axis.omega))
 
 
 class LearnedMeshPeriodic(LearnedPeriodic, LearnedMeshTorque):
-    """Learned torque in the mesh that comes back in time."""
+    """Learned torque in the mesh that is periodic in time."""
 
 
 class LearnedMotorPeriodic(LearnedPeriodic, LearnedMotorTorque):
-    """Learned torque on the motor that comes back in time."""
+    """Learned torque on the motor that is periodic in time."""
 
 
 class LearnedLoadPeriodic(LearnedPeriodic, LearnedLoadTorque):
-    """Learned torque on the load that comes back in time."""
+    """Learned torque on the load that is periodic in time."""
 
 
 _RUBBING: dict[type[LearnedTorque], type[LearnedFriction]] = {
@@ -241,8 +240,8 @@ _PERIODIC: dict[type[LearnedTorque], type[LearnedPeriodic]] = {
 
 
 class LearnedMeshError(Learned, MeshGeometryEffect):
-    """Learned error of the mesh's angle, over the motor's: what a torque of the angle can't stand for, since its force
-    grows with the speed as well."""
+    """Learned error of the mesh's angle, over the motor's. A torque over the angle is not equivalent, since the force
+    of the error also grows with the speed."""
 
     name: ClassVar[str] = "learned_mesh_error"
 
@@ -261,8 +260,8 @@ class LearnedMeshError(Learned, MeshGeometryEffect):
 
 
 class LearnedReading(Learned, SensorEffect):
-    """Learned error of an encoder's reading, over the angle that it reads: no force goes with it, so that it is not
-    amplified at resonance as an error of the mesh is."""
+    """Learned error of an encoder's reading, over that angle: it causes no force, so that it is not amplified at
+    resonance, unlike an error of the mesh."""
 
     c: tuple[Scalar, ...] = _coefficients("rad")
 
@@ -279,7 +278,7 @@ class LearnedReading(Learned, SensorEffect):
 
 
 class LearnedMotorReading(LearnedReading):
-    """Learned error of what the motor's encoder reads."""
+    """Learned error of the motor's encoder."""
 
     name: ClassVar[str] = "learned_motor_reading"
     _reads: ClassVar[str] = "theta_m"
@@ -289,7 +288,7 @@ class LearnedMotorReading(LearnedReading):
 
 
 class LearnedLoadReading(LearnedReading):
-    """Learned error of what the load's encoder reads."""
+    """Learned error of the load's encoder."""
 
     name: ClassVar[str] = "learned_load_reading"
     _reads: ClassVar[str] = "theta_l"
@@ -305,4 +304,4 @@ LEARNED_READINGS: tuple[type[LearnedReading], ...] = (LearnedMotorReading, Learn
 """A learned error of each encoder."""
 
 LEARNED: tuple[type[Learned], ...] = (*LEARNED_TORQUES, LearnedMeshError, *LEARNED_READINGS)
-"""All that can be learned."""
+"""All learned forms."""

@@ -1,4 +1,4 @@
-"""What a learned function is made of: functions of one quantity of the motion each, and products of them."""
+"""Basis of learned functions: functions of one quantity of the motion each, and their products."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -26,15 +26,15 @@ UNITS = {
 """What a learned function may depend on, with its unit."""
 
 ANGLES = {"theta_m": 6, "theta_l": 3}
-"""Those that are angles of a shaft, each with the highest order that it is given."""
+"""Angles of a shaft, each with its highest order."""
 
 DRIFTS = ("time", "temperature")
-"""Those that are no motion: what depends on them drifts."""
+"""Variables other than motion, which cause drift."""
 
-# Of what comes back in time, the highest multiple of its frequency.
+# Highest multiple of the frequency of a periodic function of time.
 _HARMONICS = 3
 _RATES = ("v", "omega_m", "omega_l")
-# Share of the largest rate within which the knots are even, and over which a sign turns at first.
+# Share of the largest rate within which the knots are even, and initial width of a sign's reversal.
 _NEAR_STANDSTILL = 0.005
 
 
@@ -43,7 +43,7 @@ class Axis(eqx.Module):
 
     Attributes:
         variable: the quantity, a field of [`hdjax.effects.Motion`][].
-        count: how many functions there are.
+        count: number of functions.
     """
 
     variable: eqx.AbstractVar[str]
@@ -51,7 +51,7 @@ class Axis(eqx.Module):
     @property
     @abc.abstractmethod
     def count(self) -> int:
-        """How many functions there are."""
+        """Number of functions."""
 
     @abc.abstractmethod
     def functions(self, value: Array) -> Float[Array, " functions"]:
@@ -59,11 +59,11 @@ class Axis(eqx.Module):
 
 
 class SplineAxis(Axis):
-    """Cubic B-splines on even knots; a straight line beyond the data.
+    """Cubic B-splines on even knots; linear beyond the data.
 
     Attributes:
         variable: the quantity.
-        low: smallest value that the data have.
+        low: smallest value in the data.
         high: largest value.
         bend: where given, the knots are even in `asinh(value / bend)`: dense near zero, where friction turns.
         intervals: number of intervals between knots.
@@ -93,7 +93,7 @@ class SplineAxis(Axis):
 
 
 class PowerAxis(Axis):
-    """Powers of a quantity, which go on beyond the data as they do within.
+    """Powers of a quantity, also beyond the data.
 
     Attributes:
         variable: the quantity.
@@ -134,7 +134,7 @@ class SignAxis(Axis):
 
     Attributes:
         variable: the rate.
-        corner: rate over which the sign turns, for a look; a fit may move it (see [`LearnedFriction`][]) [rad/s].
+        corner: rate over which the sign reverses, initially; a fit may change it (see [`LearnedFriction`][]) [rad/s].
         beside: the further functions; None where there are none.
     """
 
@@ -176,7 +176,7 @@ class PeriodicAxis(Axis):
 
     Attributes:
         variable: the time.
-        omega: the frequency, for a look; a fit may move it (see [`LearnedPeriodic`][]) [rad/s].
+        omega: the initial frequency; a fit may change it (see [`LearnedPeriodic`][]) [rad/s].
         orders: the highest multiple.
     """
 
@@ -199,22 +199,21 @@ def axes_over(
     corner: float | None = None,
     lines: Sequence[float] = (),
 ) -> list[tuple[Axis, ...]]:
-    """What a function of one or two quantities may be made of, the simplest first.
+    """Possible axes of a function of one or two quantities, the simplest first.
 
-    Of one quantity: a few powers, which go on beyond the data; any smooth function. Of two: one of them times any
-    function of the other (a stiffness or a damping that something changes); any smooth function of both. Each of the
-    former two may jump where a rate changes its sign, and of two quantities the jump may depend on the other one
-    (friction that something changes).
+    Of one quantity: a few powers, which extend beyond the data; any smooth function. Of two: one of them times any
+    function of the other (a variable stiffness or damping); any smooth function of both. Each of the former two may
+    jump where a rate changes its sign, and of two quantities the jump may depend on the other one (variable friction).
 
-    The load's angle comes back after a turn, but what is tied to the load need not, so that it has powers as well. The
-    motor's angle has none, nor has what drifts, of which nobody knows how it goes on; but a function of time may come
-    back at a frequency that stands out.
+    A function of the load's angle is periodic, but a spring to the ground is not, so that it has powers as well. The
+    motor's angle has none, nor have drifting quantities, which can't be extrapolated. A function of time may be
+    periodic at a significant frequency.
 
     Args:
-        ranges: between which values the data have each quantity.
+        ranges: of each quantity in the data.
         jumps_with: the rate, if any, whose sign the function may jump with.
-        corner: rate over which that sign turns, where something is known of it [rad/s].
-        lines: frequencies at which a function of time may come back [rad/s].
+        corner: rate over which that sign reverses, if known [rad/s].
+        lines: possible frequencies of a periodic function of time [rad/s].
     """
     if len(ranges) == 1:
         ((variable, (low, high)),) = ranges.items()
@@ -245,14 +244,14 @@ def _sign_over(variable: str, low: float, high: float, corner: float | None, bes
 
 
 def axis_over(variable: str, low: float, high: float, *, beside: str | None = None) -> Axis:
-    """The axis that suits a quantity which the data have between two values.
+    """The axis for a quantity with a given range in the data.
 
     Args:
         variable: the quantity.
         low: smallest value.
         high: largest value.
-        beside: the other quantity, where there are two: a product must do with fewer functions of each. Friction may
-            depend on an angle, or drift, and a stiffness on speed, but of two rates a smooth function must do.
+        beside: the other quantity, if any: a product has fewer functions of each. Friction may depend on an angle, or
+            drift, and a stiffness on speed; of two rates only smooth functions are used.
     """
     if variable in ANGLES:
         return AngleAxis(variable, ANGLES[variable] if beside is None else min(ANGLES[variable], 4))
@@ -268,7 +267,7 @@ def functions(axes: tuple[Axis, ...], motion: Motion) -> Float[Array, " function
 
 
 def combined(axes: tuple[Axis, ...], mixing: Array, c: tuple[Array, ...], motion: Motion) -> Array:
-    """The function of the axes that coefficients stand for, at one instant of a motion."""
+    """The function with given coefficients, at one instant of a motion."""
     return _sum((_values(axes, motion), jnp.stack(c)), axes, mixing)
 
 
@@ -287,7 +286,7 @@ def _sum(at: tuple[tuple[Array, ...], Array], axes: tuple[Axis, ...], mixing: Ar
 
 @_sum.def_jvp
 def _sum_jvp(primals, tangents):
-    """By hand, so that what is alike for all directions is not computed again for each: a fit has dozens."""
+    """Custom derivative, so that common parts of all directions are computed once: a fit has dozens."""
     (values, c), axes, mixing = primals
     (moved, c_moved), *_ = tangents
     both = [jax.jvp(axis.functions, (v,), (jnp.ones_like(v),)) for axis, v in zip(axes, values, strict=True)]

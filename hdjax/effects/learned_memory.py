@@ -1,9 +1,8 @@
-"""An effect that no formula is known for, and that remembers: a torque with states of its own.
+"""Nonparametric terms with memory: a learned torque with hidden states.
 
-A function of the present motion ([`hdjax.effects.learned`][]) can't stand for what depends on the past. Two general
-laws can. One is linear: a torque that lags behind what it follows, as all does that two further states make up, whether
-it swings or creeps. The other yields: a torque that follows how far something has moved since it last turned back,
-whatever time that took.
+A function of the present motion ([`hdjax.effects.learned`][]) can't represent a dependence on the past. Two general
+laws can. One is linear: a lagging torque with two further states, oscillating or creeping. The other is
+rate-independent hysteresis: a torque that depends on the path since the last reversal, not on time.
 """
 
 from typing import ClassVar
@@ -28,12 +27,12 @@ from hdjax.where import where
 
 DUHEM = "Oh, Bernstein 2005: the rate-independent Duhem model"
 
-# Beyond so many reaches a yielding torque is on its way back; a long step would throw it ever further.
+# Limit of z in reaches: beyond it the torque returns, and a long step would diverge.
 _FAR = 3.0
 
 
 class LearnedMemory(Effect):
-    """A torque against the motion of one angle, with a memory of it, somewhere.
+    """A torque against the motion of one angle, with memory, at some place.
 
     Attributes:
         angle: what it follows, a field of [`hdjax.effects.Motion`][].
@@ -63,7 +62,7 @@ class Lagging(LearnedMemory):
     """
 
     states: ClassVar[tuple[str, ...]] = ("lag", "rate")
-    # No single quantity shows it.
+    # No single quantity is a suitable abscissa.
     drawn_against: ClassVar[str | None] = None
 
     k: Scalar = parameter(0.0, unit="N m/rad", doc="torque by how far it lags", source=SOURCE, role="strength")
@@ -79,7 +78,7 @@ class Lagging(LearnedMemory):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         base = scales.natural_frequency
         swinging = [(omega, 0.1) for omega in (*scales.residual_frequencies, *(base * 1.25**k for k in range(-7, 8)))]
-        # What is damped so much that it creeps. Slower than the longest log it would be a stiffness.
+        # Overdamped proposals. Slower than the longest log it would act as a stiffness.
         creeping = [(base / 3.0**k, 2.0) for k in range(12) if base / 3.0**k * scales.duration > 1.0]
         span = 10.0 * scales.x * base * (scales.reduction_ratio if cls.angle == "theta_m" else 1.0)
         return tuple(
@@ -114,8 +113,8 @@ class LaggingMeshTorque(Lagging, MeshTorqueEffect):
 
 
 class LaggingShaftTorque(Lagging, ShaftEffect):
-    """What lags behind a shaft, which may have a share of the shaft's inertia and a friction of its own: with
-    `- drag u'`, any linear torque with two states that does not hold the shaft at an angle.
+    """A lagging torque on a shaft, which may have a share of the shaft's inertia and its own friction: with `- drag
+    u'`, any linear torque with two states without a static stiffness.
     """
 
     against: ClassVar[float] = -1.0
@@ -157,7 +156,8 @@ class LaggingLoadTorque(LaggingShaftTorque, LoadSideEffect):
 
 
 class Yielding(LearnedMemory):
-    """Torque `k z` against an angle u, with `z' = u' f(z)` where u moves on and `z' = u' f(-z)` where it moves back.
+    """Torque `k z` against an angle u, with `z' = u' f(z)` for motion away from zero and `z' = u' f(-z)` for motion
+    back.
 
     With s the deflection z over `reach`, `f = 1 - (1 - bow) s - bow s^2` on the way out, so that z saturates at
     `reach`, and `f = 1 + back |s| + back_bow s^2` on the way back. With `bow = 0, back = 1` it is Dahl's friction, with
@@ -227,4 +227,4 @@ LEARNED_WITH_MEMORY: tuple[type[LearnedMemory], ...] = (
     YieldingMotorTorque,
     YieldingLoadTorque,
 )
-"""All that can be learned with a memory."""
+"""All learned forms with memory."""

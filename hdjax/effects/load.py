@@ -1,4 +1,4 @@
-"""Torques on the load that the log does not contain: gravity, and what comes from outside."""
+"""Unlogged torques on the load: gravity and external torques."""
 
 from itertools import combinations
 from typing import ClassVar
@@ -11,7 +11,7 @@ from hdjax.effects.effect import Effect, LoadSideEffect, Motion, Scales
 from hdjax.effects.ripple import amplitude_and_phase, ripple
 from hdjax.parameters import Scalar, parameter
 
-# Of the strongest lines, so many are tried in pairs.
+# Number of strongest lines that are tried in pairs.
 _PAIRED = 4
 
 
@@ -59,10 +59,10 @@ class ConstantLoad(LoadSideEffect):
 
 
 class LoadDisturbance(LoadSideEffect):
-    """A torque `constant + cosine cos(omega t) + sine sin(omega t)` on the load, tied to no shaft.
+    """A torque `constant + cosine cos(omega t) + sine sin(omega t)` on the load, independent of the shafts.
 
-    The time counts from each log's start, and cosine and sine are common to all logs of a drive: of a disturbance that
-    goes on between logs, the clocks of all but one have to be put back until it is in phase.
+    The time counts from each log's start, and cosine and sine are common to all logs of a drive: for a disturbance that
+    continues between logs, the clocks of all but one must be shifted until it is in phase.
     """
 
     family: ClassVar[str] = "load_disturbance"

@@ -1,4 +1,4 @@
-"""Stiffness and friction that depend on where the motor stands."""
+"""Stiffness and friction that depend on the motor angle."""
 
 import abc
 from typing import ClassVar
@@ -15,9 +15,9 @@ _ORDERS = (1.0, 2.0, 4.0)
 
 
 class PositionDependentStiffness(MeshTorqueEffect):
-    """Torque `K f(x) (cosine cos(n theta_m) + sine sin(n theta_m))`: a stiffness that ripples with the motor angle.
+    """Torque `K f(x) (cosine cos(n theta_m) + sine sin(n theta_m))`: a stiffness with a ripple over the motor angle.
 
-    As the literature writes it, without the small torque that a spring of such stiffness puts on the motor.
+    As in the literature, without the small torque of such a spring on the motor.
     """
 
     family: ClassVar[str] = "position_dependent_stiffness"
@@ -57,10 +57,10 @@ class PositionDependentStiffness(MeshTorqueEffect):
 
 
 class ConservativePositionDependentStiffness(PositionDependentStiffness):
-    """The same ripple r(theta_m) of a spring that gives back what it stores.
+    """The same ripple r(theta_m) of a conservative spring.
 
-    With the energy `K F(x) r(theta_m)`, where `F' = f`, comes a torque `-K F(x) r'(theta_m)` on the motor: about
-    `n N x / 2` of what the ripple's mesh torque is there.
+    With the energy `K F(x) r(theta_m)`, where `F' = f`, there is a torque `-K F(x) r'(theta_m)` on the motor: about `n
+    N x / 2` times the ripple's mesh torque there.
     """
 
     name: ClassVar[str] = "conservative_position_dependent_stiffness"
@@ -92,7 +92,7 @@ class _MotorFrictionOverAngle(DryMotorFriction):
 
     @abc.abstractmethod
     def _ripple(self, theta_m: Array) -> Array:
-        """What the angle adds to T_c [N m]."""
+        """Angle-dependent part of the Coulomb torque [N m]."""
 
     def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         assert motion.theta_m is not None

@@ -14,7 +14,7 @@ from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
 SOURCE = "Canudas de Wit, Olsson, Astrom, Lischinsky 1995"
-# Bristles of this share of what the shaft turns in a radian of a period: from well resolved to nearly Coulomb.
+# Bend of the bristles over the shaft's motion in a radian of a period: from well resolved to nearly Coulomb.
 _BENDS = (0.1, 0.02, 0.5)
 
 
@@ -60,7 +60,7 @@ class _LuGre(Effect):
     `z' = omega - sigma_0 |omega| z / g`.
 
     `g = T_c (1 + excess exp(-(omega / omega_s)^2))`, `sigma_0 = T_c / bend` and `sigma_1 = sigma_0 tau`, so that the
-    bristles saturate at `bend` times the Stribeck level whatever T_c is, and nothing is left of them without it.
+    bristles saturate at `bend` times the Stribeck level for any T_c, and vanish without it.
     """
 
     states: ClassVar[tuple[str, ...]] = ("z",)
@@ -98,7 +98,7 @@ class _LuGre(Effect):
 
     @classmethod
     def at_rates(cls, rate: float, scales: Scales) -> tuple[Effect, ...]:
-        """What may be proposed for a shaft that turns at such rates [rad/s]."""
+        """Proposals (starting values) for a shaft that turns at such rates [rad/s]."""
         shape = {"omega_s": 0.2 * rate, "tau": 0.3 / scales.natural_frequency, "settling": scales.time_step}
         return tuple(cls(bend=bend, **shape) for bend in _bends(rate, scales))
 
@@ -164,10 +164,10 @@ class LuGreLoadFriction(_LuGre, LoadSideEffect):
 
 
 def _bends(rate: float, scales: Scales) -> tuple[float, ...]:
-    """Angles, as shares of what the shaft turns within a radian of the natural oscillation."""
+    """Angles, as shares of the shaft's motion within a radian of the natural oscillation."""
     return tuple(share * rate / scales.natural_frequency for share in _BENDS)
 
 
 def _bent(bend: Array, rate: Array | None) -> Float[Array, "1"]:
-    """A shaft that has long turned has bent its bristles its way."""
+    """Bristles of a shaft in steady rotation are bent in its direction."""
     return (jnp.zeros_like(bend) if rate is None else bend * jnp.sign(rate))[None]

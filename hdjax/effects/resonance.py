@@ -1,4 +1,4 @@
-"""A second resonance: something that swings on the load."""
+"""A second resonance: a third inertia on the load."""
 
 from typing import ClassVar
 
@@ -15,10 +15,10 @@ class _Resonance(LoadSideEffect):
 
         J_3 theta_3'' = -K_3 (theta_3 - theta_l) - B_3 (theta_3' - theta_l')
 
-    and the opposite torque on the load. Kept in the terms that a log determines well, and in which J_3 = 0 is the drive
-    alone: `J_3 = mass_ratio J_l`, `K_3 = J_3 omega_3^2`, `B_3 = 2 zeta omega_3 J_3`. The load's response has its zero
-    at omega_3. States: `theta_3 - theta_l`, which stays small on a load that turns, and `theta_3'`; both are driven by
-    the load's rate alone.
+    and the opposite torque on the load. Parametrised by quantities that a log determines well, with J_3 = 0 for the
+    drive alone: `J_3 = mass_ratio J_l`, `K_3 = J_3 omega_3^2`, `B_3 = 2 zeta omega_3 J_3`. The load's response has its
+    zero at omega_3. States: `theta_3 - theta_l`, which stays small on a load that turns, and `theta_3'`; both are
+    driven by the load's rate alone.
     """
 
     family: ClassVar[str] = "extra_resonance"
@@ -41,12 +41,12 @@ class _Resonance(LoadSideEffect):
 
     @classmethod
     def typical(cls, scales: Scales) -> tuple[Effect, ...]:
-        # The fit of a drive alone lies between the two resonances, and a heavy third inertia has moved it far.
+        # The fit of a drive alone is between the two resonances, and far off for a large third inertia.
         return tuple(cls._at(scales.natural_frequency * ratio, scales, mass_ratio=0.2) for ratio in (0.7, 1.0, 1.4))
 
     @classmethod
     def _at(cls, omega_3: float, scales: Scales, mass_ratio: float = 0.0) -> "_Resonance":
-        # Near its own resonance it swings far more than the drive twists.
+        # Near its resonance it moves far more than the drive's twist.
         rate = 10.0 * scales.x * scales.natural_frequency
         return cls(mass_ratio=mass_ratio, omega_3=omega_3, twist_span=rate / omega_3, rate_span=rate)
 
@@ -54,7 +54,7 @@ class _Resonance(LoadSideEffect):
         return self.mass_ratio * drive.J_l * self._pull(motion, state)
 
     def _pull(self, motion: Motion, state: Array) -> Array:
-        """What accelerates the load, over the mass ratio [rad/s^2]."""
+        """Acceleration of the load, over the mass ratio [rad/s^2]."""
         assert motion.omega_l is not None
         return self.omega_3**2 * state[0] + 2 * self.zeta * self.omega_3 * (state[1] - motion.omega_l)
 

@@ -1,4 +1,4 @@
-"""What several families share: a term that is locked to an angle."""
+"""Terms locked to an angle, which several families share."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What the encoders make of the angles: an eccentric disc, a delay."""
+"""Errors of the encoders: eccentric disc, delay."""
 
 from typing import ClassVar
 

@@ -1,4 +1,4 @@
-"""What each family of effects leaves in the residual of a model that lacks it."""
+"""Signature of each family of effects in the residual of a model without it."""
 
 SIGNATURES: dict[str, str] = {
     "stiffness_shape": "The slow torque-twist curve bends. A quadratic term makes even harmonics, the others odd ones.",

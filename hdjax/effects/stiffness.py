@@ -46,7 +46,7 @@ class ThreeSlopeStiffness(MeshTorqueEffect):
     """The vendors' three straight slopes K1, K2, K3 with knees at the twists `x1` and `x1 + gap`.
 
     Adds `K (stiffening_2 d(x, x1) + stiffening_3 d(x, x1 + gap))`, where `d(x, k) = x - clip(x, -k, k)`. K1 is the
-    drive's K; the cubic remains free beside it, and is near zero where three slopes are the truth.
+    drive's K; the cubic remains free beside it, and is near zero if three slopes are the true law.
     """
 
     family: ClassVar[str] = "stiffness_shape"
@@ -133,5 +133,5 @@ class SmoothKneeStiffness(MeshTorqueEffect):
 
 
 def _beyond(x: Array, knee: Array) -> Array:
-    """How far `x` is beyond the knee, with its sign; zero inside."""
+    """Signed distance of `x` beyond the knee; zero inside."""
     return x - jnp.clip(x, -knee, knee)

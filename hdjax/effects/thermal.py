@@ -1,4 +1,4 @@
-"""What changes as the drive warms up: stiffness, mesh damping, motor friction."""
+"""Temperature dependence of stiffness, mesh damping and motor friction."""
 
 from typing import ClassVar
 
@@ -14,7 +14,7 @@ _WOLF = "Wolf and Iskandar: viscous friction falls exponentially with temperatur
 
 
 class _Thermal(Effect):
-    """What the drive's temperature changes."""
+    """An effect of the drive's temperature."""
 
     family: ClassVar[str] = "temperature"
 
@@ -69,7 +69,7 @@ class ThermalDamping(_Thermal, MeshTorqueEffect):
 class ThermalMotorFriction(_Thermal, DryMotorFriction):
     """Motor friction that falls with temperature: `(T - T_0) (T_c_T sgn(omega_m) + b_T omega_m)` with the motor.
 
-    The change alone, to first order in the temperature, whatever law the friction itself follows.
+    The change only, to first order in the temperature, for any law of the friction itself.
     """
 
     name: ClassVar[str] = "thermal_motor_friction"

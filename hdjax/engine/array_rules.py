@@ -1,4 +1,4 @@
-"""What JAX's language does with arrays, where each entry is a node of its own."""
+"""Translation rules for array primitives of JAX; each array entry is a separate node."""
 
 import functools
 import math
@@ -12,14 +12,14 @@ from hdjax.engine.graph import Graph, Node
 Nodes = np.ndarray[Any, np.dtype[np.object_]]
 """Nodes in the shape of an array."""
 
-# A product of matrices with so many multiplications is no longer written out one by one.
+# Number of multiplications above which a matrix product is not written out.
 _LARGE = 64
-# Entries of a table that is looked up by comparisons.
+# Largest table that is looked up by comparisons.
 _LONGEST_TABLE = 64
 
 
 class UntranslatableError(Exception):
-    """A function that the graph has no words for."""
+    """A function that the graph does not support."""
 
 
 def constants(graph: Graph, array: Any) -> Nodes:
@@ -114,7 +114,7 @@ def _cumulative(graph: Graph, equation: Any, a: Nodes) -> Nodes:
 
 
 def _place_of(better: str) -> Callable[..., Nodes]:
-    """Where the first of the best entries along an axis stands."""
+    """Index of the first best entry along an axis."""
 
     def rule(graph: Graph, equation: Any, a: Nodes) -> Nodes:
         (axis,) = equation.params["axes"]

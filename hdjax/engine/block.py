@@ -34,7 +34,7 @@ def write_block(room: Room) -> None:
 
 
 def _choose_segments(room: Room) -> None:
-    """The lanes' segments; behind the last one it stands again, and what it writes is the same."""
+    """The lanes' segments; the last one is repeated to fill the block, with the same results."""
     c, b = room.code, room.code.builder
     last = c.plus(room.got("segments", I64), -1)
     for lane in range(LANES):
@@ -43,7 +43,7 @@ def _choose_segments(room: Room) -> None:
 
 
 def _choose_work(room: Room) -> None:
-    """How many intervals have to be simulated, and how many powers of each signal there are."""
+    """Number of intervals to simulate, and number of powers of each signal."""
     c, b, m = room.code, room.code.builder, room.march
     c.store(c.i(0), room.needed, 0)
     with c.loop(room.samples) as i:
@@ -75,7 +75,7 @@ def _begin_tangents(room: Room) -> None:
         c.store(c.spread(c.load(room.got("slopes"), t)), room.scale, t)
     with c.loop(room.tangents, m.parameters) as t:
         c.store(c.number(1.0), room.scale, t)
-    # Where all parameters are held, the tangents that move are those of the states; none for rows alone.
+    # With all parameters fixed, only the states have tangents; none for rows alone.
     c.store(c.i(m.parameters), room.first, 0)
     with c.loop(m.parameters) as t:
         slope = c.load(room.got("slopes"), t)

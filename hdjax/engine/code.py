@@ -1,4 +1,4 @@
-"""Instructions of one function on blocks of segments side by side: places in memory, integers, loops."""
+"""Instructions of one function on blocks of segments: memory access, integers, loops."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -9,7 +9,7 @@ from llvmlite import ir
 from hdjax.engine.emission import I64, Vectors
 
 LANES = 8
-"""Segments in a block: one wide register, or two or four narrow ones that hide each other's latencies."""
+"""Segments in a block: one wide register, or two or four narrow ones, which hide latencies."""
 
 
 class Code(Vectors):
@@ -20,7 +20,7 @@ class Code(Vectors):
         self.pointers = self.numbers.as_pointer()
 
     def i(self, value: int | ir.Value) -> ir.Value:
-        """An integer of the program."""
+        """An integer constant."""
         return ir.Constant(I64, value) if isinstance(value, int) else value
 
     def place(self, base: ir.Value, index: int | ir.Value) -> ir.Value:
@@ -39,13 +39,13 @@ class Code(Vectors):
         return self.builder.mul(self.i(a), self.i(b))
 
     def array(self, count: int, kind: Any = None) -> ir.Value:
-        """Room on the stack; asked for at the function's beginning."""
+        """Stack memory, allocated at the function's beginning."""
         room = self.builder.alloca(ir.ArrayType(kind or self.numbers, max(count, 1)))
         return self.builder.gep(room, [ir.Constant(I64, 0)] * 2)
 
     @contextlib.contextmanager
     def loop(self, count: int | ir.Value, start: int | ir.Value = 0) -> Iterator[ir.Value]:
-        """The body runs for each index from the start on; its values are its own."""
+        """Run the body for each index from the start on; values defined in it are local."""
         b = self.builder
         before = b.block
         head, body, after = (b.function.append_basic_block() for _ in range(3))
@@ -61,7 +61,7 @@ class Code(Vectors):
         b.position_at_end(after)
 
     def total(self, terms: Sequence[ir.Value | None]) -> ir.Value | None:
-        """Their sum; None is nothing."""
+        """Sum of values; None counts as zero."""
         found = None
         for term in terms:
             if term is not None:

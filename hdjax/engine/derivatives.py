@@ -1,4 +1,4 @@
-"""Forward derivatives on a graph of scalars, of those directions alone that exist."""
+"""Sparse forward derivatives on a graph of scalars."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -6,19 +6,19 @@ from typing import Any
 from hdjax.engine.graph import PARAMETER, Graph, Node
 
 Tangent = dict[Any, Node]
-"""Derivatives that are not zero, by direction: whatever name stands for it."""
+"""Nonzero derivatives by direction, which may have any name."""
 
 
 def derivatives(graph: Graph, wanted: Iterable[Node], seeds: Mapping[Node, Tangent]) -> dict[Node, Tangent]:
     """Derivatives of nodes.
 
     Args:
-        graph: takes up the nodes of the derivatives.
-        wanted: what is differentiated.
+        graph: receives the nodes of the derivatives.
+        wanted: nodes to differentiate.
         seeds: derivatives of leaves.
 
     Returns:
-        Of each wanted node.
+        The derivatives of each wanted node.
     """
     wanted = list(wanted)
     found: dict[Node, Tangent] = {}
@@ -35,7 +35,7 @@ def derivatives(graph: Graph, wanted: Iterable[Node], seeds: Mapping[Node, Tange
 
 
 def _in_order(graph: Graph, wanted: list[Node]) -> list[Node]:
-    """The nodes that derivatives run through; those of a node with given partials are its arguments'."""
+    """The nodes on the way of derivatives; a node with given partials depends on its arguments."""
     found: set[Node] = set()
     stack = list(wanted)
     while stack:
@@ -58,7 +58,7 @@ def _of_chain(graph: Graph, partials: list[tuple[Node, Node]], found: Mapping[No
 
 
 def _of_choice(graph: Graph, operation: str, arguments: list[Node], found: Mapping[Node, Tangent]) -> Tangent:
-    """The tangent of the one that is chosen; a product with zero would let an infinity of the other through."""
+    """The tangent of the chosen one; multiplication of the other by zero could give NaN."""
     condition, first, second = arguments if operation == "select" else (None, *arguments)
     one, other = found[first], found[second]
     if not (one or other):
@@ -83,7 +83,7 @@ def _partials(graph: Graph, node: Node, found: Mapping[Node, Tangent]) -> list[t
     if rule is None:
         return []
     laws = rule(graph.apply, graph.constant, node, *rest)
-    # A partial that nobody asks for should not make nodes.
+    # Unneeded partials should not create nodes.
     return [(a, law()) for a, law in zip(rest, laws, strict=True) if found[a]]
 
 

@@ -1,4 +1,4 @@
-"""The own states of effects, driven by a motion that is known already."""
+"""Hidden states of effects, driven by a given motion."""
 
 import dataclasses
 from collections.abc import Callable, Hashable
@@ -19,7 +19,7 @@ from hdjax.engine.kernel import Lanes, march_arrays, threads
 from hdjax.engine.pointwise import likeness
 from hdjax.engine.translate import traced, translated
 
-# Steps in a sample interval, along a motion that is a straight line in between.
+# Steps in a sample interval, along a motion that is linear in between.
 _STEPS = 2
 
 
@@ -40,13 +40,13 @@ class _Classical(dfx.AbstractERK):
 
 @dataclasses.dataclass(frozen=True)
 class _Driven:
-    """Machine code of an effect's own states.
+    """Machine code of an effect's hidden states.
 
     Attributes:
-        address: of the march. Its states are those of the effect, and behind them the numbers in it that matter, which
-            stay as they are: so each lane has its own.
-        numbers: which numbers of the effect these are.
-        signals: which parts of the motion come in.
+        address: of the march. Its states are those of the effect, followed by the effect's numbers as constant states,
+            so that each lane has its own numbers.
+        numbers: which numbers of the effect are included.
+        signals: which parts of the motion are inputs.
     """
 
     address: int
@@ -66,15 +66,15 @@ def own_states_along(
     *,
     by_machine_code: bool,
 ) -> Float[np.ndarray, "chains knots proposals own"]:
-    """Own states of proposals of an effect at each knot of motions that are straight lines through each interval.
+    """Hidden states of proposals of an effect at each knot of motions that are linear in each interval.
 
     Args:
         effect: the proposals, along the first axis of each array.
-        before: the motions, by chain and interval, where each interval starts.
-        after: where it ends.
-        width: of it [s].
+        before: the motions at the start of each interval, by chain and interval.
+        after: the motions at its end.
+        width: of the intervals [s].
         start: the states at the first knot.
-        by_machine_code: whether this machine can make some.
+        by_machine_code: whether machine code is available.
     """
     key = likeness(effect, 1), likeness(before, 2), by_machine_code
     if key not in _DRIVEN:
@@ -120,7 +120,7 @@ def own_states_along(
 
 
 def _translated(effect: Effect, motion: Motion) -> _Driven:
-    # What stands on llvmlite is loaded where it is there.
+    # Modules that need llvmlite are imported only if it is installed.
     from hdjax.engine.machine import compiled
     from hdjax.engine.march import MARCH, March
 
@@ -149,7 +149,7 @@ def _translated(effect: Effect, motion: Motion) -> _Driven:
         nodes += [np.array(graph.leaf(("state", i)), dtype=object) for i in range(own)]
         return graph, [node.item() for node in translated(graph, program, nodes)]
 
-    # What does not matter takes no time.
+    # Unused parts cost nothing.
     graph, found = translate(lambda kind, i: (kind, i))
     needed = sorted(graph.nodes[n][1] for n in graph.needed(found) if graph.nodes[n][0] == "leaf")
     numbers, signals = (tuple(i for kind, i in needed if kind == name) for name in ("number", "signal"))
@@ -179,7 +179,7 @@ def _translated(effect: Effect, motion: Motion) -> _Driven:
 
 @eqx.filter_jit
 def _by_jax(effect: Effect, before: Motion, after: Motion, width: Array, start: Array) -> Array:
-    """The same by a program of JAX, for functions that the graph has no words for."""
+    """The same by a JAX program, for functions that the graph does not support."""
 
     def lane(effect: Effect, before: Motion, after: Motion, width: Array, start: Array) -> Array:
         def interval(own: Array, inputs: tuple[Motion, Motion, Array]) -> tuple[Array, Array]:

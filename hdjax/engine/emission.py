@@ -11,19 +11,19 @@ from hdjax.engine.graph import COMPARISONS, LOGICAL, Graph, Node
 
 F64, I64, I32, I8, BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(32), ir.IntType(8), ir.IntType(1)
 
-# Inner products that go through a table side by side.
+# Inner products with adjacent entries of a table, computed together.
 _COLUMNS = 8
-# Fused multiply-adds, and nothing that changes results by more than rounding.
+# Fused multiply-adds, and no flag that changes results beyond rounding.
 _FUSED = ("contract",)
 _SIGNS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
-# 1.5 * 2^52: a sum with it is a whole number, which its last bits hold.
+# 1.5 * 2^52: adding it rounds to an integer, which is in the last bits.
 _WHOLE = 6755399441055744.0
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
 _LARGEST_EXPONENT, _LEAST_EXPONENT = 709.0, -708.0
 
 
 class _Same(ir.Constant):
-    """A number in each lane, written out once."""
+    """A constant in each lane, written once."""
 
     @functools.cached_property
     def _reference(self) -> str:
@@ -35,15 +35,15 @@ class _Same(ir.Constant):
 
 @functools.cache
 def _number(value: float, sign: float, lanes: int) -> ir.Constant:
-    """`sign` keeps the two zeros apart."""
+    """A constant; `sign` distinguishes the two zeros."""
     return ir.Constant(F64, value) if lanes == 1 else _Same(ir.VectorType(F64, lanes), [value] * lanes)
 
 
 class Vectors:
-    """Instructions on vectors of so many lanes; on plain numbers where it is one."""
+    """Instructions on vectors of a number of lanes; on scalars for one lane."""
 
     def __init__(self, builder: ir.IRBuilder, lanes: int):
-        # Of no type that a checker knows: it would ask of each instruction whether it has a value.
+        # Untyped: a type checker would require a check of each instruction's value.
         self.builder: Any = builder
         self.lanes = lanes
         self.numbers: Any = F64 if lanes == 1 else ir.VectorType(F64, lanes)
@@ -63,7 +63,7 @@ class Vectors:
         return ir.Constant(self.bits, int(value) if self.lanes == 1 else [int(value)] * self.lanes)
 
     def spread(self, scalar: ir.Value) -> ir.Value:
-        """A number of the program in each lane."""
+        """A scalar value, broadcast to each lane."""
         if self.lanes == 1:
             return scalar
         none = ir.Constant(self.numbers, ir.Undefined)
@@ -96,12 +96,12 @@ class Vectors:
         return self.builder.call(function, arguments)
 
     def smaller(self, a: ir.Value, b: ir.Value) -> ir.Value:
-        """Whether a < b; false for what is no number."""
+        """Whether a < b; false for NaN."""
         return self.builder.fcmp_ordered("<", a, b)
 
 
 def own_function(vectors: Vectors, name: str, body: Callable[[Vectors, ir.Value], ir.Value], x: ir.Value) -> ir.Value:
-    """Call an elementary function, which is written into the module where it is not there yet."""
+    """Call an elementary function, which is added to the module if necessary."""
     module = vectors.builder.module
     full = f"{name}.{vectors.lanes}"
     function = module.globals.get(full)
@@ -114,7 +114,7 @@ def own_function(vectors: Vectors, name: str, body: Callable[[Vectors, ir.Value]
 
 
 def _reduced(v: Vectors, x: ir.Value) -> tuple[ir.Value, ir.Value]:
-    """Powers of two, and what is left of an exponent (Cody and Waite 1980)."""
+    """Power of two and remainder of an exponent (Cody and Waite 1980)."""
     shifted = v.add(v.mul(x, v.number(1.0 / math.log(2.0))), v.number(_WHOLE))
     n = v.builder.fsub(shifted, v.number(_WHOLE))
     rest = v.sub(x, v.mul(n, v.number(_LN2_HIGH)))
@@ -148,7 +148,7 @@ def _logarithm(v: Vectors, x: ir.Value) -> ir.Value:
     root = 0x3FE6A09E667F3BCD  # of a half
     bits = b.bitcast(x, v.integers)
     biased = b.lshr(b.add(b.sub(bits, v.integer(root)), v.integer(1023 << 52)), v.integer(52))
-    # Put behind the point of 2^52, an integer becomes a number without a conversion.
+    # Or-ed into the mantissa of 2^52, an integer becomes a float without conversion.
     exponent = b.bitcast(b.or_(biased, v.integer(0x4330000000000000)), v.numbers)
     exponent = b.fsub(exponent, v.number(2.0**52 + 1023))
     scaled = b.sub(bits, b.shl(b.sub(biased, v.integer(1023)), v.integer(52)))
@@ -176,7 +176,7 @@ _INTRINSIC = {"abs": "fabs", "sqrt": "sqrt", "round": "rint", "floor": "floor", 
 
 
 def is_truth(graph: Graph, node: Node) -> bool:
-    """Whether a node is a truth value and no number."""
+    """Whether a node is a truth value."""
     operation, *rest = graph.nodes[node]
     if operation == "constant":
         return isinstance(rest[0], bool)
@@ -186,12 +186,12 @@ def is_truth(graph: Graph, node: Node) -> bool:
 
 
 def storable(vectors: Vectors, graph: Graph, node: Node, value: ir.Value) -> ir.Value:
-    """The value of a node as a number; [`restored`][] turns it back."""
+    """The value of a node as a number; [`restored`][] is the inverse."""
     return vectors.builder.uitofp(value, vectors.numbers) if is_truth(graph, node) else value
 
 
 def restored(vectors: Vectors, graph: Graph, node: Node, number: ir.Value) -> ir.Value:
-    """The value of a node from what [`storable`][] made of it."""
+    """The value of a node from its [`storable`][] form."""
     return vectors.builder.fcmp_ordered("!=", number, vectors.number(0.0)) if is_truth(graph, node) else number
 
 
@@ -207,12 +207,12 @@ def emitted(
     Args:
         vectors: instructions.
         graph: of the nodes.
-        wanted: what is computed.
-        given: how to come by the nodes that are known already, leaves included.
-        tables: where the numbers of the graph's tables stand.
+        wanted: nodes to compute.
+        given: access to known nodes, leaves included.
+        tables: addresses of the graph's tables.
 
     Returns:
-        The value of every node that was needed.
+        The value of every needed node.
     """
     found: dict[Node, ir.Value] = {}
     wanted = list(wanted)
@@ -245,8 +245,7 @@ def emitted(
 
 
 def _alike(graph: Graph, node: Node) -> tuple[Any, ...]:
-    """What inner products have in common that go through a table side by side: its name, the distance of its numbers,
-    and the factors."""
+    """Key of inner products that are computed together: table, stride and factors."""
     (table, _, stride), *factors = graph.nodes[node][1:]
     return table, stride, *factors
 
@@ -254,8 +253,8 @@ def _alike(graph: Graph, node: Node) -> tuple[Any, ...]:
 def _inner_products(
     v: Vectors, factors: Sequence[ir.Value], table: ir.Value, firsts: Sequence[int], stride: int
 ) -> list[ir.Value]:
-    """Sums of products of the same factors with numbers at even distances of a table, from each of the first places on:
-    as a loop, since what is written out takes long to compile, and to read."""
+    """Sums of products of the same factors with strided numbers of a table, for several first places: as a loop, since
+    unrolled code takes long to compile and to load."""
     b = v.builder
     with b.goto_entry_block():
         room = b.alloca(ir.ArrayType(v.numbers, len(factors)))

@@ -26,8 +26,8 @@ class Part:
     """Some of the equations.
 
     Attributes:
-        values: by row.
-        slopes: their derivatives that are not zero, by direction: `("parameter", i)`, `("state", i)`, `("held", i)`.
+        values: of each row.
+        slopes: their nonzero derivatives, by direction: `("parameter", i)`, `("state", i)`, `("held", i)`.
     """
 
     values: tuple[Node, ...]
@@ -40,19 +40,19 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Equations:
-    """All that a simulation with sensitivities needs of a model.
+    """Equations of a model for a simulation with sensitivities.
 
     Attributes:
         graph: of all nodes here.
-        paths: the parameters that derivatives are by.
-        acting: those of them that change the logged torque, and nothing else.
-        constants: how many further numbers the model holds.
-        states: how many.
-        signals: what comes in along time, beside the torque: `LOAD`, `TEMPERATURE`.
+        paths: the parameters of the derivatives.
+        acting: those of them that change only the logged torque.
+        constants: number of further numbers in the model.
+        states: their number.
+        signals: inputs other than the torque: `LOAD`, `TEMPERATURE`.
         rates: of the states.
-        held: what is computed once for a whole step.
-        outputs: what is read.
-        prior: how far the effects' own states start from where they are expected, in units of their prior.
+        held: values computed once per step.
+        outputs: of the sensors.
+        prior: deviation of hidden initial states from their expected values, in units of their prior.
     """
 
     graph: Graph
@@ -68,7 +68,7 @@ class Equations:
 
 
 class DryStep:
-    """Dry friction over a step: what is computed of it at the step's start, as a list of numbers, and its use."""
+    """Dry friction over a step: values computed at the step's start, as a list of numbers, and their use."""
 
     def __init__(self):
         self._names: list[str] = []
@@ -82,7 +82,7 @@ class DryStep:
         return [part for name in self._names for part in (found[name].sign, found[name].reach)]
 
     def within(self, conditions: Conditions, held: Array) -> Conditions:
-        """The conditions within the step; what `before` was traced for."""
+        """The conditions within the step, from the values of `before`."""
         if not self._names:
             return conditions
         rubbing = {n: Rubbing(held[2 * i], held[2 * i + 1]) for i, n in enumerate(self._names)}
@@ -90,7 +90,7 @@ class DryStep:
 
 
 def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[Array], Callable[..., Model]]:
-    """A model as numbers: the parameters at the paths, all other arrays, and what puts them together again."""
+    """A model as numbers: the parameters at the paths, all other arrays, and the inverse function."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
 
@@ -102,7 +102,7 @@ def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[A
 
 
 def structure(model: Any, paths: Sequence[str], signals: Sequence[str]) -> Hashable:
-    """What two models, or two trees that hold one, have in common that the same machine code serves."""
+    """Key of models, or of trees with one, that share machine code."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
     fixed, fixed_tree = jax.tree.flatten(rest)
@@ -114,13 +114,13 @@ def equations(model: Model, paths: Sequence[str], signals: Sequence[str], *, slo
     """Translate a model.
 
     Args:
-        model: its values don't matter, except for whole numbers and truth values.
-        paths: dotted paths of the parameters that derivatives are by.
-        signals: what comes in along time beside the torque.
-        slopes: whether derivatives are wanted.
+        model: its values don't matter, except for integers and truth values.
+        paths: dotted paths of the parameters of the derivatives.
+        signals: inputs other than the torque.
+        slopes: whether to include derivatives.
 
     Raises:
-        UntranslatableError: where the model uses a function that is not known here.
+        UntranslatableError: the model uses an unsupported function.
     """
     free, others, joined = split_model(model, paths)
     graph = Graph(tables=("constant",))

@@ -1,4 +1,4 @@
-"""A drive under a forcing from rest, as one graph of scalars: each lane has numbers of its own."""
+"""A drive under a forcing from rest, as one graph of scalars; each lane has its own numbers."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ class Drawn(NamedTuple):
     Attributes:
         model: the equations.
         forcing: motor torque, or a reduced drive's forcing, as a function of time.
-        length: how long it is simulated [s].
+        length: of the simulation [s].
     """
 
     model: Model
@@ -43,15 +43,15 @@ class Forced:
 
     Attributes:
         graph: of all nodes here.
-        length: how long the motion is simulated [s].
+        length: of the simulation [s].
         start: the state at t = 0.
         wave: amplitude, frequency, phase and mean of a harmonic forcing; empty for any other.
         circle: cosine and sine of the leaf `("angle",)`.
         torque: the forcing at `("time",)`.
-        held: what dry friction does over a step, from the state, time and `("torque",)` at its start.
+        held: dry friction over a step, from the state, time and `("torque",)` at its start.
         rates: of the states.
         seen: measured dynamic error, its rate and its acceleration.
-        largest: largest |x| within a step, from what is seen at its ends, `("before", i)` and `("after", i)`.
+        largest: largest |x| within a step, from `seen` at its ends, `("before", i)` and `("after", i)`.
     """
 
     graph: Graph
@@ -77,11 +77,11 @@ def forced(
     Args:
         drawn: a point, from arrays of its numbers.
         shapes: of these arrays.
-        seen: of a model, its state, the torque and the time.
-        largest: of what is seen at both ends of a step, and its width.
+        seen: function of a model, its state, the torque and the time.
+        largest: function of `seen` at both ends of a step, and its width.
 
     Raises:
-        UntranslatableError: where the model or the forcing uses a function that the engine does not know.
+        UntranslatableError: the model or the forcing uses an unsupported function.
     """
     graph, half = Graph(), np.float64(0.5)
     numbers: list[Nodes] = []

@@ -1,4 +1,4 @@
-"""Functions of scalars, made of such as the graph has words for."""
+"""Functions of scalars, composed of operations of the graph."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from hdjax.where import where
 
 @jax.custom_jvp
 def power(base, exponent):
-    """A power; no number of a negative base, whatever the exponent."""
+    """A power; NaN for a negative base."""
     positive = base > 0.0
     at_zero = where(exponent > 0.0, 0.0, where(exponent == 0.0, 1.0, math.inf))
     beside = where(base == 0.0, at_zero, math.nan)
@@ -23,14 +23,14 @@ def power(base, exponent):
 def _power_jvp(primals, tangents):
     (base, exponent), (moved, bent) = primals, tangents
     value = power(base, exponent)
-    # One power less than none is none, and a zero stays one whatever its exponent.
+    # The derivative of a zeroth power is zero, and so is that of a zero base.
     by_base = where(exponent == 0.0, 0.0, exponent * power(base, exponent - 1.0))
     by_exponent = jnp.log(where(base == 0.0, 1.0, base)) * value
     return value, by_base * moved + by_exponent * bent
 
 
 def with_slope(function: Callable[[Any], Any], slope: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
-    """A function whose derivative is a formula of its argument and value: what its parts give would be less exact."""
+    """A function whose derivative is a formula of its argument and value, more accurate than that of its parts."""
     found = jax.custom_jvp(function)
 
     def rule(primals, tangents):
@@ -41,13 +41,13 @@ def with_slope(function: Callable[[Any], Any], slope: Callable[[Any, Any], Any])
     return found
 
 
-# Beyond it the square of a number, or one beside it, is nothing worth having.
+# Beyond it one is negligible beside the square of a number.
 _HUGE = 1e100
 
 
 def log1p(x):
     """ln(1 + x)."""
-    # Kahan: the rounding of 1 + x is taken back.
+    # Kahan: corrects the rounding of 1 + x.
     u = 1.0 + x
     huge = u > _HUGE
     small = where((u == 1.0) | huge, 1.0, u - 1.0)

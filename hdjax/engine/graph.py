@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 Node = int
-"""A node's place in its graph. Arguments stand before what is made of them."""
+"""A node's index in its graph. Arguments precede the nodes that use them."""
 
 CONSTANT, PARAMETER, VARYING = 0, 1, 2
-"""What a node depends on: nothing, what stays the same during a simulation, or the motion."""
+"""Dependence of a node: on nothing, on values that are constant during a simulation, or on the motion."""
 
 COMPARISONS = {"eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater}
 COMPARISONS["ge"] = np.greater_equal
@@ -48,19 +48,19 @@ _OPERATIONS = {
 
 
 class Graph:
-    """Expressions of scalars, made node by node; a node that is there already is found again.
+    """Expressions of scalars, built node by node; equal nodes are shared.
 
     Attributes:
-        nodes: each as its operation and what that is applied to: `("constant", value)`, `("leaf", name)`, or an
-            operation and nodes. `("given", value, argument, partial, ...)` is the value, with its partial derivatives;
-            `("dot", (name, first, stride), *factors)` see [`Graph.dot`][].
-        level: what each depends on, see [`CONSTANT`][].
+        nodes: each as its operation and arguments: `("constant", value)`, `("leaf", name)`, or an operation and nodes.
+            `("given", value, argument, partial, ...)` is the value, with its partial derivatives; `("dot", (name,
+            first, stride), *factors)` see [`Graph.dot`][].
+        level: dependence of each, see [`CONSTANT`][].
     """
 
     def __init__(self, tables: Collection[str] = ()):
         """
         Args:
-            tables: leaves `(name, place)` of these names stand in tables, by their places.
+            tables: names of leaves `(name, place)` that are entries of tables.
         """
         self.tables = tables
         self.nodes: list[tuple[Any, ...]] = []
@@ -70,20 +70,20 @@ class Graph:
     def constant(self, value: float | bool) -> Node:
         """A number, or a truth value."""
         value = value if isinstance(value, bool) else float(value)
-        # Told apart by type and by sign, which equality is not: True is 1.0, and 0.0 is -0.0.
+        # Distinguished by type and sign, unlike by equality: True == 1.0, and 0.0 == -0.0.
         return self._make(("constant", value), (type(value), repr(value)), CONSTANT)
 
     def leaf(self, name: Hashable, level: int = VARYING) -> Node:
-        """What comes in under a name."""
+        """An input by name."""
         return self._make(("leaf", name), ("leaf", name), level)
 
     def known(self, node: Node) -> float | bool | None:
-        """The value of a constant node; None of any other."""
+        """The value of a constant node; None for others."""
         operation, *rest = self.nodes[node]
         return rest[0] if operation == "constant" else None
 
     def apply(self, operation: str, *arguments: Node) -> Node:
-        """An operation on nodes; simplified where some of them are known."""
+        """An operation on nodes, simplified if some of them are constant."""
         values = [self.known(a) for a in arguments]
         if operation not in ("given", "leaf") and None not in values:
             with np.errstate(all="ignore"):
@@ -96,7 +96,7 @@ class Graph:
         return self._make((operation, *arguments), (operation, *arguments), max(self.level[a] for a in arguments))
 
     def power(self, base: Node, exponent: int) -> Node:
-        """A whole power, as products."""
+        """An integer power, as products."""
         if exponent < 0:
             return self.apply("div", self.constant(1.0), self.power(base, -exponent))
         if exponent == 0:
@@ -108,8 +108,8 @@ class Graph:
         return self.apply("mul", square, base) if exponent % 2 else square
 
     def dot(self, numbers: Sequence[Node], factors: Sequence[Node]) -> Node | None:
-        """The sum of products of numbers and factors as one node: large matrices would make thousands. None where the
-        numbers are no leaves at even distances of a table."""
+        """The sum of products of numbers and factors as one node, since large matrices would give thousands. None where
+        the numbers are not evenly spaced leaves of a table."""
         names = [self.nodes[n][1] for n in numbers if self.nodes[n][0] == "leaf"]
         if not self.tables or len(numbers) < 2 or len(names) < len(numbers):
             return None
@@ -128,7 +128,7 @@ class Graph:
         return [(name, first + i * stride) for i in range(len(factors))]
 
     def needed(self, wanted: Iterable[Node]) -> list[Node]:
-        """The nodes that the wanted ones are made of, themselves included, in order."""
+        """The nodes that the wanted ones depend on, including themselves, in order."""
         found: set[Node] = set()
         stack = list(wanted)
         while stack:
@@ -140,12 +140,11 @@ class Graph:
         return sorted(found)
 
     def steady(self, wanted: Iterable[Node]) -> dict[Node, int]:
-        """What stays the same during a simulation and is asked for, by the wanted nodes or by what they are made of:
-        each with a place of its own."""
+        """Nodes that are constant during a simulation and needed by the wanted nodes, each with an index."""
         wanted = list(wanted)
 
         def is_steady(node: Node) -> bool:
-            # What is made of numbers alone is one too, where it was not simplified to a number.
+            # Nodes of constants only count as constant, even if not simplified to a number.
             return self.level[node] < VARYING and self.known(node) is None
 
         asked = {n for n in wanted if is_steady(n)}
@@ -155,7 +154,7 @@ class Graph:
         return {node: i for i, node in enumerate(sorted(asked))}
 
     def arguments(self, node: Node) -> Sequence[Node]:
-        """The nodes that a node's value is computed from."""
+        """The arguments of a node."""
         operation, *rest = self.nodes[node]
         if operation in ("constant", "leaf"):
             return ()
@@ -164,7 +163,8 @@ class Graph:
         return rest[:1] if operation == "given" else rest
 
     def evaluate(self, wanted: Sequence[Node], leaves: Mapping[Hashable, Any]) -> list[Any]:
-        """Values of nodes where leaves are numbers or arrays of one shape: no compilation, one numpy call a node."""
+        """Values of nodes for leaves that are numbers or arrays of one shape: no compilation, one numpy call per
+        node."""
         value: dict[Node, Any] = {}
         with np.errstate(all="ignore"):
             for node in self.needed(wanted):
@@ -188,8 +188,8 @@ class Graph:
         return self._found[key]
 
     def _simplified(self, operation: str, arguments: Sequence[Node], values: Sequence[Any]) -> Node | None:
-        """A simpler node of the same value; None where there is none. Zero times anything is zero here: no simulation
-        that goes on holds an infinity."""
+        """A simpler node of the same value; None without one. Zero times anything is zero here, as valid simulations
+        contain no infinity."""
         first, second = arguments[0], arguments[-1]
         x, y = values[0], values[-1]
         if operation == "mul":
@@ -215,7 +215,7 @@ class Graph:
                 return first
             if y is not None and y != 0.0 and math.frexp(y)[0] in (0.5, -0.5):
                 return self.apply("mul", first, self.constant(1.0 / y))
-            # Divided once for a whole simulation, rather than in each of its stages.
+            # Divide once per simulation, not in each stage.
             if self.level[second] < VARYING and self.level[first] == VARYING:
                 return self.apply("mul", first, self.apply("div", self.constant(1.0), second))
         elif operation == "neg" and self.nodes[first][0] == "neg":

@@ -1,4 +1,4 @@
-"""Machine code called from a program of JAX: the address is an operand, so that one program serves all models."""
+"""Calls of machine code from JAX programs: the address is an operand, so that one program serves all models."""
 
 import ctypes
 import functools
@@ -14,7 +14,7 @@ from hdjax.engine.machine import compiled
 
 POINTER = I8.as_pointer()
 ENTRY = ir.FunctionType(ir.VoidType(), [POINTER.as_pointer(), POINTER.as_pointer()])
-"""What stands at the address: a function of the tables of operands (the address itself is the first) and results."""
+"""Type of the function at the address: of the tables of operands (the first is the address) and results."""
 
 TARGET = "hdjax_machine_code"
 
@@ -26,26 +26,26 @@ _VERSION = (0, 3)
 
 
 def at(builder: Any, base: ir.Value, offset: int, kind: ir.Type) -> ir.Value:
-    """What stands at an offset in bytes."""
+    """The value at an offset in bytes."""
     place = builder.gep(base, [ir.Constant(I64, offset)])
     return builder.load(builder.bitcast(place, kind.as_pointer()))
 
 
 def data(builder: Any, table: ir.Value, index: int, kind: ir.Type = F64) -> ir.Value:
-    """Where the numbers of an operand or a result stand."""
+    """Address of the numbers of an operand or a result."""
     buffer = builder.load(builder.gep(table, [ir.Constant(I64, index)]))
     return builder.bitcast(at(builder, buffer, _DATA, POINTER), kind.as_pointer())
 
 
 def dimension(builder: Any, table: ir.Value, index: int, axis: int) -> ir.Value:
-    """How long an axis of an operand or a result is."""
+    """Length of an axis of an operand or a result."""
     buffer = builder.load(builder.gep(table, [ir.Constant(I64, index)]))
     return at(builder, at(builder, buffer, _DIMENSIONS, POINTER), 8 * axis, I64)
 
 
 @functools.cache
 def register() -> str:
-    """Tell XLA of the handler, once; its name."""
+    """Register the handler with XLA once; returns its name."""
     module = ir.Module(TARGET)
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), TARGET)
     frame = function.args[0]
@@ -73,12 +73,12 @@ def register() -> str:
 
 
 def called(address: int, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
-    """Call machine code from Python, which compiles no program for the arrays' shapes as JAX would.
+    """Call machine code from Python, without JAX's compilation per array shape.
 
     Args:
         address: of the code.
-        operands: what it reads.
-        results: what it writes.
+        operands: inputs.
+        results: outputs.
     """
     kept = []
 

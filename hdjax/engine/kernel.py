@@ -1,4 +1,4 @@
-"""A model's machine code, and how programs of JAX call it."""
+"""A model's machine code, and its calls from JAX programs."""
 
 import contextlib
 import dataclasses
@@ -21,10 +21,10 @@ from jaxtyping import Array, Float, Int
 from hdjax.dynamics import Model
 from hdjax.engine.equations import LOAD, TEMPERATURE, Equations, equations, structure
 
-# What stands on llvmlite is loaded where machine code is made or called: without it XLA does all.
+# Modules that need llvmlite are imported on demand: without it XLA is used.
 Mode = Literal["values", "jacobian"]
 Wanted = Literal["jacobian", "products", "rows"]
-"""What a march with derivatives gives: the Jacobian, products of its columns in its place, or the rows alone."""
+"""Result of a march with derivatives: the Jacobian, products of its columns, or the rows alone."""
 
 _LOCK = threading.Lock()
 
@@ -33,12 +33,12 @@ class Kernel(eqx.Module):
     """Machine code of a model's march.
 
     Attributes:
-        paths: the parameters that it has derivatives by.
+        paths: the parameters of its derivatives.
         acting: those of them that change the logged torque.
-        signals: what comes in along time beside the torque.
-        hidden: how many states are effects' own.
+        signals: inputs other than the torque.
+        hidden: number of hidden states.
         jacobian: address of the march with derivatives.
-        values: of the one without; None where it was not asked for.
+        values: address of the march without; None where it was not requested.
     """
 
     paths: tuple[str, ...] = eqx.field(static=True)
@@ -51,14 +51,14 @@ class Kernel(eqx.Module):
 
 @functools.cache
 def unusable() -> str | None:
-    """Why there is no machine code on this machine; None where there is."""
+    """The reason why machine code is unavailable; None where it is available."""
     if jax.default_backend() != "cpu":
         return f"the computation runs on a {jax.default_backend()}"
     try:
         importlib.import_module("hdjax.engine.handler").register()
     except ImportError:
         return "llvmlite is not installed"
-    except Exception as error:  # whatever stops a compiler on a processor that nobody has tried
+    except Exception as error:  # any failure of the compiler on an untested processor
         return f"no machine code can be made on this machine ({type(error).__name__}: {error})"
     return None
 
@@ -81,19 +81,19 @@ def kernel(
     solver: dfx.AbstractERK,
     values: bool = False,
 ) -> Kernel:
-    """The machine code of a model; made once for all models of the same structure.
+    """The machine code of a model, compiled once for all models of the same structure.
 
     Args:
         model: the equations.
-        paths: dotted paths of the parameters that derivatives are by.
+        paths: dotted paths of the parameters of the derivatives.
         loaded: whether there is a load torque.
         warm: whether the drive's temperature is known.
         solver: explicit Runge-Kutta solver of diffrax; its tableau is used.
-        values: whether the march without derivatives is wanted as well.
+        values: whether to include the march without derivatives.
 
     Raises:
-        ValueError: where an effect needs a temperature that is not known.
-        UntranslatableError: where the model uses a function that the engine does not know.
+        ValueError: an effect needs an unknown temperature.
+        UntranslatableError: the model uses an unsupported function.
     """
     warm = warm and any(e.needs_temperature for e in model.effects)
     signals = (LOAD,) * loaded + (TEMPERATURE,) * warm
@@ -120,11 +120,11 @@ def _address(made: _Made, mode: Mode, solver: dfx.AbstractERK) -> np.ndarray:
 
 
 class Lanes(eqx.Module):
-    """The data of a march; see [`hdjax.engine.march.OPERANDS`][] for what each is.
+    """The data of a march, described at [`hdjax.engine.march.OPERANDS`][].
 
     Attributes:
-        signals: coefficients of the torque, of what else comes in, and of the torque's derivatives by the parameters
-            that change it.
+        signals: coefficients of the torque, of other inputs, and of the torque's derivatives by the parameters that
+            change it.
     """
 
     free: Float[Array | np.ndarray, " width"]
@@ -141,7 +141,7 @@ class Lanes(eqx.Module):
 
 
 class Marched(eqx.Module):
-    """Results of a march: whitened rows, the states in which segments end, and where asked for their derivatives."""
+    """Results of a march: whitened rows, final states of segments, and their derivatives on request."""
 
     rows: Float[Array | np.ndarray, "segments rows"]
     end: Float[Array | np.ndarray, "segments states"]
@@ -155,12 +155,12 @@ class Marched(eqx.Module):
 def march_lanes(
     address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian"
 ) -> Marched:
-    """March all segments by machine code; inside programs of JAX or outside.
+    """March all segments by machine code, inside or outside JAX programs.
 
     Args:
         address: of the code.
         lanes: the data.
-        hidden: how many states are effects' own.
+        hidden: number of hidden states.
         mode: with derivatives or without.
         wanted: of a march with derivatives.
     """
@@ -173,9 +173,9 @@ def march_lanes(
 
 
 def _operands(address: Int[Array | np.ndarray, ""], lanes: Lanes, wanted: Wanted) -> list[Array | np.ndarray]:
-    """What comes in, in the order of [`hdjax.engine.march.OPERANDS`][] and behind it the signals."""
+    """Operands in the order of [`hdjax.engine.march.OPERANDS`][], followed by the signals."""
     asked = np.array([get_args(Wanted).index(wanted)])
-    # Outside a program of JAX none is compiled for it.
+    # Outside a JAX program nothing is compiled.
     library = jnp if isinstance(lanes.settings, Tracer) else np
     operands = vars(lanes) | {"settings": library.concatenate([lanes.settings, asked])}
     return [address, *(operands[f.name] for f in dataclasses.fields(lanes) if f.name != "signals"), *lanes.signals]
@@ -199,7 +199,7 @@ def result_shapes(lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted) -> list
 def march_arrays(
     address: Int[Array | np.ndarray, ""], lanes: Lanes, hidden: int, mode: Mode, wanted: Wanted = "jacobian"
 ) -> Marched:
-    """[`march_lanes`][] outside programs of JAX, of numpy's arrays to such: none is compiled for their shapes."""
+    """[`march_lanes`][] outside JAX programs, on numpy arrays, without compilation for their shapes."""
     from hdjax.engine.handler import called
 
     results = [np.empty(shape) for shape in result_shapes(lanes, hidden, mode, wanted)]
@@ -212,7 +212,7 @@ _ALONE = ContextVar("_ALONE", default=False)
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Marches keep to the thread that calls them, for work that is shared among threads already."""
+    """Context in which marches use the calling thread only, for work that is already parallel."""
     token = _ALONE.set(True)
     try:
         yield
@@ -221,7 +221,7 @@ def one_thread() -> Iterator[None]:
 
 
 def threads() -> int:
-    """How many threads share a march: the processors that this process may use, or one within [`one_thread`][]."""
+    """Number of threads of a march: the available processors, or one within [`one_thread`][]."""
     return 1 if _ALONE.get() else _processors()
 
 

@@ -1,4 +1,4 @@
-"""A linear system of given transitions under many forces, side by side in machine code."""
+"""Response of a linear system of given transitions to many forces, in machine code."""
 
 import functools
 
@@ -18,7 +18,7 @@ _NAME = "linear_response"
 _COUNTS = ("segments", "samples", "states", "outputs", "parts", "columns", "threads")
 _OPERANDS = ("transition", "readout", "lands", "sizes", "start")
 _RESULTS = ("read", "end")
-# Entries of the table of a call.
+# Indices in the table of a call.
 _PLACES = {name: i for i, name in enumerate((*_COUNTS, *_OPERANDS, *_RESULTS, "blocks", "next"))}
 
 
@@ -29,14 +29,14 @@ def linear_response(
     sizes: Float[np.ndarray, "segments samples parts columns"],
     start: Float[np.ndarray, "segments states columns"],
 ) -> tuple[Float[np.ndarray, "segments samples outputs columns"], Float[np.ndarray, "segments states columns"]]:
-    """Outputs at the samples, and the state in which each segment ends.
+    """Outputs at the samples, and the final state of each segment.
 
     Args:
         transition: of the state through each sample interval.
         readout: of the outputs from the state.
-        lands: what a unit of each part of a force adds to the state by the end of each interval.
-        sizes: how much of each part each force has there.
-        start: where each segment starts.
+        lands: change of the state at each interval's end by a unit of each part of a force.
+        sizes: coefficient of each part in each force.
+        start: initial state of each segment.
     """
     segments, samples, parts, columns = sizes.shape
     states = lands.shape[2]
@@ -81,7 +81,7 @@ def _address() -> int:
 
 
 def _segment(code: Code, call: ir.Value, segment: ir.Value) -> None:
-    """All forces along one segment, so many at a time."""
+    """All forces along one segment, in blocks."""
     b = code.builder
     samples, states, outputs, parts, columns = (code.load(call, _PLACES[name]) for name in _COUNTS[1:6])
     tables = (code.load(call, _PLACES[name]) for name in (*_OPERANDS, *_RESULTS))
@@ -89,7 +89,7 @@ def _segment(code: Code, call: ir.Value, segment: ir.Value) -> None:
     now, after, total = code.array(_MOST_STATES), code.array(_MOST_STATES), code.array(1)
 
     def entry(table: ir.Value, row: ir.Value, column: ir.Value, width: ir.Value) -> ir.Value:
-        """A place in a table of rows so wide."""
+        """Address of an entry in a table of rows of given width."""
         return code.place(table, code.plus(code.times(row, width), column))
 
     def lanes(place: ir.Value) -> ir.Value:
@@ -100,7 +100,7 @@ def _segment(code: Code, call: ir.Value, segment: ir.Value) -> None:
         code.store(code.add(code.load(total, 0), product), total, 0)
 
     def of_state(table: ir.Value, row: ir.Value) -> ir.Value:
-        """A row of a table times the state, added to what there is."""
+        """A row of a table times the state, added to a value."""
         with code.loop(states) as j:
             add(table, row, j, states, code.load(now, j))
         return code.load(total, 0)
@@ -108,7 +108,7 @@ def _segment(code: Code, call: ir.Value, segment: ir.Value) -> None:
     last = b.sub(columns, code.i(LANES))
     with code.loop(b.sdiv(code.plus(columns, LANES - 1), code.i(LANES))) as block:
         first = code.times(block, LANES)
-        # The last block takes some columns of the one before it once more.
+        # The last block overlaps the one before it.
         first = b.select(b.icmp_signed("<", first, last), first, last)
         with code.loop(states) as j:
             row = code.plus(code.times(segment, states), j)

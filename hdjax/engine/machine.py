@@ -1,4 +1,4 @@
-"""Machine code for this processor, from LLVM's language."""
+"""Compilation of LLVM code for this processor."""
 
 import functools
 import threading
@@ -13,10 +13,10 @@ _KEPT: list[Any] = []
 
 @functools.cache
 def target() -> Any:
-    """What this processor can do."""
+    """Target machine of this processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    # Vectors of 512 bits, where there are any, are twice as fast here as those that compilers prefer.
+    # Vectors of 512 bits, where available, are twice as fast here as those that compilers prefer.
     features = llvm.get_host_cpu_features().flatten() + ",-prefer-256-bit"
     triple = llvm.Target.from_default_triple()
     return triple.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=1, jit=True)
@@ -27,7 +27,7 @@ def compiled(module: ir.Module, *names: str) -> list[int]:
 
     Args:
         module: in LLVM's language.
-        names: functions in it.
+        names: of functions in it.
 
     Returns:
         The address of each function.
@@ -36,8 +36,8 @@ def compiled(module: ir.Module, *names: str) -> list[int]:
         machine = target()
         module.triple = llvm.get_process_triple()
         parsed = llvm.parse_assembly(str(module))
-        # No passes of optimisation: the graph has no expression twice, and all that they gain here is a few per cent
-        # of the run for most of the time that a compilation takes.
+        # No optimisation passes: the graph has no common subexpressions, and passes would save a few per cent of run
+        # time for most of the compilation time.
         engine = llvm.create_mcjit_compiler(parsed, machine)
         engine.finalize_object()
         _KEPT.append(engine)

@@ -1,7 +1,7 @@
-"""The march as machine code: samples, steps and stages around a model's equations, blocks of segments side by side.
+"""The march as machine code: samples, steps and stages of a model's equations, for blocks of segments.
 
 A step of an explicit Runge-Kutta method first computes its stages, and at each the derivatives of the rates by states
-and parameters. These are the same for all tangents, which then go through the stages one by one.
+and parameters. These are shared by all tangents, which are then propagated through the stages one by one.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,24 +23,24 @@ from hdjax.engine.sharing import block_of, share, worker
 
 OPERANDS = ("address", "free", "slopes", "constants", "states", "knots", "measured", "weight", "joined", "whitening")
 OPERANDS += ("settings",)
-"""What comes in, in order; behind it the signals: torque, those of `Equations.signals`, and derivatives of the torque
-by each of `Equations.acting`. `settings` are solver steps in a sample interval, whether the end of a segment is wanted,
-threads, and which of `kernel.Wanted` a march with derivatives gives. There may be more numbers in `free` and `slopes`
-than the model has parameters; their columns are zero."""
+"""Operands in order, followed by the signals: torque, those of `Equations.signals`, and derivatives of the torque by
+each of `Equations.acting`. `settings` are solver steps in a sample interval, whether to compute the end of a segment,
+threads, and which of `kernel.Wanted` a march with derivatives returns. `free` and `slopes` may have more numbers than
+the model has parameters; their columns are zero."""
 
 RESULTS: dict[Mode, tuple[str, ...]] = {
     "values": ("rows", "end"),
     "jacobian": ("rows", "end", "by_parameter", "by_state", "end_by_parameter", "end_by_state", "products"),
 }
-"""What goes out, in order; `by_parameter` and `by_state`, or in their place `products`: those of each segment's columns
-with each other, by parameters, states and last the residual itself."""
+"""Results in order; `by_parameter` and `by_state`, or instead `products` of each segment's columns: by parameters, by
+states, and the residual."""
 
 MARCH = "march"
 """The function's name in its module."""
 
 
 def tableau(solver: dfx.AbstractERK) -> tuple[list[list[float]], list[float], list[float]]:
-    """Weights within the stages, nodes, and weights of the result; without stages at the end that carry no weight."""
+    """Weights within the stages, nodes, and weights of the result; without final stages of weight zero."""
     table: Any = solver.tableau
     weights = [float(w) for w in np.asarray(table.b_sol)]
     nodes = [0.0, *(float(c) for c in np.asarray(table.c))]
@@ -67,7 +67,7 @@ class March:
         self.states, self.parameters = e.states, len(e.paths) if mode == "jacobian" else 0
         self.held, self.outputs, self.hidden = (len(p.values) for p in (e.held, e.outputs, e.prior))
         self.signals = 1 + len(e.signals) + (len(e.acting) if mode == "jacobian" else 0)
-        # The inputs of a part: states, signals, time, step, and what is held through a step.
+        # The inputs of a part: states, signals, time, step, and values computed once per step.
         self.at_signal = self.states
         self.at_time = self.at_signal + self.signals
         self.at_step, self.at_held = self.at_time + 1, self.at_time + 2
@@ -82,21 +82,21 @@ class March:
     # -- the equations -------------------------------------------------------------------------------------------
 
     def _wanted(self, part: Part) -> tuple[list[Node], list[Node]]:
-        """Values and their derivatives by states and by what is held; and those by parameters."""
+        """Values and their derivatives by states and by `held`; and those by parameters."""
         own, by_parameter = [*part.values], []
         for direction, node in (item for t in part.slopes for item in t.items() if self.mode == "jacobian"):
             (by_parameter if direction[0] == "parameter" else own).append(node)
         return own, by_parameter
 
     def _scalars(self) -> dict[Node, int]:
-        """What is computed once, as plain numbers."""
+        """Values that are computed once per simulation, as scalars."""
         e = self.equations
         parts = (e.rates, e.held, e.outputs, e.prior)
         return e.graph.steady(n for part in parts for nodes in self._wanted(part) for n in nodes)
 
     def _part(self, name: str, part: Part) -> Emitted:
-        """Two functions, for where all parameters are held those by them are not wanted; what both need the first one
-        passes on."""
+        """Two functions, since derivatives by parameters are not needed if all are fixed; the first passes common
+        values on."""
         graph = self.equations.graph
 
         def moving(nodes: Iterable[Node]) -> list[Node]:
@@ -115,14 +115,14 @@ class March:
     def _function(
         self, name: str, wanted: list[Node], passed: dict[Node, int], *, passes: bool
     ) -> tuple[ir.Function, dict[Node, int]]:
-        """A function of nodes, which passes others on or is passed them; and where its results are."""
+        """A function of nodes, with values passed to or from another one; and indices of its results."""
         graph = self.equations.graph
         kind = ir.VectorType(F64, LANES).as_pointer()
         arguments = [*[F64.as_pointer()] * 2, kind, kind, kind]
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), arguments), name)
         function.linkage = "internal"
         function.attributes.add("nounwind")
-        # Copies of it at each stage would multiply what there is to compile.
+        # Inlining at each stage would multiply the code to compile.
         function.attributes.add("noinline")
         for argument in function.args:
             argument.add_attribute("noalias")
@@ -198,7 +198,7 @@ class March:
         self._entry(prepare, worker(self.module, block, self.call))
 
     def _lane_by_lane(self, name: str, *, reads: bool) -> ir.Function:
-        """Read or write one number of each lane: `row[segment]` of rows so long, at an offset."""
+        """Read or write one number of each lane: `row[segment]` of rows of given length, at an offset."""
         vector = ir.VectorType(F64, LANES)
         arguments = [F64.as_pointer(), I64.as_pointer(), I64, I64] + ([] if reads else [vector])
         kind = ir.FunctionType(vector if reads else ir.VoidType(), arguments)

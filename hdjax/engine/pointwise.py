@@ -1,5 +1,5 @@
-"""Functions of an instant, evaluated at many instants by numpy: nothing is compiled, and a function is translated once
-for all models of the same structure."""
+"""Evaluation of a function at many instants by numpy: nothing is compiled, and a function is translated once for all
+models of the same structure."""
 
 import dataclasses
 import math
@@ -16,11 +16,11 @@ from hdjax.engine.derivatives import Tangent, derivatives
 from hdjax.engine.graph import PARAMETER, VARYING, Graph, Node
 from hdjax.engine.translate import traced, translated
 
-# Numbers that a node has at a time: its operands stay close to the processor.
+# Numbers per node and pass, so that operands stay in the cache.
 _AT_A_TIME = 1 << 14
 
 Instants = tuple[Any, int]
-"""A tree of arrays, and how many of each array's first axes are instants. These broadcast."""
+"""A tree of arrays, and the number of each array's first axes that are instants. These broadcast."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,9 +29,9 @@ class _Formula:
 
     Attributes:
         graph: of its nodes.
-        results: what puts arrays into the tree that the function returns.
+        results: structure of the returned tree.
         shapes: of these arrays.
-        values: their entries, one after the other.
+        values: their entries, concatenated.
         slopes: derivatives of each entry by the entries of the first argument.
     """
 
@@ -46,21 +46,21 @@ _FORMULAS: dict[Hashable, _Formula | None] = {}
 
 
 def at_instants(function: Callable[..., Any], *arguments: Instants) -> Any:
-    """What a function returns at each of many instants.
+    """Values of a function at many instants.
 
     Args:
-        function: of what its arguments are at one instant; the same object each time.
+        function: of its arguments at one instant; the same object each time.
         arguments: of the function.
 
     Returns:
-        Its tree; the axes of the instants come first.
+        The returned tree; the axes of the instants come first.
     """
     return _at_instants(function, arguments, slopes=False)
 
 
 def slopes_at_instants(function: Callable[..., Any], *arguments: Instants) -> Any:
-    """Derivatives of what a function returns at each of many instants by its first argument, an array of one axis.
-    They come last; all else as in [`at_instants`][]."""
+    """Derivatives of a function at many instants by its first argument, an array of one axis. These axes come last;
+    otherwise as in [`at_instants`][]."""
     return _at_instants(function, arguments, slopes=True)
 
 
@@ -88,11 +88,11 @@ def _at_instants(function: Callable[..., Any], arguments: Sequence[Instants], *,
 
 
 def likeness(tree: Any, axes: int) -> Hashable:
-    """What two trees have in common for which functions have the same graph.
+    """Key of trees for which functions have the same graph.
 
     Args:
-        tree: its numbers don't matter, except for whole numbers and truth values.
-        axes: how many of each array's first axes are instants.
+        tree: its numbers don't matter, except for integers and truth values.
+        axes: number of each array's first axes that are instants.
     """
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
@@ -161,7 +161,7 @@ def _pieces(lead: Sequence[int]) -> Iterator[slice]:
 
 
 def _by_jax(function: Callable[..., Any], arguments: Sequence[Instants], *, slopes: bool) -> Any:
-    """The same by a program of JAX, for functions that the graph has no words for."""
+    """The same by a JAX program, for functions that the graph does not support."""
     parts = [eqx.partition(tree, eqx.is_inexact_array) for tree, _ in arguments]
     axes = [many for _, many in arguments]
     leads = [np.shape(a)[:many] for (arrays, _), many in zip(parts, axes, strict=True) for a in jax.tree.leaves(arrays)]

@@ -1,4 +1,4 @@
-"""How a motion answers small forces: what each sample interval makes of a deviation, and of a force through it."""
+"""Linear response of a motion in each sample interval: to a deviation of the state, and to a force."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,7 +17,7 @@ from hdjax.engine.kernel import Lanes, Marched, Wanted, kernel, march_arrays, th
 
 
 class Pushed(Model):
-    """A model with a straight line in time added to its rates; its last state is the time since that began."""
+    """A model with a force that is linear in time added to its rates; its last state is the time since its start."""
 
     model: Model
     steady: tuple[Array, ...]
@@ -25,11 +25,11 @@ class Pushed(Model):
 
     @classmethod
     def of(cls, model: Model, steady: tuple[Array, ...], rising: tuple[Array, ...]) -> "Pushed":
-        """A model with rates of its states added: constant ones, and such that rise with time."""
-        # What a model must have are properties here, no fields.
+        """A model with added rates of its states: constant ones, and such that are proportional to time."""
+        # Fields of a model are properties here.
         return cls(model=model, steady=steady, rising=rising)  # pyright: ignore[reportCallIssue]
 
-    # All of its states, as far as anyone asks: no prior is wanted of any.
+    # All states count as motion states, so that none has a prior.
     @property
     def motion_states(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.state_names
@@ -52,7 +52,7 @@ class Pushed(Model):
 
     @property
     def forces(self) -> tuple[str, ...]:
-        """The paths of the line's numbers."""
+        """The paths of the force's numbers."""
         return tuple(f"{kind}.{i}" for kind in ("steady", "rising") for i in range(len(self.steady)))
 
     def _at(self, path: str) -> Any:
@@ -81,10 +81,11 @@ class Response(eqx.Module):
     """A simulated motion, and its linear response in every sample interval.
 
     Attributes:
-        states: at each knot, the end of the last interval included; no number where they are lost.
-        transition: what a deviation of the state at an interval's start is at its end.
-        from_start: what a force (a rate of the state) that falls from one to zero through the interval adds.
-        from_end: likewise of one that rises from zero to one.
+        states: at each knot, the end of the last interval included; NaN where the simulation diverges.
+        transition: derivative of the state at an interval's end by that at its start.
+        from_start: response at the end to a force (a rate of the state) that falls from one to zero through the
+            interval.
+        from_end: response to one that rises from zero to one.
     """
 
     states: Float[Array | np.ndarray, "*segments knots states"]
@@ -94,7 +95,7 @@ class Response(eqx.Module):
 
     @classmethod
     def of(cls, states: Any, transition: Any, steady: Any, rising: Any, width: Any) -> "Response":
-        """From what a steady force adds, and one that is the time since the interval's start."""
+        """From the responses to a constant force, and to one equal to the time since the interval's start."""
         from_end = rising / width[..., None, None]
         return cls(states, transition, steady - from_end, from_end)
 
@@ -108,18 +109,18 @@ def response(
     substeps: int,
     solver: dfx.AbstractERK,
 ) -> Response:
-    """Simulate segments and linearise every sample interval along the way.
+    """Simulate segments and linearise every sample interval.
 
     Args:
         model: the equations.
-        states: where each segment starts.
+        states: initial state of each segment.
         knots: of its sample intervals.
-        torque: coefficients of the torque that acts, or of the forcing.
-        beside: of what else comes in along time, by the names in `Kernel.signals`.
+        torque: coefficients of the torque after actuator effects, or of the forcing.
+        beside: coefficients of other inputs, by the names in `Kernel.signals`.
         substeps: solver steps in each interval.
         solver: explicit Runge-Kutta solver of diffrax.
     """
-    # What stands on llvmlite is loaded where it is there.
+    # Modules that need llvmlite are imported only if it is installed.
     from hdjax.engine.rows import LOST
 
     (segments, count), samples = states.shape, knots.shape[1] - 1

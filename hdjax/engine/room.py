@@ -1,4 +1,4 @@
-"""Where the function of a block keeps its numbers, and how it comes at them."""
+"""Memory layout and access of the function of a block."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hdjax.engine.march import March
 
 POWERS = 6
-"""Coefficients of a signal in an interval, at most."""
+"""Most coefficients of a signal in an interval."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Emitted:
 
     Attributes:
         function: in the module.
-        slots: where among the results each node is that moves.
-        passed: how many numbers it passes on to the function of the derivatives by parameters.
-        by_parameter: that function; None of itself.
+        slots: index of each variable node among the results.
+        passed: number of values passed to the function of the derivatives by parameters.
+        by_parameter: that function; None for that function itself.
     """
 
     function: ir.Function
@@ -38,12 +38,12 @@ class Emitted:
 
     @property
     def size(self) -> int:
-        """How many results there are."""
+        """Number of results."""
         return len(self.slots)
 
 
 class Room:
-    """What the instructions of a block work on: its place on the stack, and the arrays of the call."""
+    """Data of a block's instructions: its stack memory, and the arrays of the call."""
 
     def __init__(self, march: "March", code: Code, call: ir.Value, index: ir.Value):
         self.march, self.code, self.call, self.index = march, code, call, index
@@ -67,7 +67,7 @@ class Room:
         self.further_results = code.array(max(part.by_parameter.size if part.by_parameter else 0 for part in parts))
         self.moved = code.array(self.tangents * m.states)
         self.rates_by_parameter = m.equations.rates.rows_along("parameter") if self.jacobian else []
-        # What states do at once is nothing: all tangents go through the same instructions.
+        # Zero: all tangents use the same instructions.
         sizes = len(self.rates_by_parameter) * stages, m.held, m.outputs
         self.dense, self.held_dense, self.read_dense = (code.array(size * self.tangents) for size in sizes)
         self.scale = code.array(self.tangents)
@@ -83,7 +83,7 @@ class Room:
         self.knots = code.plus(code.plus(self.samples, self.got("first 0", I64)), 1)
 
     def got(self, name: str, kind: Any = F64) -> ir.Value:
-        """An entry of the call: an integer, or where numbers stand."""
+        """An entry of the call: an integer, or an address of numbers."""
         value = self.code.load(self.call, self.march.call[name])
         return value if kind is I64 else self.code.builder.inttoptr(value, kind.as_pointer())
 
@@ -96,7 +96,7 @@ class Room:
         c.builder.call(self.march.scatter, [base, self.segments, c.i(row), c.i(offset), value])
 
     def node(self, part: Emitted, node: Node, results: ir.Value, offset: ir.Value | int = 0) -> ir.Value:
-        """The value of a node: known, the same throughout, or among a part's results."""
+        """The value of a node: a constant, a per-simulation value, or among a part's results."""
         graph = self.march.equations.graph
         known = graph.known(node)
         if known is not None:
@@ -111,7 +111,7 @@ class Room:
             self.code.builder.call(part.function, arguments)
 
     def by_parameter(self, part: Emitted, slope: Tangent, parameter: int) -> ir.Value:
-        """The derivative of a row by a parameter, behind a call of [`run`][] for those of a part."""
+        """The derivative of a row by a parameter, after a call of [`run`][] for the part."""
         node = slope.get(("parameter", parameter))
         if node is None:
             return self.code.number(0.0)
@@ -119,16 +119,16 @@ class Room:
         return self.node(part.by_parameter, node, self.further_results)
 
     def wants(self, result: Wanted) -> ir.Value:
-        """Whether this is what the march is to give."""
+        """Whether the march is to compute this result."""
         return self.code.builder.icmp_signed("==", self.got("wanted", I64), self.code.i(get_args(Wanted).index(result)))
 
     def in_any(self, lanes: ir.Value) -> ir.Value:
-        """Whether something holds in any lane."""
+        """Whether a condition holds in any lane."""
         b = self.code.builder
         return b.icmp_unsigned("!=", b.bitcast(lanes, I8), ir.Constant(I8, 0))
 
     def first_moving(self) -> ir.Value:
-        """The first tangent that moves."""
+        """The first tangent that is not fixed."""
         return self.code.load(self.first, 0)
 
     def at_state(self) -> None:
@@ -153,7 +153,7 @@ class Room:
         return terms
 
     def fill(self, part: Emitted, slopes: Sequence[Tangent], rows: Sequence[int], dense: ir.Value) -> None:
-        """Put derivatives by parameters, where any of these moves, where a loop over them finds them."""
+        """Store derivatives by parameters, if any is free, in a dense array for loops over them."""
         c, m = self.code, self.march
         assert part.by_parameter is not None
         with c.builder.if_then(c.builder.icmp_signed("==", self.first_moving(), c.i(0))):
@@ -163,7 +163,7 @@ class Room:
                     c.store(self.by_parameter(part, slopes[row], p), dense, p * len(rows) + k)
 
     def finite(self, value: ir.Value, as_well: ir.Value) -> ir.Value:
-        """A derivative; zero where it is none."""
+        """A derivative; zero where it is not finite."""
         c = self.code
         fine = c.builder.and_(as_well, c.smaller(c.called("fabs", value), c.number(np.inf)))
         return c.builder.select(fine, value, c.number(0.0))

@@ -8,7 +8,7 @@ from hdjax.engine.emission import I64
 from hdjax.engine.room import Room
 
 LOST = 1e8
-"""A whitened error beyond this many standard deviations, or no number at all, is counted as this many."""
+"""Limit of whitened errors in standard deviations; also the value for NaN."""
 
 
 def record(room: Room, i: ir.Value) -> None:
@@ -37,7 +37,7 @@ def record(room: Room, i: ir.Value) -> None:
         room.put(room.got("rows"), room.rows, c.plus(c.times(i, m.outputs), p), values[p])
     if not room.jacobian:
         return
-    # What counts in no lane adds nothing to products.
+    # A sample that is invalid in all lanes adds nothing to products.
     useful = b.and_(room.in_any(counts), room.wants("products"))
     with b.if_then(b.or_(useful, room.wants("jacobian"))):
         _record_tangents(room, i, weight, counts, whitening, inside, values)
@@ -75,7 +75,7 @@ def _record_tangents(
 
 
 def _columns_of(room: Room, row: int) -> ir.Value:
-    """Where the derivatives of a row, and then its value, are collected."""
+    """Memory for the derivatives of a row, followed by its value."""
     return room.code.place(room.collected, row * (room.tangents + 1))
 
 
@@ -95,7 +95,7 @@ def _put_row(room: Room, row: ir.Value, columns: ir.Value, value: ir.Value) -> N
 
 
 def _write_row(room: Room, row: ir.Value, columns: ir.Value) -> None:
-    """Derivatives of a row; zero behind the last parameter."""
+    """Derivatives of a row; zero after the last parameter."""
     c, m = room.code, room.march
     width = room.got("width", I64)
     for first, last, count, result in (
@@ -113,7 +113,7 @@ def _write_row(room: Room, row: ir.Value, columns: ir.Value) -> None:
 
 
 def write_products(room: Room) -> None:
-    """The upper half of the products, mirrored; zero in the columns behind the last parameter."""
+    """The upper half of the products, mirrored; zero in the columns after the last parameter."""
     c, b = room.code, room.code.builder
     count = room.tangents + 1
     padding = b.sub(room.got("width", I64), c.i(room.march.parameters))
@@ -133,7 +133,7 @@ def write_products(room: Room) -> None:
 
 
 def write_prior(room: Room) -> None:
-    """Rows that say how far hidden states start from where they are expected; none where a segment is joined."""
+    """Rows of the hidden initial states' prior; none where a segment is joined."""
     c, b, m = room.code, room.code.builder, room.march
     if not m.hidden:
         return

@@ -1,4 +1,4 @@
-"""Blocks of lanes, shared among threads that the machine code makes itself."""
+"""Parallel processing of blocks of lanes, by threads that the machine code creates."""
 
 from collections.abc import Callable, Mapping
 
@@ -28,12 +28,12 @@ def block_of(module: ir.Module, write: Callable[[Code, ir.Value, ir.Value], None
 
 
 def worker(module: ir.Module, block: ir.Function, call: Mapping[str, int]) -> ir.Function:
-    """A function that takes one block after the other, as long as there are any.
+    """A function that processes blocks until none remain.
 
     Args:
         module: to which it is added.
-        block: what is done with one, see [`block_of`][].
-        call: places in the table of a call; at `next` and `blocks` it has the next block and how many there are.
+        block: function of one block, see [`block_of`][].
+        call: indices in the table of a call; `next` and `blocks` hold the next block and the number of blocks.
     """
     function = ir.Function(module, ir.FunctionType(POINTER, [POINTER]), "worker")
     function.linkage = "internal"
@@ -54,13 +54,13 @@ def worker(module: ir.Module, block: ir.Function, call: Mapping[str, int]) -> ir
 
 
 def share(code: Code, worker: ir.Function, call: ir.Value, blocks: ir.Value, wanted: ir.Value) -> None:
-    """Work in this thread, and in as many others as are wanted and of use.
+    """Process blocks in this thread, and in as many others as are wanted and useful.
 
     Args:
         code: instructions of a function's first block.
         worker: see [`worker`][].
         call: the table of the call.
-        blocks: how many there are.
+        blocks: their number.
         wanted: threads.
     """
     b = code.builder
@@ -81,7 +81,7 @@ def share(code: Code, worker: ir.Function, call: ir.Value, blocks: ir.Value, wan
     with code.loop(others):
         so_far = code.load(made, 0)
         failed = b.call(make, [code.place(threads, so_far), none, worker, work])
-        # A thread that could not be made is not missed: the others take its blocks.
+        # If a thread can't be created, the others process its blocks.
         well = b.zext(b.icmp_signed("==", failed, ir.Constant(failed.type, 0)), I64)
         code.store(code.plus(so_far, well), made, 0)
     b.call(worker, [work])

@@ -89,7 +89,7 @@ def _stage(room: Room, j: int, begin: ir.Value, late: ir.Value, old: list[ir.Val
 
 
 def _move_tangent(room: Room, t: ir.Value, step: ir.Value) -> None:
-    """Take one tangent through the stages of a step."""
+    """Propagate one tangent through the stages of a step."""
     c, m = room.code, room.march
     rates = m.equations.rates
     old = room.tangent(t)

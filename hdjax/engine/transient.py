@@ -1,7 +1,7 @@
-"""Transients of many drives side by side as machine code, without derivatives.
+"""Transients of many drives as vectorised machine code, without derivatives.
 
-A harmonic forcing is carried along by rotation: a lane's steps are all equal, so that its phase turns by the same angle
-from stage to stage.
+A harmonic forcing is advanced by rotation: a lane's steps are equal, so that its phase advances by the same angle from
+stage to stage.
 """
 
 import functools
@@ -32,7 +32,7 @@ def made(forced: Forced, solver: dfx.AbstractERK, *, peaks: bool) -> int:
     Args:
         forced: the drive under its forcing.
         solver: explicit Runge-Kutta solver of diffrax; its tableau is used.
-        peaks: whether the largest |x| of each window is wanted.
+        peaks: whether to compute the largest |x| of each window.
     """
     (address,) = compiled(_Transients(forced, solver, peaks=peaks).module, _NAME)
     return address
@@ -46,12 +46,12 @@ def run(
     Args:
         address: of the machine code.
         numbers: of each point.
-        windows: equal parts of each point's length, at whose ends the motion is observed.
+        windows: number of equal parts of each point's length, at whose ends the motion is returned.
         substeps: solver steps in a window.
         threads: that share the points.
 
     Returns:
-        Twist and its rate at the windows' ends, and the largest |x| in each window; zero where it is not wanted.
+        Twist and its rate at the windows' ends, and the largest |x| in each window; zero where it is not computed.
     """
     count = numbers.shape[1]
     filled = np.pad(numbers, ((0, 0), (0, -count % LANES)), mode="edge")
@@ -62,7 +62,7 @@ def run(
 
 
 class _Transients:
-    """The module: its functions and what its block is made of."""
+    """The module with its functions."""
 
     def __init__(self, forced: Forced, solver: dfx.AbstractERK, *, peaks: bool):
         self.forced, self.peaks = forced, peaks
@@ -93,7 +93,7 @@ class _Transients:
 
 
 class _Block:
-    """The function of a block: its room on the stack, and its instructions in order."""
+    """The function of a block: its stack memory and instructions."""
 
     def __init__(self, module: _Transients, code: Code, call: ir.Value, index: ir.Value):
         self.forced, self.module, self.code, self.call = module.forced, module, code, call
@@ -106,17 +106,17 @@ class _Block:
         self.room = code.array(len(self.kept))
         stages = len(module.nodes)
         self.state, self.ends = code.array(len(f.start)), code.array(6)
-        # Cosine and sine parts of the forcing, and of how far it turns from a step's start to its stages and its end.
+        # Cosine and sine of the forcing's phase, and of its advance from a step's start to its stages and end.
         self.phase, self.turns = code.array(2), code.array(2 * (stages + 1))
         self.peak = code.array(1)
 
     def _got(self, name: str, kind: ir.Type = I64) -> ir.Value:
-        """An entry of the call: an integer, or where numbers stand."""
+        """An entry of the call: an integer, or an address of numbers."""
         value = self.code.load(self.call, self.module.call[name])
         return value if kind is I64 else self.code.builder.inttoptr(value, kind.as_pointer())
 
     def _vector(self, base: str, row: ir.Value | int) -> ir.Value:
-        """Where the block's numbers of a row stand."""
+        """Address of the block's numbers of a row."""
         offset = self.code.plus(self.code.times(row, self._got("lanes")), self.first)
         place = self.code.place(self._got(base, F64), offset)
         return self.code.builder.bitcast(place, self.code.numbers.as_pointer())
@@ -128,7 +128,7 @@ class _Block:
         return [found[node] for node in wanted]
 
     def _constant(self, node: Node) -> ir.Value:
-        """A node that stays the same throughout a lane."""
+        """A node that is constant in a lane."""
         return restored(self.code, self.forced.graph, node, self.code.load(self.room, self.kept[node]))
 
     def _prepare(self) -> None:
@@ -171,7 +171,7 @@ class _Block:
     # -- the forcing -------------------------------------------------------------------------------------------
 
     def _begin_window(self, begin: ir.Value) -> None:
-        """Where the forcing's phase is worked out anew, so that rounding errors don't add up."""
+        """Recompute the forcing's phase, so that rounding errors don't accumulate."""
         c, f = self.code, self.forced
         if f.wave:
             amplitude, omega, phase, _ = self._emit(f.wave, {})
@@ -184,7 +184,7 @@ class _Block:
                 c.store(value, self.ends, i)
 
     def _torque(self, time: ir.Value, stage: int | None = None) -> ir.Value:
-        """The forcing at a stage of the step that begins, or now."""
+        """The forcing at a stage of the next step, or at its start."""
         c, f = self.code, self.forced
         if not f.wave:
             return self._emit([f.torque], {self.leaf("time"): time})[0]
@@ -195,7 +195,7 @@ class _Block:
         return c.add(cosine, self._emit(f.wave[3:], {})[0])
 
     def _turn(self) -> None:
-        """Carry the forcing to the step's end."""
+        """Advance the forcing to the step's end."""
         c, last = self.code, len(self.module.nodes)
         cosine, sine = (c.load(self.phase, k) for k in range(2))
         a, b = (c.load(self.turns, 2 * last + k) for k in range(2))
@@ -212,7 +212,7 @@ class _Block:
         return [self.code.load(self.state, i) for i in range(len(self.forced.start))]
 
     def _seen(self, time: ir.Value) -> list[ir.Value]:
-        """What is seen now."""
+        """The measured quantities at the present state."""
         return self._emit(self.forced.seen, self._at(self._state(), self._torque(time), time))
 
     def _advance(self, time: ir.Value) -> None:
@@ -252,6 +252,6 @@ class _Block:
         for i, value in enumerate(after):
             c.store(value, self.ends, i)
         peak = c.load(self.peak, 0)
-        # A motion that is no number any more stays so.
+        # A motion that has become NaN stays NaN.
         grows = c.builder.fcmp_unordered(">", largest, peak)
         c.store(c.builder.select(grows, largest, peak), self.peak, 0)

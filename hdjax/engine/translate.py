@@ -1,4 +1,5 @@
-"""From JAX's intermediate language to a graph of scalars: arrays are small, and each entry is a node of its own."""
+"""Translation of JAX's intermediate language to a graph of scalars; each entry of the (small) arrays is a separate
+node."""
 
 import functools
 import math
@@ -20,7 +21,7 @@ _LONGEST_LOOP = 64
 
 
 def traced(function: Callable[..., Any], *examples: Any) -> ClosedJaxpr:
-    """The function in JAX's language, at arguments like the examples."""
+    """The function in JAX's intermediate language, for arguments like the examples."""
     return jax.make_jaxpr(function)(*examples)
 
 
@@ -30,16 +31,16 @@ def translated(
     """Add a program to a graph.
 
     Args:
-        graph: takes up its nodes.
-        program: in JAX's language.
+        graph: receives its nodes.
+        program: in JAX's intermediate language.
         arguments: nodes for each of its inputs.
-        values_only: leave out the derivatives that functions in it bring along.
+        values_only: omit custom derivatives of functions.
 
     Returns:
         Nodes of each of its outputs.
 
     Raises:
-        UntranslatableError: for a primitive that is not known here, by its name.
+        UntranslatableError: names an unsupported primitive.
     """
     own = [constants(graph, c) for c in program.consts]
     return _run(graph, program.jaxpr, own, arguments, values_only)
@@ -80,7 +81,7 @@ def _translate(graph: Graph, equation: Any, arguments: list[Nodes], values_only:
 def _with_own_derivative(
     graph: Graph, parameters: dict[str, Any], arguments: list[Nodes], values_only: bool
 ) -> list[Nodes]:
-    """A function that brings its own rule of differentiation."""
+    """A function with a custom rule of differentiation."""
     values = translated(graph, parameters["call_jaxpr"], arguments, values_only=values_only)
     if values_only:
         return values
@@ -89,7 +90,7 @@ def _with_own_derivative(
     if not moving:
         return values
     rule, constants, zeros = parameters["jvp_jaxpr_fun"].call_wrapped(*(False for _ in arguments))
-    # The rule is linear in the tangents: of what it makes of them the derivatives by each are the partial ones.
+    # The rule is linear in the tangents: its derivatives by them are the partial derivatives.
     tangents = [np.full(a.shape, graph.constant(0.0), dtype=object) for a in arguments]
     seeds: dict[Node, Tangent] = {}
     for k, index in moving:
@@ -136,7 +137,7 @@ def _operation(name: str) -> Callable[..., Node]:
 
 
 def _by_jax(function: Callable[..., Any]) -> Callable[..., Node]:
-    """A function of scalars made of such as are known here."""
+    """A function of scalars composed of supported ones."""
 
     @functools.cache
     def program(count: int) -> ClosedJaxpr:
@@ -204,7 +205,7 @@ _ELEMENTWISE: dict[str, Callable[..., Node]] = {
     **{name: _operation(name) for name in ("add", "sub", "mul", "neg", "max", "min", "abs", "sign", "sqrt")},
     **{name: _operation(name) for name in ("floor", "ceil", "exp", "expm1", "log", "tanh", "is_finite")},
     **{name: _operation(name) for name in ("eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor")},
-    # Total orders: what asks for them has put away what is no number.
+    # Total orders: callers have removed NaN.
     "lt_to": _operation("lt"),
     "le_to": _operation("le"),
     "add_any": _operation("add"),
@@ -244,7 +245,7 @@ _ELEMENTWISE: dict[str, Callable[..., Node]] = {
 def _round(graph: Graph, equation: Any, a: Node) -> Node:
     if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
         return graph.apply("round", a)
-    # Halves away from zero. (The sum of a half and the number just below it is one.)
+    # Halves are rounded away from zero. (A half plus the number just below it gives one.)
     size = graph.apply("abs", a)
     down = graph.apply("floor", size)
     far = graph.apply("ge", graph.apply("sub", size, down), graph.constant(0.5))

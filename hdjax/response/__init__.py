@@ -1,6 +1,6 @@
 """The response to harmonic forcing: analytic, by harmonic balance, and in the time domain.
 
-Pictures are in `hdjax.response.plots`, which loads matplotlib.
+Plots are in `hdjax.response.plots`, which imports matplotlib.
 """
 
 from hdjax.response.amplitudes import AmplitudeCheck, AmplitudeRow, ErrorMap, check_amplitudes, error_map, settled

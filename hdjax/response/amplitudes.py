@@ -36,7 +36,7 @@ KINDS: dict[Kind, Callable[[Drive | ReducedDrive, ArrayLike], Resonance]] = {
     "sub-harmonic": SubharmonicResonance,
 }
 GOOD = (0.01, 0.05, 0.10)
-"""Relative errors that a verdict tells apart."""
+"""Relative errors that separate the verdicts."""
 
 _NEAR = 0.3
 _AGREEMENT = 1e-6
@@ -81,7 +81,7 @@ class AmplitudeRow:
 
     @property
     def verdict(self) -> str:
-        """What the check says of the analytic amplitude."""
+        """Verdict on the analytic amplitude."""
         if self.error is None or self.agreement is None:
             return "fails: no motion near it"
         if self.agreement > _AGREEMENT:
@@ -137,7 +137,7 @@ def check_amplitudes(
     """
     mu, omega_0, alpha = (float(v) for v in (drive.mu, drive.omega_0, drive.alpha))
     kind = resonance_kind(omega_0, omega)
-    # Off resonance the super-harmonic's expansion holds too: its third harmonic is then merely not resonant.
+    # Off resonance the super-harmonic's expansion is valid as well, with a third harmonic that is not resonant.
     resonance = KINDS.get(kind, SuperharmonicResonance)
     at = resonance(drive, A)
     first, second = _expansions(at, as_scalar(omega))
@@ -171,14 +171,14 @@ def _expansions(resonance: Resonance, omega: Array) -> tuple[SteadyStates, Stead
 
 
 def settled(branch: Branch, *, motions: int = 24, off: float = 0.01, transient_periods: int = 1000) -> PoincareSection:
-    """Time integration from beside stable motions of a branch: where the branch is right, they settle back onto it.
+    """Time integration from near stable motions of a branch, which return to it if the branch is right.
 
-    A motion that is still on its way to another one after the transient is left out.
+    A motion that has not settled after the transient is omitted.
 
     Args:
         branch: a frequency response of a reduced drive, for which it computes the stability.
-        motions: how many to integrate, evenly along its stable part.
-        off: where to start, relative to the motion.
+        motions: number to integrate, evenly along its stable part.
+        off: initial deviation, relative to the motion.
         transient_periods: forcing periods before the motion is measured.
     """
     stable = np.flatnonzero(np.asarray(branch.valid & branch.stable))
@@ -205,7 +205,7 @@ def settled(branch: Branch, *, motions: int = 24, off: float = 0.01, transient_p
 
 
 class ErrorMap(eqx.Module):
-    """Where multiple scales holds: its relative error in the largest |x|, against harmonic balance.
+    """Relative error of multiple scales in the largest |x|, against harmonic balance.
 
     Attributes:
         sigma: detuning over omega_0.

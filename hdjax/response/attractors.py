@@ -1,4 +1,4 @@
-"""Coexisting periodic motions of a forced drive, and the basins of starts that settle to each."""
+"""Coexisting periodic motions of a forced drive, and their basins of attraction."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from hdjax.fourier import FourierSeries
 from hdjax.response.poincare import PoincareSection, period_of, poincare_section
 
 ESCAPED, UNSETTLED = -1, -2
-"""Labels of starts that reach no periodic motion: beyond all numbers, and chaotic or not settled."""
+"""Labels of initial states without a periodic motion: diverged, and chaotic or not settled."""
 
 
 class Attractor(eqx.Module):
@@ -45,7 +45,7 @@ class Basins(eqx.Module):
 
     @property
     def escaped(self) -> float:
-        """Share of the starts that grow beyond all numbers."""
+        """Share of the starts that diverge."""
         return float(np.mean(self.labels == ESCAPED))
 
     @property
@@ -68,11 +68,11 @@ def attractors(
 ) -> Basins:
     """The coexisting attractors that a grid of starts settles to, and their basins.
 
-    Starts that reach the same sub-harmonic in another phase belong to one attractor. Chaotic attractors are not told
-    apart: their starts are labelled `UNSETTLED`.
+    Starts that reach the same sub-harmonic in another phase belong to one attractor. Chaotic attractors are not
+    distinguished: their starts are labelled `UNSETTLED`.
 
     Args:
-        model: a reduced model; own states of its effects start at rest.
+        model: a reduced model; hidden states start at rest.
         forcing: the reduced drive's forcing.
         x_range: twists of the starts [rad], from and to.
         v_range: rates of the starts [rad/s], from and to.
@@ -101,7 +101,7 @@ def attractors(
 def _grouped(
     section: PoincareSection, periods: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, tuple[Attractor, ...]]:
-    """Label lanes whose motions pass through the same points; each group's first lane stands for it."""
+    """Group lanes whose motions pass through the same points; each group is labelled by its first lane."""
     points = np.asarray(section.lengths)
     amplitudes = np.asarray(section.amplitude)
     labels = np.where(np.asarray(section.escaped), ESCAPED, UNSETTLED)

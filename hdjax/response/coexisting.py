@@ -1,4 +1,4 @@
-"""The response over a range of frequencies from both of its ends: where a fold lies beyond the range, they differ."""
+"""The response over a frequency range, followed from both ends; the branches differ if a fold is beyond the range."""
 
 from typing import Any
 
@@ -17,11 +17,11 @@ _SAME = 1e-6
 def from_both_ends(
     model: Model, forcing: FourierSeries | None, slow: ArrayLike, fast: ArrayLike, **options: Any
 ) -> tuple[Branch, ...]:
-    """The branch that starts at the slow end of a range, and the one from the fast end where that is another one.
+    """The branch from the slow end of a range, and the one from the fast end if it differs.
 
-    A hardening drive's branch may leave the range at large amplitude; what a drive does that comes from faster speeds
-    is then on the second branch. A softening drive's may turn back before the fast end. Rows are valid up to where a
-    branch leaves the range.
+    A hardening drive's branch may leave the range at large amplitude; motions reached from higher speeds are then on
+    the second branch. A softening drive's may turn back before the fast end. Rows are valid up to where a branch leaves
+    the range.
 
     Args:
         model: see [`hdjax.response.frequency_response`][], as for the other arguments.

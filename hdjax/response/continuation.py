@@ -1,7 +1,7 @@
 """Branches of steady motions through folds: pseudo-arclength continuation of harmonic balance.
 
-The predictor-corrector is JaxCont's (Keller 1977); it follows the branch in a few steps. What it found is then
-interpolated and every point asked for is corrected at once, as lanes of one program.
+The predictor-corrector is JaxCont's (Keller 1977); it follows the branch in a few steps. Its points are interpolated,
+and all requested points are corrected in parallel by one program.
 """
 
 import equinox as eqx
@@ -28,17 +28,17 @@ _ITERATIONS = 8
 
 
 class Branch(eqx.Module):
-    """Steady motions along a branch, by rows; where it turns back in the parameter there is a fold.
+    """Steady motions along a branch, by rows; folds are where the parameter reverses.
 
     Attributes:
-        system: what was solved.
+        system: of harmonic balance.
         parameter: `"omega"`, `"amplitude"` or a parameter's dotted path.
-        scale: of the parameter in the scaled problem that is followed.
+        scale: of the parameter in the scaled problem.
         value: the parameter's value.
         omega: the forcing frequency [rad/s].
         unknowns: the system's unknowns.
         tangents: unit direction of the branch in (unknowns, scaled parameter); the last entry changes sign at a fold.
-        valid: which rows are motions; the others lie behind the end of the branch, or were not solved.
+        valid: which rows are motions; the others are beyond the end of the branch, or not converged.
         complete: whether the branch reached the end of the parameter's range or closed upon itself.
     """
 
@@ -105,7 +105,7 @@ def frequency_response(
         omega_start: forcing frequency to start from [rad/s]; away from a resonance the start needs no guess.
         omega_end: where to stop [rad/s].
         load_torque: torque on the load.
-        points: motions to return, even along the branch's length, so that a peak gets its share.
+        points: number of motions to return, evenly along the branch's length, so that peaks are resolved.
         harmonics: highest multiple of the fundamental to keep.
         samples: points of one period.
         subharmonic: look for motions of this many forcing periods; needs a guess.
@@ -164,7 +164,7 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
     def residual(u: Array, p: Array) -> Array:
         return branch.residual(u, p, omega)
 
-    # The search itself is not differentiated; the correction of what it found is.
+    # Only the correction of its points is differentiated, not the search.
     still, still_omega = lax.stop_gradient((branch, omega))
 
     first = start if parameter == "omega" else omega
@@ -186,15 +186,15 @@ def _follow(system, parameter, start, end, omega, guess, points, steps) -> Branc
         corrected[:, :-1],
         tangents,
         found.converged[0] & (left < _SOLVED),
-        # A step that jumped to another branch leaves points between that no correction solves.
+        # A step that jumped to another branch leaves points between that can't be corrected.
         found.converged[0] & complete & jnp.all(left < _SOLVED),
     )
 
 
 def _end(found, p_0: Array, p_1: Array, step: Array, *, positive: bool) -> tuple[Array, Array]:
-    """How many points of a continuation are the branch, and whether it came to its end or back to its start.
+    """Number of points of a continuation on the branch, and whether it reached its end or its start.
 
-    A positive parameter, the frequency, must not pass zero: behind it the same motions come back mirrored.
+    A positive parameter, the frequency, must not pass zero, beyond which motions repeat mirrored.
     """
     index = jnp.arange(found.params.size)
     used = index < found.n_valid
@@ -233,12 +233,12 @@ def _interpolated(path: Array, tangents: Array, count: Array, p_1: Array, points
 
 
 def _correct(residual, point: Array, tangent: Array) -> tuple[Array, Array, Array]:
-    """Newton steps at right angles to the branch: the point, the branch's direction there, what is left over."""
+    """Newton steps at right angles to the branch: the point, the branch's direction there, and the residual."""
 
     def left_over(point: Array) -> Array:
         return residual(point[:-1], point[-1])
 
-    # Loops, not written out: the residual is most of the program.
+    # Loops: unrolling would multiply the residual's code, which dominates the program.
     def corrected(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         point, tangent = carry
         factors = lu_factor(jnp.concatenate([jax.jacfwd(left_over)(point), tangent[None]]))
@@ -281,7 +281,8 @@ def _floquet_steps(branch: Branch) -> int:
 
 def continued(residual, u_0: Array, p_0: Array, p_1: Array, steps: int):
     """JaxCont's pseudo-arclength continuation, with steps that suit unknowns and a parameter of order one."""
-    # Loaded here: JaxCont loads matplotlib, which takes as long as JAX. Its constants must not belong to this program.
+    # Imported here: JaxCont imports matplotlib, which takes as long as JAX. Its constants must not belong to this
+    # program.
     with jax.ensure_compile_time_eval():
         from jaxcont.core.scan_continuation import pseudo_arclength_scan
 

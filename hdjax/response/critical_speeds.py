@@ -1,4 +1,4 @@
-"""Which motor speeds to avoid: where the kinematic error's cycles meet the drive's natural frequency.
+"""Motor speeds to avoid, at which the kinematic error excites the drive's natural frequency.
 
 The wave generator has two lobes, so that vendors count two error cycles per input revolution (Harmonic Drive, CSG/CSF
 catalogue): the first speed to avoid is half the natural frequency.
@@ -42,7 +42,7 @@ class SpeedBand:
         start: motor rate [rad/s].
         end: motor rate [rad/s].
         speed_at_peak: where the error is largest [rad/s].
-        amplitude: its largest swing about the mean there [rad].
+        amplitude: its largest deviation from the mean there [rad].
         order: the harmonic of the motor revolution that is largest there.
     """
 
@@ -57,7 +57,7 @@ def critical_speeds(drive: Drive, orders: Sequence[int] = ORDERS) -> list[Critic
     """Speeds at which error cycles meet the natural frequency, its third or its triple, rising.
 
     Args:
-        drive: with the motor free to swing; a motor that a servo holds stiffly has `sqrt(K/J_l)` in omega_0's place.
+        drive: with a free motor; for a motor under a stiff servo use `sqrt(K/J_l)` instead of omega_0.
         orders: error cycles per motor revolution.
     """
     omega_0 = float(drive.omega_0)
@@ -76,10 +76,10 @@ def swing(branch: Branch) -> Float[Array, " points"]:
 
 
 def can_persist(branch: Branch) -> Bool[Array, " points"]:
-    """Which motions of a branch a drive stays in, by row.
+    """Which motions of a branch can persist, by row.
 
-    Of a motor under a periodic forcing the stable ones. Where the motor rotates, all but those on the way back between
-    two folds: past the resonance a free motor at constant torque can't hold its speed (Sommerfeld), but a servo can.
+    Under a periodic forcing the stable ones. With a rotating motor, all except those between two folds: past the
+    resonance a free motor at constant torque can't hold its speed (Sommerfeld), but a servo can.
     """
     if branch.system.rotating:
         return branch.valid & (branch.tangents[:, -1] * branch.tangents[0, -1] > 0.0)
@@ -87,13 +87,13 @@ def can_persist(branch: Branch) -> Bool[Array, " points"]:
 
 
 def speeds_to_avoid(*branches: Branch, limit: float) -> list[SpeedBand]:
-    """Bands of speed in which a steady motion that can persist swings beyond a limit.
+    """Bands of speed in which a steady motion that can persist exceeds a limit.
 
     Args:
         *branches: `frequency_response(model, None, slow, fast, rotating=True)` of a drive with kinematic error, or
             those of [`hdjax.response.from_both_ends`][]; or of any periodic forcing, where speed stands for its
             frequency.
-        limit: of the dynamic error's swing about its mean [rad].
+        limit: of the dynamic error's deviation from its mean [rad].
     """
     return _merged([band for branch in branches for band in _bands(branch, limit)])
 
@@ -105,7 +105,7 @@ def _bands(branch: Branch, limit: float) -> list[SpeedBand]:
     beyond = np.flatnonzero(lasting & (size > limit))
 
     def crossing(inside: int, outside: int) -> float:
-        """Speed at which the limit is crossed between neighbouring rows, where there is such a row."""
+        """Speed at which the limit is crossed between neighbouring rows, if any."""
         if not 0 <= outside < size.size or not lasting[outside]:
             return float(speed[inside])
         return float(np.interp(limit, size[[outside, inside]], speed[[outside, inside]]))
@@ -129,7 +129,7 @@ def _bands(branch: Branch, limit: float) -> list[SpeedBand]:
 
 
 def _merged(found: list[SpeedBand]) -> list[SpeedBand]:
-    """Bands that overlap as one: several motions coexist at a speed."""
+    """Overlapping bands, merged: several motions coexist at a speed."""
     bands: list[SpeedBand] = []
     for band in sorted(found, key=lambda b: b.start):
         if bands and band.start <= bands[-1].end:

@@ -1,7 +1,7 @@
-"""One steady motion of `x'' + mu x' + omega_0^2 (x + alpha x^3) = A cos(omega t)` by two routes that share nothing:
-harmonic balance in numpy, and Newton's method on scipy's time integration. Nothing is compiled.
+"""One steady motion of `x'' + mu x' + omega_0^2 (x + alpha x^3) = A cos(omega t)` by two independent methods: harmonic
+balance in numpy, and Newton's method on scipy's time integration. Nothing is compiled.
 
-What [`hdjax.response.harmonic_balance`][] and [`hdjax.response.shooting`][] do for any model, lanes and gradients.
+[`hdjax.response.harmonic_balance`][] and [`hdjax.response.shooting`][] do this for any model, with lanes and gradients.
 """
 
 import math
@@ -20,11 +20,11 @@ _STEPS = 64
 _SHOTS = 30
 _RTOL = 1e-12
 _ATOL = 1e-15
-"""Of the motion's size."""
+"""Tolerance, relative to the motion's size."""
 
 
 class ForcedCubic(NamedTuple):
-    """The equation's numbers, and after how many periods of the forcing its motion repeats."""
+    """Parameters of the equation, and number of forcing periods after which its motion repeats."""
 
     mu: float
     omega_0: float
@@ -39,7 +39,7 @@ class Closed(NamedTuple):
 
     Attributes:
         motion: over the periods after which it repeats.
-        converged: whether it repeats indeed.
+        converged: whether it is periodic.
         stable: whether its Floquet multipliers lie inside the unit circle.
     """
 

@@ -17,7 +17,7 @@ _TABLEAU = dfx.Dopri8.tableau
 def monodromy(
     system: BalancedMotion, unknowns: Float[Array, " unknowns"], omega: Array, *, steps: int = 64
 ) -> Float[Array, "states states"]:
-    """How a small deviation from a steady motion has grown after one period of the motion.
+    """Monodromy matrix: growth of a small deviation from a steady motion over one period of the motion.
 
     The variational equation is integrated with the coefficients of diffrax's eighth-order Dormand-Prince method, whose
     stages fall at the same phases for every motion, so that many motions are lanes of one program.
@@ -26,7 +26,7 @@ def monodromy(
         system: from [`hdjax.response.balance`][].
         unknowns: a solution of it.
         omega: forcing frequency [rad/s].
-        steps: of a period; at least a dozen for each natural oscillation within it, or the answer is wrong.
+        steps: of a period; at least a dozen for each natural oscillation within it.
     """
     nodes = np.concatenate([[0.0], np.asarray(_TABLEAU.c)])
     phases = (np.arange(steps)[:, None] + nodes) / steps * (2 * np.pi)
@@ -61,11 +61,11 @@ def multipliers(
         system: from [`hdjax.response.balance`][].
         unknowns: a solution of it.
         omega: forcing frequency [rad/s].
-        steps: of a period; at least a dozen for each natural oscillation within it, or the answer is wrong.
+        steps: of a period; at least a dozen for each natural oscillation within it.
     """
     matrix = monodromy(system, unknowns, omega, steps=steps)
     if matrix.shape[0] == 2:
-        # In closed form: a general eigenvalue solver costs more than all the rest.
+        # In closed form: a general eigenvalue solver would dominate the cost.
         half, determinant = 0.5 * jnp.trace(matrix), jnp.linalg.det(matrix)
         root = jnp.sqrt(jnp.astype(half**2 - determinant, complex))
         half = jnp.astype(half, complex)

@@ -1,4 +1,4 @@
-"""Folds of a branch of steady motions, where the response jumps: where they are, and how they move with a parameter."""
+"""Folds of a branch of steady motions, where the response jumps, and their dependence on a parameter."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ class Folds(eqx.Module):
     Attributes:
         value: the branch's parameter at each fold.
         unknowns: the system's unknowns there.
-        null_vector: the direction in which the motion can change while the parameter stands still.
+        null_vector: the direction in which the motion can change at a constant parameter.
         exists: which entries are folds.
     """
 
@@ -47,7 +47,7 @@ def folds(branch: Branch, *, at_most: int = 4) -> Folds:
     n = branch.unknowns.shape[1]
 
     def locate(i: Array) -> tuple[Array, Array]:
-        # Where the branch turns back, its direction is the null vector.
+        # At a fold, the direction of the branch is the null vector.
         guess = jnp.concatenate([branch.unknowns[i], branch.value[i, None] / branch.scale, branch.tangents[i, :-1]])
 
         def residual(y: Array, given: tuple[BalancedMotion, Array]) -> Array:

@@ -29,9 +29,8 @@ class SteadyState(eqx.Module):
 
     Attributes:
         motion: the coordinates as one series: the dynamic error x, and for two inertias theta_l beside it [rad].
-        mean_torque: what the motor adds to hold its mean speed [N m]; zero for a reduced drive.
-        defect: size of what the equations leave over above the highest harmonic kept, relative to the forces: how
-            much the truncation leaves out.
+        mean_torque: of the motor, to hold its mean speed [N m]; zero for a reduced drive.
+        defect: truncation error: residual of the equations above the highest harmonic, relative to the forces.
         converged: whether the algebraic system was solved. Where not, the motion is zero.
     """
 
@@ -51,8 +50,8 @@ class BalancedMotion(eqx.Module):
     """The algebraic system of harmonic balance for one model and forcing: `residual(unknowns, omega) = 0`.
 
     The unknowns are Fourier coefficients in units of `length`, each coordinate's as (mean, cosines, sines). For two
-    inertias the coordinates are x and theta_l; the rigid rotation leaves the mean of theta_l free, so that it is
-    zero, and its place is taken by the mean motor torque (in units of `length * K / N`) that keeps the mean speed.
+    inertias the coordinates are x and theta_l; the rigid rotation leaves the mean of theta_l free, so that it is zero
+    and replaced by the mean motor torque (in units of `length * K / N`) that keeps the mean speed.
 
     Attributes:
         model: the equations.
@@ -91,7 +90,7 @@ class BalancedMotion(eqx.Module):
         return eqx.tree_at(lambda s: s.model, self, self.model.replace({path: value}))
 
     def residual(self, unknowns: Float[Array, " unknowns"], omega: Array) -> Float[Array, " unknowns"]:
-        """What the equations of motion leave over, by harmonic, in units of `length * omega_0^2`."""
+        """Residual of the equations of motion, by harmonic, in units of `length * omega_0^2`."""
         return self._left_over(unknowns, omega)[..., : 2 * self.harmonics + 1].reshape(-1)
 
     def defect(self, unknowns: Float[Array, " unknowns"], omega: Array) -> Float[Array, ""]:
@@ -168,7 +167,7 @@ class BalancedMotion(eqx.Module):
         return jnp.linalg.solve(jacobian, -self.residual(zero, omega))
 
     def steady_state(self, unknowns: Float[Array, " unknowns"], omega: Array, converged: Array) -> SteadyState:
-        """The motion that the unknowns mean."""
+        """The motion of the unknowns."""
         coefficients, mean_torque = self._coefficients(unknowns)
         H = self.harmonics
         motion = FourierSeries(
@@ -177,7 +176,7 @@ class BalancedMotion(eqx.Module):
         return SteadyState(motion, mean_torque, self.defect(unknowns, omega), converged)
 
     def unknowns(self, motion: FourierSeries) -> Float[Array, " unknowns"]:
-        """The unknowns that mean a given dynamic error (of a reduced drive)."""
+        """The unknowns of a given dynamic error (of a reduced drive)."""
         if self.coordinates != 1:
             raise ValueError("`motion` can be given for a ReducedModel only")
         series = motion.padded(self.harmonics)
@@ -197,7 +196,7 @@ def balance(
     """Set up harmonic balance for a model and a periodic forcing.
 
     Args:
-        model: the equations; effects must have no states of their own and must not act on a logged torque.
+        model: the equations; effects must have no hidden states and must not act on a logged torque.
         forcing: motor torque [N m] or a reduced drive's forcing; none where not given. For two inertias its mean is
             not used: the mean torque is what keeps the mean speed.
         load_torque: torque on the load along +theta_l [N m], with the same fundamental.
@@ -207,7 +206,7 @@ def balance(
         rotating: the motor turns at the forcing frequency (two inertias only).
 
     Raises:
-        ValueError: where the model has effects that harmonic balance can't carry.
+        ValueError: the model has effects that harmonic balance does not support.
     """
     for effect in model.effects:
         if effect.states or isinstance(effect, ActuatorEffect):
@@ -256,7 +255,7 @@ def solve(
         system: from [`balance`][].
         omega: forcing frequency [rad/s].
         guess: a dynamic error to start from (reduced drives); the linearised response where not given.
-        max_steps: where to give up.
+        max_steps: largest number of steps.
     """
     return _solve(system, as_scalar(omega), guess, max_steps)
 
@@ -283,7 +282,7 @@ def find_root(
         left = jnp.max(jnp.abs(system.residual(unknowns, omega)))
         return unknowns, jnp.where(jnp.isfinite(left), left, jnp.inf)
 
-    # Near a resonance the linearised motion is far too large: smaller ones are starts too.
+    # Near a resonance the linearised motion is far too large: smaller starts are tried as well.
     scales = jnp.asarray(_START_SCALES if guess is None else [1.0])
     roots, left = jax.vmap(root)(scales[:, None] * start[None, :])
     solved = left < _SOLVED * (1.0 + jnp.max(jnp.abs(roots), axis=1))

@@ -51,7 +51,7 @@ def critical_energy(drive: Drive | ReducedDrive) -> Float[Array, ""]:
 
 
 def in_basin_estimate(drive: Drive | ReducedDrive, x: Float[Array, "*n"], v: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-    """Whether V shows that the unforced motion from (x, v) comes to rest at the origin; needs mu > 0.
+    """Whether V proves that the unforced motion from (x, v) tends to the origin; needs mu > 0.
 
     True everywhere for alpha >= 0. For alpha < 0 true inside `|x| < 1/sqrt(-alpha), V < V_c`; a motion outside may
     come to rest as well.

@@ -1,9 +1,9 @@
 """A forced motion in a fixed number of classical Runge-Kutta steps for each forcing period.
 
-So every start is one lane of one program. An oscillation that takes s steps for a turn loses `(2 pi)^5 / (120 s^4)` rad
-of phase in it: 5e-6 rad at 64 steps, which is the default for the fastest of natural frequency and forcing harmonics. A
-motion whose amplitude makes it faster than that needs more. A motion that grows beyond all numbers has `escaped`; it
-keeps its last finite state. For alpha > 0, which bounds every motion, an escape says that the steps are too large.
+Every start is one lane of one program. An oscillation that takes s steps for a turn loses `(2 pi)^5 / (120 s^4)` rad of
+phase in it: 5e-6 rad at 64 steps, which is the default for the fastest of natural frequency and forcing harmonics. A
+motion whose amplitude makes it faster than that needs more. A motion that diverges has `escaped`; it keeps its last
+finite state. For alpha > 0, which bounds every motion, an escape means that the steps are too large.
 """
 
 import math
@@ -24,7 +24,7 @@ from hdjax.response.shooting import require_reduced
 STEPS = 64
 """Steps for a turn of the fastest oscillation."""
 SETTLED = 1e-6
-"""What is left of a disturbance after the default transient."""
+"""Remaining share of a disturbance after the default transient."""
 
 
 class Measured(eqx.Module):
@@ -34,7 +34,7 @@ class Measured(eqx.Module):
         states: at the end of each period.
         amplitude: half of peak to peak of x over them; zero where escaped.
         fundamental: amplitude of the harmonic at omega in x over them; zero where escaped.
-        escaped: whether the motion grew beyond all numbers.
+        escaped: whether the motion diverged.
     """
 
     states: Float[Array, "kept states"]

@@ -50,7 +50,7 @@ class Modulation(eqx.Module):
         mu: damping of the dynamic error [1/s].
         q: shift of the mode's frequency per squared amplitude, `3/8 omega_0 alpha` [1/(s rad^2)].
         kappa: shift of the mode's frequency by the forced response [1/s].
-        e: what feeds the mode [rad/s], or [1/(s rad)] where it multiplies the squared amplitude.
+        e: excitation of the mode [rad/s], or [1/(s rad)] where it multiplies the squared amplitude.
     """
 
     mu: eqx.AbstractVar[Float[Array, ""]]
@@ -61,11 +61,11 @@ class Modulation(eqx.Module):
 
     @abc.abstractmethod
     def feed(self, z: Float[Array, "2"]) -> Float[Array, "2"]:
-        """What feeds the mode, as real and imaginary part [rad/s]."""
+        """Excitation of the mode, as real and imaginary part [rad/s]."""
 
     @abc.abstractmethod
     def gain(self, a: Array) -> Array:
-        """Size of the feed over the amplitude [1/s]."""
+        """Magnitude of the excitation over the amplitude [1/s]."""
 
     @abc.abstractmethod
     def states(self, s: Array) -> tuple[Float[Array, "3"], Float[Array, "3"], Bool[Array, "3"]]:
@@ -114,7 +114,7 @@ class Modulation(eqx.Module):
 
 
 class AdditiveModulation(Modulation):
-    """A mode fed at a constant rate: primary, super-harmonic and combination resonances."""
+    """A mode with constant excitation: primary, super-harmonic and combination resonances."""
 
     mu: Float[Array, ""]
     q: Float[Array, ""]
@@ -170,7 +170,8 @@ class AdditiveModulation(Modulation):
 
 
 class SubharmonicModulation(Modulation):
-    """A mode fed at the square of its own amplitude: the sub-harmonic of order 1/3, beside the state without it."""
+    """A mode with excitation by the square of its amplitude: the sub-harmonic of order 1/3, and the state without
+    it."""
 
     mu: Float[Array, ""]
     q: Float[Array, ""]
@@ -187,7 +188,7 @@ class SubharmonicModulation(Modulation):
 
     @property
     def fed(self) -> Bool[Array, ""]:
-        """Whether anything feeds the mode."""
+        """Whether the mode is excited."""
         return self.e * self.q != 0
 
     @property

@@ -244,7 +244,7 @@ def second_order(resonance: Resonance, omega: ArrayLike) -> SteadyStates:
     r = resonance.response - 1
 
     def expand(z: Float[Array, "2"]) -> tuple[Float[Array, "2"], FourierSeries]:
-        """What is left of the resonant harmonic's balance [rad/s^2], and the response."""
+        """Residual of the resonant harmonic's balance [rad/s^2], and the response."""
         x_0 = _leading_series(resonance, omega, z[0], z[1])
         H = x_0.harmonics
         times = 2 * jnp.pi / SAMPLES / x_0.omega * jnp.arange(1.0 * SAMPLES)
@@ -310,8 +310,8 @@ def _solve_two(J: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
     return where(determinant == 0, b, solved / where(determinant == 0, 1.0, determinant))
 
 
-# As printed: the seed's own equations, errors included, to be shown beside the correct ones above. Each function gives
-# what its equation implies.
+# As printed: the seed's equations, errors included, for comparison with the correct ones above. Each function gives the
+# result of its equation.
 
 
 def printed_omega_0() -> float:

@@ -1,8 +1,8 @@
 """The stable steady motion whose largest |x| comes nearest to a given one, of all that coexist under one sine.
 
-`x'' + mu x' + omega_0^2 (x + alpha x^3) = A cos(omega t)`: any motion with the symmetry of the equation,
-`x(t + T/2) = -x(t)` over its period T, may be it, on any branch, with its super-harmonics, and sub-harmonics of order
-1/3. Motions that break the symmetry (even harmonics) and longer sub-harmonics are not looked for.
+`x'' + mu x' + omega_0^2 (x + alpha x^3) = A cos(omega t)`: any motion with the symmetry of the equation, `x(t + T/2) =
+-x(t)` over its period T, is considered, on any branch, with its super-harmonics, and sub-harmonics of order 1/3.
+Motions without the symmetry (even harmonics) and longer sub-harmonics are not searched.
 
 All by numpy: many drives and frequencies are lanes of its arrays, and nothing is compiled.
 """
@@ -51,7 +51,7 @@ class NearestMotions(eqx.Module):
     Attributes:
         motion: the dynamic error over three forcing periods [rad].
         size: its largest |x| among some instants [rad].
-        exists: whether there is any; where not, the others mean nothing.
+        exists: whether there is any; if not, the other values have no meaning.
     """
 
     motion: FourierSeries
@@ -69,7 +69,7 @@ def nearest_motions(
 ) -> NearestMotions:
     """At each frequency the stable steady motion of a forced drive whose largest |x| comes nearest in ratio.
 
-    Balances of two harmonics give all motions roughly; the nearest are corrected and their stability decided.
+    Balances of two harmonics give all motions approximately; the nearest are corrected and their stability is computed.
 
     Args:
         drive: gives mu, omega_0 and alpha.
@@ -127,7 +127,7 @@ def _of_period(
     distance, waves = np.take_along_axis(distance, nearest, 1), np.take_along_axis(rough, nearest[..., None], 1)
     exists = np.isfinite(distance)
     lane, place = np.nonzero(exists)
-    # What is not there is not corrected.
+    # Missing motions are not corrected.
     own = Oscillators(*(v[lane] for v in given))
     waves[lane, place], exists[lane, place] = _corrected(own, waves[lane, place], harmonics, periods)
     largest = _largest(waves, harmonics)
@@ -139,7 +139,7 @@ def _of_period(
 
 
 def _distance(largest: np.ndarray, there: np.ndarray, size: np.ndarray) -> Float[np.ndarray, "lanes motions"]:
-    """Logarithm of the ratio between each motion's size and the given one; infinite where it is not there."""
+    """Logarithm of the ratio between each motion's size and the given one; infinite where there is no motion."""
     there = there & (largest > 0.0) & np.isfinite(largest)
     return np.where(there, np.abs(np.log(np.where(there, largest, 1.0) / size[:, None])), np.inf)
 
@@ -151,8 +151,8 @@ class _Odd(NamedTuple):
         orders: of the harmonics.
         values: cosines, then sines, at the samples.
         means: from samples to their coefficients.
-        above: likewise of the odd harmonics left out that the samples tell apart.
-        products: from samples of a factor to what it makes of each wave, by wave.
+        above: likewise of omitted odd harmonics that the samples resolve.
+        products: from samples of a factor to its product with each wave, by wave.
         even: likewise of the even waves.
         evens: orders of the even waves.
         looks: values at the instants among which the largest |x| is sought.
@@ -235,13 +235,13 @@ def _largest_of(mean: np.ndarray, z: np.ndarray, orders: np.ndarray) -> np.ndarr
 
 
 def _linear(given: Oscillators, periods: int, orders: np.ndarray) -> Float[np.ndarray, "2 lanes orders"]:
-    """What inertia and spring, and the damper, make of waves of some orders, over omega_0^2."""
+    """Response of inertia and spring, and of the damper, to waves of some orders, over omega_0^2."""
     speeds = orders * (given.omega / (periods * given.omega_0))[:, None]
     return np.stack([1.0 - speeds**2, speeds * (given.mu / given.omega_0)[:, None]])
 
 
 def _system(linear: np.ndarray, bend: np.ndarray, mean: bool = False) -> np.ndarray:
-    """Derivative of what is left over, by lane, from its linear part and the cubic's own."""
+    """Derivative of the residual, by lane, from its linear and cubic parts."""
     spring, damper = linear
     n = spring.shape[1]
     wave = np.arange(n)
@@ -286,14 +286,14 @@ class _Balance:
         self.push[:, (periods - 1) // 2] = given.A / given.omega_0**2
 
     def left_over(self, kept: np.ndarray, x: np.ndarray, of: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Of the equation, over omega_0^2."""
+        """Residual of the equation, over omega_0^2."""
         spring, damper = self.linear[:, of]
         cosine, sine = np.split(kept, 2, axis=1)
         straight = np.concatenate([spring * cosine + damper * sine, spring * sine - damper * cosine], axis=1)
         return straight + _times(self.cubic[of] * x**3, self.odd.means) - self.push[of]
 
     def missed(self, kept: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Largest part left over, relative to the motion."""
+        """Largest residual, relative to the motion."""
         return np.max(np.abs(self.left_over(kept, x)), axis=1) / np.max(np.abs(kept), axis=1)
 
     def solved(self, kept: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Pictures of the response, as matplotlib figures that the caller saves or shows. Nothing is computed here."""
+"""Plots of the response, as matplotlib figures that the caller saves or shows."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ from hdjax.response.poincare import PoincareSection
 from hdjax.response.resonance import Backbone, Peak
 from hdjax.response.swept_sine import SweptSine
 
-# Okabe and Ito's colours, which colour-blind readers tell apart, also in grey print.
+# Okabe and Ito's colours, which colour-blind readers can distinguish, also in grey print.
 STABLE, UNSTABLE, UP, DOWN, INK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#444444"
 ANALYTIC, NOTHING = "#E69F00", "#888888"
 _RPM = 30.0 / np.pi
@@ -121,7 +121,7 @@ def phase_portrait_plot(portrait: PhasePortrait, *, unit: str = "rad") -> Figure
             grid[span], -level[span], level[span], color=UP, alpha=0.15, label="$V < V_c$: returns to rest"
         )
     axes.plot(0.0, 0.0, "+", color="black", markersize=10, label="equilibrium")
-    # What escapes would leave nothing else to be seen.
+    # Escaping motions would dominate the scale.
     near = np.abs(np.asarray(portrait.x)) <= grid[-1]
     axes.set_xlim(grid[0], grid[-1])
     axes.set_ylim(*(sign * 1.1 * np.abs(np.asarray(portrait.v))[near].max() for sign in (-1.0, 1.0)))
@@ -183,7 +183,7 @@ def error_map_plot(errors: ErrorMap, *, title: str, strength: str) -> Figure:
         for axes, error, order in zip(
             grid[row], (errors.first_order, errors.second_order), ("first", "second"), strict=True
         ):
-            # What is not painted is grey.
+            # Missing values are grey.
             axes.set_facecolor(NOTHING)
             level = np.where(np.isfinite(error[row]), error[row], np.nan)
             axes.contourf(np.asarray(errors.sigma), size, level, levels=[0.0, *GOOD, 1e9], colors=colours)

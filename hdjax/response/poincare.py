@@ -1,4 +1,4 @@
-"""What forced motions have settled to, seen once in each forcing period: Poincare sections and bifurcation diagrams."""
+"""Steady forced motions at multiples of the forcing period: Poincare sections and bifurcation diagrams."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from hdjax.response.marching import march, transient_and_steps
 
 
 class PoincareSection(eqx.Module):
-    """States at multiples of the forcing period, after a transient. Every field has an axis of lanes in front.
+    """States at multiples of the forcing period, after a transient. Every field has a leading axis of lanes.
 
     Attributes:
         omega: forcing frequency [rad/s].
@@ -28,7 +28,7 @@ class PoincareSection(eqx.Module):
 
     @property
     def lengths(self) -> Float[Array, "*lanes kept 2"]:
-        """x and v / omega, the part of a state whose repetition is looked for [rad]."""
+        """x and v / omega, the part of a state that is tested for repetition [rad]."""
         return jnp.stack([self.states[..., 0], self.states[..., 1] / self.omega[..., None]], axis=-1)
 
 
@@ -41,13 +41,13 @@ def poincare_section(
     kept_periods: int = 12,
     steps_per_period: int | None = None,
 ) -> PoincareSection:
-    """What motions from many starts have settled to, at multiples of the forcing period.
+    """Settled motions from many starts, at multiples of the forcing period.
 
     Args:
         model: a reduced model; a load torque is part of its forcing, see [`hdjax.Drive.error_forcing`][].
         forcing: the reduced drive's forcing.
         initial_states: states at t = 0, by row.
-        transient_periods: periods before the section; where not given, what `exp(-mu t / 2)` takes to fall to 1e-6.
+        transient_periods: periods before the section; where not given, until `exp(-mu t / 2)` has fallen to 1e-6.
         kept_periods: periods in the section.
         steps_per_period: Runge-Kutta steps for each forcing period; where not given, 64 for each turn of the fastest
             of natural frequency and forcing harmonics.
@@ -84,11 +84,12 @@ def bifurcation_diagram(
 
 @eqx.filter_jit
 def period_of(section: PoincareSection, *, max_period: int = 6, tolerance: float = 1e-3) -> Int[Array, "*lanes"]:
-    """After how many forcing periods each motion repeats; 0 for chaos, an escape, or a motion that has not settled.
+    """Number of forcing periods after which each motion repeats; 0 for chaos, an escape, or a motion that has not
+    settled.
 
     Args:
         section: of more than `max_period` periods.
-        max_period: the longest to look for.
+        max_period: the longest one to consider.
         tolerance: how close a repetition must come, relative to the amplitude (for v, to omega times that). A transient
             that shrinks by less than this in a repetition counts as settled.
     """

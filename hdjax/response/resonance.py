@@ -22,7 +22,7 @@ class Peak(eqx.Module):
         value: the branch's parameter there; the forcing frequency [rad/s] of a frequency response.
         amplitude: largest |x| over a period [rad].
         steady_state: the motion.
-        converged: whether the peak was located within the branch; an end of the branch is no peak.
+        converged: whether the peak was located within the branch; an end of the branch is not a peak.
     """
 
     value: Float[Array, ""]
@@ -33,7 +33,7 @@ class Peak(eqx.Module):
 
 @eqx.filter_jit
 def peak(branch: Branch, *, harmonic: int | None = None) -> Peak:
-    """Where the dynamic error of a branch is largest; value and amplitude have gradients in drive and forcing.
+    """Largest dynamic error of a branch; value and amplitude have gradients by drive and forcing.
 
     Args:
         branch: from [`hdjax.response.frequency_response`][] or [`hdjax.response.follow`][].
@@ -90,11 +90,11 @@ class Backbone(eqx.Module):
 def backbone(model: ReducedModel, amplitudes: ArrayLike, *, harmonics: int = DEFAULT_HARMONICS) -> Backbone:
     """The natural frequency as a function of the amplitude.
 
-    A free undamped motion is even in time when it starts from its turning point, and what damps does not act on its
-    cosines: the cosine part of harmonic balance is the whole condition.
+    A free undamped motion that starts from its turning point is even in time, and damping does not act on its cosines.
+    So the cosine part of harmonic balance is the whole condition.
 
     Args:
-        model: its forcing and damping play no part.
+        model: its forcing and damping are not used.
         amplitudes: first harmonics [rad], rising; each motion is the start for the next.
         harmonics: highest multiple of the frequency to keep.
     """

@@ -1,4 +1,4 @@
-"""What the seed document prints in its Tables 1 to 4 and beside its Figure 1, typed from it."""
+"""Printed values of the seed document's Tables 1 to 4 and Figure 1."""
 
 from typing import NamedTuple
 

@@ -1,8 +1,8 @@
-"""The model that comes nearest to a table of amplitudes over frequency, by least squares over every kind of motion.
+"""Least-squares fit of a model to a table of amplitudes over frequency, over all kinds of motion.
 
 `x'' + mu x' + omega_0^2 (x + alpha x^3) = A cos(omega t)`: what (A, omega_0, mu, alpha) give these largest |x|? At each
-frequency the nearest stable steady motion stands for the table's (see [`hdjax.response.nearest_motion`][]). The choice
-is thus the most charitable one, and what remains of misfit belongs to the table.
+frequency the nearest stable steady motion is used (see [`hdjax.response.nearest_motion`][]). This is the best possible
+choice, so that the remaining misfit is due to the table.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ _FAR = 5.0
 
 @dataclasses.dataclass(frozen=True)
 class AmplitudeFit:
-    """The parameters nearest to a table of amplitudes, and how near they come.
+    """The parameters fitted to a table of amplitudes, and the misfit.
 
     Attributes:
         A: amplitude of the forcing [rad/s^2].
@@ -85,7 +85,7 @@ def fit_amplitudes(
     Args:
         omega: forcing frequencies [rad/s].
         amplitude: largest |x| at each [rad].
-        bands: of omega_0, each searched by itself for either sign of alpha: the best of one would draw the others away.
+        bands: of omega_0, each searched separately for either sign of alpha, to keep several minima.
         generations: of the search, at most.
         seed: of the random numbers.
     """
@@ -120,14 +120,14 @@ def fit_amplitudes(
 
 @functools.cache
 def best_fit_of_table_2() -> AmplitudeFit:
-    """What comes nearest to the analytical column of the seed's Table 2, see [`fit_amplitudes`][]."""
+    """Best fit to the analytical column of the seed's Table 2, see [`fit_amplitudes`][]."""
     return fit_amplitudes(tuple(r.omega for r in TABLE_2), tuple(r.analytical for r in TABLE_2))
 
 
 def _parameters(
     points: Float[np.ndarray, "*points 4"], amplitude: Float[np.ndarray, " rows"]
 ) -> tuple[np.ndarray, ...]:
-    """A, omega_0, mu and alpha that points of the search mean."""
+    """A, omega_0, mu and alpha of points of the search."""
     a = np.exp(np.mean(np.log(amplitude)))
     push, omega_0, damping = np.exp(points[:, :3].T)
     return push * omega_0**2 * a, omega_0, damping * omega_0, _STRAIGHT * np.sinh(points[:, 3]) / a**2
@@ -136,7 +136,7 @@ def _parameters(
 def _misfits(
     points: Float[np.ndarray, "points 4"], omega: np.ndarray, amplitude: np.ndarray
 ) -> Float[np.ndarray, " points"]:
-    """Sums of squared log ratios; a missing motion counts as one far off."""
+    """Sums of squared log ratios; a missing motion counts as a large misfit."""
     A, omega_0, mu, alpha = (v[:, None] for v in _parameters(points, amplitude))
     _, size, exists = nearest_waves(Oscillators(mu, omega_0, alpha, A, omega), amplitude, _HARMONICS)
     return np.sum(np.where(exists, np.log(np.where(exists, size, 1.0) / amplitude) ** 2, _FAR**2), axis=1)

@@ -1,4 +1,4 @@
-"""The seed document's Tables 1 to 4 and its figure, recomputed beside what is printed."""
+"""The seed document's Tables 1 to 4 and its figure, recomputed and compared with the printed values."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ AGREEMENT = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A printed number beside what the stated model gives.
+    """A printed number compared with that of the stated model.
 
     Attributes:
         row: which row.
         column: which column.
         printed: what the seed prints.
-        recomputed: what its model gives; None where it states none.
+        recomputed: from its model; None without one.
         unit: of both.
-        note: what was computed, or why it can't be.
+        note: how it was computed, or why it can't be.
     """
 
     row: str
@@ -40,7 +40,7 @@ class Cell:
 
     @property
     def verdict(self) -> str:
-        """Whether the printed number is what the stated model gives."""
+        """Whether the printed number agrees with the stated model."""
         if self.recomputed is None:
             return "does not follow from the stated model"
         if abs(self.printed - self.recomputed) <= AGREEMENT * abs(self.recomputed):
@@ -131,7 +131,7 @@ def _half_power_bandwidth(mu: float, omega_0: float) -> float:
 
 
 def _table_4() -> Table:
-    """Of the effects named the stated model holds the cubic stiffness alone."""
+    """Of the named effects the stated model only contains the cubic stiffness."""
     cubic = float(hdc_40_050().alpha) * max(case.numerical for case in TABLE_2) ** 3
     cells = []
     for source in TABLE_4:

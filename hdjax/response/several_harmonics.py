@@ -107,7 +107,7 @@ class OffResonance(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Combination:
-    """A way in which the forcing's frequencies excite the mode at first order of the cubic.
+    """A combination of the forcing's frequencies that excites the mode at first order of the cubic.
 
     Attributes:
         name: for instance `"2 w_1 + w_l"`, with all terms that share its frequency.
@@ -186,7 +186,7 @@ class CombinationResonance(eqx.Module):
 
     @property
     def _feed(self) -> tuple[Array, Array]:
-        """Cosine and negative sine coefficient of what feeds the mode [rad/s]."""
+        """Cosine and negative sine coefficient of the mode's excitation [rad/s]."""
         x = forced_response(self.drive, self.forcing)
         n = jnp.asarray(self.multiples, dtype=float)
         M = jnp.asarray([6 / math.prod(math.factorial(abs(i)) for i in term) for term in self.multiples])

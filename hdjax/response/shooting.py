@@ -29,7 +29,7 @@ class PeriodicOrbit(eqx.Module):
         state: state at t = 0; names in `Model.state_names`.
         monodromy: derivative of the state after `periods` periods with respect to the state at t = 0.
         multipliers: Floquet multipliers, the eigenvalues of the monodromy.
-        residual: what the motion misses itself by, relative to its size (see [`shoot`][]).
+        residual: difference of the state after the periods, relative to the motion's size (see [`shoot`][]).
         converged: whether Newton's method met its tolerance.
     """
 
@@ -69,13 +69,14 @@ def period_map(
         model: the equations.
         forcing: motor torque [N m] (or a reduced drive's forcing).
         state: the state at t = 0.
-        periods: how many forcing periods.
+        periods: number of forcing periods.
         load_torque: torque on the load along +theta_l [N m]; ignored by a reduced drive.
         solver: any diffrax solver; Dopri8 where not given.
         rtol: relative tolerance of the steps.
         atol: absolute tolerance of the steps.
         max_steps: steps until the motion counts as escaped.
-        throw: whether a motion that did not reach the end raises; never inside a trace, where it is not finite.
+        throw: whether a motion that did not reach the end raises an error; never inside a trace, where it is not
+            finite.
 
     Raises:
         SimulationError: with the [`hdjax.Ending`][] that names cause and mend.
@@ -112,7 +113,7 @@ def shoot(
 ) -> PeriodicOrbit:
     """The periodic motion near a guess, stable or not, by Newton's method on the period map.
 
-    Sub-harmonics repeat after several `periods`; so does the harmonic motion, so that the guess decides what is found.
+    Sub-harmonics repeat after several `periods`; so does the harmonic motion, so that the result depends on the guess.
     The unknowns are measured in the motion's size, `L` for x and `omega L` for v, with `L` from the guess and the
     forcing. Derivatives of the orbit with respect to the model and the forcing are those of the implicit function
     theorem, in forward mode (`jax.jvp`, `jax.jacfwd`). Works under `jax.vmap`: each lane keeps its own `converged`.
@@ -139,7 +140,7 @@ def shoot(
     require_reduced(model)
     solver = dfx.Dopri8() if solver is None else solver
     options: dict[str, Any] = {"solver": solver, "rtol": rtol, "atol": atol, "max_steps": max_steps, "throw": False}
-    # The number of periods is no part of the program: sub-harmonics are found without compiling again.
+    # The number of periods is data, so that sub-harmonics need no further compilation.
     found = _shoot(model, forcing, guess, jnp.asarray(periods, dtype=float), options, tolerance, max_iterations)
     return PeriodicOrbit(forcing.omega, *found, periods=periods)
 
@@ -159,7 +160,7 @@ def steady_series(
     Args:
         model: the equations.
         forcing: the forcing that the orbit was found under.
-        orbit: what [`shoot`][] found.
+        orbit: from [`shoot`][].
         harmonics: the highest multiple of `omega / periods` to keep.
         samples: of one repetition; what the motion holds above half of them is folded down. Where not given, four for
             each harmonic, and at least 64.
@@ -173,7 +174,7 @@ def steady_series(
 
 
 def period(forcing: FourierSeries, periods: int | Float[Array, ""] = 1) -> Float[Array, ""]:
-    """How long `periods` forcing periods take [s]."""
+    """Duration of `periods` forcing periods [s]."""
     return 2.0 * jnp.pi * periods / forcing.omega
 
 

@@ -1,4 +1,4 @@
-"""A sine swept up or down in steps of frequency: the response, its jumps, and where the two directions differ."""
+"""Stepped-sine sweeps up or down: response, jumps and hysteresis."""
 
 from typing import Literal
 
@@ -15,14 +15,14 @@ from hdjax.response.marching import march, transient_and_steps
 
 
 class SweptSine(eqx.Module):
-    """Response to a sine whose frequency goes from step to step while the drive keeps moving.
+    """Response to a sine whose frequency changes in steps without a restart.
 
     Attributes:
         omegas: forcing frequencies [rad/s], rising whatever the direction.
         amplitude: half of peak to peak of x at each; zero where escaped.
         fundamental: amplitude of the harmonic at omega in x at each; zero where escaped.
         states: state at the end of each step.
-        escaped: whether the motion had grown beyond all numbers.
+        escaped: whether the motion had diverged.
     """
 
     omegas: Float[Array, " n"]
@@ -32,9 +32,9 @@ class SweptSine(eqx.Module):
     escaped: Bool[Array, " n"]
 
     def jumps(self, ratio: float = 1.3) -> Bool[Array, " neighbours"]:
-        """Between which neighbouring frequencies the amplitude changes by more than a ratio.
+        """Neighbouring frequencies between which the amplitude changes by more than a ratio.
 
-        A fold is a jump however fine the frequencies; a steep flank is one only where they are coarse.
+        A fold is a jump for any frequency spacing; a steep flank only for a coarse one.
         """
         low = jnp.minimum(self.amplitude[1:], self.amplitude[:-1])
         high = jnp.maximum(self.amplitude[1:], self.amplitude[:-1])

@@ -1,4 +1,4 @@
-"""Sweeps: the response of very many drives and forcings, on all devices of a machine or of many machines."""
+"""Sweeps: responses of many drives and forcings, on all devices of one or many machines."""
 
 from hdjax.sweep.points import Points, drawn, spread_values
 from hdjax.sweep.request import Request

@@ -1,12 +1,12 @@
-"""Steady motions of very many drives and frequencies: harmonic balance whose lanes are points.
+"""Steady motions of many drives and frequencies: vectorised harmonic balance.
 
 Every motion starts from a root of the Duffing oscillator's amplitude equation,
 
     ((omega_0^2 - w^2 + 3/4 omega_0^2 alpha z)^2 + (mu w)^2) z = A^2,    z = a^2,
 
-of which there are one or three, and Newton's method takes it to as many harmonics as are asked for (alternating
-frequency-time, Cameron and Griffin 1989). Motions that have no such relative, sub-harmonic ones for instance, are not
-found; [`hdjax.response`][] finds those of a single drive.
+of which there are one or three, and Newton's method extends it to the requested harmonics (alternating frequency-time,
+Cameron and Griffin 1989). Motions unrelated to these, such as sub-harmonic ones, are not found; [`hdjax.response`][]
+finds those of a single drive.
 """
 
 from typing import NamedTuple
@@ -25,19 +25,19 @@ from hdjax.sweep.windows import largest_between
 from hdjax.where import where
 
 MOTIONS = 3
-"""At most, by rising amplitude: on the low branch, between the folds, and on the high branch."""
+"""Largest number of motions, by rising amplitude: low branch, between the folds, high branch."""
 _LOPSIDED: tuple[type[Effect], ...] = (QuadraticStiffness,)
 _SEARCHES = 60
 _FOUND = 1e-9
-# What is left after a step is of the order of its square.
+# Newton's error after a step is of the order of its square.
 _SOLVED = 1e-7
 _LONGEST_STEP = 0.5
-_LEAST_STIFFNESS = 1e-3  # of a harmonic left out, at its resonance
+_LEAST_STIFFNESS = 1e-3  # of an omitted harmonic, at its resonance
 _PEAK_SAMPLES = 32  # of half a period
 
 
 class Waves(NamedTuple):
-    """The harmonics that are kept, and their values at samples of a period (of half of it where all are odd).
+    """The kept harmonics, and their values at samples of a period (half a period if all are odd).
 
     Attributes:
         orders: of the harmonics.
@@ -46,7 +46,7 @@ class Waves(NamedTuple):
         slopes: their derivatives by the phase.
         means: cosines, then sines, of 0, 1, 2, ... steps, over the number of samples.
         push: the forcing's cosine at the samples.
-        beyond: the orders left out that the samples tell apart.
+        beyond: omitted orders that the samples resolve.
         above: from samples to their coefficients.
     """
 
@@ -61,11 +61,11 @@ class Waves(NamedTuple):
 
     @property
     def weights(self) -> Float[np.ndarray, "harmonics 1"]:
-        """Of a mean over the samples in a coefficient."""
+        """Factor from means over the samples to coefficients."""
         return np.where(self.orders == 0.0, 1.0, 2.0)[:, None]
 
     def coefficients(self, a: Float[Array, "samples lanes"]) -> Float[Array, "2 harmonics lanes"]:
-        """Cosine and sine coefficients of what was sampled."""
+        """Cosine and sine coefficients of sampled values."""
         rows = jnp.asarray((self.weights * self.values / self.push.size).reshape(-1, self.push.size))
         return (rows @ a).reshape(2, self.orders.size, -1)
 
@@ -76,7 +76,7 @@ class Waves(NamedTuple):
         return values @ flat, slopes @ flat
 
     def product(self, factor: Float[Array, "samples lanes"]) -> Float[Array, "2 harmonics 2 harmonics lanes"]:
-        """The matrix that takes a series to the coefficients of its product with a factor.
+        """The matrix from a series to the coefficients of its product with a factor.
 
         Its entries are sums and differences of the factor's own coefficients: 2 cos j cos k = cos (j - k) + cos (j + k)
         and so on. That takes fewer operations than to project the product of each pair.
@@ -93,7 +93,7 @@ class Waves(NamedTuple):
 
 
 def symmetric(model: Model) -> bool:
-    """Whether the mesh is the same both ways, so that a motion about zero has odd harmonics only."""
+    """Whether the mesh is symmetric, so that a motion about zero has odd harmonics only."""
     return not any(isinstance(e, _LOPSIDED) for e in model.effects)
 
 
@@ -180,7 +180,7 @@ class Balanced(eqx.Module):
         unknowns: cosine and sine of each order [rad], about the forcing's own phase.
         peak: largest |x| [rad].
         saddle: whether the motion is unstable by a real multiplier above 1, as between two folds.
-        truncation: size of the largest harmonic left out over the largest kept, estimated.
+        truncation: estimated size of the largest omitted harmonic over the largest kept.
         converged: whether the balance was solved.
     """
 
@@ -211,12 +211,12 @@ def balance_lanes(
     *,
     iterations: Int[Array, ""],
 ) -> Balanced:
-    """Newton's method from motions nearby.
+    """Newton's method from approximate motions.
 
     Args:
         equation: its leaves carry one lane an entry.
         push: amplitude of the forcing acceleration [rad/s^2].
-        still: its constant part.
+        still: constant part of it.
         omega: forcing frequency [rad/s].
         start: cosine and sine of each order [rad].
         kept: the harmonics.
@@ -226,12 +226,12 @@ def balance_lanes(
     count = kept.orders.size
     inertia = kept.orders[:, None] ** 2 * (omega**2 / square)[None, :]
     damping = kept.orders[:, None] * (equation.drive.mu * omega / square)[None, :]
-    # The sine of order 0 is nothing: its place is held by an equation of its own.
+    # The sine of order 0 vanishes: it has a trivial equation.
     own = jnp.stack([-inertia, -inertia + (kept.orders == 0.0).astype(float)[:, None]])
     outside = jnp.asarray(kept.push)[:, None] * push[None, :] + still[None, :]
 
     def accelerations(x: Array, v: Array) -> Array:
-        """Of the samples, in units of omega_0^2."""
+        """Accelerations at the samples, in units of omega_0^2."""
         found = jax.vmap(lambda eq, x, v, o: eq.acceleration(x, v, o), in_axes=(0, 1, 1, 1), out_axes=1)
         return found(equation, x, v, outside) / square[None, :]
 
@@ -274,7 +274,7 @@ def balance_lanes(
 
 
 def _peak(u: Array, kept: Waves) -> Array:
-    """Largest |x| over a period, between samples too; over half of it where the other is its mirror image."""
+    """Largest |x| over a period, also between samples; over half a period for symmetric motions."""
     samples = _PEAK_SAMPLES * 2 // kept.step
     angles = np.arange(samples + 1) * (2 * np.pi / kept.step / samples)
     k = kept.orders[:, None]
@@ -291,8 +291,8 @@ def _eliminated(
 ) -> tuple[Float[Array, "2 n lanes"], Float[Array, " lanes"]]:
     """Solution of a linear system in each lane, and the sign of its determinant.
 
-    By 2 x 2 blocks without exchanges: a harmonic's own block, `[[d, m], [-m, d]]` and what the motion adds, is regular
-    wherever there is damping; what rounding leaves, the next Newton step sees.
+    By 2 x 2 blocks without pivoting: the diagonal block of a harmonic, `[[d, m], [-m, d]]` plus the motion's part, is
+    regular with damping. Rounding errors are corrected by the next Newton step.
     """
 
     def block(j: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -308,9 +308,9 @@ def _eliminated(
         return jax.lax.dynamic_update_index_in_dim(rows, solved, j, axis=1), sign * jnp.sign(determinant[0])
 
     n = matrix.shape[1]
-    # The right side is a column pair more, of which the second is empty.
+    # The right-hand side is one more column pair, of which the second is empty.
     beside = jnp.stack([right, jnp.zeros_like(right)], axis=2)[:, :, :, None]
     rows = jnp.concatenate([matrix, beside], axis=3)
-    # A loop, not its steps written out: that program takes a quarter of a minute to compile.
+    # A loop: the unrolled program takes a quarter of a minute to compile.
     rows, sign = jax.lax.fori_loop(0, n, block, (rows, jnp.ones_like(right[0, 0])))
     return rows[:, :, 0, -1], sign

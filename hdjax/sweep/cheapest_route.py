@@ -1,4 +1,4 @@
-"""Which route a sweep's transients take: the cheapest that keeps the tolerance on points drawn from the sweep."""
+"""Choice of the method for a sweep's transients: the cheapest within the tolerance on random points."""
 
 import dataclasses
 import math
@@ -15,8 +15,8 @@ from hdjax.sweep.transients import Method, TransientRoute, transients
 from hdjax.sweep.windows import Windows
 
 _REFERENCE = 1e-11
-# What a step costs beside a Strang step in double precision, measured on a CPU; Runge-Kutta steps by machine code, with
-# motor friction and beside each other alone.
+# Cost of a step relative to a Strang step in double precision, measured on a CPU; Runge-Kutta steps by machine code
+# with motor friction.
 _COST = {"strang": 1.0, "aba864": 3.0, "srkn14": 6.0, "tsit5": 1.0, "dopri8": 1.7}
 _LOOKS_PER_TURN = 24
 _MOST_STEPS_PER_TURN = 512
@@ -24,7 +24,7 @@ _FINER = 1.25
 _SAFETY = 0.5
 # Steps of ABA(8,6,4) for a turn below which a Strang step, and above which a step of higher order, may be cheaper.
 _FEW_STEPS, _MANY_STEPS = 10.0, 24.0
-# Below this the rounding errors of single precision would be asked too much of.
+# Tolerance below which single precision is insufficient.
 _SINGLE_FROM = 1e-4
 _ATTEMPTS = 4
 
@@ -34,7 +34,7 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
 
     Args:
         case: the model and its forcing.
-        request: what is wanted.
+        request: of the sweep.
     """
     pilot, other = drawn_points(request)
     reference = TransientRoute(
@@ -57,7 +57,7 @@ def choose(case: Case, request: Request) -> tuple[TransientRoute, Check]:
         if route.method == "adaptive":
             route = dataclasses.replace(route, tolerance=0.1 * route.tolerance)
         else:
-            # The points that decide are rare: steps finer than the pilot asked for.
+            # The critical points are rare: use finer steps than the pilot needed.
             route = dataclasses.replace(route, substeps=math.ceil(_FINER * route.substeps))
     return route, check
 
@@ -79,7 +79,7 @@ def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, 
                 found = needed("dopri8", found.substeps * _COST["tsit5"] / _COST["dopri8"], by_code=True) or found
         elif (found := needed("aba864", math.inf)) is not None:
             each = found.substeps / turns
-            # Each further method is a program to compile: only where it can win.
+            # Each further method must be compiled: only if it may be cheaper.
             other = "strang" if each < _FEW_STEPS else "srkn14" if each > _MANY_STEPS else None
             if other is not None:
                 most = found.substeps * _COST["aba864"] / _COST[other]
@@ -92,7 +92,8 @@ def _cheapest(case: Case, request: Request, values: dict, truth: tuple[Windows, 
 def _fewest_steps(
     case: Case, request: Request, route: TransientRoute, values: dict, truth: tuple, turns: float, most: float
 ) -> TransientRoute | None:
-    """The route with as few steps as the pilot allows, or none where more steps don't help or cost more than others."""
+    """The method with the fewest steps that the pilot allows; None where more steps don't help or cost more than
+    others."""
     substeps, least, rises = max(1, math.ceil(turns)), math.inf, 0
     while substeps <= min(most, max(1.0, turns) * _MOST_STEPS_PER_TURN) and rises < 3:
         tried = dataclasses.replace(route, substeps=substeps)
@@ -100,7 +101,7 @@ def _fewest_steps(
         worst = float(np.max(errors, initial=0.0))
         if worst <= _SAFETY * request.tolerance:
             return tried
-        # Rounding errors don't shrink with the step.
+        # Rounding errors don't decrease with the step.
         rises = rises + 1 if worst > 0.9 * least and worst < 0.1 else 0
         least, substeps = min(least, worst), math.ceil(_FINER * substeps)
     return None
@@ -136,5 +137,5 @@ def _looks(case: Case, request: Request, points: np.ndarray) -> int:
 
 
 def _looks_for(turns: float) -> int:
-    """Points between which the largest |x| is looked for, enough for a motion twice as fast as a linear one."""
+    """Points between which the largest |x| is searched, enough for a motion twice as fast as a linear one."""
     return max(4, math.ceil(2 * _LOOKS_PER_TURN * turns))

@@ -1,4 +1,4 @@
-"""What a sweep's route is checked on, and how far it was right."""
+"""Check of a sweep's method on random points."""
 
 import dataclasses
 
@@ -8,19 +8,19 @@ from jaxtyping import Int
 from hdjax.sweep.request import Request
 
 SAMPLED = 64
-"""Points that a route is chosen on, and as many others that it is checked on."""
+"""Number of points to choose a method, and of others to check it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """A route against the reference on points that it was not chosen on.
+    """Errors of a method against the reference, on points that were not used to choose it.
 
     Attributes:
-        points: how many were drawn.
-        unfinished: how many of them the reference could not integrate.
+        points: number of drawn ones.
+        unfinished: number of points that the reference could not integrate.
         error: largest error, as a part of each motion's largest |x|.
         median: the median over the points.
-        reference: what the reference was.
+        reference: description of the reference.
     """
 
     points: int
@@ -31,7 +31,7 @@ class Check:
 
 
 def drawn_points(request: Request) -> tuple[Int[np.ndarray, " pilot"], Int[np.ndarray, " check"]]:
-    """Points to choose a route on, and others to check it on; the same where the sweep has too few."""
+    """Points to choose a method, and others to check it; the same if the sweep has too few."""
     random = np.random.default_rng(request.seed)
     size = request.points.size
     if size <= 2 * SAMPLED:

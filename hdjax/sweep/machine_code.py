@@ -25,11 +25,11 @@ _MADE: dict[Hashable, int | None] = {}
 
 
 def address(case: Case, request: Request, tableau: Tableau) -> int | None:
-    """Address of the machine code for a request's transients; None where this machine or the model allows none.
+    """Address of the machine code for a request's transients; None if unavailable for this machine or model.
 
     Args:
         case: the model and its forcing.
-        request: what is wanted.
+        request: of the sweep.
         tableau: the Runge-Kutta method.
     """
     paths = request.points.paths
@@ -40,7 +40,7 @@ def address(case: Case, request: Request, tableau: Tableau) -> int | None:
 
 
 def _compiled(case: Case, request: Request, tableau: Tableau) -> int | None:
-    # What stands on llvmlite is loaded where it is there.
+    # Modules that need llvmlite are imported only if it is installed.
     from hdjax.engine.transient import made
 
     arrays, rest = eqx.partition(case, eqx.is_inexact_array)
@@ -68,7 +68,7 @@ def transients_by_code(
     Args:
         address: of the machine code for this request.
         case: the model and its forcing.
-        request: what is wanted.
+        request: of the sweep.
         values: parameters of the points, by path.
         substeps: steps in a window.
     """

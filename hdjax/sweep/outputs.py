@@ -1,4 +1,4 @@
-"""What a sweep gives for each point: names, units, dimensions, and the values of a chunk."""
+"""Results of a sweep per point: names, units, dimensions, and the values of a chunk."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -23,8 +23,8 @@ class Variable:
     Attributes:
         name: of the variable.
         unit: SI unit.
-        doc: one line that says what it is.
-        dims: dimensions behind those of the points.
+        doc: its meaning in one line.
+        dims: dimensions after those of the points.
         kind: NumPy's type.
     """
 
@@ -37,7 +37,7 @@ class Variable:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How a sweep is worked out: chosen once, so that whoever goes on with it does the same.
+    """Method of a sweep, chosen once, so that a resumed run uses the same.
 
     Attributes:
         route: of steady or of transient motions.
@@ -64,7 +64,7 @@ def plan(case: Case, request: Request) -> Plan:
 
 
 def variables(request: Request) -> tuple[Variable, ...]:
-    """What the result of a request holds."""
+    """Variables of a request's result."""
     if request.response == "transient":
         possible = {
             "peak": (Variable("peak", "rad", "largest |x| of the transient"),),
@@ -97,7 +97,7 @@ def variables(request: Request) -> tuple[Variable, ...]:
 
 
 def extra_dims(request: Request, plan: Plan) -> dict[str, np.ndarray]:
-    """Coordinates of the dimensions behind those of the points."""
+    """Coordinates of the dimensions after those of the points."""
     if isinstance(plan.route, SteadyRoute):
         return {"motion": np.arange(1, MOTIONS + 1), "harmonic": np.array(plan.route.orders)}
     return {"window": np.arange(1, request.windows + 1) / request.windows}
@@ -106,7 +106,7 @@ def extra_dims(request: Request, plan: Plan) -> dict[str, np.ndarray]:
 def answers(
     case: Case, request: Request, plan: Plan, values: Mapping[str, Float[np.ndarray, " points"]]
 ) -> dict[str, np.ndarray]:
-    """The variables of a chunk's points, one point a row."""
+    """The variables of a chunk's points, one point per row."""
     found = (_steady if isinstance(plan.route, SteadyRoute) else _transient)(case, request, plan, values)
     return {v.name: np.asarray(found[v.name]).astype(v.kind) for v in variables(request)}
 
@@ -115,7 +115,7 @@ def _steady(case: Case, request: Request, plan: Plan, values: Mapping[str, np.nd
     assert isinstance(plan.route, SteadyRoute)
     found = steady_states(case, plan.route, values)
     size = np.hypot(found.cosine, found.sine)
-    # The series counts its phase from that of the forcing.
+    # The series' phase is relative to that of the forcing.
     behind = np.asarray(values.get("forcing.phase", case.forcing.phase))  # pyright: ignore[reportFunctionMemberAccess]
     phase = np.arctan2(-found.sine, found.cosine) + np.multiply.outer(behind, plan.route.orders).reshape(
         -1, 1, len(plan.route.orders)

@@ -1,4 +1,4 @@
-"""Which points a sweep visits: a grid of axes, and a joint sample of further parameters."""
+"""Points of a sweep: a grid of axes, and a joint sample of further parameters."""
 
 import dataclasses
 import math
@@ -49,7 +49,7 @@ class Points:
 
     @property
     def size(self) -> int:
-        """How many points there are."""
+        """Number of points."""
         return math.prod(self.shape.values())
 
     @property
@@ -58,18 +58,18 @@ class Points:
         return (*self.axes, *self.sample)
 
     def column(self, path: str) -> Float[np.ndarray, " values"] | None:
-        """All values that a parameter takes; none where it does not vary."""
+        """All values of a parameter; empty if it does not vary."""
         return self.axes.get(path, self.sample.get(path))
 
     def values(self, points: Int[np.ndarray, " points"]) -> dict[str, Float[np.ndarray, " points"]]:
-        """The parameters' values at points, which are counted with the last dimension fastest."""
+        """The parameters' values at points, numbered with the last dimension fastest."""
         index = dict(zip(self.shape, np.unravel_index(points, tuple(self.shape.values())), strict=True))
         found = {name: np.asarray(values)[index[name]] for name, values in self.axes.items()}
         return found | {name: np.asarray(column)[index[SAMPLE]] for name, column in self.sample.items()}
 
 
 def spread_values(start: float, end: float, points: int, spacing: Spacing = "linear") -> Float[np.ndarray, " points"]:
-    """Evenly spaced values from `start` to `end`, or even in their logarithm."""
+    """Values from `start` to `end`, evenly spaced, linearly or logarithmically."""
     if spacing == "log" and not (start > 0.0 and end > 0.0):
         raise ValueError(f"`start` and `end` must be positive for a log spacing, but are {start} and {end}")
     return np.geomspace(start, end, points) if spacing == "log" else np.linspace(start, end, points)
@@ -83,7 +83,7 @@ def drawn(
     Args:
         ranges: lower end, upper end and spacing by parameter path.
         points: rows of the sample; a power of two keeps the balance of a Sobol sequence.
-        rule: how the unit cube is filled (scipy.stats.qmc).
+        rule: sampling of the unit cube (scipy.stats.qmc).
         seed: of the sample.
     """
     if rule not in RULES:
@@ -92,7 +92,7 @@ def drawn(
     if rule == "random":
         cube = np.random.default_rng(seed).random((points, width))
     elif rule == "sobol":
-        # The whole power of two that holds the points: SciPy warns of a part of one.
+        # The next power of two: SciPy warns for other sizes.
         cube = qmc.Sobol(width, rng=seed).random_base2(max(points - 1, 0).bit_length())[:points]
     else:
         cube = qmc.LatinHypercube(width, rng=seed).random(points)

@@ -1,4 +1,4 @@
-"""What a sweep is asked for."""
+"""Request of a sweep."""
 
 import dataclasses
 import hashlib
@@ -25,26 +25,26 @@ OUTPUTS: dict[Response, tuple[str, ...]] = {
 }
 FORCING = "forcing."
 _FORCING_UNITS = {"amplitude": "N m", "offset": "N m", "phase": "rad", "duration": "s"}
-_ALGORITHMS = 1  # raised when the same request would be answered otherwise
+_ALGORITHMS = 1  # increased when results of the same request change
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is wanted of every point.
+    """Points and outputs of a sweep.
 
     Attributes:
-        points: by their parameters' dotted paths: those of the model (`K`, `backlash.b`), and those of the forcing
-            behind `forcing.` (`forcing.omega`).
-        response: `"steady"` for the periodic motions under a harmonic forcing, all that relate to the one-harmonic
+        points: by their parameters' dotted paths: those of the model (`K`, `backlash.b`), and those of the forcing with
+            the prefix `forcing.` (`forcing.omega`).
+        response: `"steady"` for the periodic motions under a harmonic forcing, all that are related to the one-harmonic
             ones; `"transient"` for the motion from rest.
         outputs: some of `OUTPUTS` of that response.
         duration: of a transient [s].
         periods: of the forcing that a transient lasts, in place of a duration.
-        windows: equal parts of a transient. A trace has as many samples; a settling time is known to one part, which
-            should hold a period of the forcing.
-        band: what counts as settled: the largest |x| of a window within this part of the last window's.
-        tolerance: largest relative error of a motion, as a part of its largest |x|.
-        seed: of the samples on which the route is chosen and checked.
+        windows: equal parts of a transient. A trace has as many samples; a settling time is resolved to one part, which
+            should contain a period of the forcing.
+        band: for settling: largest relative difference of a window's largest |x| from the last window's.
+        tolerance: largest error of a motion, relative to its largest |x|.
+        seed: of the points to choose and check the method.
     """
 
     points: Points
@@ -78,12 +78,12 @@ class Request:
 
     @property
     def peaks(self) -> bool:
-        """Whether the largest |x| of each window is wanted."""
+        """Whether the largest |x| of each window is needed."""
         return bool({"peak", "settling_time"} & set(self.outputs))
 
 
 class Case(eqx.Module):
-    """A model and its forcing, into which a point's values are put.
+    """A model and its forcing, with parameters to be set per point.
 
     Attributes:
         model: the equations.
@@ -103,10 +103,10 @@ class Case(eqx.Module):
         return Case(self.model.replace(own) if own else self.model, forcing)
 
     def require(self, request: Request) -> None:
-        """Refuse a request that the case can't answer.
+        """Refuse a request that does not suit the case.
 
         Raises:
-            ValueError: that names the parameter and what is wrong with it.
+            ValueError: names the parameter and the reason.
         """
         acting = [effect.name for effect in self.model.effects if isinstance(effect, ActuatorEffect)]
         if acting:
@@ -116,7 +116,7 @@ class Case(eqx.Module):
         for path in points.paths:
             if path not in known:
                 raise ValueError(f"`{path}` is no parameter of this sweep; there are {', '.join(known)}")
-        # The drive's own; an effect may be swept from its absence, which is the end of its parameter's interval.
+        # Bounds of the drive's parameters; an effect may be swept from its absence, the end of its interval.
         limits = {path: info.bounds for path, (_, info) in parameters.items() if "." not in path}
         if request.response == "steady" or request.periods is not None:
             limits[FORCING + "omega"] = (0.0, math.inf)
@@ -137,7 +137,7 @@ class Case(eqx.Module):
 
 
 def digest(case: Case, request: Request) -> str:
-    """A name for what is asked: the same question has the same name, any other another one."""
+    """A hash of the request, as its name."""
     texts: list[Any] = [version("hdjax"), _ALGORITHMS, jax.config.read("jax_enable_x64")]
     for field in dataclasses.fields(request):
         if field.name != "points":
@@ -152,7 +152,7 @@ def digest(case: Case, request: Request) -> str:
 
 
 def duration(case: Case, seconds: float | None, periods: float | None) -> Array:
-    """How long a point's transient is [s]: so many seconds, or so many periods of its forcing."""
+    """Duration of a point's transient [s]: as stated, or a number of periods of its forcing."""
     if seconds is not None:
         return jnp.asarray(seconds, dtype=case.model.drive.omega_0.dtype)
     if periods is None or not hasattr(case.forcing, "omega"):

@@ -1,4 +1,4 @@
-"""The sweep itself: chunk by chunk, on this machine's devices or on the workers of a cluster."""
+"""Execution of a sweep: chunk by chunk, on this machine's devices or on the workers of a cluster."""
 
 import math
 import time
@@ -24,7 +24,7 @@ _MEANINGS = {
     "harmonic": "multiple of the forcing frequency",
     "window": "part of the duration at whose end the value stands",
 }
-_COPIES = 4  # of a chunk's values that are about at a time
+_COPIES = 4  # copies of a chunk's values in memory at a time
 
 
 def sweep(
@@ -38,26 +38,26 @@ def sweep(
     memory: int = _MEMORY,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Any:
-    """The response of very many drives, forcings or both.
+    """Compute the response of many drives, forcings or both.
 
     Args:
         model: the equations; the parameters that the request does not vary.
         forcing: motor torque [N m] or a reduced drive's forcing, as a function of time; a module whose fields are
             scalars, such as [`hdjax.Harmonic`][].
-        request: the points, and what is wanted of them.
-        store: folder in which finished chunks are kept; a run that was killed goes on from there. Needed for workers.
+        request: the points and outputs.
+        store: folder of finished chunks, from which an interrupted run is resumed. Needed for workers.
         workers: processes of a cluster on this machine (Dask); none where 0.
         scheduler: address of a cluster's scheduler, in place of `workers`.
-        memory: what the chunks in work may take [byte]. The result is held beside it.
-        progress: told how many points of how many are done.
+        memory: for the chunks being computed [byte], without the result.
+        progress: receives the counts of done and total points.
 
     Returns:
-        An xarray.Dataset with a dimension for each axis (and `sample`). Its attributes name the route,
-        the check on a drawn sample and what it cost.
+        An xarray.Dataset with a dimension for each axis (and `sample`). Its attributes state the method, the check on a
+        random sample, and the cost.
 
     Raises:
-        ValueError: where the request does not suit the model.
-        ImportError: where the extra `sweep` is not installed.
+        ValueError: the request does not suit the model.
+        ImportError: the extra `sweep` is not installed.
     """
     required("xarray")
     case = Case(model, forcing)
@@ -76,7 +76,7 @@ def sweep(
 
 
 def opened(folder: Path, case: Case, request: Request, *, memory: int = _MEMORY) -> tuple[Store, Plan]:
-    """A request's store, begun where it was not, and its plan."""
+    """A request's store, created if necessary, and its plan."""
     required("zarr")
     kept = Store(folder, case, request, chunk=1)
     chosen = kept.plan
@@ -123,7 +123,7 @@ def _in_memory(
 
 
 def _chunk_points(request: Request, chosen: Plan, memory: int) -> int:
-    """Points of a chunk within the bound on memory; a power of two."""
+    """Number of points of a chunk within the memory limit; a power of two."""
     lengths = {name: len(c) for name, c in extra_dims(request, chosen).items()}
     widest = max(math.prod(lengths[d] for d in v.dims) for v in variables(request))
     # A transient holds twist, rate and peak of every window; a steady motion all its harmonics and their matrix's rows.
@@ -168,7 +168,7 @@ def dataset(case: Case, request: Request, chosen: Plan, found: dict[str, np.ndar
 
 
 def _folds(motions: tuple) -> tuple:
-    """Where the number of motions changes on the way to the next frequency."""
+    """Whether the number of motions changes before the next frequency."""
     dims, values, _ = motions
     axis = dims.index("forcing.omega")
     change = np.diff(values, axis=axis) != 0

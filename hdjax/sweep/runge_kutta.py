@@ -1,8 +1,8 @@
 """Runge-Kutta steps for any model under any forcing, as lanes.
 
-Fixed ones are slower than [`hdjax.sweep.splitting`][], whose steps need not resolve the oscillation, but serve every
-model without sharp corners. They are for devices and models without machine code ([`hdjax.sweep.machine_code`][]).
-Adaptive ones serve models with corners too, and are the reference of every sweep of transients.
+Fixed ones are slower than [`hdjax.sweep.splitting`][], whose steps need not resolve the oscillation, but suit every
+smooth model. They are for devices and models without machine code ([`hdjax.sweep.machine_code`][]). Adaptive ones also
+suit nonsmooth models, and are the reference of every sweep of transients.
 """
 
 from collections.abc import Callable
@@ -39,10 +39,10 @@ def march_steps(
         model: any model.
         forcing: motor torque, or a reduced drive's forcing, as a function of time.
         state: at t = 0.
-        duration: how long [s].
-        windows: equal parts of the duration that are observed.
+        duration: of the motion [s].
+        windows: number of equal parts of the duration.
         substeps: steps of each window; data, so that one compiled program serves any number.
-        peaks: whether the largest |x| of each window is looked for.
+        peaks: whether to compute the largest |x| of each window.
     """
     width = duration / windows
     h = width / substeps.astype(width.dtype)
@@ -96,11 +96,11 @@ def march_adaptively(
         model: any model.
         forcing: motor torque, or a reduced drive's forcing, as a function of time.
         state: at t = 0.
-        duration: how long [s].
-        windows: equal parts of the duration that are observed.
-        looks: points of each window between which the largest |x| is looked for.
+        duration: of the motion [s].
+        windows: number of equal parts of the duration.
+        looks: points of each window between which the largest |x| is searched.
         tolerance: relative tolerance.
-        scale: size of the motion, of which the absolute tolerance is the same part [rad].
+        scale: size of the motion, to which the absolute tolerance is relative [rad].
 
     Returns:
         The motion, and whether the solver reached the end.
@@ -153,7 +153,7 @@ def _advanced(y: list[Array], h: Array, weights: tuple[float, ...], slopes: list
 
 
 def _packed(y: list[Array]) -> list[Array]:
-    """States two by two as complex numbers: a step that leaves as one result is worked out once, not once for each."""
+    """Pairs of states as complex numbers: a step with a single result is computed once, not once per result."""
     padded = y + [jnp.zeros_like(y[0])] * (len(y) % 2)
     return [jax.lax.complex(a, b) for a, b in zip(padded[::2], padded[1::2], strict=True)]
 

@@ -1,9 +1,9 @@
-"""Forced motion by splitting: the linear drive exactly, the rest of the spring in kicks.
+"""Forced motion by splitting: exact flow of the linear drive, kicks by the nonlinear spring.
 
-`x'' + mu x' + omega_0^2 x = F(t)` under a harmonic F has a closed form; what the spring adds to it depends on the twist
-alone and changes nothing but the rate. Taking turns with the two costs a rotation and a power of x for each kick, and
-the error is proportional to alpha x^2: a weakly nonlinear drive takes steps of more than a radian, where Runge-Kutta
-steps resolve the oscillation itself (McLachlan 1995; Blanes, Casas, Farres, Laskar, Makazaga and Murua 2013).
+`x'' + mu x' + omega_0^2 x = F(t)` under a harmonic F has a closed form; the nonlinear spring torque depends on the
+twist alone and changes only the rate. Alternating the two costs a rotation and a power of x for each kick, and the
+error is proportional to alpha x^2: a weakly nonlinear drive takes steps of more than a radian, where Runge-Kutta steps
+resolve the oscillation itself (McLachlan 1995; Blanes, Casas, Farres, Laskar, Makazaga and Murua 2013).
 """
 
 import itertools
@@ -82,17 +82,17 @@ def march_split(
         model: see [`splits`][].
         forcing: motor torque, or a reduced drive's forcing.
         state: x and x' at t = 0.
-        duration: how long [s].
+        duration: of the motion [s].
         method: the sequence of a step.
-        windows: equal parts of the duration that are observed.
+        windows: number of equal parts of the duration.
         substeps: steps of each window; data, so that one compiled program serves any number.
-        peaks: whether the largest |x| of each window is looked for.
+        peaks: whether to compute the largest |x| of each window.
     """
     equation = twist_equation(model)
     mu, square = equation.drive.mu, equation.drive.omega_0**2
     width = duration / windows
     h = width / substeps.astype(width.dtype)
-    # At an undamped resonance there is no steady motion; a stiffer drive has one, and the kicks make up for it.
+    # At an undamped resonance there is no steady motion; a stiffer drive is used, and the kicks compensate.
     resonant = jnp.abs(square - forcing.omega**2) + jnp.abs(mu * forcing.omega) < _LEAST_DETUNING * square
     excess = where(resonant, 2.0 * _LEAST_DETUNING * square, 0.0)
     motion = _ForcedMotion(equation, forcing, square + excess)
@@ -128,12 +128,12 @@ def march_split(
         return jax.lax.complex(*first((v + 0.5 * mu * q) / rate, q))
 
     def window(carry: Array, index: Array) -> tuple[Array, tuple[Array, ...]]:
-        # From the clock again: rounding errors of the rotation end with the window.
+        # Recomputed from the time, so that rounding errors of the rotation do not accumulate.
         begin = _turn(motion.omega * (index * width))
 
         def advance(_, c):
             y, phase, peak = c
-            # One complex number leaves each program fragment, so that nothing is worked out twice for two results.
+            # Each program fragment has one complex result, so that nothing is computed twice.
             moved, turned = jax.lax.optimization_barrier((step(y, phase), phase * turn))
             if peaks:
                 peak = jnp.maximum(peak, largest_between(at(y, phase), at(moved, turned), h))
@@ -159,17 +159,17 @@ class _ForcedMotion:
         self.still = equation.gain * forcing.offset / square
 
     def wave(self, later: Array) -> tuple[Array, Array]:
-        """Real and imaginary part of the response, turned on by a time."""
+        """Real and imaginary part of the response, rotated by a time."""
         turned = self.response * _turn(self.omega * later)
         return turned.real, turned.imag
 
     def own(self, x: Array, v: Array, phase: Array) -> tuple[Array, Array]:
-        """What a motion has beyond the forced one."""
+        """The free part of a motion."""
         z = self.response * phase
         return x - z.real - self.still, v + self.omega * z.imag
 
     def given(self, y: Array, v: Array, phase: Array) -> tuple[Array, Array]:
-        """The motion that has this beyond the forced one."""
+        """The motion with a given free part."""
         z = self.response * phase
         return y + z.real + self.still, v - self.omega * z.imag
 

@@ -25,9 +25,9 @@ _BLOCK = 128
 _TILE = 16384
 _FEW_BLOCKS = 16
 _FEW, _MANY = 6, 40
-# A motion is balanced with few harmonics first, and with more where these leave out too much.
+# A motion is first balanced with few harmonics, and with more if the truncation error is too large.
 _LADDER = (5, 11, 25)
-# Of the tolerance, what the harmonics left out may come to by their estimate.
+# Share of the tolerance for the estimated truncation error.
 _SAFETY = 0.3
 _ATTEMPTS = 3
 _REFERENCE = 1e-11
@@ -44,7 +44,7 @@ class SteadyRoute:
     Attributes:
         harmonics: the highest order kept of any motion.
         odd: whether the even ones vanish.
-        truncation: how large the largest harmonic left out may be beside the largest one.
+        truncation: largest omitted harmonic over the largest one, at most.
     """
 
     harmonics: int
@@ -53,7 +53,7 @@ class SteadyRoute:
 
     @property
     def description(self) -> str:
-        """What a reader is told."""
+        """Description for reports."""
         kind = "odd harmonics" if self.odd else "harmonics"
         return f"harmonic balance by lanes, {kind} up to {self.harmonics} where a motion needs them, double precision"
 
@@ -64,7 +64,7 @@ class SteadyRoute:
 
     @property
     def rungs(self) -> list[int]:
-        """Highest orders of the balances that are tried one after the other."""
+        """Highest orders of the successive balances."""
         return [*(h for h in _LADDER if h < self.harmonics), self.harmonics]
 
 
@@ -79,7 +79,7 @@ class SteadyStates:
         peak: largest |x| [rad].
         stable: no real multiplier above 1, that is not between two folds; False where there is no motion.
         exists: whether there is a motion.
-        truncation: estimated size of the largest harmonic left out over the largest kept.
+        truncation: estimated size of the largest omitted harmonic over the largest kept.
         lost: points of which a motion was not found.
     """
 
@@ -94,10 +94,10 @@ class SteadyStates:
 
 
 def require_balanced(model: Model, forcing: object) -> None:
-    """Refuse a case whose steady motions are beyond this route.
+    """Refuse a case that this method does not support.
 
     Raises:
-        ValueError: that says what is in the way.
+        ValueError: states the reason.
     """
     if not isinstance(forcing, Harmonic):
         raise ValueError(f"a steady sweep needs a Harmonic forcing, but has {type(forcing).__name__}")
@@ -113,7 +113,7 @@ def steady_states(case: Case, route: SteadyRoute, values: Mapping[str, Float[np.
 
     Args:
         case: the model and its forcing.
-        route: how.
+        route: the method.
         values: parameters of the points, by path.
     """
     count = len(next(iter(values.values())))
@@ -129,7 +129,7 @@ def steady_states(case: Case, route: SteadyRoute, values: Mapping[str, Float[np.
         kept = {path: v[waiting] for path, v in own.items()}
         rung = _balanced(case, SteadyRoute(harmonics, route.odd, 0.0), kept, series[waiting])
         found = _widened(rung, route) if found is None else _replaced(found, waiting, _widened(rung, route))
-        # A motion that was not found is looked for again from where it began.
+        # Motions that were not found are searched again from their start.
         series = np.where(found.converged[:, None, None], found.unknowns, _padded(series, found.unknowns.shape[-1]))
         waiting = waiting[~(rung.converged & (rung.truncation <= route.truncation))]
         if not waiting.size:
@@ -179,7 +179,7 @@ def _balanced(case: Case, route: SteadyRoute, values: dict, series: np.ndarray) 
 
     found = solved(slice(None), _FEW)
     slow = np.flatnonzero(~found.converged)
-    # Few lanes need many iterations; with the others they would make these wait.
+    # A few lanes need many iterations; they are run separately, so that the others do not wait.
     return _replaced(found, slow, solved(slow, _MANY)) if slow.size else found
 
 
@@ -213,12 +213,12 @@ def _roots(case: Case, values: dict[str, Array]) -> tuple[Array, Array]:
 
 
 def _padded(series: np.ndarray, width: int) -> np.ndarray:
-    """Series with as many orders; those that are new are nothing."""
+    """Series padded with zeros to as many orders."""
     return np.pad(series, [(0, 0), (0, 0), (0, max(0, width - series.shape[-1]))])
 
 
 def _widened(found: Balanced, route: SteadyRoute) -> Balanced:
-    """Motions in as many harmonics as a route has."""
+    """Motions padded to the method's harmonics."""
     width = len(route.orders) + (not route.odd)
     return eqx.tree_at(lambda b: b.unknowns, found, _padded(np.asarray(found.unknowns), width))
 
@@ -244,9 +244,10 @@ def _replaced(found: Balanced, rows: np.ndarray, by: Balanced) -> Balanced:
 
 
 def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
-    """As many harmonics as the tolerance needs on points drawn from the sweep, checked on others.
+    """The number of harmonics for the tolerance on random points of the sweep, checked on others.
 
-    The check integrates one period from the balanced motion, by adaptive steps: what it has moved away from the series.
+    The check integrates one period from the balanced motion, by adaptive steps, and compares the motion with the
+    series.
     """
     require_balanced(case.model, case.forcing)
     pilot, other = drawn_points(request)
@@ -255,7 +256,7 @@ def choose_steady(case: Case, request: Request) -> tuple[SteadyRoute, Check]:
     odd = symmetric(case.model) and not np.any(offset)
     route = SteadyRoute(_LADDER[-1], odd, _SAFETY * request.tolerance)
     found = steady_states(case, route, values)
-    # As many as any of the points takes, and the next more: other points may need them.
+    # The number that any of the points needs, and the next larger one, since other points may need it.
     taken = np.max(np.array(route.orders) * np.any(found.cosine[found.exists] != 0.0, axis=0), initial=1)
     rung = min(int(np.searchsorted(_LADDER, taken)) + 1, len(_LADDER) - 1)
     others = request.points.values(other)
@@ -288,8 +289,7 @@ def _checked(case: Case, found: SteadyStates, route: SteadyRoute, values: dict) 
 
 
 def _one_period(constants: tuple[Case, Array], values: dict[str, Array]) -> tuple[Array, Array]:
-    """How far motions that start on their series have left them within a period, as a part of their size, and whether
-    they were integrated."""
+    """Relative deviation of motions from their series within a period, and whether they were integrated."""
     case, orders = constants
     at = jnp.linspace(0.0, 2 * np.pi, _LOOKS + 1)
     waves = jnp.stack([jnp.cos(orders[:, None] * at[None, :]), jnp.sin(orders[:, None] * at[None, :])])

@@ -1,8 +1,8 @@
-"""The store of a sweep: finished chunks on disk, so that a run that was killed goes on where it stopped.
+"""The store of a sweep: finished chunks on disk, so that an interrupted run can be resumed.
 
 A folder holds one zarr group for each request, named by the request's digest. A chunk of points is one zarr chunk of
-each variable; a mark of its own says that it is whole, and is written last. Workers on other hosts write to the same
-folder, which they must see under the same path.
+each variable; a mark, written last, states that it is complete. Workers on other hosts write to the same folder, which
+must have the same path for them.
 """
 
 import json
@@ -34,7 +34,7 @@ class Store:
     def __init__(self, folder: Path, case: Case, request: Request, *, chunk: int):
         self.path = Path(folder) / digest(case, request)
         self._request = request
-        # A store that was begun keeps its chunks.
+        # An existing store keeps its chunks.
         self.chunk = int(self._read().get("chunk", chunk))
 
     def _read(self) -> dict[str, Any]:
@@ -45,17 +45,17 @@ class Store:
 
     @property
     def plan(self) -> Plan | None:
-        """The plan of a store that was begun."""
+        """The plan of an existing store."""
         content = self._read()
         return Plan.from_dict(content, self._request) if content else None
 
     @property
     def chunks(self) -> int:
-        """How many there are."""
+        """Number of chunks."""
         return -(-self._request.points.size // self.chunk)
 
     def begin(self, plan: Plan) -> None:
-        """Make the arrays; the plan is written last and says that they are there."""
+        """Create the arrays; the plan is written last, as a mark that they exist."""
         zarr = required("zarr")
         group = zarr.open_group(self.path / "data", mode="w")
         points = self._request.points.size
@@ -77,7 +77,7 @@ class Store:
         _write(self.path / _PLAN, json.dumps(plan.as_dict() | {"chunk": self.chunk}, allow_nan=False))
 
     def finished(self) -> Bool[np.ndarray, " chunks"]:
-        """Which chunks are whole."""
+        """Which chunks are complete."""
         marks = np.zeros(self.chunks, dtype=bool)
         if (self.path / _MARKS).is_dir():
             for mark in (self.path / _MARKS).iterdir():
@@ -86,7 +86,7 @@ class Store:
         return marks
 
     def has(self, chunk: int) -> bool:
-        """Whether a chunk is whole."""
+        """Whether a chunk is complete."""
         return (self.path / _MARKS / str(chunk)).exists()
 
     def points(self, chunk: int) -> np.ndarray:
@@ -94,7 +94,7 @@ class Store:
         return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self._request.points.size))
 
     def write(self, chunk: int, found: dict[str, np.ndarray]) -> None:
-        """Keep a chunk, and mark it with who worked it out: host and process."""
+        """Write a chunk, and mark it with its host and process."""
         group = required("zarr").open_group(self.path / "data", mode="r+")
         points = self.points(chunk)
         for name, values in found.items():
@@ -102,20 +102,20 @@ class Store:
         _write(self.path / _MARKS / str(chunk), f"{platform.node()} {os.getpid()}")
 
     def read(self) -> dict[str, np.ndarray]:
-        """All variables, one point a row."""
+        """All variables, one point per row."""
         group = required("zarr").open_group(self.path / "data", mode="r")
         return {v.name: group[v.name][:] for v in variables(self._request)}
 
 
 def work(kept: Store, case: Case, request: Request, chosen: Plan, chunk: int) -> int:
-    """Work out a chunk and keep it, unless it was kept: the worker that did it may have died before it said so."""
+    """Compute and write a chunk, unless it exists: its worker may have failed before reporting it."""
     if not kept.has(chunk):
         kept.write(chunk, answers(case, request, chosen, request.points.values(kept.points(chunk))))
     return chunk
 
 
 def _write(path: Path, text: str) -> None:
-    """A small file, whole or not at all."""
+    """Write a small file atomically."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     with os.fdopen(handle, "w", encoding="utf-8") as file:
         file.write(text)

@@ -1,4 +1,4 @@
-"""Lane programs over any number of points: shared among the devices, and block by block on each."""
+"""Programs over any number of points: distributed over the devices, and block by block on each."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,7 +13,7 @@ from jaxtyping import Array
 from hdjax.lanes import jit_lanes, spread
 
 _TILE = 1 << 14
-# A GPU takes the same time for any number up to about this, seen on one of 132 multiprocessors.
+# A GPU takes the same time for any number up to about this, as measured with 132 multiprocessors.
 _WIDE_TILE = 1 << 16
 _LANES, _EVERYWHERE = PartitionSpec("lanes"), PartitionSpec()
 
@@ -30,15 +30,15 @@ def in_tiles(
     """Run a program over points, `tile` of them at a time: one shape of program for any number.
 
     Args:
-        program: takes `constants` and a block's values, and gives arrays with one point a row. A function of a module,
-            or equal to another one like it: it is compiled once.
+        program: function of `constants` and a block's values that returns arrays with one point per row. A function at
+            module level, or equal to a previous one, so that it is compiled once.
         constants: arrays that all points share.
-        values: arrays with one point a row.
-        tile: a power of two. The last point fills up the last tile.
-        block: points that go together on a processor, so that they stay in its cache. Other devices take the whole
-            tile: they are slow at what comes one after the other.
-        checked: whether the program checks itself by a call of Python, as those of diffrax do: it can't be kept between
-            processes then, and to try would take a second trace.
+        values: arrays with one point per row.
+        tile: a power of two. The last tile is padded with the last point.
+        block: points per pass on a CPU, so that they stay in its cache. Other devices process the whole tile, as
+            sequential passes are slow there.
+        checked: whether the program contains a Python callback, like those of diffrax. Such programs can't be cached on
+            disk, and trying would need a second trace.
     """
     run = _checked_tile if checked else _tile
     if jax.default_backend() != "cpu":
@@ -48,13 +48,13 @@ def in_tiles(
     for begin in range(0, count, tile):
         own = {path: v[begin : begin + tile] for path, v in values.items()}
         filled = {path: jnp.asarray(_filled(v, tile)) for path, v in own.items()}
-        # The same blocks on any number of devices: so the same points give the same bits.
+        # The same blocks on any number of devices, so that results are identical.
         shared = spread(filled, tile) if tile >= block * len(jax.local_devices()) else filled
         sharding = next(iter(shared.values())).sharding
         mesh = sharding.mesh if isinstance(sharding, NamedSharding) else None
         assert mesh is None or isinstance(mesh, Mesh)
         parts.append(run(program, constants, shared, mesh, block))
-    # What runs while the next tile is sent off is fetched last.
+    # Results are fetched after the next tile has been started.
     rows = [jax.tree.map(np.asarray, part) for part in parts]
     return jax.tree.map(lambda *r: np.concatenate(r)[:count], *rows)
 
@@ -84,6 +84,6 @@ def _filled(rows: np.ndarray, tile: int) -> np.ndarray:
 
 
 def tile_for(points: int) -> int:
-    """The power of two that holds so many points, or the largest there shall be."""
+    """The smallest power of two for so many points, up to a limit."""
     most = _TILE if jax.default_backend() == "cpu" else _WIDE_TILE
     return min(most, 1 << max(points - 1, 63).bit_length())

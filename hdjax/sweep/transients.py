@@ -21,7 +21,7 @@ from hdjax.sweep.windows import Windows
 Method = Literal["strang", "aba864", "srkn14", "tsit5", "dopri8", "adaptive"]
 _SPLITTINGS = {"strang": STRANG, "aba864": ABA864, "srkn14": SRKN14}
 _NAMES = {method: splitting.name for method, splitting in _SPLITTINGS.items()} | NAMES
-# The lanes that are moved together: their states and constants stay in a core's cache.
+# Number of lanes per pass, whose states and constants stay in a core's cache.
 _BLOCK = 1024
 # Adaptive lanes wait for the slowest of their block.
 _ADAPTIVE_BLOCK = 64
@@ -29,14 +29,14 @@ _ADAPTIVE_BLOCK = 64
 
 @dataclasses.dataclass(frozen=True)
 class TransientRoute:
-    """How transients are worked out.
+    """Method for transients.
 
     Attributes:
         method: splitting, Runge-Kutta steps or adaptive steps.
-        substeps: steps of each window; for adaptive steps, looks for the largest |x|.
+        substeps: steps of each window; for adaptive steps, points to search the largest |x|.
         single: whether in single precision.
         tolerance: of adaptive steps.
-        by_code: whether Runge-Kutta steps are taken by machine code. Without, there is `tsit5` alone.
+        by_code: whether Runge-Kutta steps are taken by machine code. Without it, only `tsit5` is available.
     """
 
     method: Method
@@ -63,12 +63,12 @@ def transients(
 
     Args:
         case: the model and its forcing.
-        request: what is wanted.
+        request: of the sweep.
         route: how.
         values: parameters of the points, by path.
 
     Raises:
-        RuntimeError: for a route by machine code where there is none.
+        RuntimeError: the method needs machine code, which is unavailable.
     """
     if route.by_code:
         return _by_code(case, request, route, values)
@@ -76,7 +76,7 @@ def transients(
     tile, block = tile_for(request.points.size), _BLOCK
     if adaptive := route.method == "adaptive":
         tile, block = _ADAPTIVE_BLOCK, _ADAPTIVE_BLOCK
-    # The looks of adaptive steps shape the program; numbers of steps and tolerances are data.
+    # The search points of adaptive steps are part of the program; numbers of steps and tolerances are data.
     fixed = dataclasses.replace(route, substeps=route.substeps if adaptive else 0, tolerance=0.0)
     wanted = (request.duration, request.periods, request.windows, request.peaks)
     numbers = jnp.asarray(route.substeps, dtype=int), jnp.asarray(route.tolerance, dtype=float)
@@ -95,8 +95,7 @@ def _by_code(
 
 
 class _Lanes(eqx.Module):
-    """Transients of a block of points: what of a request shapes the program. Other values and other numbers of steps
-    share it."""
+    """Transients of a block of points: the static part of the program. Values and numbers of steps are data."""
 
     route: TransientRoute = eqx.field(static=True)
     duration: float | None = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""The dynamic error's own equation, for every drive on which nothing acts but the mesh."""
+"""The equation of the dynamic error, for drives without effects on motor or load."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ SPRINGS: tuple[type[Effect], ...] = (QuadraticStiffness, QuinticStiffness, Three
 class TwistEquation(eqx.Module):
     """`x'' = gain T_m - mu x' - omega_0^2 (x + alpha x^3) - per_torque (effects' torque)`.
 
-    Two inertias between which nothing acts but the mesh obey it exactly.
+    It is exact for two inertias with only the mesh between them.
 
     Attributes:
         drive: gives mu, omega_0 and alpha.
@@ -32,7 +32,7 @@ class TwistEquation(eqx.Module):
     per_torque: Float[Array, "*lanes"]
 
     def kick(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Acceleration by what the spring adds to its linear part, where all effects are [`SPRINGS`][]."""
+        """Acceleration by the nonlinear part of the spring, if all effects are [`SPRINGS`][]."""
         return -(self.drive.omega_0**2 * (self.drive.alpha * x) * (x * x) + self._beside(x, jnp.zeros_like(x)))
 
     def acceleration(

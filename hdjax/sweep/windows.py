@@ -1,4 +1,4 @@
-"""What a marched lane leaves behind: its motion at the ends of equal windows, and the largest twist in each."""
+"""Results of a lane: its motion at the ends of equal windows, and the largest twist in each."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ class Windows(eqx.Module):
     Attributes:
         x: twist at each window's end [rad].
         v: its rate there [rad/s].
-        peak: largest |x| in each window [rad]; zero where it was not looked for.
+        peak: largest |x| in each window [rad]; zero where it was not computed.
     """
 
     x: Float[Array, "*lanes windows"]

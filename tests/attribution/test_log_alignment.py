@@ -10,11 +10,11 @@ import pytest
 
 import rig
 from fitting.attribution.candidate_fit import Trial, attempt, halo_for
-from fitting.attribution.log_alignment import Phasors, put_back, with_clocks_set
+from fitting.attribution.log_alignment import Phasors, clock_shifts, with_clocks_set
 from fitting.attribution.study import Data, Setting, Study
 from fitting.estimation.base_fit import base_fit
 from fitting.estimation.experiment import Experiment, experiment_from_log, split
-from fitting.first_order.gains import Acting, look_along, products
+from fitting.first_order.gains import Acting, linearise_along, products
 from hdjax import Hold
 from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMeshTorque
 
@@ -63,7 +63,7 @@ def test_logs_that_begin_in_other_phases(begun):
     after, clocked = with_clocks_set(base, replace(study, progress=told.append))
     for hold in HOLDS:
         for old, new in zip(study.data[hold], clocked.data[hold], strict=True):
-            assert put_back(old, new) == (0.0, pytest.approx((first - second) / OMEGA, abs=1e-4))
+            assert clock_shifts(old, new) == (0.0, pytest.approx((first - second) / OMEGA, abs=1e-4))
     assert len(told) == 1
     assert after.training.objective == pytest.approx(base.training.objective, abs=1e-3)
     for path, (value, _) in base.model.parameters().items():
@@ -122,7 +122,7 @@ def test_a_segment_that_runs_away_tells_nothing(begun):
         unknowns=replace(fit.unknowns, states=jnp.asarray(states)),
         error=jnp.asarray(np.where(np.arange(len(states))[:, None, None] == 2, np.inf, np.asarray(fit.error))),
     )
-    look = look_along(broken)
+    look = linearise_along(broken)
     weight = np.asarray(look.problem.segments.weight)
     assert not weight[2].any() and weight[[1, 3]].all()
     time = np.asarray(look.conditions.time)

@@ -14,7 +14,7 @@ from fitting.estimation.estimate import Fit, Start, Strategy, fit, half_log_dete
 from fitting.estimation.experiment import split
 from fitting.estimation.free_parameters import FreeParameters, base_paths, fitted_paths
 from fitting.estimation.problem import Segmentation
-from fitting.estimation.projection import solved, without_untold
+from fitting.estimation.projection import solved, without_undetermined
 from fitting.estimation.residual import Blocks
 from fitting.first_order.surrogates import DRAWS, PARTNERS, chance_of_gain, surrogates
 from hdjax import Model
@@ -199,7 +199,7 @@ def test_only_a_positive_parameter_that_is_not_told_to_a_factor_e_is_left_out():
     before = jnp.ones((2, 4, 3))
     other = jnp.zeros((2, 8)), by_parameter, jnp.zeros((2, 8, 4)), jnp.zeros((2, 4)), before, jnp.zeros((2, 4, 4))
     free = FreeParameters(("K", "B_sp", "alpha"), (True, True, False), jnp.ones(3), jnp.zeros(3), jnp.zeros(3))
-    found = without_untold(Blocks(*other), free)
+    found = without_undetermined(Blocks(*other), free)
     np.testing.assert_array_equal(np.linalg.norm(found.by_parameter, axis=(0, 1)), [30.0, 0.0, 0.5])
     np.testing.assert_array_equal(found.before_by_parameter[..., 1], 0.0)
     np.testing.assert_array_equal(found.before_by_parameter[..., [0, 2]], 1.0)

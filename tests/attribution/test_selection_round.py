@@ -206,7 +206,7 @@ def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
     assert (seen is not by_base) == asked
 
 
-def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
+def nonzero_effects(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether a strength counts as determined beside a parameter of the drive, by a fit with this covariance."""
     drive, own = (rig.drive_model(), "B_sp") if effect.needs_motor else (rig.reduced_model(), "mu")
     model = drive.with_effects(effect)
@@ -220,7 +220,7 @@ def told_from_zero(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest
     found = Uncertainty(estimates, covariance / np.outer(spread, spread), covariance, covariance)
     monkeypatch.setattr(support, "uncertainty", lambda *args, **options: found)
     before, _ = verdicts
-    return support.told_from_zero(eqx.tree_at(lambda f: f.model, before.training, model), {effect.name}) != set()
+    return support.nonzero_effects(eqx.tree_at(lambda f: f.model, before.training, model), {effect.name}) != set()
 
 
 def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: pytest.MonkeyPatch):
@@ -228,15 +228,15 @@ def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: p
     creep = Creep(k=400.0, tau=0.5, span=1e-3)
     along_valley = np.diag([1.0, 0.0, 0.0])
     along_valley[1:, 1:] = np.outer([400.0, 1.0], [400.0, 1.0])
-    assert told_from_zero(verdicts, creep, along_valley + np.diag([0.0, 50.0**2, 0.0]), monkeypatch)
-    assert not told_from_zero(verdicts, creep, along_valley + np.diag([0.0, 400.0**2, 0.0]), monkeypatch)
-    assert not told_from_zero(verdicts, creep, np.diag([1.0, 400.0**2, 1.0]), monkeypatch)
+    assert nonzero_effects(verdicts, creep, along_valley + np.diag([0.0, 50.0**2, 0.0]), monkeypatch)
+    assert not nonzero_effects(verdicts, creep, along_valley + np.diag([0.0, 400.0**2, 0.0]), monkeypatch)
+    assert not nonzero_effects(verdicts, creep, np.diag([1.0, 400.0**2, 1.0]), monkeypatch)
 
 
 def test_what_an_effect_is_named_for_must_be_there(verdicts, monkeypatch: pytest.MonkeyPatch):
     """Rippling friction whose ripple may be zero is friction, however well that is known."""
     rippling = PositionDependentMotorFriction(T_c=0.1, cosine=2e-3, sine=0.0, n=2.0, transition=0.1)
     std = dict.fromkeys(effect_paths(rippling), 1e-4)
-    assert told_from_zero(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
+    assert nonzero_effects(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
     std |= {f"{rippling.name}.{n}": 1e-3 for n in ("cosine", "sine")}
-    assert not told_from_zero(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
+    assert not nonzero_effects(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)

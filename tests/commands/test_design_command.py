@@ -81,17 +81,17 @@ def test_no_design_that_keeps_the_limits_is_said_and_written(tmp_path: Path, cap
     text = GOOD.replace("at_most = 90.0", "at_most = 20.0")
     assert run("design", written(tmp_path, text), "--out", tmp_path / "out", "--no-plot") == 1
     told = capsys.readouterr()
-    assert "no design that was found keeps all limits" in told.err and "MISSED by 125 %" in told.out
+    assert "no design that was found meets all limits" in told.err and "MISSED by 125 %" in told.out
     assert not json.loads((tmp_path / "out" / "design.json").read_text())["feasible"]
 
 
 BAD = {
     "no such file": (None, "can't be read"),
     "not TOML": ("[drive", "not a TOML file"),
-    "unknown section": (GOOD + "[extra]\n", "[extra] is not known here"),
+    "unknown section": (GOOD + "[extra]\n", "[extra] is not known"),
     "unknown preset": (GOOD.replace("J_l = 0.8", 'preset = "X"'), "preset must be one of HDC-40-050"),
     "negative inertia": (GOOD.replace("J_l = 0.8", "J_l = -1.0"), "[drive] J_l must be between 0 and 1e+06"),
-    "unknown effect": (GOOD + "[effects.magic]\n", "[effects.magic] is no effect"),
+    "unknown effect": (GOOD + "[effects.magic]\n", "[effects.magic] is not an effect"),
     "no variables": (GOOD.replace("N = {", "# ").replace("size = {", "# "), "[variables] must name"),
     "falling range": (GOOD.replace("from = 30", "from = 300"), "range that rises"),
     "unknown variable": (GOOD.replace("N = {", "Q = {"), "`Q` is no parameter of this drive"),
@@ -103,7 +103,7 @@ BAD = {
     "a limit without a side": (GOOD.replace("at_most = 90.0", ""), "one of `at_most` and `at_least`"),
     "both sources": (GOOD.replace("spread =", 'report = "x"\nspread ='), "model.json"),
     "neither source": (GOOD.replace("spread = { J_l = 0.2 }", ""), "one of `report`"),
-    "a spread of nothing": (GOOD.replace("J_l = 0.2", "alpha_2 = 0.2"), "alpha_2 is not known here"),
+    "a spread of nothing": (GOOD.replace("J_l = 0.2", "alpha_2 = 0.2"), "alpha_2 is not known"),
     "a wide spread": (GOOD.replace("J_l = 0.2", "J_l = 3.0"), "J_l must be between 0 and 1"),
     "half a start": (GOOD.replace("starts = 2", "starts = 2.5"), "starts must be a whole number"),
     "wide": (GOOD + "width = 2.0\n", "width must be above 0 and at most 1"),
@@ -180,7 +180,7 @@ def test_draws_of_something_else_are_refused(tmp_path: Path):
 
 
 def test_what_the_log_does_not_tell_is_not_drawn(tmp_path: Path):
-    with pytest.raises(DataError, match=r"does not tell alpha.*hold = \[\"alpha\"\]"):
+    with pytest.raises(DataError, match=r"does not determine alpha.*hold = \[\"alpha\"\]"):
         drawn_from_report(report(tmp_path, identifiable=False, std=None), 8)
 
 

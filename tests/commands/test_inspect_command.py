@@ -58,7 +58,7 @@ def test_logs_with_the_same_columns_are_inspected_together(tmp_path: Path, capsy
     (tmp_path / "notes.pdf").write_bytes(b"no log")
     assert run("inspect", tmp_path) == 0
     told = capsys.readouterr().out
-    assert told.count("What such a log can tell:") == 2
+    assert told.count("What a fit of such a log can determine:") == 2
     assert all(str(tmp_path / name) in told for name in ("a.csv", "b.csv", "c.csv"))
     assert run("init", tmp_path / "a.csv", tmp_path / "c.csv", "--out", tmp_path / "drive.toml") == 2
     assert "its columns are not those of" in capsys.readouterr().err

@@ -190,7 +190,7 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
         learned = any(isinstance(e, LearnedMeshTorque) for e in kept)
         return with_effects(*kept, objective=-7.0 + missed_by if learned else -5.0)
 
-    monkeypatch.setattr(module, "told_from_zero", lambda fit, names: told)
+    monkeypatch.setattr(module, "nonzero_effects", lambda fit, names: told)
     monkeypatch.setattr(module, "refitted_without", refitted_without)
     names = (Creep(k=1.0, tau=1.0, span=1.0), TorqueBias())
     chosen = Candidate(LearnedMeshTorque, ("v",), 1.0, LEARNED, np.zeros((2, 1)))

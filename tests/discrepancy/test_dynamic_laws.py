@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 import rig
 from fitting.attribution.effect_search import base_trial
 from fitting.attribution.screening import Screen
-from fitting.discrepancy.dynamic_laws import remembering
+from fitting.discrepancy.dynamic_laws import screen_memory
 from fitting.discrepancy.dynamic_stiffness import learned_response
 from fitting.discrepancy.learn import share_of
-from fitting.discrepancy.variable_selection import learned_look
+from fitting.discrepancy.variable_selection import search_context
 from fitting.estimation.experiment import experiment_from_log, split
 from fitting.first_order.motion import place_of
 from fitting.loop import close_loop
@@ -181,9 +181,9 @@ def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: p
     monkeypatch.setattr("fitting.discrepancy.dynamic_laws.screen", screen)
     data = {"zero-order": split((rig.reduced_experiment(1200, noise=NOISE),))}
     before, study = base_trial(rig.reduced_model(), data, "zero-order")
-    seen = learned_look(before.training)
+    seen = search_context(before.training)
     before = replace(before, model=before.model.with_effects(KNOWN["Dahl"][0]))
-    remembering(before, seen, study, least=0.1)
+    screen_memory(before, seen, study, least=0.1)
     assert set(asked) == {form for form in LEARNED_WITH_MEMORY if place_of(form) is not LearnedMeshTorque}
 
 

@@ -390,7 +390,7 @@ def test_a_name_that_is_right_stands_beside_what_has_none(tmp_path: Path):
     units = {"dynamic_error": "V", "forcing": "V"}
     paths = Report.of(loop, units=units).write(tmp_path)
     report = json.loads(paths["report.json"].read_text())
-    assert "friction" in report["summary"] and "Something unknown is missing beside it" in report["summary"]
+    assert "friction" in report["summary"] and "Something unknown is also missing" in report["summary"]
     assert report["unexplained"] is None and report["unknown"]["variables"] == ["x"]
     assert "What the learned torque looks like" in paths["report.html"].read_text()
     assert eqx.tree_equal(read_model(paths["model.json"]).model, loop.after.model, rtol=1e-12)

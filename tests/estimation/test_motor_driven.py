@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import joints
-from fitting.estimation.base_fit import base_fit, is_held, told_by_load
+from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.motor_driven import held_at, motor_driven_fit
@@ -71,12 +71,12 @@ def test_the_base_fit_holds_what_the_load_tells(stretches):
     found = base_fit(model_of(RUBBING), stretches)
     assert is_held(found)
     assert float(found.model.get("K")) == pytest.approx(RUBBING.K, rel=0.01)
-    assert told_by_load(found) is not None
+    assert fit_behind_fixed_values(found) is not None
 
 
 def test_without_friction_nothing_is_held():
     found = base_fit(model_of(SMOOTH), stretches_of(SMOOTH))
-    assert not is_held(found) and told_by_load(found) is None
+    assert not is_held(found) and fit_behind_fixed_values(found) is None
     assert float(found.model.get("K")) == pytest.approx(SMOOTH.K, rel=0.01)
 
 

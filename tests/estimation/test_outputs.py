@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import joints
-from fitting.estimation.base_fit import base_fit, is_held, told_by_load
+from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
 from fitting.estimation.driven_load import through_load, twist
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.linear_drive import readings
@@ -68,7 +68,7 @@ def test_stiffness_and_inertias_follow_from_any_subset(sensors: tuple[str, ...],
 def test_friction_of_the_motor_does_not_mislead_what_sees_no_twist():
     stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
     found = base_fit(model_of(stretches, free=True), stretches)
-    told = told_by_load(found)
+    told = fit_behind_fixed_values(found)
     assert is_held(found) and told is not None
     estimates = uncertainty(told).estimates
     for path in ("K", "J_m", "J_l"):

@@ -98,7 +98,7 @@ def test_excitation_and_promises_of_each_kind(motion: Motion):
     for name, kind in kinds.items():
         assert told[name].inspection.joint.kind == kind
     words = {"own names": "inertias", "motor side alone": "One side alone", "twist and joint torque": "hysteresis"}
-    words |= {"input and output": "omega_0", "nothing that is a drive": "No fit can be made"}
+    words |= {"input and output": "omega_0", "nothing that is a drive": "not sufficient for a fit"}
     for name, word in words.items():
         assert word in " ".join(told[name].told)
 
@@ -188,10 +188,10 @@ def test_a_result_shows_itself(drive_log: dict[str, np.ndarray], tmp_path: Path)
     assert told["kind"] == "drive" and told["signals"]["load_angle"]["unit"] == "rad"
     assert len(found.plot()) == 3
     path = found.save(tmp_path / "drive.toml")
-    with pytest.raises(InputError, match="there is a file already"):
+    with pytest.raises(InputError, match="the file exists already"):
         found.save(path)
     assert found.save(path, force=True) == path
-    with pytest.raises(ValueError, match="nothing to draw"):
+    with pytest.raises(ValueError, match="nothing to plot"):
         fitting.inspect({"t": np.arange(500) / 100, "a": np.random.default_rng(0).normal(size=500)}).plot()
 
 

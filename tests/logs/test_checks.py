@@ -103,8 +103,8 @@ def test_findings_of_the_reader_come_first() -> None:
 
 @pytest.mark.parametrize("ratio", [100.0, 49.0, 25.0, 160.0])
 def test_wrong_ratio(ratio: float) -> None:
-    finding = only(examine(drive_log(), drive_file(ratio)), "refusal", f"says {ratio:g} but")
-    assert "the angles say 50.0" in finding.what and "[drive]" in finding.consequence
+    finding = only(examine(drive_log(), drive_file(ratio)), "refusal", f"is {ratio:g} but")
+    assert "the angles give 50.0" in finding.what and "[drive]" in finding.consequence
 
 
 def test_ratio_of_the_other_member_of_the_gear_held_still() -> None:
@@ -112,7 +112,7 @@ def test_ratio_of_the_other_member_of_the_gear_held_still() -> None:
     log = drive_log(swing=6.0)
     motor, load = angles(log)
     log = replace(log, motor_angle=motor * 101 / N)
-    only(examine(log, drive_file(100.0)), "refusal", "says 100 but the angles say 101.0")
+    only(examine(log, drive_file(100.0)), "refusal", "is 100 but the angles give 101.0")
     assert examine(log, drive_file(101.0)) == ()
 
 
@@ -159,7 +159,7 @@ def test_slow_torque_that_twists_the_gear_is_no_wrong_ratio(swing: float, severi
     """The load stays behind by 3 %, which over a small swing is a twist that gears bear, over a large one none."""
     motor, load = angles(drive_log(swing=swing))
     log = replace(drive_log(), motor_angle=motor, load_angle=0.97 * load)
-    only(examine(log, drive_file()), severity, "says 50 but")
+    only(examine(log, drive_file()), severity, "is 50 but")
 
 
 def test_a_resonance_is_no_wrong_ratio() -> None:
@@ -178,7 +178,7 @@ def test_a_resonance_is_no_wrong_ratio() -> None:
 def test_constant_torque(value: float) -> None:
     log = replace(drive_log(), motor_torque=np.full(ROWS, value))
     findings = examine(log, drive_file())
-    only(findings, "refusal", f"motor_torque is {value:g}", "excites nothing")
+    only(findings, "refusal", f"motor_torque is {value:g}", "does not excite")
     with pytest.raises(DataError, match="motor_torque"):
         refuse_unfit(findings, log)
     braked = replace(log, load_torque=np.random.default_rng(2).normal(size=ROWS))
@@ -389,7 +389,7 @@ def test_wrong_ratio_on_a_practice_log(tmp_path: Path, shared: Path, ratio: int)
     (tmp_path / "drive.toml").write_text(text)
     drive = read_drive_file(tmp_path / "drive.toml")
     log = read_log(case / "train_1.csv", drive)
-    with pytest.raises(DataError, match=f"says {ratio} but the angles say 50.0"):
+    with pytest.raises(DataError, match=f"is {ratio} but the angles give 50.0"):
         refuse_unfit(examine(log, drive), log)
 
 
@@ -419,6 +419,6 @@ def test_a_soft_spring_is_no_wrong_ratio():
     # The slowest motion of this log is a fifth of the antiresonance.
     joint = joints.with_friction(joints.drawn(0), 0.2, 0.2)
     log = joints.log_of(joint)
-    assert not [f for f in examine(log, drive_file(joint.N)) if "the angles say" in f.what]
-    (refused,) = [f for f in examine(log, drive_file(1.2 * joint.N)) if "the angles say" in f.what]
+    assert not [f for f in examine(log, drive_file(joint.N)) if "the angles give" in f.what]
+    (refused,) = [f for f in examine(log, drive_file(1.2 * joint.N)) if "the angles give" in f.what]
     assert refused.severity == "refusal"

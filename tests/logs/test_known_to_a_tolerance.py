@@ -82,6 +82,6 @@ def test_report_and_model_tell_what_was_known(tmp_path: Path, own_cache):
     assert known["J_m"]["prior"] == {"value": 4.4e-5, "tolerance": 0.1}
     assert known["J_l"]["prior"] == {"value": None, "tolerance": None} and known["K"]["prior"] is None
     assert known["J_m"]["value"] == pytest.approx(JOINT.J_m, rel=0.01)
-    assert any(note.startswith("J_m was known to be") for note in report["cannot_tell"])
+    assert any(note.startswith("J_m has a prior of") for note in report["cannot_tell"])
     stored = read_model(tmp_path / "out/model.json").model
     assert [p.path for p in stored.drive.priors] == ["J_m", "J_l"] and math.isinf(stored.drive.priors[1].tolerance)

@@ -49,7 +49,7 @@ def test_lone_wrong_samples(name: str, size: float):
     log = spoilt(DRIVE_LOG, name, change)
     np.testing.assert_array_equal(untrusted(log), rows)
     (finding,) = masked(log).findings
-    assert "5 samples stand out" in finding.what and f"{name}, first in data row 41" in finding.where
+    assert "5 samples differ" in finding.what and f"{name}, first in data row 41" in finding.where
 
 
 @pytest.mark.parametrize("length", [2, 3, 5])

@@ -129,11 +129,11 @@ def test_mistakes_are_told(tmp_path: Path):
     log = read_log(path, drive(tmp_path, DRIVE.replace('"Motor"', "2").replace('"Load"', '"Motor (2)"')))
     np.testing.assert_array_equal(log.load_angle, LOAD)
     still = save(tmp_path, [(TIME, MOTOR), (0 * TIME, LOAD), (TIME, TORQUE)])
-    with pytest.raises(InputError, match=r"'Time \(2\)' is no clock"):
+    with pytest.raises(InputError, match=r"'Time \(2\)' is not a clock"):
         read_log(still, drive(tmp_path))
     restarted = np.concatenate([TIME[:1000], TIME[:1000]])
     again = save(tmp_path, [(TIME, MOTOR), (restarted, LOAD), (TIME, TORQUE)])
-    with pytest.raises(InputError, match="clock of load_angle, starts anew"):
+    with pytest.raises(InputError, match="clock of load_angle, restarts"):
         read_log(again, drive(tmp_path))
 
 

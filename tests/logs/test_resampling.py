@@ -129,7 +129,7 @@ def test_angles_too_slow_to_meet_are_refused(tmp_path: Path):
     [
         (CLOCKS.replace('"load_angle/t"', '"load_angle/tt"'), ["'load_angle/tt'", "did you mean"]),
         (CLOCKS.replace(', time = "load_angle/t"', ""), ["load_angle", "no time column of its own"]),
-        (CLOCKS.replace('"load_angle/t"', '"still"'), ["still", "no clock"]),
+        (CLOCKS.replace('"load_angle/t"', '"still"'), ["still", "not a clock"]),
         (CLOCKS.replace('"load_angle/t"', '"short"'), ["load_angle", "one stamp a sample"]),
     ],
 )

@@ -17,7 +17,7 @@ from fitting.quasi_static.plots import loop_pictures
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import QuasiStaticData
 from fitting.quasi_static.report import report_page
-from fitting.quasi_static.rests import RestLook, look_at_rests
+from fitting.quasi_static.rests import RestAnalysis, analyse_rests
 from fitting.quasi_static.test_part import Parted
 from fitting.quasi_static.twist_model import strengths_of
 
@@ -27,19 +27,19 @@ STOPS = {"moves": "one way", "kind": "weight", "cycles": 0.4}
 SLOWLY_ON = {"torque_noise": 3.0, "cycles": 0.2, "kind": "sine"}
 
 
-def at_rest(effects: list[Effect], **options) -> RestLook:
+def at_rest(effects: list[Effect], **options) -> RestAnalysis:
     """The look at rests beside the straight line, of a joint that goes one way and stops."""
     log, how = slow_joint(effects, **STOPS | options)
     points = points_of([log], [how], RATIO)
     held = Held.of(points)
-    found = look_at_rests(held, held.attempt(), seed=0)
+    found = analyse_rests(held, held.attempt(), seed=0)
     assert found is not None
     return found
 
 
 def figures(loop: QuasiStaticLoop) -> dict[str, Known]:
     (creep,) = (one for one in loop.findings if one.family == "creep")
-    points, model, (form,) = loop.told_by(creep)
+    points, model, (form,) = loop.evidence_of(creep)
     return strengths_of(points, model, form)
 
 

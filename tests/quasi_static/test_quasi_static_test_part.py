@@ -11,7 +11,7 @@ from slow_joints import RATIO, slow_joint
 
 from fitting.logs.drive_file import DriveFile, read_drive_file
 from fitting.logs.log import Log
-from fitting.quasi_static.told import close_quasi_static_loop
+from fitting.quasi_static.results import close_quasi_static_loop
 from fitting.search_options import SearchOptions
 
 NOISE = 4e-6

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitting.quasi_static.torque_twist import MEMORIES, SHAPES, Curve, Shape, loop, remembered, twist
+from fitting.quasi_static.torque_twist import MEMORIES, SHAPES, Curve, Shape, hysteresis_branch, loop, twist
 
 COEFFICIENTS: dict[Shape, np.ndarray] = {
     "linear": np.log([3e4]),
@@ -64,7 +64,7 @@ def test_the_abrupt_law_is_a_spring_beside_a_slider() -> None:
     K, k, most = 3e4, 9e4, 4.0
     torque = slider(x, K, k, most)
     # In torque, the slider takes both springs' share to turn: most (K + k)/k each way.
-    path = remembered("abrupt", torque, most * (K + k) / k, 0.0)
+    path = hysteresis_branch("abrupt", torque, most * (K + k) / k, 0.0)
     np.testing.assert_allclose((torque - most * path) / K, x, rtol=0, atol=1e-12)
 
 
@@ -73,7 +73,7 @@ def test_memory_depends_on_the_path_not_on_the_samples(memory) -> None:
     turns = np.array([0.0, 50.0, -20.0, 30.0, -50.0])
     fine = np.concatenate([np.linspace(a, b, 101)[:-1] for a, b in zip(turns, turns[1:], strict=False)] + [turns[-1:]])
     np.testing.assert_allclose(
-        remembered(memory, fine, 7.0, 0.3)[::100], remembered(memory, turns, 7.0, 0.3), rtol=0, atol=1e-12
+        hysteresis_branch(memory, fine, 7.0, 0.3)[::100], hysteresis_branch(memory, turns, 7.0, 0.3), rtol=0, atol=1e-12
     )
 
 

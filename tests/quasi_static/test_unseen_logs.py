@@ -12,7 +12,7 @@ from torque_cycles import cycles
 from fitting.commands.main import main
 from fitting.logs.drive_file import DriveFile, drive_of
 from fitting.logs.log import Log
-from fitting.quasi_static.told import fit_quasi_static_logs
+from fitting.quasi_static.results import fit_quasi_static_logs
 
 LARGEST = 2.2e-3  # rad
 

@@ -293,7 +293,7 @@ def test_a_value_beyond_real_drives_is_told(loop: Loop, gap: float, said: bool):
     info = dict(own_parameters(Backlash(b=gap)))["b"]
     b = Estimate("backlash.b", gap, 1e-6, 1e-6, (gap - 2e-6, gap + 2e-6), "rad", True)
     note = parameter_note(b, loop.after.identifiability, info)
-    assert (note is not None and "real drives show up to 290 µrad" in note) == said
+    assert (note is not None and "real drives have at most 290 µrad" in note) == said
     assert parameter_note(b, loop.after.identifiability) is None
 
 
@@ -331,7 +331,7 @@ def test_the_page_tells_the_story_in_order(page: str):
     heads = re.findall(r"<h2>(.*?)</h2>", page)
     assert heads == [
         "What was fitted",
-        "What was left over",
+        "Residual",
         "What was found",
         "Why this decision",
         "What it changed",
@@ -351,7 +351,7 @@ def test_a_fit_alone_has_a_report_too(fitted: FitOnly, tmp_path: Path):
     assert found["after"]["parameters"] == {} and not any(found["after"]["rmse"].values())
     assert found["before"]["parameters"]["K"]["value"] == pytest.approx(rig.K, rel=0.05)
     heads = re.findall(r"<h2>(.*?)</h2>", page)
-    assert heads[:4] == ["Parameters", "Goodness", "What was left over", "Frequency response"]
+    assert heads[:4] == ["Parameters", "Goodness", "Residual", "Frequency response"]
     assert not re.search(r"\bNaN\b|\bInfinity\b|\bnan\b|\bNone\b", page)
 
 
@@ -400,9 +400,7 @@ def test_a_perfect_model_is_told_so(monkeypatch: pytest.MonkeyPatch):
     # What a profile says of an interval goes before the parabola, in the reason as well.
     alpha = good["before"]["parameters"]["alpha"]
     assert (alpha["interval"], alpha["ci95"]) == ("profile", [-900.0, None])
-    assert alpha["note"].startswith(
-        "alpha is not identifiable from these logs: they leave it open above -9e+02 rad^-2."
-    )
+    assert alpha["note"].startswith("alpha is not identifiable from these logs: it may lie above -9e+02 rad^-2.")
     # 600 samples know a share of 95 % to 1 %.
     assert good["goodness"]["band_coverage"] == pytest.approx(0.95, abs=0.03)
     assert {t["verdict"] for t in good["residual_tests"]} == {"passed"}
@@ -492,7 +490,7 @@ def test_what_a_log_cannot_tell(fitted: FitOnly, tmp_path: Path):
     held = fitted.account.identifiability.held
     assert [h.path for h in held] == ["J_m", "J_l"]
     first, *others = fitted.account.identifiability.directions
-    weak = dataclasses.replace(first, sentence="The logs can't tell K and B_sp apart")
+    weak = dataclasses.replace(first, sentence="The logs do not separate K and B_sp")
     blind = with_limits(fitted, "account", directions=(weak, *others))
     found = report_dict(blind)["identifiability"]
     assert [h["sentence"] for h in found["held"]] == [h.sentence for h in held]
@@ -536,7 +534,7 @@ def test_share_of_test_samples_in_the_band(fitted: FitOnly, tmp_path: Path):
     # The model lacks the motor's friction, which no band knows of.
     assert share < 0.9
     assert f"95 % band of the free runs: {formatting.percent(share)}" in report_text(report_dict(fitted))
-    assert f"it holds {formatting.percent(share)} of them" in write_page(tmp_path, fitted)
+    assert f"it contains {formatting.percent(share)} of them" in write_page(tmp_path, fitted)
     (picture,) = [p for p in fit_plots(fitted, units={}) if p.key == "prediction-0"]
     edges = [t["y"] for t in picture.figure["data"] if t["name"] == "95 % band"]
     assert len(edges) == 4 and all(np.all(np.array(a) <= b) for a, b in (edges[:2], edges[2:]))
@@ -574,7 +572,7 @@ def test_draws_are_told_and_written(fitted: FitOnly, tmp_path: Path):
 @pytest.mark.parametrize("changes", [{"divergences": 3}, {"r_hat": np.array([1.0, 1.2, math.nan])}])
 def test_draws_that_have_not_settled_are_told_so(fitted: FitOnly, tmp_path: Path, changes: dict):
     doubtful = drawn(fitted, **changes)
-    assert "NOT settled" in report_text(report_dict(doubtful)) and "NOT settled" in write_page(tmp_path, doubtful)
+    assert "NOT converged" in report_text(report_dict(doubtful)) and "NOT converged" in write_page(tmp_path, doubtful)
     assert not report_dict(doubtful)["posterior"]["settled"]
 
 
@@ -706,9 +704,9 @@ def test_the_summary_claims_no_gain_where_the_error_rises(after: float | None, s
         (
             8.7e-7,
             (0.2, 1e-4),
-            "It shows in the motor's angle, whose error on test data falls by 99.95 %, from 200 mrad to 0.1",
+            "It affects the motor's angle, whose error on test data falls by 99.95 %, from 200 mrad to 0.1",
         ),
-        (8.8e-7, (0.2, 1e-4), "It shows in the motor's angle"),
+        (8.8e-7, (0.2, 1e-4), "It affects the motor's angle"),
         (8.7e-7, (None, 1e-4), "from a simulation that diverged to 100 µrad"),
         (8.7e-7, (0.2, 0.2), "It removes 0 % of the error on test data"),
         (1e-7, (0.2, 1e-4), "It removes 89 % of the error on test data"),
@@ -720,7 +718,7 @@ def test_the_summary_tells_of_the_motor_what_the_dynamic_error_does_not_show(
     assert said in _change("It", _changed(8.7e-7, after, motor=motor))
 
 
-@pytest.mark.parametrize(("memory", "said"), [(0.028, "remembers itself for about 28 ms"), (None, "")])
+@pytest.mark.parametrize(("memory", "said"), [(0.028, "correlation time of about 28 ms"), (None, "")])
 def test_the_summary_tells_where_the_noise_was_told_from_what_is_missing_by_its_memory(memory: float | None, said: str):
     sentence = _remembering({"noise": {"memory": memory}})
     assert said in sentence and bool(sentence) == (memory is not None)

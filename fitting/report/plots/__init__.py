@@ -1,4 +1,4 @@
-"""Pictures of a fit or a closed loop, as plotly figures in plain dictionaries. Statistics are computed elsewhere."""
+"""Plots of a fit or a closed loop, as plotly figures in plain dictionaries. Statistics are computed elsewhere."""
 
 from fitting.report.plots.evidence import evidence_plot as evidence_plot
 from fitting.report.plots.gallery import fit_plots as fit_plots

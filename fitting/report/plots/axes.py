@@ -1,4 +1,4 @@
-"""The house's look: colours, axes, lines, and numbers as plotly takes them."""
+"""Common style of plots: colours, axes, lines, and numbers for plotly."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from fitting.formatting import number
 from fitting.report.plots.plot import Figure
 
-# Okabe and Ito's vermillion and blue, which colour-blind readers tell apart, also in grey print.
+# Okabe and Ito's vermillion and blue, which colour-blind readers can distinguish, also in grey print.
 BEFORE, AFTER = "#D55E00", "#0072B2"
 MEASURED, FAINT, INK = "#8c8c8c", "#c9c9c9", "#222222"
 
@@ -17,8 +17,8 @@ _DIGITS = 6
 
 
 def figure(traces: Sequence[Figure], height: int, **layout: Any) -> Figure:
-    """A figure in the house's look."""
-    # Labels of vertical lines stand right above the plot, the legend above them.
+    """A figure in the common style."""
+    # Labels of vertical lines are above the plot, the legend above them.
     top = 58 if "annotations" in layout else 40
     legend = 1 + (top - 38) / (height - top - 50)
     look: dict[str, Any] = {
@@ -35,7 +35,7 @@ def figure(traces: Sequence[Figure], height: int, **layout: Any) -> Figure:
 
 
 def axis(title: str, **more: Any) -> Figure:
-    """An axis in the house's look."""
+    """An axis in the common style."""
     look = {
         "title": {"text": title, "standoff": 8},
         "gridcolor": "#e8e8e8",
@@ -62,7 +62,7 @@ def vertical_line(*, x: float) -> Figure:
 
 
 def note(text: str, *, x: float) -> Figure:
-    """A label above a vertical line. On a logarithmic axis plotly wants the logarithm here, but not in the line."""
+    """A label above a vertical line. On a logarithmic axis plotly needs the logarithm here, but not in the line."""
     return {
         "text": text,
         "x": x,
@@ -90,17 +90,17 @@ def line_trace(x: np.ndarray, y: np.ndarray, *, name: str, color: str = MEASURED
     line: Figure = {"color": color, "width": width or 1.5}
     if name == "noise":
         line |= {"dash": "dot", "color": INK}
-    # Times need more digits than values: a long log's samples would fall on top of each other.
+    # Times need more digits than values: samples of a long log would coincide.
     return {"type": "scatter", "mode": "lines", "name": name, "x": numbers(x, 9), "y": numbers(y), "line": line}
 
 
 def names_and_colors(two: bool) -> list[tuple[str, str]]:
-    """What the curves of one model, or of two side by side, are called, and their colours."""
+    """Names and colours of the curves of one model or two."""
     return [("before", BEFORE), ("after", AFTER)] if two else [("model", AFTER)]
 
 
 def numbers(values: np.ndarray, digits: int = _DIGITS) -> list[float | None]:
-    """For JSON: as many digits as a screen can show, null for what is no number."""
+    """Numbers for JSON: rounded to screen resolution, null for NaN."""
     return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
 
 

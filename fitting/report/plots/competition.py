@@ -1,4 +1,4 @@
-"""What each form of missing physics gains."""
+"""Gain of each form of missing physics."""
 
 import html
 
@@ -21,7 +21,7 @@ from fitting.report.plots.plot import Plot
 
 
 def competition(this: Round, turn: int) -> Plot:
-    """What each form of the catalogue gains on selection data, against chance."""
+    """Gain of each form of the catalogue on selection data, with its null distribution."""
     verdicts = sorted(this.verdicts, key=lambda v: v.gain)
     chance = float(np.quantile(this.screen.null_gains, 0.99))
     gains = np.array([v.gain for v in verdicts])
@@ -68,8 +68,8 @@ def competition(this: Round, turn: int) -> Plot:
         "found",
         f"Round {turn}: {outcome}",
         "Gain is the decrease of the logarithm of the error on selection data. Filled bars were refitted inside the "
-        "equations; hollow ones are the first-order estimate of the screening; below zero an effect does harm. The "
-        "dotted line is what the best of the whole catalogue reaches by chance in 99 of 100 cases.",
+        "equations; hollow ones are the first-order estimate of the screening; below zero an effect increases the "
+        "error. The dotted line is the 99 % quantile of the best gain of the whole catalogue by chance.",
         figure([bars, labels], 120 + 24 * len(verdicts), **layout),
     )
 

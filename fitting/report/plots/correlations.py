@@ -1,4 +1,4 @@
-"""How the errors of the fitted parameters go together."""
+"""Correlation of the fitted parameters' errors."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ _NEGATIVE, _POSITIVE = "#762a83", "#1b7837"
 
 
 def correlations(uncertainty: Uncertainty) -> Plot:
-    """How the errors of the fitted parameters go together."""
+    """Correlation of the fitted parameters' errors."""
     names = list(uncertainty.estimates)
     matrix = np.asarray(uncertainty.correlation)
     few = len(names) <= 14

@@ -1,4 +1,4 @@
-"""What a found effect does, beside what the data say of it."""
+"""An accepted effect, with its estimate from the data without a law."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _NORMAL_95 = 1.96
 
 
 def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
-    """The effect along the motion as points, and with error bars what the data call for.
+    """The effect along the motion as points, and the estimate from the data with error bars.
 
     Args:
         found: the evidence.
@@ -30,14 +30,14 @@ def evidence_plot(found: Evidence, *, units: dict[str, str]) -> Plot:
         "xaxis": axis(axis_label(found.variable, pretty_unit(units[found.variable])), exponentformat="power"),
         "yaxis": axis(axis_label(found.quantity, pretty_unit(units[found.quantity])), exponentformat="power"),
     }
-    caption = f"What {_plain(found.effect)} does along the fitted motion."
+    caption = f"Contribution of {_plain(found.effect)} along the fitted motion."
     if found.told.size:
         caption += (
-            " With error bars (95 %): the torque that the data call for at this place, whatever its law, with all else "
-            "as fitted. Where the law is right, the points lie on it."
+            " With error bars (95 %): the torque estimated from the data at this place without a law, with all other "
+            "parameters as fitted. Under the right law, the points agree with it."
         )
     if len(found.told) > 1:
-        caption += " The two directions of the motion are asked apart."
+        caption += " The two directions of motion are estimated separately."
     return Plot(
         f"evidence-{found.effect.replace('_', '-')}",
         "found",

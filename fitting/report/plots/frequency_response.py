@@ -10,7 +10,7 @@ from fitting.report.plots.axes import AFTER, MEASURED, axis, axis_scale, figure,
 from fitting.report.plots.plot import Plot
 from fitting.validation.frequency_response import FrequencyResponse, strong_lines
 
-# The first view reaches beyond the excited lines by this factor.
+# The first view extends beyond the excited lines by this factor.
 _AROUND = 2.5
 _MOST_LINES = 2000
 _MEANINGLESS = 0.5
@@ -62,13 +62,13 @@ def bode(found: FrequencyResponse, *, units: Mapping[str, str]) -> Plot:
         f"Frequency response from {found.source} to {output}",
         "Measured: cross-spectrum over input spectrum (H1). Model: the fitted drive with its stiffness averaged over "
         f"the measured twist. Coherence is the share of the {output}'s power that follows linearly from the "
-        f"{found.source}; where it is below {_MEANINGLESS}, the measured curve means nothing and is not drawn.",
+        f"{found.source}; where it is below {_MEANINGLESS}, the measured curve is meaningless and not shown.",
         figure(traces, 560, **layout),
     )
 
 
 def _shown(found: FrequencyResponse) -> np.ndarray:
-    """Lines to draw: all, or as many as a logarithmic axis can show."""
+    """Lines to plot: all, or as many as a logarithmic axis resolves."""
     count = found.frequency.size
     if count <= _MOST_LINES:
         return np.arange(count)
@@ -76,7 +76,7 @@ def _shown(found: FrequencyResponse) -> np.ndarray:
 
 
 def _view(found: FrequencyResponse) -> tuple[float, float]:
-    """Frequencies of the first view: what the input excites and the resonance, with some room."""
+    """Frequencies of the first view: excited lines and resonance, with a margin."""
     excited = found.frequency[strong_lines(found)]
     low = min(float(excited[0]), found.antiresonance or found.resonance) / _AROUND
     high = max(float(excited[-1]), found.resonance) * _AROUND
@@ -84,6 +84,6 @@ def _view(found: FrequencyResponse) -> tuple[float, float]:
 
 
 def _degrees(response: np.ndarray) -> np.ndarray:
-    """Phase from -270 to 90 degrees, where that of an oscillator does not jump."""
+    """Phase from -270 to 90 degrees, so that an oscillator's does not jump."""
     phase = np.degrees(np.angle(response))
     return np.where(phase > 90.0, phase - 360.0, phase)

@@ -1,4 +1,4 @@
-"""Which pictures a report has, in the order of the story."""
+"""Plots of a report, in order."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,7 +22,7 @@ _MOST_LOGS = 4
 
 
 def plots(loop: Loop, *, units: Mapping[str, str]) -> list[Plot]:
-    """All pictures of a closed loop.
+    """All plots of a closed loop.
 
     Args:
         loop: the outcome.
@@ -41,7 +41,7 @@ def plots(loop: Loop, *, units: Mapping[str, str]) -> list[Plot]:
 
 
 def fit_plots(fitted: FitOnly, *, units: Mapping[str, str]) -> list[Plot]:
-    """All pictures of a fit; arguments as in [`plots`][]."""
+    """All plots of a fit; arguments as in [`plots`][]."""
     unit, twist_unit = units.get(fitted.account.judged[0].output, "rad"), units.get("dynamic_error", "rad")
     step = 0.5 / float(fitted.residual.frequency[-1])
     found = _predictions(fitted.account, None, unit, fitted.bands)

@@ -1,4 +1,4 @@
-"""What was learned, a torque or an error of an angle, against what it depends on, or over frequency."""
+"""A learned torque or angle error over its variables, or over frequency."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def learned_plot(curve: LearnedCurve, *, unit: str, units: dict[str, str]) -> Pl
 
 
 def response_plot(found: LearnedResponse, *, unit: str) -> Plot:
-    """The stiffness over frequency of a learned torque that lags, with its band.
+    """The stiffness over frequency of a learned lagging torque, with its band.
 
     Args:
         found: the response.
@@ -42,15 +42,15 @@ def response_plot(found: LearnedResponse, *, unit: str) -> Plot:
     sizes = float(np.min(found.stiffness)), float(np.max(found.stiffness))
     layout = {
         "xaxis": axis("frequency [Hz]", **axis_scale(True, *ends)),
-        "yaxis": axis(axis_label("size of torque over angle", pretty_unit(unit)), **axis_scale(True, *sizes)),
+        "yaxis": axis(axis_label("magnitude of torque over angle", pretty_unit(unit)), **axis_scale(True, *sizes)),
     }
     return Plot(
         "learned-torque",
         "found",
         f"The learned {WORDS[found.place]}",
         "What is missing, as learned inside the equations of motion: a torque that lags behind an angle, over the "
-        "angle, at each frequency. The band is that of the standard errors; what the logs do not excite is the law's "
-        "word alone.",
+        "angle, at each frequency. The band is that of the standard errors; where the logs have no excitation, the "
+        "curve is extrapolated by the law.",
         figure(traces, 360, **layout),
     )
 
@@ -73,7 +73,7 @@ def _line(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     layout = {
         "xaxis": axis(axis_label(name, pretty_unit(units[name])), exponentformat="power"),
         "yaxis": axis(axis_label(curve.quantity, pretty_unit(unit)), exponentformat="power", overlaying="y2"),
-        # The density needs no axis of its own.
+        # The density has no axis.
         "yaxis2": {"range": [0, 4], "visible": False, "side": "right"},
         "bargap": 0,
     }
@@ -98,7 +98,7 @@ def _surface(curve: LearnedCurve, unit: str, units: dict[str, str]) -> Plot:
     one, other = curve.variables
     edges = [_edges(g) for g in curve.grid]
     count, _, _ = np.histogram2d(curve.at[:, 0], curve.at[:, 1], bins=edges)
-    # Where there are no data, nothing is known.
+    # Unknown where there are no data.
     shown = np.where(count > 0, curve.on_grid, np.nan)
     heat = {
         "type": "heatmap",
@@ -126,10 +126,11 @@ def _plot(curve: LearnedCurve, drawn: Figure) -> Plot:
         "learned-torque",
         "found",
         f"The learned {WORDS[curve.place]}",
-        "What is missing, as learned inside the equations of motion, without what the drive's own parameters can do. "
-        "The band is that of the standard errors; where there are few data, little is known."
+        "What is missing, as learned inside the equations of motion, without what the drive's parameters can "
+        "represent. "
+        "The band is that of the standard errors; it is uncertain where there are few data."
         if len(curve.variables) == 1
-        else "What is missing, as learned inside the equations of motion, without what the drive's own parameters can "
-        "do. Only where there are data.",
+        else "What is missing, as learned inside the equations of motion, without what the drive's parameters can "
+        "represent. Only where there are data.",
         drawn,
     )

@@ -1,4 +1,4 @@
-"""Curves of more samples than a screen has points."""
+"""Curves with more samples than a screen resolves."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _MOST_POINTS = 4000
 def long_trace(
     time: np.ndarray, values: np.ndarray, window: tuple[float, float], *, name: str, color: str, width: float = 1.5
 ) -> Figure:
-    """A long curve: complete where it is seen first, with its peaks kept elsewhere."""
+    """A long curve: complete in the first view, decimated with its peaks elsewhere."""
     first, last = np.searchsorted(time, window)
     inside = decimated(time[first:last], values[first:last], _MOST_POINTS // 2)
     left = decimated(time[:first], values[:first], _MOST_POINTS // 4)
@@ -21,7 +21,7 @@ def long_trace(
 
 
 def decimated(time: np.ndarray, values: np.ndarray, most: int = _MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """At most so many points of a curve that keep every peak: the lowest and highest of each of equal bins."""
+    """At most so many points of a curve, with all peaks: the lowest and highest of each of equal bins."""
     if time.size <= most:
         return time, values
     bins = most // 2

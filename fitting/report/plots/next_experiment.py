@@ -1,4 +1,4 @@
-"""The proposed experiment: its command, the motion it makes, and where it tells the explanations apart."""
+"""The proposed experiment: command, predicted motion, and separation of the explanations over time."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ _COLORS = (BEFORE, AFTER, "#009E73")
 
 
 def next_experiment_plot(found: NextExperiment, *, unit: str, forcing_unit: str) -> Plot:
-    """The command above, the motion in the middle, and below what the experiment has told so far.
+    """The command above, the motion in the middle, and the accumulated information below.
 
     Args:
         found: the experiment.
@@ -27,16 +27,16 @@ def next_experiment_plot(found: NextExperiment, *, unit: str, forcing_unit: str)
         "xaxis": axis("time [s]", anchor="y3"),
         "yaxis": axis(command, domain=[0.7, 1]),
         "yaxis2": axis(label, domain=[0.36, 0.64]),
-        "yaxis3": axis("told so far", domain=[0, 0.3], rangemode="tozero"),
+        "yaxis3": axis("information so far", domain=[0, 0.3], rangemode="tozero"),
     }
-    what = "the log-likelihood ratio to be expected by then, dashed where the rival is right"
+    what = "the expected log-likelihood ratio up to then, dashed where the rival is right"
     if found.precision is not None:
-        what = "the share of what it knows of alpha that has been gathered by then"
+        what = "the share of the information about alpha up to then"
     return Plot(
         "next-experiment",
         "next",
         "The proposed command",
-        f"Above the command, which grew out of {found.begins_like}. In the middle the motion that {found.found} "
+        f"Above the command, which was optimised from {found.begins_like}. In the middle the motion that {found.found} "
         f"predicts. Below {what}.",
         figure([*traces, *_told(found)], 560, **layout),
     )

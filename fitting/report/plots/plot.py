@@ -1,4 +1,4 @@
-"""A figure with its place in the story."""
+"""A figure with its position in the report."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,10 +8,10 @@ Figure = dict[str, Any]
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure with its place in the story.
+    """A figure with its position in the report.
 
     Attributes:
-        key: unique within a report; a word for an element's id.
+        key: unique within a report; used as an element's id.
         section: "fit", "left_over", "look", "found" or "next".
         title: what it shows, as plain text.
         caption: how to read it, as plain text.

@@ -12,7 +12,7 @@ from fitting.report.plots.long_trace import long_trace
 from fitting.report.plots.plot import Figure, Plot
 from fitting.uncertainty.prediction_band import PredictionBand, coverage
 
-# Natural periods that a trace shows at first sight.
+# Natural periods in the first view of a trace.
 _PERIODS = 15
 _BAND = "rgba(0,114,178,0.25)"
 
@@ -30,7 +30,7 @@ def predictions(
 
     Args:
         runs: the same stretch by the base model and by the final one.
-        part: of the data that the stretch is.
+        part: of the data.
         omega_0: natural frequency [rad/s], for the first view.
         unit: of the principal output.
         key: of the plot.
@@ -67,7 +67,7 @@ def predictions(
         key,
         "fit",
         f"{part.capitalize()} data of {first.name}: measured and predicted",
-        "Free run from the first samples on; the model sees the torque only. Below: measured minus predicted. "
+        "Free run from the first samples on; the model uses the torque only. Below: measured minus predicted. "
         f"The view starts where the {'base ' if runs[1] else ''}model errs most; "
         f"double-click for the whole stretch, drag to zoom.{_coverage(band)}",
         figure(traces, 460, **layout),
@@ -75,30 +75,30 @@ def predictions(
 
 
 def _band(band: PredictionBand, window: tuple[float, float], factor: float, error_factor: float) -> list[Figure]:
-    """Where measured samples are expected, and where their errors are; nothing where that is not known."""
+    """The band of measured samples and of their errors; empty where it is unknown."""
     low, high = band.band95
     if not np.isfinite([low, high]).all():
         return []
     predicted, time = band.run.predicted, band.run.time
     made = []
     for curve, scale, place in ((low, factor, {}), (low - predicted, error_factor, {"yaxis": "y2"})):
-        # The upper edge is as far from the prediction as the lower one.
+        # The band is symmetric about the prediction.
         other = curve + (high - low)
         edges = [long_trace(time, scale * c, window, name="95 % band", color=_BAND, width=0.0) for c in (curve, other)]
         edges[1] |= {"fill": "tonexty", "fillcolor": _BAND}
-        # One entry in the legend stands for all.
+        # One legend entry for all.
         made += [e | place | {"hoverinfo": "skip", "showlegend": bool(not place and "fill" in e)} for e in edges]
     return made
 
 
 def _coverage(band: PredictionBand | None) -> str:
-    """How many samples the band holds."""
+    """A sentence on the coverage of the band."""
     share = np.nan if band is None else coverage([band])
     if not np.isfinite(share):
         return ""
     return (
-        f" The blue band is where 95 % of the samples are expected, from what is open of parameters, initial state and "
-        f"noise; it holds {percent(share)} of them. What the model lacks is not in it."
+        " The blue band is where 95 % of the samples are expected, from the uncertainty of parameters and initial "
+        f"state, and noise; it contains {percent(share)} of them. Model discrepancy is not included."
     )
 
 
@@ -113,7 +113,7 @@ def _first_view(run: FreeRun, omega_0: float) -> tuple[float, float]:
 
 
 def _span(measured: np.ndarray, others: Sequence[np.ndarray]) -> list[float] | None:
-    """Range that shows all curves with some air, but a runaway prediction only in part."""
+    """Range of all curves with a margin, limited for a diverging prediction."""
     own = float(np.ptp(measured))
     values = np.concatenate([measured, *others])
     values = values[np.isfinite(values)]

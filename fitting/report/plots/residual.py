@@ -1,4 +1,4 @@
-"""What a model leaves over: its colour, its memory, and what it depends on."""
+"""Plots of a residual: spectrum, autocorrelation and dependences."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -71,13 +71,13 @@ def orders(before: ResidualDiagnostics, after: ResidualDiagnostics | None, *, un
         "orders",
         "left_over",
         "Residual locked to the motor angle",
-        "Peaks at whole orders speak for errors of the gear, the motor or an encoder.",
+        "Peaks at whole orders indicate errors of the gear, the motor or an encoder.",
         figure(traces, 320, **layout),
     )
 
 
 def autocorrelation(before: ResidualDiagnostics, after: ResidualDiagnostics | None) -> Plot:
-    """Memory of the residual."""
+    """Autocorrelation of the residual."""
     step = 0.5 / float(before.frequency[-1])
     found = [r.autocorrelation for r in (before, after) if r is not None]
     factor, label = scaled_unit(step * found[0].size, "s")
@@ -86,7 +86,7 @@ def autocorrelation(before: ResidualDiagnostics, after: ResidualDiagnostics | No
         for (name, color), a in zip(names_and_colors(after is not None), found, strict=False)
     ]
     limit = float(before.white_limit)
-    # At lag zero it is 1 by definition, which is not worth the height.
+    # Lag zero, which is 1 by definition, is outside the view.
     reach = min(1.05, max(4 * limit, 1.1 * max(float(np.max(np.abs(a[1:]), initial=0.0)) for a in found)))
     layout = {
         "xaxis": axis(axis_label("lag", label)),
@@ -96,15 +96,15 @@ def autocorrelation(before: ResidualDiagnostics, after: ResidualDiagnostics | No
     return Plot(
         "autocorrelation",
         "left_over",
-        "Memory of the residual",
+        "Autocorrelation of the residual",
         "At lag zero it is 1. The grey band holds 95 % of the lags of white noise. "
-        "A residual that stays outside it is not white: the model lacks something, or the noise has a memory.",
+        "A residual that stays outside it is not white: the model lacks something, or the noise is coloured.",
         figure(traces, 300, **layout),
     )
 
 
 def input_correlation(found: InputCorrelation, *, step: float) -> Plot:
-    """What the residual has to do with an input.
+    """Correlation of the residual with an input.
 
     Args:
         found: the correlations.
@@ -121,15 +121,15 @@ def input_correlation(found: InputCorrelation, *, step: float) -> Plot:
         f"input-{found.name.replace(' ', '-')}",
         "left_over",
         f"Residual and {found.name}",
-        "The grey band holds 95 % of the correlations of a residual that has nothing to do with the input. Outside it "
-        "to the right, the model misses a part of the response; to the left only, the input responds to the error, as "
+        "The grey band holds 95 % of the correlations of a residual that is independent of the input. Outside it to "
+        "the right, the model lacks a part of the response; to the left only, the input responds to the error, as "
         "under feedback.",
         figure([line_trace(factor * step * found.lag, found.correlation, name="model", color=AFTER)], 280, **layout),
     )
 
 
 def _band(limit: float) -> Figure:
-    """What is within chance, from -limit to limit."""
+    """The band of insignificant values, from -limit to limit."""
     return {
         "type": "rect",
         "xref": "paper",
@@ -183,9 +183,9 @@ def dependences(before: ResidualDiagnostics, after: ResidualDiagnostics | None, 
     return Plot(
         "dependence",
         "left_over",
-        "What the residual depends on",
-        "Mean residual in bins of equally many samples, with its standard error. A curve that leaves zero is a "
-        "force that the model lacks, drawn against the quantity that it depends on.",
+        "Dependence of the residual",
+        "Mean residual in bins of equally many samples, with its standard error. A curve away from zero is a force "
+        "that the model lacks, over the quantity that it depends on.",
         figure(traces, 270 * rows, **layout),
     )
 

@@ -22,8 +22,8 @@ from fitting.search_options import SearchOptions
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What was found on quasi-static logs, ready to be shown.
+class QuasiStaticResult:
+    """Content and plots of a quasi-static report.
 
     Attributes:
         content: What `report.json` holds.
@@ -35,7 +35,7 @@ class Told:
 
     @property
     def text(self) -> str:
-        """For a terminal."""
+        """Text for a terminal."""
         return report_text(self.content)
 
     def write(self, folder: str | PathLike[str]) -> Path:
@@ -45,20 +45,20 @@ class Told:
 
 def fit_quasi_static_logs(
     logs: Sequence[Log], drive_file: DriveFile, *, test: Sequence[Log] = (), progress: Callable[[str], None]
-) -> Told:
+) -> QuasiStaticResult:
     """Fit all torque-twist curves.
 
     Args:
         logs: Of kind "quasi-static", of one drive.
         drive_file: Of the drive.
         test: Logs of test data; where there are none, all rows are fitted, and held-out stretches tell an error.
-        progress: Told what is being done.
+        progress: Receives messages.
     """
     progress("fitting torque-twist curves")
     data = prepare(logs, drive_file)
     unseen = UnseenLogs.of(test, drive_file)
     found = fit_quasi_static(data.logs, rated_torque=drive_file.rated_torque, hysteresis="one way" not in data.motion)
-    return Told(report_dict(data, found, unseen), fit_pictures(found))
+    return QuasiStaticResult(report_dict(data, found, unseen), fit_pictures(found))
 
 
 def close_quasi_static_loop(
@@ -68,16 +68,16 @@ def close_quasi_static_loop(
     test: Sequence[Log] = (),
     search: SearchOptions,
     progress: Callable[[str], None],
-) -> Told:
-    """Look for what the torque-twist line lacks.
+) -> QuasiStaticResult:
+    """Search for effects that the torque-twist line lacks.
 
     Args:
         logs: Of kind "quasi-static", of one drive.
         drive_file: Of the drive.
-        test: Logs of test data; where there are none, the end of each log is, if the rest is long enough.
-        search: How effects are searched for.
-        progress: Told what is being done.
+        test: Logs of test data; without any, the end of each log is, if the rest is long enough.
+        search: Settings of the search for effects.
+        progress: Receives messages.
     """
     parts = parted(logs, drive_file, test)
     loop = close_loop(parts.points, max_effects=search.max_effects, seed=search.seed, progress=progress)
-    return Told(loop_report(parts, loop), loop_pictures(loop))
+    return QuasiStaticResult(loop_report(parts, loop), loop_pictures(loop))
