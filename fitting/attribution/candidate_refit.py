@@ -11,7 +11,7 @@ from fitting.attribution.screening import Lead
 from fitting.attribution.study import Study
 from fitting.estimation.estimate import Fit, Strategy
 from fitting.estimation.scales import scales
-from hdjax import Hold
+from hdjax import Hold, Model
 from hdjax.effects import Effect
 from hdjax.parameters import as_scalar, own_parameters
 
@@ -42,12 +42,11 @@ def begin(before: Trial, lead: Lead, study: Study) -> Fit:
         new = float(value) + change
         # First-order changes may overshoot; a positive parameter stays positive.
         moved[path] = max(new, 0.3 * float(value)) if info.positive else new
-    first = model.replace(moved).with_effects(_with_positive_strengths(lead.effect))
     swing = scales(before.training.stretches, model)
     starts = [
-        first,
-        *(model.with_effects(effect) for effect in lead.effect.typical(swing)),
-        *(model.replace(values).with_effects(effect) for values, effect in lead.effect.imitated(model.drive, swing)),
+        _with_form(model.replace(moved), _with_positive_strengths(lead.effect)),
+        *(_with_form(model, effect) for effect in lead.effect.typical(swing)),
+        *(_with_form(model.replace(values), effect) for values, effect in lead.effect.imitated(model.drive, swing)),
     ]
     return first_pass(starts, study, before.hold, champion=before, own_states=lead.own_states)
 
@@ -71,6 +70,16 @@ def try_hold(before: Trial, hold: Hold, study: Study) -> Trial | None:
     if near.objective > before.training.objective + RULES.least_gain:
         return None
     return challenge([near.model], study, hold, champion=before)
+
+
+def _with_form(model: Model, effect: Effect) -> Model:
+    """The model with an effect, which replaces the forms that it contains and takes over their parameters."""
+    for narrow in (e for e in model.effects if e.name in effect.contains):
+        for name, _ in own_parameters(narrow):
+            sum_of_both = getattr(effect, name) + getattr(narrow, name)
+            effect = eqx.tree_at(lambda e, n=name: getattr(e, n), effect, sum_of_both)
+        model = model.without_effect(narrow.name)
+    return model.with_effects(effect)
 
 
 def _with_positive_strengths(effect: Effect) -> Effect:

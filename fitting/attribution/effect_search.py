@@ -96,7 +96,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         # Continue the fit: a remainder that has not converged would be taken for a further effect.
         current = continued(this.winner.trial, study)
         study.progress(f"found {this.winner.name}")
-    dropped = _holds_given_up(rounds, base.hold, current.hold)
+    dropped = [*_holds_given_up(rounds, base.hold, current.hold), *_replaced(rounds)]
     current, superfluous, without = _without_superfluous(current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
@@ -119,6 +119,12 @@ def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Tri
         else:
             without[name] = poorer
     return current, dropped, without
+
+
+def _replaced(rounds: Sequence[Round]) -> list[str]:
+    """Accepted effects that a later one contains and replaces."""
+    models = [(this.before.model, this.winner.trial.model) for this in rounds if this.accepted and this.winner.trial]
+    return [e.name for before, after in models for e in before.effects if e.name not in {f.name for f in after.effects}]
 
 
 def _holds_given_up(rounds: Sequence[Round], first: Hold, last: Hold) -> list[str]:

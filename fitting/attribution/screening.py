@@ -83,7 +83,7 @@ def screen(
         seed: of the surrogates.
     """
     model = training.model
-    present = {e.name for e in model.effects}
+    present = {name for e in model.effects for name in (e.name, *e.contains)}
     lines = replace(scales(training.stretches, model), residual_frequencies=spectral_lines(training))
     forms = [form for form in catalogue if form.name not in present]
     found = applicable(forms, lines, has_motor=isinstance(model, TwoInertiaModel))

@@ -90,6 +90,7 @@ class DryLoadFriction(DryFriction, LoadSideEffect):
     """Dry friction against the load, and viscous friction beside it."""
 
     opposes: ClassVar[str] = "omega_l"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_load_friction",)
 
     transition: eqx.AbstractVar[Scalar]
     b: eqx.AbstractVar[Scalar]

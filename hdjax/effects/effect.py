@@ -119,6 +119,7 @@ class Effect(eqx.Module):
         drawn_against: the quantity, a field of [`Motion`][], that it is plotted over; None where no single one is
             suitable.
         one_shape_of: the quantity that it is a specific function of; another function would be another effect.
+        contains: names of the forms that it contains, with the same symbols: it replaces them.
         imperfection: possible rms error of its law, as a share of the error that it removes: no form is exact.
     """
 
@@ -129,6 +130,7 @@ class Effect(eqx.Module):
     named_for: ClassVar[tuple[str, ...]] = ()
     drawn_against: ClassVar[str | None] = None
     one_shape_of: ClassVar[str | None] = None
+    contains: ClassVar[tuple[str, ...]] = ()
     imperfection: ClassVar[float] = 3e-3
 
     @classmethod

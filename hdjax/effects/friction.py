@@ -87,6 +87,7 @@ class MotorFriction(DryMotorFriction):
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "motor_friction"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
 
     T_c: Scalar = parameter(
         0.0,
@@ -118,6 +119,7 @@ class StribeckMotorFriction(DryMotorFriction):
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "stribeck_motor_friction"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
 
     T_c: Scalar = parameter(
         0.0,

@@ -26,6 +26,7 @@ class DahlMotorFriction(MotorSideEffect):
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "dahl_motor_friction"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
     states: ClassVar[tuple[str, ...]] = ("z",)
 
     T_c: Scalar = parameter(
@@ -135,6 +136,7 @@ class LuGreMotorFriction(_LuGre, MotorSideEffect):
 
     family: ClassVar[str] = "motor_friction"
     name: ClassVar[str] = "lugre_motor_friction"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_motor_friction",)
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
@@ -153,6 +155,7 @@ class LuGreLoadFriction(_LuGre, LoadSideEffect):
 
     family: ClassVar[str] = "load_friction"
     name: ClassVar[str] = "lugre_load_friction"
+    contains: ClassVar[tuple[str, ...]] = ("viscous_load_friction",)
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:

@@ -87,4 +87,4 @@ def test_a_fit_reports_it_with_the_intervals_of_the_loads_equation(stretches):
     stiffness = report["before"]["parameters"]["K"]
     low, high = stiffness["ci95"]
     assert low < RUBBING.K < high and high - low < 0.1 * RUBBING.K
-    assert "motor does not move as the logged torque says" in " ".join(report["meaning"])
+    assert "motor does not move as the logged torque predicts" in " ".join(report["meaning"])

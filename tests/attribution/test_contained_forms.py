@@ -1,0 +1,46 @@
+"""Forms that contain simpler ones: these are found where they suffice, and are replaced where they do not."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rig
+from fitting.attribution.candidate_refit import _with_form
+from fitting.loop import close_loop
+from hdjax.effects import BY_NAME, CATALOGUE, Effect
+from hdjax.effects.friction import MotorFriction, ViscousLoadFriction, ViscousMotorFriction
+
+COUNT, B = 3000, 2e-5
+WIDER = [form for form in CATALOGUE if form.contains]
+
+
+def test_a_contained_form_has_no_other_parameters():
+    assert len(WIDER) == 7
+    for form in WIDER:
+        for name in form.contains:
+            narrow = BY_NAME[name]
+            assert narrow.family == form.family
+            assert {f.name for f in dataclasses.fields(narrow)} <= {f.name for f in dataclasses.fields(form)}
+
+
+def test_the_wider_form_takes_over_what_it_replaces():
+    beside = ViscousLoadFriction(b=jnp.asarray(0.3))
+    model = rig.drive_model().with_effects(ViscousMotorFriction(b=jnp.asarray(0.2)), beside)
+    found = _with_form(model, MotorFriction(T_c=jnp.asarray(0.1), b=jnp.asarray(0.05), transition=jnp.asarray(1.0)))
+    assert [e.name for e in found.effects] == ["viscous_load_friction", "motor_friction"]
+    assert float(found.get("motor_friction.b")) == pytest.approx(0.25)
+
+
+# A corner far beyond the drive's speeds: viscous friction alone.
+@pytest.mark.parametrize(
+    "friction, form", [((B * 1e5, 1e5), ViscousMotorFriction), ((2e-3, 0.1), MotorFriction)], ids=["viscous", "dry"]
+)
+def test_the_simplest_sufficient_form_is_found(friction: tuple[float, float], form: type[Effect]):
+    experiment = rig.drive_experiment(COUNT, motor_friction=friction)
+    catalogue = (MotorFriction, ViscousMotorFriction)
+    loop = close_loop(rig.drive_model(), {"zero-order": (experiment,)}, hold="zero-order", catalogue=catalogue)
+    assert [f.name for f in loop.findings] == [form.name]
+    if form is ViscousMotorFriction:
+        np.testing.assert_allclose(float(loop.after.model.get("viscous_motor_friction.b")), B, rtol=0.05)
