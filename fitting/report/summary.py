@@ -46,10 +46,13 @@ def _decision(report: Mapping[str, Any]) -> str:
         if report["unknown"]:
             rest = f" Something unknown is also missing: a learned {_learned(report)}, represents it."
         elif report["times_noise"] >= RULES.excess:
-            left = formatting.number(report["times_noise"])
-            rest = f" Something unknown is also missing: the residual is {left} times the noise."
+            left = f"the residual is {formatting.number(report['times_noise'])} times the noise"
+            rest = f" Something unknown is also missing: {left}."
+            if report["evidence"]["challenge"]["imperfect"]:
+                rest = f" {left.capitalize()}, which an inexact law of the effect may explain."
         several = bool(report["unknown"]) or len(families) > 1
-        change = _change("Together they" if several else "It", report, several=several)
+        subject = "Together they" if several else "The effect" if rest else "It"
+        change = _change(subject, report, several=several)
         return f"{opening}: {found}.{rest} {change}{_remembering(report)}{_noisy_torque(report)}"
     left = report["unexplained"]
     opening = "Something is missing that the catalogue does not explain."

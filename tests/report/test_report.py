@@ -38,7 +38,7 @@ from fitting.report import (
 from fitting.report.intervals import is_withheld, say_what_intervals_hold
 from fitting.report.limits import limits, parameter_note
 from fitting.report.plots import decimated, fit_plots, plots
-from fitting.report.summary import _change, _remembering
+from fitting.report.summary import _change, _remembering, summary
 from fitting.report.web_page import environment
 from fitting.search_options import SearchOptions
 from fitting.stored_model import to_json
@@ -716,6 +716,22 @@ def test_the_summary_tells_of_the_motor_what_the_dynamic_error_does_not_show(
     after: float, motor: tuple[float | None, float], said: str
 ):
     assert said in _change("It", _changed(8.7e-7, after, motor=motor))
+
+
+@pytest.mark.parametrize(
+    ("imperfect", "said"),
+    [
+        (
+            True,
+            "The residual is 1.90 times the noise, which an inexact law of the effect may explain. The effect removes",
+        ),
+        (False, "Something unknown is also missing: the residual is 1.90 times the noise. The effect removes"),
+    ],
+)
+def test_the_summary_tells_what_an_inexact_law_may_leave(loop: Loop, imperfect: bool, said: str):
+    report = report_dict(loop)
+    report["times_noise"], report["evidence"]["challenge"]["imperfect"] = 1.9, imperfect
+    assert said in summary(report)
 
 
 @pytest.mark.parametrize(("memory", "said"), [(0.028, "correlation time of about 28 ms"), (None, "")])
