@@ -97,7 +97,8 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         current = continued(this.winner.trial, study)
         study.progress(f"found {this.winner.name}")
     dropped = [*_holds_given_up(rounds, base.hold, current.hold), *_replaced(rounds)]
-    current, superfluous, without = _without_superfluous(current, base, study)
+    accepted = [this.winner.name for this in rounds if this.accepted and this.winner.name not in dropped]
+    current, superfluous, without = _without_superfluous(accepted[:-1], current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
     if kept and not dropped:
@@ -107,11 +108,20 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
     return Search(current, tuple(rounds), tuple(dropped), without, noise)
 
 
-def _without_superfluous(current: Trial, base: Trial, study: Study) -> tuple[Trial, list[str], dict[str, Trial]]:
-    """The model without superfluous effects, their names, and the model without each of the others but the last. An
-    effect is superfluous if its removal hardly changes the error on selection data."""
+def _without_superfluous(
+    names: Sequence[str], current: Trial, base: Trial, study: Study
+) -> tuple[Trial, list[str], dict[str, Trial]]:
+    """The model without superfluous effects, their names, and the model without each of the others. An effect, or a
+    hold, is superfluous if its removal hardly changes the error on selection data.
+
+    Args:
+        names: of what was accepted before the last round.
+        current: the model.
+        base: the model without effects.
+        study: the data and their segmentation.
+    """
     dropped, without = [], {}
-    for name in [e.name for e in current.model.effects][:-1]:
+    for name in names:
         poorer = refitted_without([name], current, base, study)
         if poorer.held_out.objective - current.held_out.objective < RULES.least_gain:
             dropped.append(name)

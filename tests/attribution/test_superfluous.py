@@ -1,12 +1,15 @@
-"""Forms that contain simpler ones: these are found where they suffice, and are replaced where they do not."""
+"""What a search has accepted and later effects make superfluous: simpler forms, and holds of the torque."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rig
+from fitting.attribution import effect_search
 from fitting.attribution.candidate_refit import _with_form
 from fitting.loop import close_loop
 from hdjax.effects import BY_NAME, CATALOGUE, Effect
@@ -44,3 +47,17 @@ def test_the_simplest_sufficient_form_is_found(friction: tuple[float, float], fo
     assert [f.name for f in loop.findings] == [form.name]
     if form is ViscousMotorFriction:
         np.testing.assert_allclose(float(loop.after.model.get("viscous_motor_friction.b")), B, rtol=0.05)
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_a_hold_that_later_effects_make_superfluous_is_dropped(monkeypatch: pytest.MonkeyPatch, better: bool):
+    """A base model without friction may follow a log better under a wrong hold."""
+
+    def trial(objective: float) -> Any:
+        return SimpleNamespace(held_out=SimpleNamespace(objective=objective))
+
+    current, reverted = trial(-20.0), trial(-22.0 if better else -19.0)
+    monkeypatch.setattr(effect_search, "refitted_without", lambda names, *_: {"linear hold": reverted}[names[0]])
+    found, dropped, without = effect_search._without_superfluous(["linear hold"], current, trial(0.0), cast(Any, None))
+    assert dropped == (["linear hold"] if better else [])
+    assert found is (reverted if better else current) and set(without) == (set() if better else {"linear hold"})
