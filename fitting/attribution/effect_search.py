@@ -98,7 +98,7 @@ def search_effects(base: Trial, study: Study, *, max_effects: int, catalogue: Se
         study.progress(f"found {this.winner.name}")
     dropped = [*_holds_given_up(rounds, base.hold, current.hold), *_replaced(rounds)]
     accepted = [this.winner.name for this in rounds if this.accepted and this.winner.name not in dropped]
-    current, superfluous, without = _without_superfluous(accepted[:-1], current, base, study)
+    current, superfluous, without = _without_superfluous(accepted, current, base, study)
     dropped += superfluous
     kept = [this for this in rounds if this.accepted and this.winner.name not in dropped]
     if kept and not dropped:
@@ -115,13 +115,16 @@ def _without_superfluous(
     hold, is superfluous if its removal hardly changes the error on selection data.
 
     Args:
-        names: of what was accepted before the last round.
+        names: of what was accepted, in that order. The last was accepted beside all others: it is tried only where one
+            of these was dropped.
         current: the model.
         base: the model without effects.
         study: the data and their segmentation.
     """
     dropped, without = [], {}
-    for name in names:
+    for i, name in enumerate(names):
+        if i == len(names) - 1 and not dropped:
+            break
         poorer = refitted_without([name], current, base, study)
         if poorer.held_out.objective - current.held_out.objective < RULES.least_gain:
             dropped.append(name)
