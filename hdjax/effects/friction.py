@@ -1,5 +1,6 @@
 """Friction that needs no state: in the mesh, on the motor, on the load."""
 
+import abc
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -7,7 +8,7 @@ from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
 from hdjax.effects.dry import DryLoadFriction, DryMeshFriction, DryMotorFriction, load_rate, motor_rate
-from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales
+from hdjax.effects.effect import Effect, LoadSideEffect, Motion, MotorSideEffect, Scales, ShaftEffect
 from hdjax.elementary import exponential
 from hdjax.parameters import Scalar, parameter
 
@@ -66,11 +67,8 @@ class LoadDependentFriction(DryMeshFriction):
         return self.T_c + self.share * jnp.abs(drive.stiffness * restoring(motion.x, drive.alpha))
 
 
-class ViscousMotorFriction(MotorSideEffect):
-    """Friction torque `b omega_m` against the motor."""
-
-    family: ClassVar[str] = "motor_friction"
-    name: ClassVar[str] = "viscous_motor_friction"
+class _Viscous(ShaftEffect):
+    """Friction torque `b omega` against a shaft."""
 
     b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
 
@@ -78,8 +76,24 @@ class ViscousMotorFriction(MotorSideEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return (cls(),)
 
+    @staticmethod
+    @abc.abstractmethod
+    def rate_of(motion: Motion) -> Array:
+        """Rate of the shaft [rad/s]."""
+
     def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return -self.b * motor_rate(motion)
+        return -self.b * self.rate_of(motion)
+
+
+class ViscousMotorFriction(_Viscous, MotorSideEffect):
+    """Friction torque `b omega_m` against the motor."""
+
+    family: ClassVar[str] = "motor_friction"
+    name: ClassVar[str] = "viscous_motor_friction"
+
+    @staticmethod
+    def rate_of(motion: Motion) -> Array:
+        return motor_rate(motion)
 
 
 class MotorFriction(DryMotorFriction):
@@ -160,20 +174,15 @@ class StribeckMotorFriction(DryMotorFriction):
         return super().torque(motion, drive, state) - self.b * motor_rate(motion)
 
 
-class ViscousLoadFriction(LoadSideEffect):
+class ViscousLoadFriction(_Viscous, LoadSideEffect):
     """Friction torque `b omega_l` against the load."""
 
     family: ClassVar[str] = "load_friction"
     name: ClassVar[str] = "viscous_load_friction"
 
-    b: Scalar = parameter(0.0, unit="N m s/rad", doc="viscous friction", source="EFFECTS", role="strength")
-
-    @classmethod
-    def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
-        return (cls(),)
-
-    def torque(self, motion: Motion, drive: Drive, state: Array) -> Array:
-        return -self.b * load_rate(motion)
+    @staticmethod
+    def rate_of(motion: Motion) -> Array:
+        return load_rate(motion)
 
 
 class LoadFriction(DryLoadFriction):
