@@ -9,11 +9,12 @@ from jaxtyping import Array, Bool, Float
 
 from fitting.estimation.engines import linearise, simulate
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.experiment import Stretch, cut
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters, free_parameters
 from fitting.estimation.problem import Segmentation, suggested_substeps
 from fitting.estimation.reach import Quantity, reach
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.segments import cut
 from hdjax import Model, TwoInertiaModel
 
 WINDOW = 50

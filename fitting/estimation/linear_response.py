@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial.polynomial import polyval
 
-from fitting.estimation.experiment import Segments
 from fitting.estimation.machine_code import actuated
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.segments import Segments
 from hdjax import Model, PiecewisePolynomial
 from hdjax.effects import ActuatorEffect, Conditions
 from hdjax.engine import unusable

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from fitting.estimation.experiment import Segments
 from fitting.estimation.linear_drive import over_a_step, readings
+from fitting.estimation.segments import Segments
 from hdjax import TwoInertiaModel
 
 # Periods of the slower resonance from which an initial state is estimated.

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitting.estimation.engines import with_engine
-from fitting.estimation.experiment import Segments, Stretch, cut
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import free_parameters
 from fitting.estimation.observed_states import observed_states
 from fitting.estimation.residual import Engine, Problem, Unknowns
 from fitting.estimation.scales import scales
+from fitting.estimation.segments import Segments, cut
 from hdjax import Drive, Model, TwoInertiaModel
 from hdjax.dynamics import BOTH_ANGLES
 from hdjax.engine.pointwise import at_instants
@@ -33,7 +34,7 @@ class Segmentation:
         length: samples in a segment; see [`segment_length`][] where not given.
         halo: intervals of torque before each segment, for delays.
         substeps: solver steps in a sample interval; from the natural frequency where not given.
-        count: number of segments, see [`fitting.estimation.experiment.cut`][].
+        count: number of segments, see [`fitting.estimation.segments.cut`][].
     """
 
     horizon: int

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitting.estimation.experiment import Segments
 from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.linear_response import Followed, Forces, respond
 from fitting.estimation.residual import Blocks
+from fitting.estimation.segments import Segments
 
 # Numbers whose square overflows.
 _NOTHING = 1e-200

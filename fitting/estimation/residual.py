@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.estimation.experiment import Segments
 from fitting.estimation.free_parameters import FreeParameters
+from fitting.estimation.segments import Segments
 from hdjax import Model
 from hdjax.compilation import library_of
 from hdjax.engine import Kernel

@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, lost
-from fitting.estimation.experiment import Segments
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.linear_response import Followed, follow
 from fitting.estimation.problem import STEP_ANGLE, suggested_substeps
 from fitting.estimation.projection import Answers, without_undetermined
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.segments import Segments
 from fitting.first_order.close_following import followed_closely
 from fitting.first_order.motion import Along, along
 from fitting.first_order.regressors import regressors

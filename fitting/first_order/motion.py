@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fitting.estimation.experiment import Segments, Stretch
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.linear_response import NODES, WEIGHTS, Followed, acting, inputs_at, polynomial
 from fitting.estimation.machine_code import actuated
+from fitting.estimation.segments import Segments
 from hdjax import Model, TwoInertiaModel
 from hdjax.effects import (
     ActuatorEffect,

@@ -15,10 +15,11 @@ from fitting.attribution.candidate_fit import Trial
 from fitting.attribution.selection_round import Verdict
 from fitting.estimation.base_fit import as_followed
 from fitting.estimation.estimate import Fit, Start, Strategy, fit
-from fitting.estimation.experiment import Experiment, Stretch, segment_count, whole
+from fitting.estimation.experiment import Experiment, Stretch, whole
 from fitting.estimation.free_parameters import fitted_paths
 from fitting.estimation.problem import Segmentation, segment_length, typical_scales
 from fitting.estimation.scales import scales
+from fitting.estimation.segments import segment_count
 from fitting.estimation.weighing import whitening
 from fitting.fit_drive import FitOnly
 from fitting.next_experiment.command_search import Candidate, is_smooth, largest_twist, search

@@ -7,10 +7,11 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import REWEIGHTINGS, Fit, zeros_like
-from fitting.estimation.experiment import Stretch, cut
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import initial_states, natural_frequency, on_all_devices
 from fitting.estimation.residual import RUNAWAY, Blocks, Problem, Unknowns
 from fitting.estimation.scales import of_twist, scales
+from fitting.estimation.segments import cut
 from fitting.estimation.solve import FIRST_DAMPING, NEARBY_DAMPING, solve
 from fitting.estimation.weighing import Shown, weighed
 

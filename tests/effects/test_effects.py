@@ -14,9 +14,10 @@ from scipy.integrate import solve_ivp
 
 import hdjax.effects
 from fitting.estimation.engines import linearise, with_engine
-from fitting.estimation.experiment import Experiment, Stretch, cut
+from fitting.estimation.experiment import Experiment, Stretch
 from fitting.estimation.free_parameters import FreeParameters
 from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.segments import cut
 from hdjax import Drive, Harmonic, ReducedDrive, ReducedModel, TwoInertiaModel, sampled, simulate
 from hdjax.effects import CATALOGUE, Motion, Scales
 from hdjax.effects.actuation import InputDelay

@@ -14,7 +14,8 @@ from scipy.interpolate import BSpline
 
 import rig
 from fitting.errors import InputError
-from fitting.estimation.experiment import cut, experiment_from_log, split
+from fitting.estimation.experiment import experiment_from_log, split
+from fitting.estimation.segments import cut
 from fitting.first_order.motion import acting_at_knots, unit_pushes, unit_reading
 from fitting.stored_model import StoredModel, read_model, to_json
 from hdjax import sampled

@@ -11,10 +11,11 @@ from test_engine_equations import models
 
 import rig
 from fitting.estimation.engines import linearise, residual_at, residual_with_blocks, simulate, with_engine
-from fitting.estimation.experiment import Experiment, Stretch, cut
+from fitting.estimation.experiment import Experiment, Stretch
 from fitting.estimation.free_parameters import fitted_paths, free_parameters
 from fitting.estimation.machine_code import _gap, lanes_of, task
 from fitting.estimation.residual import LOST, Blocks, Problem, Products, Unknowns, blocks
+from fitting.estimation.segments import cut
 from hdjax import Hold, Model, ReducedDrive, ReducedModel, TwoInertiaModel, sampled
 from hdjax.effects import CATALOGUE, DryFriction
 from hdjax.effects.effect import MeshTorqueEffect, Motion

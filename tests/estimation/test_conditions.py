@@ -8,10 +8,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import rig
-from fitting.estimation.experiment import Experiment, Stretch, cut, experiments_from_log
+from fitting.estimation.experiment import Experiment, Stretch, experiments_from_log
 from fitting.estimation.free_parameters import free_parameters
 from fitting.estimation.residual import Problem, Unknowns, simulate_segments
 from fitting.estimation.scales import scales
+from fitting.estimation.segments import cut
 from fitting.logs.log import Log
 from hdjax.effects.load import LoadDisturbance
 from hdjax.effects.thermal import ThermalStiffness

@@ -8,9 +8,10 @@ import pytest
 
 import rig
 from fitting.estimation.estimate import Fit, Start, Strategy, fit, lost
-from fitting.estimation.experiment import Stretch, cut
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
+from fitting.estimation.segments import cut
 from fitting.estimation.solver_steps import needed_substeps
 from fitting.estimation.weighing import whitening
 from fitting.uncertainty.standard_errors import uncertainty

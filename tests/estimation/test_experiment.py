@@ -9,16 +9,9 @@ from hypothesis import strategies as st
 
 import rig
 from fitting.errors import DataError
-from fitting.estimation.experiment import (
-    Experiment,
-    Stretch,
-    cut,
-    experiment_from_log,
-    experiments_from_log,
-    segment_count,
-    split,
-)
+from fitting.estimation.experiment import Experiment, Stretch, experiment_from_log, experiments_from_log, split
 from fitting.estimation.scales import scales
+from fitting.estimation.segments import cut, segment_count
 
 COUNT = 47
 LOAD_TORQUE = np.linspace(3.0, -2.0, COUNT)

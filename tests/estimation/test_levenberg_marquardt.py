@@ -10,11 +10,12 @@ from scipy.optimize import least_squares
 
 import rig
 from fitting.estimation.engines import residual_and_products
-from fitting.estimation.experiment import Stretch, cut
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths, free_parameters
 from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt, normal_equations, project
 from fitting.estimation.problem import initial_states
 from fitting.estimation.residual import Blocks, Problem, Products, Unknowns, blocks, residual
+from fitting.estimation.segments import cut
 from fitting.estimation.solve import evaluate
 from fitting.estimation.solve import solve as solve_by_steps
 

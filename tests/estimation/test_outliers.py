@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.estimation.experiment import Stretch, cut, experiment_from_log
+from fitting.estimation.experiment import Stretch, experiment_from_log
 from fitting.estimation.outliers import _alone, left_out, with_weights, without_glitches
+from fitting.estimation.segments import cut
 
 COUNT = 2000
 

@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import rig
-from fitting.estimation.experiment import Stretch, cut, experiment_from_log
+from fitting.estimation.experiment import Stretch, experiment_from_log
 from fitting.estimation.problem import initial_states, short_horizon, states_from, suggested_substeps
+from fitting.estimation.segments import cut
 from hdjax.effects.creep import Creep
 from hdjax.effects.hysteresis import BoucWen
 

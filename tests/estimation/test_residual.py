@@ -8,9 +8,10 @@ import pytest
 
 import rig
 from fitting.estimation.engines import residual_with_blocks
-from fitting.estimation.experiment import Stretch, cut
+from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths, effect_paths, free_parameters
 from fitting.estimation.residual import Problem, Unknowns, blocks, residual, simulate_segments
+from fitting.estimation.segments import cut
 from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.hysteresis import BoucWen
