@@ -6,7 +6,7 @@ also on held-out data. Applied to surrogates of the residual, it gives the null 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Generic
 
@@ -26,7 +26,7 @@ from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
 from hdjax import TwoInertiaModel
 from hdjax.effects import CATALOGUE, Effect, applicable
 
-# Relative error of the motion above which effects are evaluated along the measured motion instead.
+# Relative error of the motion above which effects are evaluated along the measured motion as well.
 _NEAR = 0.1
 
 
@@ -95,26 +95,42 @@ def screen(
     skipped = len(training.free.paths) - len(free_now)
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
-    fitted_motions = fitted_motion(training, seed, measured=strays), fitted_motion(held_out, seed + 1, measured=strays)
     known = len(free_now)
-    for batch in batches(fitted_motions, proposals, follow_on(training, held_out)):
-        scores = [_scores(*pair) for pair in zip(fitted_motions, batch.answers, strict=True)]
-        for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
-            fitted, unseen = (score.columns([*range(known), *(skipped + known + c for c in own)]) for score in scores)
-            columns = list(range(known, known + len(own)))
-            paths = strength_paths(effect)
-            info = model.with_effects(effect).parameters()
-            positive = [c for c, p in zip(columns, paths, strict=True) if info[p][1].positive]
-            step, gain = _linear_gain(fitted, unseen, known, positive)
-            chance = np.maximum(chance, null_gains(fitted, unseen, known))
-            if effect.name in leads and leads[effect.name].gain >= gain:
-                continue
-            strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
-            filled = model.with_effects(effect).replace(strengths).effect(effect.name)
-            changes = {p: step[i] for i, p in enumerate(free_now)}
-            leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
+    for effect, own, states, (fitted, unseen) in _responses(training, held_out, proposals, seed, strays=strays):
+        used = [*range(known), *(skipped + known + c for c in own)]
+        fitted, unseen = fitted.columns(used), unseen.columns(used)
+        columns = list(range(known, known + len(own)))
+        paths = strength_paths(effect)
+        info = model.with_effects(effect).parameters()
+        positive = [c for c, p in zip(columns, paths, strict=True) if info[p][1].positive]
+        step, gain = _linear_gain(fitted, unseen, known, positive)
+        chance = np.maximum(chance, null_gains(fitted, unseen, known))
+        if effect.name in leads and leads[effect.name].gain >= gain:
+            continue
+        strengths = {p: float(info[p][0]) + step[c] for c, p in zip(columns, paths, strict=True)}
+        filled = model.with_effects(effect).replace(strengths).effect(effect.name)
+        changes = {p: step[i] for i, p in enumerate(free_now)}
+        leads[effect.name] = Lead(filled, changes, gain, None if states is None else _filled_up(states, training))
     ordered = sorted(leads.values(), key=lambda lead: -lead.gain)
     return Screen(tuple(ordered), chance)
+
+
+def _responses(
+    training: Fit, held_out: Fit, proposals: Sequence[Effect], seed: int, *, strays: bool
+) -> Iterator[tuple[Effect, list[int], np.ndarray | None, tuple[Scores, Scores]]]:
+    """Each proposal, its columns, its hidden states at the start of each training segment, and the scores of training
+    and held-out data.
+
+    Where the model's motion strays from the log, effects are evaluated along the measured motion too. The true one is
+    between the two: an encoder reads a kinematic error as a twist that the spring does not have.
+    """
+    goes_on = follow_on(training, held_out)
+    for measured in (False, True) if strays else (False,):
+        motions = fitted_motion(training, seed, measured=measured), fitted_motion(held_out, seed + 1, measured=measured)
+        for batch in batches(motions, proposals, goes_on):
+            fitted, unseen = (_scores(*pair) for pair in zip(motions, batch.answers, strict=True))
+            for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
+                yield effect, own, states, (fitted, unseen)
 
 
 def _was_held(fit: Fit) -> bool:

@@ -16,6 +16,7 @@ from fitting.estimation.free_parameters import FreeParameters, base_paths, fitte
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.projection import solved, without_undetermined
 from fitting.estimation.residual import Blocks
+from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.surrogates import DRAWS, PARTNERS, chance_of_gain, surrogates
 from hdjax import Model
 from hdjax.effects import CATALOGUE, Effect
@@ -23,6 +24,7 @@ from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.backlash import Backlash
 from hdjax.effects.damping import QuadraticDamping
 from hdjax.effects.friction import CoulombFriction, MotorFriction
+from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, HORIZON, NOISE = 1200, 128, 1e-3
@@ -203,3 +205,18 @@ def test_only_a_positive_parameter_that_is_not_told_to_a_factor_e_is_left_out():
     np.testing.assert_array_equal(np.linalg.norm(found.by_parameter, axis=(0, 1)), [30.0, 0.0, 0.5])
     np.testing.assert_array_equal(found.before_by_parameter[..., 1], 0.0)
     np.testing.assert_array_equal(found.before_by_parameter[..., [0, 2]], 1.0)
+
+
+def test_a_kinematic_error_leads_although_the_encoders_read_it_as_a_twist():
+    physics = {"rms": 0.05, "kinematic": (1e-4, 2e-4), "state": (0.0, 0.0, 15.0, 0.3)}
+    training, held_out = split([rig.drive_experiment(2400, **physics)])
+    segmentation = Segmentation(HORIZON, halo=4, substeps=2)
+    found = fit(rig.drive_model(), training, base_paths(rig.drive_model()), segmentation)
+    again = Strategy(hold_parameters=True)
+    unseen = fit(
+        found.model, held_out, base_paths(found.model), segmentation, start=Start(found.covariance), strategy=again
+    )
+    assert not follows(found, share=0.1)
+    lead = screen(found, unseen, catalogue=(KinematicError, MotorFriction)).leads[0]
+    assert isinstance(lead.effect, KinematicError)
+    assert float(lead.effect.sin_2) == pytest.approx(2e-4, rel=0.1)
