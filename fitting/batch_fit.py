@@ -23,9 +23,10 @@ import polars as pl
 from fitting.drive_data import Rig, read_rig
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
-from fitting.fit_drive import FitOnly, fit_only
+from fitting.fit_drive import fit_only
 from fitting.formatting import in_log_words
 from fitting.logs.read_table import LOG_SUFFIXES
+from fitting.outcome import FitOnly
 from fitting.validation.account import Account
 from hdjax import SimulationError
 from hdjax.cluster import on_cluster

@@ -84,7 +84,8 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
-        beyond = surprise(fitted, at_first, runs, current.held_out, **known)
+        enough = RULES.free_run_explained
+        beyond = surprise(fitted, at_first, runs, current.held_out, explained=enough, **known)
         seen = replace(seen, surprise=beyond)
         outcome, _ = conclude(seen)
         if outcome == "unexplained":

@@ -1,13 +1,9 @@
 """A fit without a search for effects, with all its diagnostics."""
 
 from collections.abc import Mapping
-from typing import ClassVar
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
 
-from fitting.attribution.selection_round import Round
 from fitting.clock import Clock
 from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
 from fitting.estimation.estimate import Fit
@@ -16,75 +12,17 @@ from fitting.estimation.free_parameters import with_priors
 from fitting.estimation.sample_rate import refined_intervals, with_intervals
 from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import long_fit
-from fitting.outcome import Finding
+from fitting.outcome import FitOnly
 from fitting.progress import Progress, silent
-from fitting.stored_model import StoredModel
 from fitting.uncertainty.measurement_noise import measurement_noise
-from fitting.uncertainty.posterior import Posterior, posterior
-from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
-from fitting.validation.account import Account, account
-from fitting.validation.frequency_response import FrequencyResponse, frequency_response
-from fitting.validation.goodness_of_fit import Goodness, goodness
-from fitting.validation.residual_diagnostics import ResidualDiagnostics, diagnose
-from fitting.validation.residual_tests import ResidualTests, residual_tests
+from fitting.uncertainty.posterior import posterior
+from fitting.uncertainty.prediction_band import prediction_bands
+from fitting.validation.account import account
+from fitting.validation.frequency_response import frequency_response
+from fitting.validation.goodness_of_fit import goodness
+from fitting.validation.residual_diagnostics import diagnose
+from fitting.validation.residual_tests import residual_tests
 from hdjax import Hold, Model, TwoInertiaModel
-
-
-class FitOnly(eqx.Module):
-    """A fitted drive; takes the place of a [`Loop`][] in reports.
-
-    Attributes:
-        account: of the fitted model.
-        start: the starting model.
-        noise: covariance of the measurement noise of the outputs.
-        hold: inter-sample behaviour of the torque, as used.
-        residual: diagnostics of the residual.
-        tests: of the residual.
-        goodness: figures of merit.
-        frequency_response: of the logs and of the model; None where the logs are too short.
-        bands: prediction bands of the free runs, along test data where there are any.
-        posterior: draws, if requested.
-        seconds: time by stage.
-        by_load: whether K, alpha and B_sp are those of the load's equation, see [`fitting.estimation.motor_driven`][],
-            since the torque does not explain the motion.
-        by_friction: whether all parameters are those of a fit with friction of the motor, see
-            [`fitting.estimation.beside_friction`][], for the same reason, if the load was not measured.
-        assumed: value of an unknown inertia in the load's equation, if `by_load`.
-    """
-
-    account: Account
-    start: Model
-    noise: Float[Array, "outputs outputs"]
-    hold: Hold = eqx.field(static=True)
-    residual: ResidualDiagnostics
-    tests: ResidualTests
-    goodness: Goodness
-    frequency_response: FrequencyResponse | None
-    bands: tuple[PredictionBand, ...]
-    posterior: Posterior | None
-    seconds: dict[str, float]
-    by_load: bool = eqx.field(static=True)
-    by_friction: bool = eqx.field(static=True)
-    assumed: dict[str, float]
-    decision: ClassVar[str] = "fit_only"
-    findings: ClassVar[tuple[Finding, ...]] = ()
-    rounds: ClassVar[tuple[Round, ...]] = ()
-    dropped: ClassVar[tuple[str, ...]] = ()
-
-    @property
-    def stored(self) -> StoredModel:
-        """The model, as `model.json` has it."""
-        return StoredModel(self.account.model, self.hold, self.goodness.substeps, 0, self.noise)
-
-    @property
-    def before(self) -> Account:
-        """The account."""
-        return self.account
-
-    @property
-    def after(self) -> Account:
-        """The account, as there is no second model."""
-        return self.account
 
 
 def fit_only(

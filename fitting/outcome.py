@@ -1,4 +1,6 @@
-"""Outcome of the closed loop."""
+"""Outcomes of a fit and of the closed loop."""
+
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -11,9 +13,14 @@ from fitting.attribution.study import Setting
 from fitting.discrepancy.learn import Unknown
 from fitting.estimation.experiment import Stretch
 from fitting.stored_model import StoredModel
+from fitting.uncertainty.posterior import Posterior
+from fitting.uncertainty.prediction_band import PredictionBand
 from fitting.validation.account import Account
+from fitting.validation.frequency_response import FrequencyResponse
+from fitting.validation.goodness_of_fit import Goodness
 from fitting.validation.residual_diagnostics import ResidualDiagnostics
-from hdjax import Hold
+from fitting.validation.residual_tests import ResidualTests
+from hdjax import Hold, Model
 from hdjax.effects import Effect
 
 
@@ -34,6 +41,63 @@ class Finding(eqx.Module):
     family: str = eqx.field(static=True)
     gain: float
     p_value: float
+
+
+class FitOnly(eqx.Module):
+    """The outcome of a fit without a search for effects.
+
+    Attributes:
+        account: of the fitted model.
+        start: the starting model.
+        noise: covariance of the measurement noise of the outputs.
+        hold: inter-sample behaviour of the torque, as used.
+        residual: diagnostics of the residual.
+        tests: of the residual.
+        goodness: figures of merit.
+        frequency_response: of the logs and of the model; None where the logs are too short.
+        bands: prediction bands of the free runs, along test data where there are any.
+        posterior: draws, if requested.
+        seconds: time by stage.
+        by_load: whether K, alpha and B_sp are those of the load's equation, see [`fitting.estimation.motor_driven`][],
+            since the torque does not explain the motion.
+        by_friction: whether all parameters are those of a fit with friction of the motor, see
+            [`fitting.estimation.beside_friction`][], for the same reason, if the load was not measured.
+        assumed: value of an unknown inertia in the load's equation, if `by_load`.
+    """
+
+    account: Account
+    start: Model
+    noise: Float[Array, "outputs outputs"]
+    hold: Hold = eqx.field(static=True)
+    residual: ResidualDiagnostics
+    tests: ResidualTests
+    goodness: Goodness
+    frequency_response: FrequencyResponse | None
+    bands: tuple[PredictionBand, ...]
+    posterior: Posterior | None
+    seconds: dict[str, float]
+    by_load: bool = eqx.field(static=True)
+    by_friction: bool = eqx.field(static=True)
+    assumed: dict[str, float]
+    decision: ClassVar[str] = "fit_only"
+    findings: ClassVar[tuple[Finding, ...]] = ()
+    rounds: ClassVar[tuple[Round, ...]] = ()
+    dropped: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def stored(self) -> StoredModel:
+        """The model, as `model.json` has it."""
+        return StoredModel(self.account.model, self.hold, self.goodness.substeps, 0, self.noise)
+
+    @property
+    def before(self) -> Account:
+        """The account."""
+        return self.account
+
+    @property
+    def after(self) -> Account:
+        """The account, as there is no second model."""
+        return self.account
 
 
 class Loop(eqx.Module):

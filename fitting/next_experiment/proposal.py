@@ -21,11 +21,10 @@ from fitting.estimation.problem import Segmentation, segment_length, typical_sca
 from fitting.estimation.scales import scales
 from fitting.estimation.segments import segment_count
 from fitting.estimation.weighing import whitening
-from fitting.fit_drive import FitOnly
 from fitting.next_experiment.command_search import Candidate, is_smooth, largest_twist, search
 from fitting.next_experiment.discrimination import Bench, Explanation, Refit, Response, explanation, in_own_units
 from fitting.next_experiment.excitation import Excitation, Limits, excitations, reached
-from fitting.outcome import Loop
+from fitting.outcome import FitOnly, Loop
 from fitting.progress import Progress, silent
 from fitting.uncertainty.normal_law import NORMAL_95
 from hdjax import Hold, Model, TwoInertiaModel, sampled

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitting import formatting
-from fitting.fit_drive import FitOnly
+from fitting.outcome import FitOnly
 from fitting.report.outputs import in_words
 from fitting.uncertainty.prediction_band import coverage
 from fitting.validation.frequency_response import (

@@ -1,6 +1,5 @@
 """Subject of a report: a closed loop, or a fit alone."""
 
-from fitting.fit_drive import FitOnly
-from fitting.outcome import Loop
+from fitting.outcome import FitOnly, Loop
 
 Outcome = Loop | FitOnly

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fitting import formatting
-from fitting.loop import Finding
+from fitting.outcome import Finding
 from fitting.report.limits import NOT_TOLD_FROM_ZERO, in_words_of_log, parameter_note
 from fitting.report.outcome import Outcome
 from fitting.uncertainty.standard_errors import Estimate, Uncertainty

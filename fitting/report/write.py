@@ -10,9 +10,8 @@ from typing import Any
 from fitting.discrepancy.curve import LearnedCurve
 from fitting.drive_data import Rig
 from fitting.files import write_whole
-from fitting.fit_drive import FitOnly
 from fitting.next_experiment.proposal import NextExperiment
-from fitting.outcome import Loop
+from fitting.outcome import FitOnly, Loop
 from fitting.report.content import report_dict
 from fitting.report.outcome import Outcome
 from fitting.report.page import report_page

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.attribution.rules import RULES
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_run import FreeRun, rms_error
 from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
@@ -19,6 +18,7 @@ def surprise(
     after: Sequence[FreeRun],
     held_out: Fit,
     *,
+    explained: float,
     noise: Float[Array, "outputs outputs"],
     halo: int,
     torque_noise: float = 0.0,
@@ -26,8 +26,8 @@ def surprise(
     """Rms error of free runs along held-out stretches, over the rms of their prediction bands. Bands contain the
     residual of short segments, and the uncertainty of parameters and initial state.
 
-    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where the model explains most
-    of the free runs' error (bands do not contain inexact laws), or where its bands diverge.
+    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where the effects explain
+    enough of the free runs' error (bands do not contain inexact laws), or where its bands diverge.
 
     Args:
         final: the model with its effects.
@@ -35,6 +35,7 @@ def surprise(
         after: likewise of the final model.
         held_out: the final model on short segments of the held-out stretches, whose residual contains all coloured
             noise.
+        explained: share of the base model's variance beyond the noise that is enough.
         noise: covariance of the measurement noise, estimated from shorter pieces.
         halo: intervals of torque before a stretch.
         torque_noise: standard deviation of the noise of a torque sample [N m].
@@ -42,7 +43,7 @@ def surprise(
     short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
     variance = float(short[-1, -1])
     at_first = rms_error(before) ** 2 - variance
-    if rms_error(after) ** 2 - variance <= (1.0 - RULES.free_run_explained) * at_first:
+    if rms_error(after) ** 2 - variance <= (1.0 - explained) * at_first:
         return None
     bands = prediction_bands(
         final,

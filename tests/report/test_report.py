@@ -24,10 +24,10 @@ from fitting.attribution.selection_round import Verdict
 from fitting.estimation.estimate import Fit
 from fitting.estimation.experiment import Experiment, whole
 from fitting.estimation.starting_values import starting_models
-from fitting.fit_drive import FitOnly, fit_only
+from fitting.fit_drive import fit_only
 from fitting.logs.findings import Finding
 from fitting.loop import close_loop
-from fitting.outcome import Loop
+from fitting.outcome import FitOnly, Loop
 from fitting.report import (
     Report,
     explained_share,

@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fitting.estimation.free_run import FreeRun
-from fitting.fit_drive import FitOnly
-from fitting.outcome import Loop
+from fitting.outcome import FitOnly, Loop
 from fitting.report.outputs import noise_of_outputs
 from fitting.report.plots.competition import competition
 from fitting.report.plots.correlations import correlations
