@@ -20,7 +20,14 @@ from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.scales import scales
 from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import follows
-from fitting.first_order.linearised_fit import Answered, FittedMotion, batches, fitted_motion, follow_on
+from fitting.first_order.linearised_fit import (
+    Answered,
+    FittedMotion,
+    along_measured_motion,
+    batches,
+    fitted_motion,
+    follow_on,
+)
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
 from hdjax import TwoInertiaModel
@@ -124,13 +131,15 @@ def _responses(
     Where the model's motion strays from the log, effects are evaluated along the measured motion too. The true one is
     between the two: an encoder reads a kinematic error as a twist that the spring does not have.
     """
-    goes_on = follow_on(training, held_out)
-    for measured in (False, True) if strays else (False,):
-        motions = fitted_motion(training, seed, measured=measured), fitted_motion(held_out, seed + 1, measured=measured)
-        for batch in batches(motions, proposals, goes_on):
+    first, second = fitted_motion(training, seed), fitted_motion(held_out, seed + 1)
+    pairs = [(first, second)]
+    if strays:
+        pairs.append((along_measured_motion(first, training), along_measured_motion(second, held_out)))
+    for motions in pairs:
+        for batch in batches(motions, proposals, follow_on(training, held_out)):
             fitted, unseen = (_scores(*pair) for pair in zip(motions, batch.answers, strict=True))
-            for effect, own, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
-                yield effect, own, states, (fitted, unseen)
+            for effect, columns, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
+                yield effect, columns, states, (fitted, unseen)
 
 
 def _was_held(fit: Fit) -> bool:

@@ -46,13 +46,12 @@ class FittedMotion(eqx.Module):
     surrogates: Float[np.ndarray, "draws segments rows"]
 
 
-def fitted_motion(fit: Fit, seed: int, *, measured: bool = False) -> FittedMotion:
+def fitted_motion(fit: Fit, seed: int) -> FittedMotion:
     """Linearise a fit along its motion.
 
     Args:
         fit: of the current model.
         seed: of the surrogates.
-        measured: whether effects act along the measured motion, see [`fitting.first_order.close_following`][].
     """
     problem, unknowns = _linearised(fit)
     found = without_undetermined(linearise(problem, unknowns), problem.free)
@@ -63,13 +62,23 @@ def fitted_motion(fit: Fit, seed: int, *, measured: bool = False) -> FittedMotio
         before_by_parameter=jnp.asarray(np.asarray(found.before_by_parameter) / slopes),
     )
     followed, segments, residual = motion_and_residual(fit, problem, unknowns)
-    seen = followed_closely(fit) if measured else followed
     return FittedMotion(
-        seen=along(fit.model, seen, segments, fit.stretches),
+        seen=along(fit.model, followed, segments, fit.stretches),
         answers=Answers.of(found, followed, segments, np.asarray(problem.whitening)),
         residual=residual,
         surrogates=surrogates(fit, seed)[:, : len(residual)],
     )
+
+
+def along_measured_motion(fitted: FittedMotion, fit: Fit) -> FittedMotion:
+    """The same with inputs of effects along the measured motion, see [`fitting.first_order.close_following`][].
+
+    Args:
+        fitted: along the fit's own motion.
+        fit: that was linearised.
+    """
+    seen = along(fit.model, followed_closely(fit), fitted.seen.segments, fit.stretches)
+    return replace(fitted, seen=seen)
 
 
 def motion_and_residual(
