@@ -31,7 +31,7 @@ from fitting.first_order.linearised_fit import (
 from fitting.first_order.spectral_lines import spectral_lines
 from fitting.first_order.surrogates import DRAWS, PARTNERS, Scores, null_gains
 from hdjax import TwoInertiaModel
-from hdjax.effects import CATALOGUE, Effect, applicable
+from hdjax.effects import CATALOGUE, ActuatorEffect, Effect, applicable
 
 # Relative error of the motion above which effects are evaluated along the measured motion as well.
 _NEAR = 0.1
@@ -132,11 +132,13 @@ def _responses(
     between the two: an encoder reads a kinematic error as a twist that the spring does not have.
     """
     first, second = fitted_motion(training, seed), fitted_motion(held_out, seed + 1)
-    pairs = [(first, second)]
+    passes = [((first, second), proposals)]
     if strays:
-        pairs.append((along_measured_motion(first, training), along_measured_motion(second, held_out)))
-    for motions in pairs:
-        for batch in batches(motions, proposals, follow_on(training, held_out)):
+        measured = along_measured_motion(first, training), along_measured_motion(second, held_out)
+        # Effects on the torque signal do not depend on the motion.
+        passes.append((measured, [p for p in proposals if not isinstance(p, ActuatorEffect)]))
+    for motions, tried in passes:
+        for batch in batches(motions, tried, follow_on(training, held_out)):
             fitted, unseen = (_scores(*pair) for pair in zip(motions, batch.answers, strict=True))
             for effect, columns, states in zip(batch.proposals, batch.columns, batch.own_states, strict=True):
                 yield effect, columns, states, (fitted, unseen)
