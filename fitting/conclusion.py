@@ -20,7 +20,7 @@ from fitting.estimation.whole_log_fit import long_fit
 from fitting.uncertainty.measurement_noise import MeasurementNoise
 from fitting.uncertainty.noise_model import NoiseModel
 from fitting.validation.account import excess, free_runs
-from fitting.validation.free_run_check import surprise
+from fitting.validation.free_run_check import share_explained, surprise
 from hdjax import Hold
 
 
@@ -84,9 +84,9 @@ def draw_conclusion(base: Trial, challenge: Challenge, study: Study, *, noise: M
     at_first, runs = along_selection(base.training, base.hold), along_selection(fitted, current.hold)
     if outcome == "effect_found":
         known = {"noise": covariance, "halo": study.setting.halo, "torque_noise": noise_of_torque(left) or 0.0}
-        enough = RULES.free_run_explained
-        beyond = surprise(fitted, at_first, runs, current.held_out, explained=enough, **known)
-        seen = replace(seen, surprise=beyond)
+        # Laws are not exact, which bands do not include.
+        enough = not share_explained(at_first, runs, current.held_out, covariance) < RULES.free_run_explained
+        seen = replace(seen, surprise=None if enough else surprise(fitted, runs, current.held_out, **known))
         outcome, _ = conclude(seen)
         if outcome == "unexplained":
             # A learned term that follows long stretches may replace names that do not.

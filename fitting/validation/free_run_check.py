@@ -12,13 +12,28 @@ from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
 from fitting.uncertainty.standard_errors import uncertainty
 
 
+def share_explained(
+    before: Sequence[FreeRun], after: Sequence[FreeRun], held_out: Fit, noise: Float[Array, "outputs outputs"]
+) -> float:
+    """Share of the variance beyond noise, of the base model's free runs, that the effects remove. NaN where both models
+    diverge.
+
+    Args:
+        before: free runs of the base model along the held-out stretches.
+        after: likewise of the final model.
+        held_out: the final model on short segments of the held-out stretches.
+        noise: covariance of the measurement noise, estimated from shorter pieces.
+    """
+    variance = float(_short_error(held_out, noise)[-1, -1])
+    at_first = max(rms_error(before) ** 2 - variance, np.finfo(float).tiny)
+    return 1.0 - (rms_error(after) ** 2 - variance) / at_first
+
+
 def surprise(
     final: Fit,
-    before: Sequence[FreeRun],
-    after: Sequence[FreeRun],
+    runs: Sequence[FreeRun],
     held_out: Fit,
     *,
-    explained: float,
     noise: Float[Array, "outputs outputs"],
     halo: int,
     torque_noise: float = 0.0,
@@ -26,35 +41,24 @@ def surprise(
     """Rms error of free runs along held-out stretches, over the rms of their prediction bands. Bands contain the
     residual of short segments, and the uncertainty of parameters and initial state.
 
-    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where the effects explain
-    enough of the free runs' error (bands do not contain inexact laws), or where its bands diverge.
+    Near one for a right model, also a chaotic one, whose bands grow like its errors. None where its bands diverge.
 
     Args:
         final: the model with its effects.
-        before: free runs of the base model along the held-out stretches.
-        after: likewise of the final model.
-        held_out: the final model on short segments of the held-out stretches, whose residual contains all coloured
-            noise.
-        explained: share of the base model's variance beyond the noise that is enough.
+        runs: its free runs along the held-out stretches.
+        held_out: the model on short segments of these stretches, whose residual contains all coloured noise.
         noise: covariance of the measurement noise, estimated from shorter pieces.
         halo: intervals of torque before a stretch.
         torque_noise: standard deviation of the noise of a torque sample [N m].
     """
-    short = max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
-    variance = float(short[-1, -1])
-    at_first = rms_error(before) ** 2 - variance
-    if rms_error(after) ** 2 - variance <= (1.0 - explained) * at_first:
-        return None
-    bands = prediction_bands(
-        final,
-        uncertainty(final),
-        held_out.stretches,
-        noise=short,
-        halo=halo,
-        runs=after,
-        torque_noise=torque_noise,
-    )
-    return over_bands(bands)
+    short = _short_error(held_out, noise)
+    known = {"noise": short, "halo": halo, "runs": runs, "torque_noise": torque_noise}
+    return over_bands(prediction_bands(final, uncertainty(final), held_out.stretches, **known))
+
+
+def _short_error(held_out: Fit, noise: Float[Array, "outputs outputs"]) -> Float[Array, "outputs outputs"]:
+    """Covariance of the error over short segments; at least the measurement noise."""
+    return max(noise, held_out.covariance, key=lambda covariance: float(covariance[-1, -1]))
 
 
 def over_bands(bands: Sequence[PredictionBand]) -> float | None:
