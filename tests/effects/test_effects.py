@@ -1,4 +1,4 @@
-"""Laws that every effect of the catalogue obeys, and what is special to some."""
+"""Laws that every effect of the catalogue obeys: zero strength, derivatives and energy."""
 
 import functools
 
@@ -33,7 +33,7 @@ from hdjax.effects.stiffness import ThreeSlopeStiffness
 from hdjax.parameters import own_parameters
 from hdjax.simulate import march
 
-# A drive like the preset, damped enough to forget its start within the record, with a cubic term of one per cent.
+# A drive like the preset with a cubic term of one per cent; its initial transient decays within the record.
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0, alpha=2e4, B_sp=2.0)
 STEP = 1e-3
 TIME = STEP * np.arange(200)
@@ -43,16 +43,17 @@ TORQUE = sampled(
     1.5 * np.cos(50 * TIME) + 0.8 * np.sin(330 * TIME) + 0.5 * np.sin(410 * TIME + 1.0),
     hold="linear",
 )
-# Ten kelvin up over the record; the base drive does not care.
+# It rises by ten kelvin over the record; the base drive does not depend on it.
 TEMPERATURE = sampled(TIME, 300.0 + 50.0 * TIME, hold="linear")
 START = jnp.asarray([0.3, 0.007, 5.0, 0.2])
 
 
-def marched(model, torque, start, substeps=1, settled=None):
-    """What the encoders read, and its derivatives by each parameter of the last effect, by dotted path. The drive's own
-    states start at `start`, an effect's where those of `settled` are, of the model itself where not given.
+def outputs_and_slopes(model, torque, start, substeps=1, settled=None):
+    """Outputs of a simulation and their derivatives by each parameter of the last effect, by dotted path.
 
-    By machine code, which agrees with XLA for every form (`test_engine_march.py`) and compiles sooner.
+    The drive's states start at `start`. States of effects start where those of the model `settled` are, by default of
+    the model itself. It runs by machine code, which agrees with XLA for every form (`test_engine_march.py`) and
+    compiles sooner.
     """
     count = torque.knots.size - 1
     warmth = eqx.tree_at(lambda s: s.coefficients, torque, jnp.zeros((count, 1)) + 300.0)
@@ -75,13 +76,13 @@ def marched(model, torque, start, substeps=1, settled=None):
 
 
 def outputs(model, torque, start, substeps=1, settled=None):
-    """What the encoders read, as in [`marched`][]."""
-    return marched(model, torque, start, substeps, settled)[0]
+    """Outputs of a simulation, as in [`outputs_and_slopes`][]."""
+    return outputs_and_slopes(model, torque, start, substeps, settled)[0]
 
 
 def slopes(model, torque, start):
     """Derivative of the outputs with respect to each parameter of the last effect, by dotted path."""
-    return marched(model, torque, start)[1]
+    return outputs_and_slopes(model, torque, start)[1]
 
 
 BASE = TwoInertiaModel(DRIVE)
@@ -98,7 +99,7 @@ def rms(x) -> float:
 
 @functools.cache
 def scales() -> Scales:
-    """As they would be taken from the motion itself."""
+    """Scales of the base model's motion."""
     theta, x = base_outputs().T
     rate = functools.partial(np.gradient, axis=0)
     v, omega = rate(x) / STEP, rate(theta) / STEP
@@ -120,9 +121,9 @@ def scales() -> Scales:
 
 @functools.cache
 def at_strength(form, share: float):
-    """The base model with the effect so strong that each of its strengths alone would move the twist by this share.
+    """The base model with the effect, each of whose strengths alone changes the twist by this share to first order.
 
-    To first order; the signs are positive.
+    All strengths are positive.
     """
     effect = form.proposals(scales())[0]
     model = BASE.with_effects(effect)
@@ -144,17 +145,17 @@ DELAYED = ("input_delay", "input_lag", "motor_encoder_delay")
 
 
 @every_form
-def test_at_zero_strength_the_effect_is_gone(form):
+def test_effect_of_zero_strength_is_the_base_model(form):
     for effect in form.proposals(scales()):
         found = np.asarray(outputs(BASE.with_effects(effect), TORQUE, START))
-        # Rounding over 200 steps; a delayed torque is late by 1e-9 of a step, in which the twist moves by as much.
+        # Rounding over 200 steps; a delayed torque is late by 1e-9 of a step, which changes the twist by as much.
         error = np.abs(found - base_outputs()).max(axis=0) / np.abs(base_outputs()).max(axis=0)
         assert error.max() < (1e-8 if form.name in DELAYED else 1e-12)
 
 
 @every_form
-def test_at_some_strength_the_motion_changes(form):
-    """By about what the derivative at zero promised: a tenth for each strength."""
+def test_effect_changes_the_motion_as_its_derivative_predicts(form):
+    """By about a tenth for each strength, according to the derivative at zero."""
     model = at_strength(form, 0.1)
     change = rms(np.asarray(outputs(model, TORQUE, START))[:, 1] - base_outputs()[:, 1]) / rms(base_outputs()[:, 1])
     count = sum(info.role == "strength" for _, info in own_parameters(model.effects[0]))
@@ -162,7 +163,7 @@ def test_at_some_strength_the_motion_changes(form):
 
 
 @every_form
-def test_gradients_with_respect_to_every_strength_and_shape(form):
+def test_gradients_by_strength_and_shape_agree_with_differences(form):
     model = at_strength(form, 0.03)
     gradients = slopes(model, TORQUE, START)
     for name, info in own_parameters(model.effects[0]):
@@ -188,12 +189,12 @@ def test_gradients_with_respect_to_every_strength_and_shape(form):
 FREE_STEP = 2e-5
 FREE_TIME = FREE_STEP * np.arange(4000)
 NO_TORQUE = sampled(FREE_TIME, np.zeros(FREE_TIME.size), hold="zero-order")
-SPRUNG = jnp.asarray([0.2, 0.7, 3.0, 0.1]).at[0].add(50 * 0.7)  # twisted by 4 mrad, away from gravity's rest
+SPRUNG = jnp.asarray([0.2, 0.7, 3.0, 0.1]).at[0].add(50 * 0.7)  # twisted by 4 mrad off its equilibrium
 
 
 @eqx.filter_jit
 def released(model):
-    """States of a drive let go from a twist, without torque."""
+    """States of a drive released from a twist, without torque."""
     state = model.rest().at[:4].set(SPRUNG)
     return march(model, NO_TORQUE, None, state, solver=dfx.Tsit5(), substeps=1)[0]
 
@@ -203,7 +204,7 @@ def spring(x, alpha):
 
 
 def energy(model: TwoInertiaModel, states) -> np.ndarray:
-    """Kinetic energy and every potential, each written down from EFFECTS.md."""
+    """Kinetic energy and every potential, by the equations of EFFECTS.md."""
     theta_m, theta_l, omega_m, omega_l, *own = np.asarray(states).T
     value = {path.split(".")[-1]: float(v) for path, (v, _) in model.parameters().items()}
     names = {effect.name for effect in model.effects}
@@ -293,7 +294,7 @@ def lossless(form, share=0.2):
     [*(f for f in CATALOGUE if f.family in CONSERVATIVE), ConservativePositionDependentStiffness],
     ids=lambda form: form.name,
 )
-def test_a_conservative_effect_keeps_the_energy(form):
+def test_conservative_effect_keeps_the_energy(form):
     model, states = lossless(form)
     found = energy(model, states)
     exchanged = np.ptp(energy(model.without_effect(form.name), states))
@@ -303,12 +304,12 @@ def test_a_conservative_effect_keeps_the_energy(form):
 
 
 @forms_of(DISSIPATIVE)
-def test_a_dissipative_effect_loses_energy(form):
+def test_dissipative_effect_loses_energy(form):
     model, states = lossless(form)
     found = energy(model, states)
     # A light third inertia or a slow creep takes little in five periods.
     assert found[-1] < (0.999 if form.family in ("creep", "extra_resonance") else 0.97) * found[0]
-    # A form with states of its own stores some and gives it back.
+    # A form with hidden states stores some energy and returns it.
     if not form.states or form in STORE_IS_KNOWN:
         assert np.all(np.diff(found) < 1e-9 * found[0])
 
@@ -316,7 +317,7 @@ def test_a_dissipative_effect_loses_energy(form):
 # -- what is special to one effect --
 
 
-def test_coulomb_friction_makes_a_linear_envelope():
+def test_decay_under_coulomb_friction_has_a_linear_envelope():
     """Each half period of an undamped drive costs 2 T_c / omega_0^2 of amplitude."""
     omega, f = 50.0, 0.02
     friction = CoulombFriction(T_c=f * omega**2, v_0=1e-3 * omega)
@@ -329,7 +330,7 @@ def test_coulomb_friction_makes_a_linear_envelope():
 
 
 @jax.jit
-def follow(effect: BoucWen, x: jax.Array) -> jax.Array:
+def hysteresis_states(effect: BoucWen, x: jax.Array) -> jax.Array:
     """z along a prescribed, piecewise linear twist, by Runge-Kutta steps in the path."""
 
     def step(z, dx):
@@ -353,26 +354,28 @@ def follow(effect: BoucWen, x: jax.Array) -> jax.Array:
     n=st.floats(1.0, 4.0),
     memory_twist=st.floats(1e-5, 1e-2),
 )
-def test_bouc_wen_never_exceeds_its_yield(seed, ratio, n, memory_twist):
+def test_bouc_wen_state_never_exceeds_its_yield_twist(seed, ratio, n, memory_twist):
     rng = np.random.default_rng(seed)
     yield_twist = memory_twist * (1 + ratio) ** (-1 / n)
     x = np.interp(np.arange(3000) / 100, np.arange(31), yield_twist * 4 * rng.normal(size=31))
-    z = np.asarray(follow(BoucWen(k=1.0, memory_twist=memory_twist, ratio=ratio, n=n), jnp.asarray(x)))
+    z = np.asarray(hysteresis_states(BoucWen(k=1.0, memory_twist=memory_twist, ratio=ratio, n=n), jnp.asarray(x)))
     assert np.abs(z).max() <= yield_twist * (1 + 1e-9)
     assert np.abs(z).max() > 0.5 * yield_twist
 
 
-def test_bouc_wen_against_its_own_closed_form():
-    """n = 1 loads from 0 as y (1 - exp(-x/y)), unloads with slope 1 + (beta - gamma)|z|; where gamma < -beta, y is
-    negative and z runs away."""
+def test_bouc_wen_with_unit_exponent_agrees_with_the_closed_form():
+    """Loading from 0 gives `y (1 - exp(-x/y))`, unloading has the slope `1 + (beta - gamma)|z|`.
+
+    Where gamma < -beta, y is negative and z diverges.
+    """
     y = 1e-3
     x = np.linspace(0, 3 * y, 1001)
     effect = BoucWen(k=1.0, memory_twist=y / 0.7, ratio=3 / 7)
-    z = np.asarray(follow(effect, jnp.asarray(x)))
+    z = np.asarray(hysteresis_states(effect, jnp.asarray(x)))
     np.testing.assert_allclose(z, y * (1 - np.exp(-x[1:] / y)), atol=1e-9 * y)
     hardening = BoucWen(k=1.0, memory_twist=1e-3, ratio=-1.5)
     np.testing.assert_allclose(
-        np.asarray(follow(hardening, jnp.asarray(x))), 2 * y * (np.exp(x[1:] / (2 * y)) - 1), rtol=1e-9
+        np.asarray(hysteresis_states(hardening, jnp.asarray(x))), 2 * y * (np.exp(x[1:] / (2 * y)) - 1), rtol=1e-9
     )
     unloading = effect.state_rates(Motion(x=jnp.asarray(0.0), v=jnp.asarray(-2.0)), jnp.asarray([0.5 * y]))
     np.testing.assert_allclose(unloading, [-2.0 * (1 + 0.4 * 0.5)], rtol=1e-12)
@@ -400,14 +403,14 @@ def loop_area(omega: float) -> float:
     return float(np.trapezoid(3000.0 * z, 1e-3 * np.sin(omega * t[-401:])))
 
 
-def test_the_area_of_the_hysteresis_loop_does_not_depend_on_frequency():
+def test_bouc_wen_loop_area_does_not_depend_on_frequency():
     slow, fast = loop_area(1.0), loop_area(30.0)
     assert slow == pytest.approx(fast, rel=1e-5)
     # Less than the parallelogram of an ideal element that slips at the yield, 4 T (x - x_yield), by its round corners.
     assert 0.5 < slow / (4 * 3000 * 4e-4 * (1e-3 - 4e-4)) < 1.0
 
 
-def test_a_slow_motor_shows_the_kinematic_error_itself():
+def test_twist_of_a_slow_unloaded_drive_is_the_negative_kinematic_error():
     """Unloaded and slow, the mesh does not twist: x_s = 0, so x = -e.
 
     The error's own inertia force is (4 * 1 / 386)^2 = 1e-4 of it, and starts a ringing of the same size.
@@ -427,8 +430,8 @@ def test_a_slow_motor_shows_the_kinematic_error_itself():
 
 
 @pytest.mark.parametrize("stribeck", (False, True))
-def test_three_effects_at_once_against_scipy(stribeck):
-    """The equations of EFFECTS.md written down again, without hdjax."""
+def test_three_effects_at_once_agree_with_scipy(stribeck):
+    """The equations of EFFECTS.md are solved without hdjax."""
     N, J_m, J_l, K, alpha, B = 50.0, 5.26e-4, 5.0e-2, 7160.0, 2e4, 2.0
     T_c, T_excess, b, turn, omega_s = 0.2, 0.15 * stribeck, 0.004, 1.0, 8.0
 
@@ -475,7 +478,7 @@ def test_kinematic_error_reports_amplitude_and_phase():
     assert float(derived["phase_2"][0]) == pytest.approx(0.7)
 
 
-def test_three_slopes_pass_through_the_vendors_table():
+def test_three_slope_stiffness_passes_through_the_vendor_table():
     """Size 40, ratio 50 (EFFECTS.md): 54 N m at the first knee, 196 N m at the second, slopes 10 and 14 e4 N m/rad."""
     x1 = 54 / 10e4
     effect = ThreeSlopeStiffness(stiffening_2=0.4, stiffening_3=0.3, x1=x1, gap=(196 - 54) / 14e4)
@@ -493,7 +496,7 @@ def test_three_slopes_pass_through_the_vendors_table():
     assert derived == pytest.approx({"K1": 10e4, "K2": 14e4, "K3": 17e4, "T1": 54.0, "T2": 196.0})
 
 
-def test_backlash_pushes_only_outside_its_zone():
+def test_backlash_torque_is_zero_inside_its_gap():
     effect = Backlash(b=1e-4)
 
     def torque(x):
@@ -513,8 +516,8 @@ SWING = Scales(x=4e-4, x_max=1e-3, v=0.1, omega_m=5.0, omega_l=0.1, time_step=1e
     [eqx.tree_at(lambda d: d.alpha, DRIVE, jnp.asarray(5e8)), ReducedDrive(mu=3.0, omega_0=90.0, alpha=5e8, gain=20.0)],
     ids=["drive", "reduced"],
 )
-def test_a_spring_that_hardens_from_nothing_may_be_a_dead_zone(drive):
-    """Beyond which a straight spring has the same torque and slope at some twist of the motion."""
+def test_backlash_imitates_a_strongly_hardening_spring(drive):
+    """Outside the gap a linear spring has the torque and slope of the hardening one, at a twist of the motion."""
     starts = Backlash.imitated(drive, SWING)
     for (values, effect), x in zip(starts, jnp.asarray([np.sqrt(2.0) * SWING.x, SWING.x_max]), strict=True):
         stiff = eqx.tree_at(lambda d, v=values: [getattr(d, n) for n in v], drive, list(values.values()))
@@ -532,17 +535,17 @@ def test_a_spring_that_hardens_from_nothing_may_be_a_dead_zone(drive):
         assert float(jax.grad(torque)(x)) == pytest.approx(float(jax.grad(hardening)(x)), rel=1e-9)
 
 
-def test_a_plausible_spring_stands_for_nothing_else():
+def test_moderately_hardening_spring_is_imitated_by_no_effect():
     hard = eqx.tree_at(lambda d: d.alpha, DRIVE, jnp.asarray(4.5e5))
     assert [form for form in CATALOGUE if form.imitated(hard, SWING)] == []
 
 
 @pytest.mark.parametrize("fine", (7, 19, 68))
-def test_a_delay_is_a_late_torque(fine):
+def test_input_delay_equals_a_torque_shifted_in_time(fine):
     """A held torque, `fine` fiftieths of an interval late, against the same torque on a 50 times finer grid.
 
-    Within an interval the delayed jump is smeared, at equal moments up to the third: what is left is below 1e-3 of
-    what the delay does.
+    Within an interval the delayed jump is smoothed with equal moments up to the third. The remaining difference is
+    below 1e-3 of the delay's effect.
     """
     rows = 100
     values = np.random.default_rng(8).normal(size=rows)
