@@ -108,11 +108,15 @@ def deflections(law, rates: list[float], z: float, limit: float, settling: float
     """Deflections after each step of classical Runge-Kutta at these rates."""
     # One program for all lengths; padding after the last rate does not change the results before it.
     padded = np.pad(np.array(rates), (0, MOST_STEPS - len(rates)))
-    return np.asarray(padded_deflections(law, jnp.asarray(padded), *map(jnp.asarray, (z, limit, settling, h))))[: len(rates)]
+    return np.asarray(padded_deflections(law, jnp.asarray(padded), *map(jnp.asarray, (z, limit, settling, h))))[
+        : len(rates)
+    ]
 
 
 @eqx.filter_jit
-def padded_deflections(law, rates: jax.Array, z: jax.Array, limit: jax.Array, settling: jax.Array, h: jax.Array) -> jax.Array:
+def padded_deflections(
+    law, rates: jax.Array, z: jax.Array, limit: jax.Array, settling: jax.Array, h: jax.Array
+) -> jax.Array:
     def step(z, v):
         k1 = law(v, z, limit, settling)
         k2 = law(v, z + h / 2 * k1, limit, settling)
