@@ -156,7 +156,7 @@ def test_identification_time_is_where_scipys_covariance_reaches_the_error():
     """Sensitivities by differences of scipy's motion under the held torque, and the covariance of the least squares."""
     at = case(1e5, amplitude=0.4, omega=420.0)
     found, slopes, differences = value_and_slopes(PLAN, at, ("forcing.amplitude", "forcing.omega"))
-    # Between samples the crossing has one continuous derivative, so that differences see the second jump.
+    # The crossing has one continuous derivative between samples, so that jumps of the second limit differences.
     np.testing.assert_allclose(slopes, differences, rtol=1e-4)
     time = np.arange(601) / 2000.0
     torque = 0.4 * np.cos(420.0 * time)

@@ -106,7 +106,7 @@ def test_fold_distance_is_the_log_ratio_to_the_nearest_fold(found: tuple[np.ndar
 
 
 @pytest.mark.slow
-def test_peak_error_and_mesh_torque_under_a_kinematic_error_agree_with_closed_form():
+def test_peak_error_and_mesh_torque_under_kinematic_error_agree_with_closed_form():
     """`x'' + mu (x' + e') + (x + e) = 0`, e = E cos 2 theta_m at the speed of the motor: amplitude and mesh torque."""
     E, speeds = 1e-3, np.linspace(0.2, 0.9, 20_001)
     at = Case(TwoInertiaModel(case().drive, (KinematicError(cos_2=E),)))

@@ -235,7 +235,7 @@ def test_conservative_effect_keeps_the_energy(form):
 def test_dissipative_effect_loses_energy(form):
     model, states = lossless(form)
     found = energy(model, states)
-    # A light third inertia or a slow creep takes little in five periods.
+    # A light third inertia or a slow creep dissipates little energy in five periods.
     assert found[-1] < (0.999 if form.family in ("creep", "extra_resonance") else 0.97) * found[0]
     # A form with hidden states stores some energy and returns it.
     if not form.states or form in STORE_IS_KNOWN:

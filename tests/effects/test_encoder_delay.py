@@ -51,7 +51,7 @@ def test_encoder_delay_is_estimated_from_a_log(form: type[SensorEffect], side: i
 
 
 def test_load_encoder_delay_reads_the_earlier_state():
-    """Against the drive's own motion, without a torque, backwards in time."""
+    """Against the motion of the drive without a torque, integrated backwards in time."""
     drive = eqx.tree_at(lambda d: (d.K, d.B_sp), MODEL.drive, (jnp.asarray(rig.K), jnp.asarray(rig.B_SP)))
     model = TwoInertiaModel(drive)
     state, delay = jnp.asarray(np.array([1.0, 0.018, 3.0, -0.4])), 0.1 / float(drive.omega_0)

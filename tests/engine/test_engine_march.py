@@ -91,7 +91,7 @@ def relative_differences(problem: Problem, unknowns: Unknowns) -> dict[str, np.n
         assert ours.shape == theirs.shape and np.isfinite(ours).all()
         size = np.max(np.abs(theirs), axis=(0, 1) if theirs.ndim == 3 else None, keepdims=True, initial=0.0)
         if name == "before_by_state":
-            # It is the identity at the segment's start: a state that decays leaves the rounding of one.
+            # It is the identity at the segment's start: errors of a decayed state are relative to one.
             size = np.maximum(size, 1.0)
         result[name] = np.abs(ours - theirs) / np.where(size > 0, size, 1.0)
     return result

@@ -38,7 +38,7 @@ def test_basin_shares_add_up_to_one(basins):
 
 
 def test_basins_have_the_symmetry_of_the_equation(basins):
-    """(x, v, t) -> (-x, -v, t + T/2) leaves the equation as it is: half a period later the basins are turned by pi."""
+    """(x, v, t) -> (-x, -v, t + T/2) leaves the equation unchanged: half a period later the basins are turned by pi."""
     later = attractors(RICH, harmonic_series(*SHAKEN, jnp.pi), (-3.0, 3.0), (-6.0, 6.0), 40)
     assert len(later.attractors) == len(basins.attractors)
     # The mirrored pair is of one amplitude, in either order: compare amplitudes, not labels.

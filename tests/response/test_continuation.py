@@ -27,7 +27,7 @@ def response(p) -> tuple[Branch, Folds]:
 
 
 def assert_energy_balance(branch: Branch, mu: float, level: float):
-    """The first harmonic's power is what damping takes from all."""
+    """The power of the first harmonic equals the dissipation of all harmonics."""
     x = branch.steady_states.x
     rates = np.arange(1, x.harmonics + 1) * np.asarray(x.omega)[:, None]
     power_in = 0.5 * level * rates[:, 0] * np.asarray(x.sine)[:, 0]
@@ -77,7 +77,7 @@ def random_parameters() -> np.ndarray:
 @pytest.fixture(scope="module")
 def lanes() -> tuple[Branch, Folds]:
     rows = jnp.asarray(np.concatenate([np.stack(list(NAMED.values())), random_parameters()]))
-    # As numpy arrays, whose slices cost nothing.
+    # As numpy arrays, which are sliced without compilation.
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(response))(rows))
 
 
@@ -147,10 +147,10 @@ def test_branches_of_light_damping_or_softening_are_complete(lanes, name):
     assert_whole(branch, start, end)
     assert_energy_balance(branch, 2 * zeta, level)
     assert len(turns(branch)) == 2
-    # A softening drive meets its own peak from above: the order in which the folds come.
+    # Of a hardening drive followed upwards, the fold of higher frequency comes first.
     first, second = np.asarray(branch.value)[turns(branch)]
     assert (first > second) == (end > start) or alpha < 0 or start > end
-    # The peak of one term, a = A / (mu omega); the third harmonic takes part of the energy.
+    # The peak of one term, a = A / (mu omega); the third harmonic dissipates part of the power.
     x = branch.steady_states.x
     i = int(np.argmax(np.asarray(x.amplitudes)[:, 0]))
     assert float(x.amplitudes[i, 0] * branch.omega[i]) == pytest.approx(level / (2 * zeta), rel=0.02)
@@ -165,7 +165,7 @@ def test_branch_of_a_strong_nonlinearity_is_complete(lanes):
     assert_whole(branch, 10.0, 1.5)
     assert len(turns(branch)) == 2 and float(10.0 * jnp.max(branch.amplitude) ** 2) > 35
     i = int(np.argmax(np.asarray(branch.amplitude)))
-    # Eleven harmonics leave a few 1e-7 there.
+    # Eleven harmonics err by a few 1e-7 there.
     assert period_error(duffing_rates(0.1, 10.0, 1.0, float(branch.omega[i])), row(branch, i)) < 1e-5
 
 

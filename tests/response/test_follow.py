@@ -43,7 +43,7 @@ def test_subharmonic_branch_is_a_closed_curve(subharmonic):
     assert chords.max() < 1.2 * np.median(chords)
     assert np.linalg.norm(path(branch)[0] - path(branch)[-1]) < 1.5 * chords.max() + 0.1
     assert len(turns(branch)) == 2
-    # Half of it stable; nowhere the motion of the forcing's own period.
+    # About half of it is stable, and no motion has the period of the forcing.
     stable = np.asarray(branch.stable)
     assert 0.2 < stable.mean() < 0.8
     assert np.asarray(branch.steady_states.x.amplitudes)[:, 0].min() > 0.3

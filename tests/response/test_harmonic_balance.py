@@ -22,7 +22,7 @@ from hdjax.fourier import FourierSeries, harmonic_series
 from hdjax.response.harmonic_balance import SteadyState, balance, solve
 
 SUFFICES = 1e-10
-"""A defect below this says that the harmonics suffice for 1e-8: errors grow in a period, but by far less than 100."""
+"""A defect below this means that the harmonics suffice for 1e-8: errors grow in a period, but by far less than 100."""
 
 
 # -- random cases --

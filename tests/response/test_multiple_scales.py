@@ -89,7 +89,7 @@ def test_errors_fall_with_the_order_of_the_expansion(kind, branch):
         exact = balanced(made.drive, omega / made.forcing, {made.forcing: float(made.A)}, found[1])
         errors.append([np.linalg.norm(X - exact) / np.linalg.norm(exact) for X in found])
     slopes = np.diff(np.log(errors), axis=0) / np.diff(np.log(epsilons))[:, None]
-    # The next order's share at the largest epsilon, and harmonic balance's own precision at the smallest.
+    # Limited by the next order at the largest epsilon, and by the harmonic balance at the smallest.
     np.testing.assert_allclose(slopes[-1], [1, 2], atol=0.05)
     np.testing.assert_allclose(slopes.mean(axis=0), [1, 2], atol=0.25)
     assert errors[-1][1] < 1e-2 * errors[-1][0]
@@ -145,7 +145,7 @@ def test_secondary_resonances_of_a_linear_drive_have_zero_amplitude():
 
 
 def test_peak_agrees_with_the_closed_form_and_the_branches():
-    # DESIGN 2.2: 10 N m on the motor of the seed's Table 1.
+    # DESIGN 2.2: 10 N m on the motor of the source document's Table 1.
     drive = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0, alpha=0.1, B_sp=0.017)
     A = 10.0 / (50.0 * 5.26e-4)
     made = PrimaryResonance(drive, A)
@@ -185,7 +185,7 @@ def test_folds_lie_where_the_detuning_curve_turns(kind, sign):
 
 
 def test_folds_exist_only_above_the_critical_forcing():
-    """Two folds are born at `|q| (A/2 omega_0)^2 = 8/(3 sqrt 3) (mu/2)^3`: Duffing's critical amplitude."""
+    """Two folds appear at `|q| (A/2 omega_0)^2 = 8/(3 sqrt 3) (mu/2)^3`: Duffing's critical amplitude."""
     drive = ReducedDrive(mu=0.2, omega_0=W0, alpha=3.0)
     critical = np.sqrt(8 / (3 * np.sqrt(3)) * 0.1**3 / (3 / 8 * W0 * 3.0)) * 2 * W0
     for factor, wanted in ((0.999, False), (1.001, True)):

@@ -20,7 +20,7 @@ def duffing(alpha: float = 0.5, mu: float = 0.1, omega_0: float = 1.0, gain: flo
 
 
 def settled(model: ReducedModel, forcing: FourierSeries, state: Array, periods: int) -> Array:
-    """Where a long simulation ends, by another solver."""
+    """End state of a long simulation by another solver."""
     times = np.array([0.0, 2 * np.pi / float(forcing.omega) * periods])
     return simulate(model, forcing, times, state, solver=dfx.Tsit5(), rtol=1e-11, atol=1e-13).states[-1]
 

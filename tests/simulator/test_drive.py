@@ -38,7 +38,7 @@ KNOWN_FAMILIES = {
 
 
 def test_preset_has_the_natural_frequency_of_its_table():
-    """Not the 122.5 rad/s that the seed prints beside it (DESIGN 2.3). Digits as published."""
+    """Not the 122.5 rad/s that the source document prints beside it (DESIGN 2.3). Digits as published."""
     drive = hdc_40_050()
     assert float(drive.omega_0) == pytest.approx(385.545, abs=5e-4)
     assert float(drive.mu) == pytest.approx(0.353, abs=5e-4)
@@ -48,7 +48,7 @@ def test_preset_has_the_natural_frequency_of_its_table():
 
 
 def test_preset_has_the_closed_form_peak_twist():
-    """A/(mu omega_0) at resonance under 10 N m is 2.79 rad (DESIGN 2.2), where the seed prints 0.015."""
+    """A/(mu omega_0) at resonance under 10 N m is 2.79 rad (DESIGN 2.2), where the source document prints 0.015."""
     drive = hdc_40_050()
     amplitude = drive.error_forcing(jnp.asarray(10.0), jnp.asarray(0.0))
     assert float(amplitude / (drive.mu * drive.omega_0)) == pytest.approx(2.79, abs=0.005)

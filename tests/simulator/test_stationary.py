@@ -43,7 +43,7 @@ def test_variances_agree_with_scipy_equipartition_and_virial(alpha):
 
 
 def test_variance_of_a_purely_cubic_spring_agrees_with_the_limit():
-    """sigma^2/sqrt(epsilon) 2 Gamma(3/4)/Gamma(1/4) is the limit; what is left goes with 1/sqrt(epsilon)."""
+    """sigma^2/sqrt(epsilon) 2 Gamma(3/4)/Gamma(1/4) is the limit; the remainder is proportional to 1/sqrt(epsilon)."""
     limit = 2 * gamma(0.75) / gamma(0.25)
     assert float(stationary_variance(oscillator(1e16), S).x) * 1e8 == pytest.approx(limit, rel=1e-7)
     linearised = float(linearised_variance(oscillator(1e16), S).x) * 1e8
@@ -69,7 +69,7 @@ def test_density_agrees_with_its_normalisation_by_bessel_functions(alpha):
 
 @pytest.mark.parametrize("alpha", (0.0, 2.0))
 def test_density_integrates_to_one_and_to_the_variances(alpha):
-    # The trapezoidal rule on a grid that the density leaves at 1e-18: exact to rounding.
+    # The trapezoidal rule on a grid at whose edge the density is 1e-18: exact to rounding.
     x, v = np.meshgrid(np.linspace(-9, 9, 181), np.linspace(-9, 9, 181) * OMEGA_0, indexing="ij")
     weight = np.asarray(stationary_density(oscillator(alpha), S, x, v)) * 0.1 * 0.1 * OMEGA_0
     assert weight.sum() == pytest.approx(1.0, rel=1e-12)
