@@ -45,7 +45,7 @@ def value_and_slopes(measure: Measure, at: Case, paths: tuple[str, ...]) -> tupl
     return float(found), np.asarray(slopes), np.array(differences)
 
 
-def test_a_case_knows_its_paths():
+def test_case_replaces_parameters_by_dotted_path():
     changed = case(amplitude=1.0).replace({"K": 8000.0, "forcing.omega": 3.0})
     assert float(changed.drive.K) == 8000.0 and float(changed.excitation.omega) == 3.0
     assert float(changed.excitation.amplitude) == 1.0
@@ -53,13 +53,13 @@ def test_a_case_knows_its_paths():
         case().replace({"stiffness": 1.0})
 
 
-def test_every_measure_says_what_it_is():
+def test_every_measure_has_name_unit_and_description():
     for name, kind in MEASURES.items():
         assert kind.name == name and kind.unit and kind.says and kind.__doc__
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1e5, -1e4])
-def test_the_static_twist_is_the_root_of_the_cubic(alpha: float):
+def test_static_twist_is_the_root_of_the_cubic(alpha: float):
     found, slopes, differences = value_and_slopes(StaticTwist(20.0), case(alpha), ("K",))
     roots = np.roots([7160.0 * alpha, 0.0, 7160.0, -20.0]) if alpha else np.array([20.0 / 7160.0])
     real = roots[np.abs(roots.imag) < 1e-9].real
@@ -67,14 +67,14 @@ def test_the_static_twist_is_the_root_of_the_cubic(alpha: float):
     np.testing.assert_allclose(slopes, differences, rtol=1e-6)
 
 
-def test_a_softening_drive_that_gives_way_has_no_static_twist():
-    # Its torque is largest, 2/3 K/sqrt(3 |alpha|), at x = 1/sqrt(3 |alpha|).
+def test_static_twist_is_nan_above_the_largest_torque_of_a_softening_drive():
+    # The torque is largest, 2/3 K/sqrt(3 |alpha|), at x = 1/sqrt(3 |alpha|).
     most = 2.0 / 3.0 * 7160.0 / np.sqrt(3e5)
     assert np.isfinite(float(StaticTwist(0.99 * most)(case(-1e5))))
     assert np.isnan(float(StaticTwist(1.01 * most)(case(-1e5))))
 
 
-def test_the_motor_torque_is_least_at_the_ratio_that_matches_the_inertias():
+def test_motor_torque_is_least_at_the_inertia_matching_ratio():
     a, T = 30.0, 4.0
     best = np.sqrt((DRIVE.J_l * a + T) / (DRIVE.J_m * a))
     measure = MotorTorque(a, T)
@@ -86,7 +86,7 @@ def test_the_motor_torque_is_least_at_the_ratio_that_matches_the_inertias():
     assert float(MotorSpeed(2.0)(case())) == pytest.approx(100.0)
 
 
-def test_the_resonance_is_as_far_as_the_logarithm_says():
+def test_resonance_distance_is_the_log_ratio_of_frequencies():
     w = float(DRIVE.omega_0)
     below = ResonanceDistance(w / 8, w / 4, 2.0)
     found, slopes, _ = value_and_slopes(below, case(), ("K",))
@@ -97,7 +97,7 @@ def test_the_resonance_is_as_far_as_the_logarithm_says():
     assert float(ResonanceDistance(w / 400, w / 200, 2.0, at_load=True)(case())) == pytest.approx(np.log(2.0))
 
 
-def test_bistability_begins_where_the_first_order_curve_has_a_vertical_tangent():
+def test_bistability_begins_at_the_forcing_with_three_first_order_amplitudes():
     """Of `(mu^2/4 + (sigma - k a^2)^2) a^2 = A^2/(4 omega_0^2)` as a cubic in a^2: at the least forcing for which the
     cubic has three real roots at some sigma."""
     at = case(1e5, amplitude=0.2)
@@ -115,7 +115,7 @@ def test_bistability_begins_where_the_first_order_curve_has_a_vertical_tangent()
     assert not three_roots(A / ratio * 0.99) and three_roots(A / ratio * 1.02)
 
 
-def test_a_linear_drive_settles_as_its_damping_says():
+def test_settling_time_of_a_linear_drive_follows_its_damping():
     """The swing's energy falls by mu on average: `2 log(twist/band)/mu`."""
     twist, band = 5.0 / 7160.0, 1e-5
     found, slopes, differences = value_and_slopes(SettlingTime(5.0, band), case(), ("B_sp", "K"))
@@ -126,13 +126,13 @@ def test_a_linear_drive_settles_as_its_damping_says():
     assert slopes[0] == pytest.approx(-found, rel=2e-3)
 
 
-def test_what_settles_beyond_the_simulation_is_extrapolated():
+def test_settling_time_beyond_the_simulation_is_extrapolated():
     soon, late = (eqx.filter_jit(SettlingTime(5.0, 1e-5, turns=turns)) for turns in (60, 12))
     assert float(late(case())) == pytest.approx(float(soon(case())), rel=0.01)
 
 
-def test_friction_settles_sooner_than_damping_alone():
-    """`x'' + mu x' + omega_0^2 x = -c T_c sign(x')` from scipy: the last time that the swing's energy is above."""
+def test_settling_time_with_friction_agrees_with_scipy_and_is_shorter():
+    """`x'' + mu x' + omega_0^2 x = -c T_c sign(x')` from scipy: the last time at which the energy exceeds the band."""
     rough = dataclasses.replace(case(), model=case().model.with_effects(CoulombFriction(T_c=0.1, v_0=4e-3)))
     found = float(SettlingTime(5.0, 1e-4)(rough))
     c, w, mu = (float(getattr(DRIVE, n)) for n in ("c", "omega_0", "mu"))
@@ -144,7 +144,7 @@ def test_friction_settles_sooner_than_damping_alone():
     x, v = solve_ivp(rates, (0.0, 0.4), [5.0 / 7160.0, 0.0], method="LSODA", t_eval=time, rtol=1e-9, atol=1e-13).y
     above = np.log((0.5 * 7160.0 * x**2 + 0.5 * v**2 / c) / (0.5 * 7160.0 * 1e-8))
     crossing = time[np.flatnonzero(above > 0.0)[-1]]
-    # Friction makes the energy fall ever faster: the softened crossing is within a quarter of a period of it.
+    # Friction makes the energy fall at a growing rate: the softened crossing is within a quarter of a period.
     assert found == pytest.approx(crossing, abs=0.25 * 2 * np.pi / w)
     assert found < 0.9 * float(SettlingTime(5.0, 1e-4)(case()))
 
@@ -152,11 +152,11 @@ def test_friction_settles_sooner_than_damping_alone():
 PLAN = IdentificationTime(rate=2000.0, duration=0.3, noise=2e-6, relative_error=0.02)
 
 
-def test_the_shortest_log_is_the_one_whose_scipy_covariance_reaches_the_error():
-    """Sensitivities by differences of scipy's motion under the held torque, and the whole least squares' covariance."""
+def test_identification_time_is_where_scipys_covariance_reaches_the_error():
+    """Sensitivities by differences of scipy's motion under the held torque, and the covariance of the least squares."""
     at = case(1e5, amplitude=0.4, omega=420.0)
     found, slopes, differences = value_and_slopes(PLAN, at, ("forcing.amplitude", "forcing.omega"))
-    # Between samples the crossing has one continuous derivative, so that differences see the second jump.
+    # The crossing has one continuous derivative between samples, so that jumps of the second limit differences.
     np.testing.assert_allclose(slopes, differences, rtol=1e-4)
     time = np.arange(601) / 2000.0
     torque = 0.4 * np.cos(420.0 * time)
@@ -187,21 +187,21 @@ def test_the_shortest_log_is_the_one_whose_scipy_covariance_reaches_the_error():
         return float(np.sqrt(np.linalg.inv(used.T @ used)[0, 0]))
 
     reached = next(n for n in range(20, 600) if relative(n) <= 0.02)
-    # The weak prior, and differences of third order, make less than a sample.
+    # The weak prior and third-order differences change this by less than a sample.
     assert found * 2000.0 == pytest.approx(reached, abs=1.5)
     assert 40 < reached < 590
 
 
-def test_a_log_that_does_not_suffice_is_carried_on():
+def test_identification_time_beyond_the_log_is_extrapolated():
     at = case(1e5, amplitude=0.4, omega=420.0)
     short, long = (IdentificationTime(2000.0, duration, 2e-6, 0.0012) for duration in (0.5, 1.0))
     needed = float(eqx.filter_jit(long)(at))
     assert 0.5 < needed < 1.0
-    # The motion still beats, so that what it tells does not come evenly.
+    # The motion still beats, so that information does not accumulate evenly.
     assert float(eqx.filter_jit(short)(at)) == pytest.approx(needed, rel=0.2)
 
 
-def test_the_largest_twist_is_the_steady_one_after_the_transient():
+def test_largest_twist_from_rest_is_one_to_two_steady_amplitudes():
     at = case(0.0, amplitude=0.4, omega=300.0)
     A, w, mu = 0.4 / (50.0 * 5.26e-4), float(DRIVE.omega_0), float(DRIVE.mu)
     steady = A / np.hypot(w**2 - 300.0**2, 300.0 * mu)
@@ -221,12 +221,12 @@ def test_the_largest_twist_is_the_steady_one_after_the_transient():
         (IdentificationTime(2000.0, 1.0, 0.0), case(amplitude=1.0), "positive noise"),
     ],
 )
-def test_what_can_not_be_measured_is_refused(measure: Measure, at: Case, message: str):
+def test_measure_refuses_unusable_settings(measure: Measure, at: Case, message: str):
     with pytest.raises(ValueError, match=message):
         measure.refuse(at)
 
 
-def test_the_vendor_table_in_between():
+def test_gear_interpolates_the_vendor_table():
     from hdjax.design.vendor import SIZES, gear
 
     assert [float(gear(s).K) for s in SIZES] == pytest.approx([3400, 8100, 1.3e4, 2.5e4, 5.4e4, 1e5, 2e5, 4.4e5])

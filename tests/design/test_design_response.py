@@ -27,7 +27,7 @@ def measured(alphas: jax.Array, dampings: jax.Array, ends: jax.Array) -> tuple[j
 
     def of_one(p, end):
         at = case(p[0], p[1])
-        # Folds of 0.5 to 1 are looked for from 0.25 to 2.
+        # Folds of 0.5 to 1 are searched for from 0.25 to 2.
         measures = [PeakError(SLOW, end), Loss(SLOW, end), FoldDistance(0.5, 1.0)]
         found = jnp.stack(responses(at, measures))
         return found, found
@@ -53,7 +53,7 @@ def linear(omega: np.ndarray) -> np.ndarray:
     return 0.5 * TORQUE / np.hypot(1.0 - omega**2, MU * omega)
 
 
-def test_the_peak_of_a_linear_drive(found: tuple[np.ndarray, np.ndarray]):
+def test_peak_error_of_a_linear_drive_agrees_with_the_closed_form(found: tuple[np.ndarray, np.ndarray]):
     values, slopes = found
     # The amplitude is largest, A/(mu omega_d), a little below omega_0.
     exact = 0.5 * TORQUE / (MU * np.sqrt(1.0 - MU**2 / 4.0))
@@ -61,14 +61,14 @@ def test_the_peak_of_a_linear_drive(found: tuple[np.ndarray, np.ndarray]):
     assert slopes[0, 0, 1] == pytest.approx(-exact / MU * (1.0 - MU**2 / 4.0 / (1.0 - MU**2 / 4.0)), rel=1e-6)
 
 
-def test_below_the_resonance_the_end_of_the_range_is_the_worst(found: tuple[np.ndarray, np.ndarray]):
+def test_peak_error_below_resonance_is_that_at_the_fastest_speed(found: tuple[np.ndarray, np.ndarray]):
     values, slopes = found
     size = linear(np.array(0.7))
     assert values[1, 0] == pytest.approx(size, rel=1e-9)
     assert slopes[1, 0, 1] == pytest.approx(-(size**3) * MU * 0.49 / (0.5 * TORQUE) ** 2, rel=1e-6)
 
 
-def test_the_loss_of_a_linear_drive_is_that_of_its_damper(found: tuple[np.ndarray, np.ndarray]):
+def test_loss_of_a_linear_drive_is_the_power_of_its_damper(found: tuple[np.ndarray, np.ndarray]):
     """`pi B_sp w a^2` in a cycle, so `B_sp w^2 a^2/2` on average."""
     values, _ = found
     for row, end in ((0, FAST), (1, 0.7)):
@@ -77,7 +77,7 @@ def test_the_loss_of_a_linear_drive_is_that_of_its_damper(found: tuple[np.ndarra
         assert values[row, 1] == pytest.approx(power.mean(), rel=1e-9)
 
 
-def test_the_peak_of_a_hardening_drive_lies_where_damping_takes_all_force(found: tuple[np.ndarray, np.ndarray]):
+def test_peak_error_of_a_hardening_drive_lies_on_the_backbone(found: tuple[np.ndarray, np.ndarray]):
     """There `A = mu omega a`, and the backbone of one harmonic is `omega^2 = 1 + 3/4 a^2`."""
     values, _ = found
     a = np.roots([0.75 * MU**2, 0.0, MU**2, 0.0, -((0.5 * TORQUE) ** 2)])
@@ -86,7 +86,7 @@ def test_the_peak_of_a_hardening_drive_lies_where_damping_takes_all_force(found:
     assert values[2, 0] == pytest.approx(first, rel=0.03)
 
 
-def test_gradients_are_differences(found: tuple[np.ndarray, np.ndarray]):
+def test_peak_error_gradients_agree_with_differences(found: tuple[np.ndarray, np.ndarray]):
     values, slopes = found
     differences = np.stack([values[3] - values[4], values[5] - values[6]], axis=1) / (2 * STEP)
     # Which speeds lie between which folds, and so the loss, changes by jumps; the peak does not.
@@ -94,7 +94,7 @@ def test_gradients_are_differences(found: tuple[np.ndarray, np.ndarray]):
     np.testing.assert_allclose(slopes[2, 1], differences[1], rtol=1e-4)
 
 
-def test_the_distance_of_the_folds(found: tuple[np.ndarray, np.ndarray]):
+def test_fold_distance_is_the_log_ratio_to_the_nearest_fold(found: tuple[np.ndarray, np.ndarray]):
     """Folds of this hardening drive are at 1.7797 and 1.3242 (docs/response.md); the linear one has none in reach."""
     values, slopes = found
     assert values[2, 2] == pytest.approx(np.log(1.3242), abs=1e-4)
@@ -106,7 +106,7 @@ def test_the_distance_of_the_folds(found: tuple[np.ndarray, np.ndarray]):
 
 
 @pytest.mark.slow
-def test_two_inertias_with_a_kinematic_error():
+def test_peak_error_and_mesh_torque_under_kinematic_error_agree_with_closed_form():
     """`x'' + mu (x' + e') + (x + e) = 0`, e = E cos 2 theta_m at the speed of the motor: amplitude and mesh torque."""
     E, speeds = 1e-3, np.linspace(0.2, 0.9, 20_001)
     at = Case(TwoInertiaModel(case().drive, (KinematicError(cos_2=E),)))

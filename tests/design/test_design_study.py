@@ -24,8 +24,8 @@ RATIO = Variable("N", 20.0, 200.0, "log")
 BEST = np.sqrt((J_L * ACCELERATION + TORQUE) / (J_M * ACCELERATION))
 
 
-class Named(Measure):
-    """A function of K alone, for what no drive has: kinks, holes and wrong slopes."""
+class StiffnessFunction(Measure):
+    """A function of K alone with a kink, an interval without values, no value at all or a wrong slope."""
 
     name: ClassVar[str] = "named"
     unit: ClassVar[str] = "1"
@@ -40,7 +40,7 @@ class Named(Measure):
             return jnp.where(K < 0.9, jnp.nan, (K - 1.1) ** 2)
         if self.kind == "nowhere":
             return jnp.nan * K
-        # Whatever K does, the gradient says nothing.
+        # The value follows K, but its gradient is zero.
         return jnp.round(K * 1e6) / 1e6
 
 
@@ -55,7 +55,7 @@ def torque_study(*limits: Limit, draws: Draws | None = None, criterion="expected
     )
 
 
-def test_the_best_ratio_matches_the_inertias():
+def test_optimal_ratio_matches_the_inertias():
     study = torque_study()
     found = optimise(study, 3)
     assert [end.outcome for end in found.ends] == [Outcome.optimum] * 3
@@ -69,7 +69,7 @@ def test_the_best_ratio_matches_the_inertias():
     assert proof.gradient_error < 1e-7
 
 
-def test_a_limit_that_holds_has_a_price():
+def test_active_upper_limit_has_the_closed_form_multiplier():
     """`N omega <= 0.3` at omega = 0.02 holds the ratio at 15: `-d torque/d limit = -torque'(15)/omega`."""
     study = torque_study(Limit("speed", MotorSpeed(0.02), 0.3))
     best = optimise(study, 3).best
@@ -79,7 +79,7 @@ def test_a_limit_that_holds_has_a_price():
     assert confirm(study, best).confirmed()
 
 
-def test_at_least_is_the_other_side():
+def test_active_lower_limit_has_the_closed_form_multiplier():
     study = torque_study(Limit("speed", MotorSpeed(0.02), 2.0, least=True))
     best = optimise(study, 2).best
     assert best.values["N"] == pytest.approx(100.0, rel=1e-6)
@@ -88,7 +88,7 @@ def test_at_least_is_the_other_side():
     )
 
 
-def test_a_bound_holds_and_has_a_price():
+def test_active_bound_is_reported_with_its_multiplier():
     best = optimise(torque_study(low=60.0), 3).best
     assert best.outcome is Outcome.optimum
     assert best.at_bound == {"N": "low"} and best.values["N"] == pytest.approx(60.0)
@@ -96,7 +96,7 @@ def test_a_bound_holds_and_has_a_price():
     assert best.bound_multipliers["N"] == pytest.approx(slope, rel=1e-4)
 
 
-def test_no_design_keeps_the_limits():
+def test_infeasible_study_is_reported_with_the_excess():
     found = optimise(torque_study(Limit("speed", MotorSpeed(0.02), 0.08)), 3)
     assert {end.outcome for end in found.ends} == {Outcome.infeasible}
     assert not found.best.feasible and found.best.excess["speed"] == pytest.approx(0.25, rel=1e-3)
@@ -105,16 +105,16 @@ def test_no_design_keeps_the_limits():
 
 
 def stiffness_study(kind: str) -> Study:
-    return Study(CASE, (Variable("K", 5000.0, 9000.0),), (Term("it", Named(kind)),))
+    return Study(CASE, (Variable("K", 5000.0, 9000.0),), (Term("it", StiffnessFunction(kind)),))
 
 
-def test_a_kink_is_called_one():
+def test_search_at_a_kink_is_reported_as_stalled():
     best = optimise(stiffness_study("kink"), 2).best
     assert best.values["K"] == pytest.approx(7700.0, rel=1e-4)
     assert best.outcome is Outcome.stalled
 
 
-def test_a_lane_without_a_value_is_named_and_the_others_go_on():
+def test_start_without_a_value_is_reported_as_lost_and_others_converge():
     found = optimise(stiffness_study("hole"), np.array([[0.1], [0.6], [0.95]]))
     assert [end.outcome for end in found.ends] == [Outcome.lost, Outcome.optimum, Outcome.optimum]
     assert found.best.values["K"] == pytest.approx(7700.0, rel=1e-4)
@@ -123,7 +123,7 @@ def test_a_lane_without_a_value_is_named_and_the_others_go_on():
         optimise(stiffness_study("nowhere"), 2)
 
 
-def test_a_wrong_gradient_and_a_better_neighbour_are_noticed():
+def test_confirmation_detects_a_wrong_gradient_and_a_better_neighbour():
     assert gradient_error(stiffness_study("deaf"), np.array([0.4])) > 0.5
     study = torque_study()
     best = optimise(study, 1).best
@@ -133,10 +133,10 @@ def test_a_wrong_gradient_and_a_better_neighbour_are_noticed():
     assert not confirm(study, off).confirmed()
 
 
-# -- what is not known exactly --
+# -- uncertain parameters --
 
 
-def test_the_worst_share_of_a_normal_law():
+def test_worst_share_of_a_normal_distribution_agrees_with_the_closed_form():
     """`sigma phi(z)/share` at the quantile z of the share."""
     values = norm.ppf((np.arange(4000) + 0.5) / 4000)
     exact = norm.pdf(norm.ppf(0.95)) / 0.05
@@ -146,20 +146,20 @@ def test_the_worst_share_of_a_normal_law():
     assert float(worst_share(jnp.full(8, 7.0), 0.05)) == pytest.approx(7.0)
 
 
-def drawn(count: int = 64) -> Draws:
+def inertia_draws(count: int = 64) -> Draws:
     quantiles = norm.ppf((np.arange(count) + 0.5) / count)
     return Draws(("J_l",), jnp.asarray(J_L * (1.0 + 0.2 * quantiles))[:, None])
 
 
-def test_the_expected_value_of_a_linear_measure_is_that_of_the_mean():
-    best = optimise(torque_study(draws=drawn()), 2).best
+def test_expected_criterion_of_a_linear_measure_gives_the_optimum_of_the_mean():
+    best = optimise(torque_study(draws=inertia_draws()), 2).best
     assert best.values["N"] == pytest.approx(BEST, rel=1e-4)
     assert best.draws["torque"].shape == (64,)
 
 
-def test_against_the_worst_the_ratio_is_that_of_the_worst_inertia():
+def test_worst_criterion_gives_the_ratio_of_the_worst_inertia():
     """The torque rises with the load's inertia, so that its worst share is the torque at the inertia's worst share."""
-    study = torque_study(draws=drawn(), criterion="worst")
+    study = torque_study(draws=inertia_draws(), criterion="worst")
     best = optimise(study, 2).best
     worst = exact_worst_share(np.asarray(study.draws.values[:, 0]), 0.05)
     assert best.values["N"] == pytest.approx(np.sqrt((worst * ACCELERATION + TORQUE) / (J_M * ACCELERATION)), rel=1e-3)
@@ -168,7 +168,7 @@ def test_against_the_worst_the_ratio_is_that_of_the_worst_inertia():
     assert proof.confirmed() and proof.gradient_error < 1e-5
 
 
-def test_a_limit_against_the_worst_is_kept_by_nearly_all():
+def test_limit_under_the_worst_criterion_holds_for_most_draws():
     draws = Draws(("K",), jnp.asarray(7160.0 * (1.0 + 0.1 * norm.ppf((np.arange(64) + 0.5) / 64)))[:, None])
     study = Study(
         CASE,
@@ -181,7 +181,7 @@ def test_a_limit_against_the_worst_is_kept_by_nearly_all():
     best = optimise(study, 3).best
     assert best.outcome is Outcome.optimum
     assert np.mean(best.draws["twist"] <= 3e-4) >= 0.95
-    # And not by more than it must: the worst twist is J_l a over the mean of the softest twentieth.
+    # It holds without a margin: the worst twist is J_l a over the mean of the softest twentieth.
     softest = exact_worst_share(1.0 / np.asarray(draws.values[:, 0]), 0.05)
     assert best.values["J_l"] == pytest.approx(3e-4 / (ACCELERATION * softest), rel=2e-3)
 
@@ -204,7 +204,7 @@ class TwistOfLoad(Measure):
         return StaticTwist(1.0)(case) * case.drive.J_l * ACCELERATION
 
 
-def test_a_chosen_parameter_takes_the_chosen_value_in_every_draw():
+def test_design_variable_has_its_chosen_value_in_every_draw():
     draws = Draws(("N", "J_l"), jnp.array([[40.0, J_L], [60.0, J_L]]))
     best = optimise(torque_study(draws=draws), 2).best
     assert np.ptp(best.draws["torque"]) == pytest.approx(0.0, abs=1e-12)
@@ -224,7 +224,7 @@ def test_a_chosen_parameter_takes_the_chosen_value_in_every_draw():
         (lambda: optimise(Study(CASE, (Variable("Q", 1.0, 2.0),), (Term("t", MotorTorque(1.0)),))), "`Q` is no"),
     ],
 )
-def test_what_makes_no_study_is_refused(build, message: str):
+def test_invalid_study_is_refused(build, message: str):
     with pytest.raises(ValueError, match=message):
         build()
 
@@ -232,7 +232,7 @@ def test_what_makes_no_study_is_refused(build, message: str):
 # -- lockstep --
 
 
-def test_searches_are_answered_together():
+def test_lockstep_evaluates_all_searches_in_one_batch():
     asked: list[int] = []
 
     def answers(points: np.ndarray) -> list[float]:
@@ -246,7 +246,7 @@ def test_searches_are_answered_together():
     assert asked == [3, 2, 1]
 
 
-def test_an_error_ends_all_searches():
+def test_lockstep_error_ends_all_searches():
     def search(number, ask) -> float:
         ask(np.zeros(1))
         if number == 1:

@@ -1,4 +1,4 @@
-"""Bristles and slipping springs against their closed forms and an own numpy implementation."""
+"""Bristle friction and Maxwell slip against closed forms and a numpy implementation."""
 
 import equinox as eqx
 import jax
@@ -15,12 +15,12 @@ from hdjax.effects.hysteresis import Dahl, MaxwellSlip
 from hdjax.effects.presliding import DahlMotorFriction, LuGreLoadFriction, LuGreMotorFriction
 
 DRIVE = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0)
-NO_LIMIT = 1e-12  # s: bristles as fast as their law
+NO_LIMIT = 1e-12  # s: a settling time that does not bound the bristles' rate
 MOST_STEPS = 700
 
 
 @eqx.filter_jit
-def followed(effect: Effect, x: jax.Array, rate: jax.Array, step: jax.Array) -> jax.Array:
+def states_along(effect: Effect, x: jax.Array, rate: jax.Array, step: jax.Array) -> jax.Array:
     """States along a motion whose rate is given at the start, middle and end of each step, by classical Runge-Kutta.
 
     The motions of twist, motor and load are the same here.
@@ -48,7 +48,7 @@ def along_sine(effect: Effect, size: float, omega: float, cycles: int, samples: 
     t = step * np.arange(cycles * samples + 1)
     rate = size * omega * np.cos(omega * np.stack([t[:-1], t[:-1] + step / 2, t[1:]], axis=1))
     x = size * np.sin(omega * t)
-    return x, np.asarray(followed(effect, jnp.asarray(x), jnp.asarray(rate), jnp.asarray(step)))
+    return x, np.asarray(states_along(effect, jnp.asarray(x), jnp.asarray(rate), jnp.asarray(step)))
 
 
 def elastoplastic(x: np.ndarray, limit: float) -> np.ndarray:
@@ -69,28 +69,28 @@ def slip_torque(states: np.ndarray, effect: MaxwellSlip = SLIP) -> np.ndarray:
 
 
 def test_maxwell_slip_is_a_sum_of_elastoplastic_elements():
-    """With minor loops, to what the motion changes its rate by within a settling time: the corners are sharp."""
+    """With minor loops, to within the change of the rate over a settling time, since corners are sharp."""
     samples = 4000
     t = np.linspace(0.0, 2 * np.pi, samples + 1)
     x = 1.5e-3 * np.sin(t) + 5e-4 * np.sin(5 * t)
     rate = lambda t: 1.5e-3 * np.cos(t) + 2.5e-3 * np.cos(5 * t)  # noqa: E731
     step = t[1]
     rates = np.stack([rate(t[:-1]), rate(t[:-1] + step / 2), rate(t[1:])], axis=1)
-    states = np.asarray(followed(SLIP, jnp.asarray(x), jnp.asarray(rates), jnp.asarray(step)))
+    states = np.asarray(states_along(SLIP, jnp.asarray(x), jnp.asarray(rates), jnp.asarray(step)))
     torque = slip_torque(states)
     ideal = sum(k * elastoplastic(x, d) for k, d in SPRINGS)
     assert np.abs(ideal).max() == pytest.approx(sum(k * d for k, d in SPRINGS))
     assert np.abs(torque - ideal).max() < 2e-3 * np.abs(ideal).max()
 
 
-def test_springs_slip_at_shares_of_the_last_one():
+def test_maxwell_slip_limits_are_shares_of_the_yield_twist():
     effect = MaxwellSlip(k_1=1.0, k_2=10.0, k_3=100.0, yield_twist=6e-4, share_2=0.7, share_3=0.1, settling=1e-3)
     far = slip_torque(np.full((1, 3), 1.0), effect)
     assert far[0] == pytest.approx(6e-4 * (1.0 + 10.0 * 0.7 + 100.0 * 0.1))
 
 
 @pytest.mark.parametrize("omega", (0.5, 40.0))
-def test_the_area_of_a_slip_loop_does_not_depend_on_the_rate(omega):
+def test_maxwell_slip_loop_area_does_not_depend_on_the_rate(omega):
     """4 sum k_i d_i (X - d_i) at every rate, as long as the settling time is short against the period."""
     size = 2e-3
 
@@ -104,15 +104,19 @@ def test_the_area_of_a_slip_loop_does_not_depend_on_the_rate(omega):
     np.testing.assert_allclose(states, moved(1.0)[1], atol=1e-9 * 6e-4)
 
 
-def stepped(law, rates: list[float], z: float, limit: float, settling: float, h: float) -> np.ndarray:
+def deflections(law, rates: list[float], z: float, limit: float, settling: float, h: float) -> np.ndarray:
     """Deflections after each step of classical Runge-Kutta at these rates."""
-    # One program for all lengths; nothing comes back from behind the last rate.
+    # One program for all lengths; padding after the last rate does not change the results before it.
     padded = np.pad(np.array(rates), (0, MOST_STEPS - len(rates)))
-    return np.asarray(all_steps(law, jnp.asarray(padded), *map(jnp.asarray, (z, limit, settling, h))))[: len(rates)]
+    return np.asarray(padded_deflections(law, jnp.asarray(padded), *map(jnp.asarray, (z, limit, settling, h))))[
+        : len(rates)
+    ]
 
 
 @eqx.filter_jit
-def all_steps(law, rates: jax.Array, z: jax.Array, limit: jax.Array, settling: jax.Array, h: jax.Array) -> jax.Array:
+def padded_deflections(
+    law, rates: jax.Array, z: jax.Array, limit: jax.Array, settling: jax.Array, h: jax.Array
+) -> jax.Array:
     def step(z, v):
         k1 = law(v, z, limit, settling)
         k2 = law(v, z + h / 2 * k1, limit, settling)
@@ -129,17 +133,19 @@ def all_steps(law, rates: jax.Array, z: jax.Array, limit: jax.Array, settling: j
     limit=st.floats(1e-7, 1e-1),
     steps=st.floats(0.05, 2.5),
 )
-def test_a_slipping_spring_takes_any_motion(rates, limit, steps):
-    """However narrow its limit and however fast the motion, it runs ahead by no more than the path of a step or of a
-    settling time, and comes back within the limit once the motion has stopped."""
+def test_slipping_spring_stays_bounded_for_any_rate(rates, limit, steps):
+    """It exceeds its limit by no more than the path of a step or of a settling time.
+
+    It is within the limit again once the motion has stopped.
+    """
     settling = 1e-3
     h, fastest = steps * settling, max(map(abs, rates))
-    z = np.abs(stepped(slip_rate, [*rates, *[0.0] * (5 + int(30 / steps))], 0.0, limit, settling, h))
+    z = np.abs(deflections(slip_rate, [*rates, *[0.0] * (5 + int(30 / steps))], 0.0, limit, settling, h))
     assert np.all(z <= limit + 3.0 * fastest * max(h, settling))
     assert z[-1] <= limit + 1e-3 * fastest * settling
 
 
-def test_dahl_loads_exponentially_and_forgets_its_start():
+def test_dahl_loading_and_unloading_agree_with_the_closed_form():
     """z = d (1 - exp(-x/d)) from rest; on the way back z = -d + (d + z_0) exp(-|dx|/d)."""
     d, size = 4e-4, 1e-3
     effect = Dahl(k=1000.0, yield_twist=d, settling=NO_LIMIT)
@@ -157,15 +163,15 @@ def test_dahl_loads_exponentially_and_forgets_its_start():
     start=st.floats(-1.0, 1.0),
     steps=st.floats(0.05, 1.0),
 )
-def test_no_rate_is_too_fast_for_a_step_of_the_settling_time(rates, limit, start, steps):
-    """However short the bristle and however fast the motion, it stays within its limit."""
+def test_bristle_stays_within_its_limit_for_steps_below_the_settling_time(rates, limit, start, steps):
+    """For any limit and any rate."""
     settling = 1e-3
-    z = stepped(bristle_rate, rates, limit * start, limit, settling, steps * settling)
+    z = deflections(bristle_rate, rates, limit * start, limit, settling, steps * settling)
     assert np.all(np.abs(z) <= limit * (1 + 1e-2))
 
 
 @pytest.mark.parametrize("v", (-3.0, 0.02, 7.0))
-def test_slow_bristles_are_not_bounded(v):
+def test_bristle_law_is_dahls_where_the_settling_time_is_short(v):
     """Where settling is short against the time to yield, the law is Dahl's own."""
     z, d = jnp.asarray(0.3), jnp.asarray(1.0)
     found = bristle_rate(jnp.asarray(v), z, d, jnp.asarray(1e-5))
@@ -174,12 +180,12 @@ def test_slow_bristles_are_not_bounded(v):
 
 @pytest.mark.parametrize("form", (LuGreMotorFriction, LuGreLoadFriction))
 @pytest.mark.parametrize("omega", (-30.0, -2.0, 0.5, 5.0, 80.0))
-def test_lugre_at_constant_speed_is_the_stribeck_curve(form, omega):
+def test_lugre_friction_at_constant_speed_is_the_stribeck_curve(form, omega):
     """Friction of EFFECTS.md, `(T_c + (T_s - T_c) exp(-(w/w_s)^2)) sgn w + b w`, once the bristles have bent."""
     effect = form(T_c=0.2, b=0.01, excess=0.5, omega_s=4.0, bend=1e-3, tau=0.02, settling=1e-4)
     rate = np.full((400, 3), omega)
     step = 0.3 * np.hypot(1e-3 / omega, 1e-4)  # of the time within which it bends
-    (bent,) = np.asarray(followed(effect, jnp.zeros(401), jnp.asarray(rate), jnp.asarray(step)))[-1]
+    (bent,) = np.asarray(states_along(effect, jnp.zeros(401), jnp.asarray(rate), jnp.asarray(step)))[-1]
     turning = jnp.asarray(omega)
     motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=turning, omega_l=turning)
     torque = float(effect.torque(motion, DRIVE, jnp.asarray([bent])))
@@ -187,12 +193,12 @@ def test_lugre_at_constant_speed_is_the_stribeck_curve(form, omega):
     assert torque == pytest.approx(-level * np.sign(omega) - 0.01 * omega, rel=1e-6)
     derived = {name: float(v) for name, (v, _) in effect.derived(DRIVE).items()}
     assert derived == pytest.approx({"sigma_0": 200.0, "sigma_1": 4.0, "T_s": 0.3})
-    # A shaft that has long turned starts there, to the Stribeck level.
+    # The initial state of a turning shaft is its steady state, up to the Stribeck level.
     assert float(effect.initial_state(motion)[0]) == pytest.approx(1e-3 * np.sign(omega))
 
 
-def test_while_bristles_stick_they_are_a_spring_and_a_damper():
-    """`sigma_0 z + sigma_1 omega`, for motions far smaller than what they bend by."""
+def test_sticking_lugre_friction_is_a_spring_and_a_damper():
+    """`sigma_0 z + sigma_1 omega`, for motions far below the deflection at which bristles slip."""
     effect = LuGreMotorFriction(T_c=0.2, excess=0.5, omega_s=4.0, bend=0.1, tau=0.02, settling=NO_LIMIT)
     for z, omega_m in ((1e-6, 1e-4), (-2e-6, 3e-5), (0.0, -1e-4)):
         motion = Motion(x=jnp.zeros(()), v=jnp.zeros(()), omega_m=jnp.asarray(omega_m))
@@ -209,7 +215,7 @@ def test_while_bristles_stick_they_are_a_spring_and_a_damper():
     ),
     ids=("dahl", "lugre", "lugre_damped"),
 )
-def test_bristles_on_the_motor_take_work_and_give_back_no_more_than_they_store(effect):
+def test_motor_bristle_friction_returns_no_more_work_than_it_stored(effect):
     angle, states = along_sine(effect, 1e-3, 30.0, cycles=2)
     rate = 1e-3 * 30.0 * np.cos(2 * np.pi * np.linspace(0.0, 2.0, angle.size))
 

@@ -13,7 +13,7 @@ EFFECT = Creep(k=SHARE * OMEGA**2, tau=TAU, span=1e-3)
 DRIVE = ReducedDrive(mu=80.0, omega_0=OMEGA)
 
 
-def test_after_a_step_the_twist_relaxes_to_its_end():
+def test_creep_after_a_torque_step_agrees_with_the_closed_form():
     """At once F / (K (1 + share)), in the end F / K = F / omega_0^2, between them exp(-t / (tau (1 + share))).
 
     Inertia and damping follow in 1 / 30 s; they leave the slow motion late by about mu / omega_0^2 = 0.02 s.
@@ -28,7 +28,7 @@ def test_after_a_step_the_twist_relaxes_to_its_end():
 
 
 @pytest.mark.parametrize("omega", (0.05, 1.25, 40.0))
-def test_complex_stiffness(omega):
+def test_creep_has_the_complex_stiffness_of_the_standard_linear_solid(omega):
     """k(omega) = K (1 + share i omega tau / (1 + i omega tau)), from the rates at a harmonic twist."""
     s = 1j * omega
     z = 1.0 / (1.0 + s * TAU)  # of the harmonic twist 1
@@ -42,7 +42,7 @@ def test_complex_stiffness(omega):
         assert float(torque) == pytest.approx((k * turn).real, rel=1e-12, abs=1e-9)
 
 
-def test_a_twist_that_has_long_been_there_has_crept():
+def test_creep_initial_state_is_the_relaxed_one():
     motion = Motion(x=jnp.asarray(2e-3), v=jnp.asarray(0.0))
     state = EFFECT.initial_state(motion)
     assert float(state[0]) == 2e-3

@@ -1,4 +1,4 @@
-"""Effects on angles, time and temperature against the equations of EFFECTS.md, written down again for scipy."""
+"""Effects of angles, rates, time and temperature against the equations of EFFECTS.md, solved by scipy."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def temperature(t):
     return 300.0 + 40.0 * t
 
 
-def against_scipy(effects, rates):
+def assert_agrees_with_scipy(effects, rates):
     """The model with these effects, and `rates(t, y)` -> (on_motor, on_load), under 1.5 cos(50 t + 0.2) N m."""
     found = simulate(
         BASE.with_effects(*effects),
@@ -64,7 +64,7 @@ def spring(x, v):
     return K * (x + ALPHA * x**3) + B * v
 
 
-def test_what_depends_on_the_angles():
+def test_angle_dependent_effects_agree_with_scipy():
     effects = (
         Cogging(cos_1=0.02, sin_2=-0.03, cos_4=0.01),
         SingleOrderCogging(cosine=0.02, sine=0.01, n=6.0),
@@ -83,10 +83,10 @@ def test_what_depends_on_the_angles():
         level = 0.1 + 0.03 * np.cos(4 * theta_m) + 0.02 * np.sin(4 * theta_m)
         return cogging - level * np.tanh(omega_m / 2.0) - tau / N, tau
 
-    against_scipy(effects, rates)
+    assert_agrees_with_scipy(effects, rates)
 
 
-def test_what_depends_on_time_and_temperature():
+def test_time_and_temperature_dependent_effects_agree_with_scipy():
     effects = (
         LoadDisturbance(constant=0.5, cosine=1.0, sine=-2.0, omega=130.0),
         TwoLineDisturbance(constant=0.1, cos_1=0.3, sin_1=0.4, cos_2=0.5, sin_2=0.6, omega_1=60.0, omega_2=270.0),
@@ -105,10 +105,10 @@ def test_what_depends_on_time_and_temperature():
         fall = warmer * (0.01 * np.tanh(omega_m / 2.0) + 0.001 * omega_m)
         return fall - tau / N, tau + disturbance
 
-    against_scipy(effects, rates)
+    assert_agrees_with_scipy(effects, rates)
 
 
-def test_what_depends_on_rates_and_shapes():
+def test_rate_and_twist_dependent_effects_agree_with_scipy():
     effects = (
         LoadFriction(T_c=0.5, b=0.2, transition=0.05),
         StribeckLoadFriction(T_c=0.3, T_excess=0.4, b=0.1, transition=0.05, omega_s=0.1),
@@ -127,10 +127,10 @@ def test_what_depends_on_rates_and_shapes():
         level = 0.5 + 0.3 + 0.4 * np.exp(-((omega_l / 0.1) ** 2))
         return -tau / N, tau - level * np.tanh(omega_l / 0.05) - 0.3 * omega_l
 
-    against_scipy(effects, rates)
+    assert_agrees_with_scipy(effects, rates)
 
 
-def test_sidebands_are_a_modulated_error():
+def test_kinematic_sidebands_are_an_amplitude_modulated_error():
     """cos(n t)(1 + cos(t / N)) has its sidebands at n +- 1/N, each of half the size."""
     effect = KinematicSidebands(cos_below=5e-5, cos_above=5e-5, n=2.0, ratio=N)
     theta = jnp.linspace(-30.0, 400.0, 301)
@@ -139,7 +139,7 @@ def test_sidebands_are_a_modulated_error():
     np.testing.assert_allclose(effect.slope(theta), by_jax, atol=1e-15)
 
 
-def test_an_encoder_reads_wrongly_and_moves_nothing():
+def test_encoder_eccentricity_changes_outputs_and_not_the_motion():
     model = BASE.with_effects(
         MotorEncoderEccentricity(cosine=3e-3, sine=1e-3), LoadEncoderEccentricity(cosine=-2e-4, sine=1e-4, n=2.0)
     )
@@ -152,7 +152,7 @@ def test_an_encoder_reads_wrongly_and_moves_nothing():
         np.testing.assert_array_equal(model.rates(state, nothing, nothing), BASE.rates(state, nothing, nothing))
 
 
-def test_a_smooth_knee_becomes_sharp():
+def test_narrow_smooth_knee_equals_three_slope_stiffness():
     """With a narrow knee it is three slopes whose second knee is never reached."""
     smooth = SmoothKneeStiffness(stiffening=0.4, knee=5e-4, width=1e-9)
     sharp = ThreeSlopeStiffness(stiffening_2=0.4, stiffening_3=0.2, x1=5e-4, gap=0.05)
@@ -164,7 +164,7 @@ def test_a_smooth_knee_becomes_sharp():
     assert float(smooth.derived(BASE.drive)["K2"][0]) == pytest.approx(1.4 * K)
 
 
-def test_friction_with_a_ripple_below_its_mean_dissipates():
+def test_position_dependent_friction_dissipates_with_a_ripple_below_its_mean():
     """At every angle and rate, on either side."""
     motor = PositionDependentMotorFriction(T_c=0.1, cosine=0.05, sine=0.05, n=2.0, transition=1.0)
     mesh = PositionDependentMeshFriction(T_c=0.1, cosine=0.05, sine=0.05, n=2.0, v_0=0.01)
@@ -176,7 +176,7 @@ def test_friction_with_a_ripple_below_its_mean_dissipates():
             assert float(mesh.torque(motion, BASE.drive, jnp.zeros(0))) * rate > 0
 
 
-def test_what_a_model_is_not_told_it_asks_for():
+def test_model_without_needed_time_or_temperature_is_refused():
     nothing = jnp.zeros(())
     for effect, asked in (
         (ThermalStiffness(k_T=1e-3), "`thermal_stiffness` needs the drive's temperature"),
@@ -192,7 +192,7 @@ SCALES = Scales(x=1e-3, x_max=3e-3, v=0.4, omega_m=20.0, omega_l=0.4, time_step=
 
 
 @pytest.mark.parametrize("has_motor", (True, False))
-def test_only_forms_that_a_log_can_show_are_proposed(has_motor):
+def test_only_effects_supported_by_the_logs_signals_are_proposed(has_motor):
     names = {form.name for form in applicable(CATALOGUE, SCALES, has_motor=has_motor)}
     assert not names & {"thermal_stiffness", "thermal_damping", "thermal_motor_friction"}
     assert not names & {"load_disturbance", "two_line_disturbance"}
@@ -216,8 +216,8 @@ def test_only_forms_that_a_log_can_show_are_proposed(has_motor):
 
 
 @pytest.mark.parametrize("lag", (1e-8, 3e-5, 8.3e-5, 4e-4, 3e-3))
-def test_a_lag_is_a_first_order_filter(lag):
-    """Against the exact response to a held torque, whose mean in each interval a smooth drive sees."""
+def test_lag_of_a_held_torque_is_a_first_order_filter(lag):
+    """Against the exact response to a held torque, by its mean in each interval."""
     random = np.random.default_rng(5)
     step, count = 1e-3, 40
     time = step * np.cumsum(random.uniform(0.8, 1.2, count))
@@ -234,7 +234,7 @@ def test_a_lag_is_a_first_order_filter(lag):
     np.testing.assert_allclose(ours, means, atol=1e-12)
 
 
-def test_a_lag_of_a_smooth_torque_against_scipy():
+def test_lag_of_a_linear_torque_agrees_with_scipy():
     time = 1e-3 * np.arange(30)
     values = np.sin(200 * time) + 0.3 * np.cos(700 * time)
     lag = 2e-3
@@ -254,7 +254,7 @@ def first_coefficients(signal, lag):
     return jax.value_and_grad(lambda lag: jnp.sum(signal.lagged(lag).coefficients[:, 0]))(lag)
 
 
-def test_the_derivative_of_a_lag_is_finite_down_to_almost_none():
+def test_derivative_by_the_lag_is_finite_for_tiny_lags():
     signal = sampled(1e-3 * np.arange(20), np.random.default_rng(1).normal(size=20), hold="zero-order")
     for lag in (1e-12, 1e-6, 8.33333e-5, 1e-3):
         value = jnp.asarray(lag)
@@ -266,7 +266,7 @@ def test_the_derivative_of_a_lag_is_finite_down_to_almost_none():
             assert slope == pytest.approx(float(after - before) / (2 * h), rel=1e-5)
 
 
-def test_every_form_stands_in_the_docs():
+def test_every_effect_is_documented():
     text = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
     for form in CATALOGUE:
         assert f"`{form.family}`" in text

@@ -1,4 +1,4 @@
-"""An encoder that is read late: recovered from logs, beside stiffness and damping."""
+"""Encoder delays: their estimates from logs together with stiffness and damping, and their effect on readings."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ FINE = rig.drive_motion(np.repeat(TORQUE, FINER), step=rig.STEP / FINER, substep
 MODEL = TwoInertiaModel(Drive(N=rig.N, J_m=rig.J_M, J_l=rig.J_L, K=1.0))
 
 
-def late(side: int, steps: int) -> Stretch:
+def log_with_late_encoder(side: int, steps: int) -> Stretch:
     """The rig's log with one encoder read some fifths of a sample late."""
     rows = np.arange(COUNT) * FINER
     motion = FINE[rows].copy()
@@ -34,9 +34,9 @@ def late(side: int, steps: int) -> Stretch:
 
 
 @pytest.mark.parametrize("form, side", [(MotorEncoderDelay, 0), (LoadEncoderDelay, 1)])
-def test_a_late_encoder_is_recovered(form: type[SensorEffect], side: int):
+def test_encoder_delay_is_estimated_from_a_log(form: type[SensorEffect], side: int):
     steps = 4
-    stretch = late(side, steps)
+    stretch = log_with_late_encoder(side, steps)
     base = base_fit(MODEL, (stretch,))
     model = base.model.with_effects(form(delay=1e-5))  # pyright: ignore[reportCallIssue]
     paths = (*base_paths(base.model), *effect_paths(model.effects[0]))
@@ -50,8 +50,8 @@ def test_a_late_encoder_is_recovered(form: type[SensorEffect], side: int):
         assert abs(estimates[path].value - true) < 4 * estimates[path].std
 
 
-def test_the_load_is_read_where_it_was():
-    """Against the drive's own motion, without a torque, backwards in time."""
+def test_load_encoder_delay_reads_the_earlier_state():
+    """Against the motion of the drive without a torque, integrated backwards in time."""
     drive = eqx.tree_at(lambda d: (d.K, d.B_sp), MODEL.drive, (jnp.asarray(rig.K), jnp.asarray(rig.B_SP)))
     model = TwoInertiaModel(drive)
     state, delay = jnp.asarray(np.array([1.0, 0.018, 3.0, -0.4])), 0.1 / float(drive.omega_0)
@@ -61,12 +61,12 @@ def test_the_load_is_read_where_it_was():
     ).y[:, -1]
     read = TwoInertiaModel(drive, (LoadEncoderDelay(delay=delay),), ("load_angle", "load_velocity"))
     moved = np.abs(earlier - np.asarray(state))[[1, 3]]
-    # What is left of the rate, to the third order in the delay.
+    # The remainder of the rate, of third order in the delay.
     np.testing.assert_allclose(read.outputs(state), earlier[[1, 3]], rtol=0, atol=3e-3 * moved.max())
 
 
-def test_each_delay_moves_its_own_reading():
-    """To first order: the motor's delay in the simulation's time, which is that of the motor's reading."""
+def test_encoder_delays_shift_the_dynamic_error_to_first_order():
+    """The simulation's time is that of the motor's reading, so that a motor delay advances the load's reading."""
     state = jnp.asarray(np.array([1.0, 0.01, 3.0, -0.4]))
     rest = TwoInertiaModel(MODEL.drive).outputs(state)
     for form, moved in ((MotorEncoderDelay, (0.0, -1e-6 * -0.4)), (LoadEncoderDelay, (0.0, 1e-6 * -0.4))):

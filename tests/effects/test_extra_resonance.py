@@ -42,7 +42,7 @@ def three_masses(J_3: float, K_3: float, B_3: float, left: float) -> tuple[np.nd
 
 @pytest.mark.parametrize("form", [ExtraResonance, ResonanceBesideLoad])
 @given(ratio=st.floats(1e-3, 0.8), omega=st.floats(50.0, 3000.0), zeta=st.floats(1e-3, 0.5))
-def test_poles_and_transfer_function_of_three_masses(form, ratio, omega, zeta):
+def test_third_inertia_has_poles_and_transfer_function_of_three_masses(form, ratio, omega, zeta):
     J_3 = ratio * J_L
     K_3, B_3 = J_3 * omega**2, 2 * zeta * omega * J_3
     A, b = (np.asarray(a) for a in linear(model(J_3, K_3, B_3, form)))
@@ -62,22 +62,22 @@ def test_poles_and_transfer_function_of_three_masses(form, ratio, omega, zeta):
         np.testing.assert_allclose(state[4], output[2] - output[1], rtol=1e-6, atol=1e-9 * abs(output[2]))
 
 
-def test_the_load_stands_still_where_the_third_inertia_swings_freely():
+def test_load_response_has_a_zero_at_the_third_inertias_frequency():
     """The zero of the load's response, undamped."""
     A, b = (np.asarray(a) for a in linear(model(1e-2, 1e-2 * 500.0**2, 0.0)))
     state = np.linalg.solve(500j * np.eye(6) - A, b)
     assert abs(state[1]) < 1e-9 * abs(state[4])
 
 
-def test_a_load_that_turns_evenly_is_left_alone():
-    """Whatever its angle and rate: the third inertia starts with the load, and nothing pulls."""
+def test_third_inertia_exerts_no_torque_on_a_load_at_constant_speed():
+    """The third inertia starts at the load's angle and rate, so that their spring is not twisted."""
     drive = model(1e-2, 4000.0, 0.1)
     turning = drive.settled(jnp.asarray([50.0 * 12.0, 12.0, 50.0 * 3.0, 3.0]))
     rates = drive.rates(turning, jnp.zeros(()), jnp.zeros(()))
     np.testing.assert_allclose(rates, [150.0, 3.0, 0.0, 0.0, 0.0, 0.0], atol=1e-9)
 
 
-def test_derived_figures():
+def test_third_inertia_reports_its_derived_parameters():
     effect = model(1e-2, 4000.0, 0.1)
     found = {name: float(v) for name, (v, _) in effect.effects[0].derived(effect.drive).items()}
     assert found == pytest.approx({"J_3": 1e-2, "K_3": 4000.0, "B_3": 0.1, "zero": np.sqrt(4e5) / (2 * np.pi)})

@@ -1,4 +1,4 @@
-"""The equations of every form, with their derivatives, are those that JAX takes from the same model."""
+"""Translated equations of every effect and their derivatives against those that JAX takes from the same model."""
 
 import functools
 import zlib
@@ -57,12 +57,12 @@ _SIZES = {"learned_mesh_torque": 0.5, "learned_load_torque": 0.5, "learned_motor
 _FRICTION = {"v": 0.5, "omega_m": 0.02, "omega_l": 0.3}
 
 
-def of_some_strength(model: Model, seed: int = 1) -> Model:
-    """The model with what is zero in its effects set to something else, so that every term counts."""
+def with_nonzero_strengths(model: Model, seed: int = 1) -> Model:
+    """The model with zero parameters of its effects set to random values, so that every term counts."""
     random = np.random.default_rng(seed)
     own = {path: float(v) for path, (v, _) in model.parameters().items() if "." in path}
     changed = {path: 10 ** random.uniform(-5, -3) for path, value in own.items() if value == 0.0}
-    # Friction too weak to change a rate within a step has a sign that is all rounding.
+    # The sign of friction too weak to change a rate within a step is determined by rounding.
     dry = {e.name: e.opposes for e in model.effects if isinstance(e, DryFriction)}
     changed |= {f"{name}.T_c": _FRICTION[rate] for name, rate in dry.items() if f"{name}.T_c" in own}
     return model.replace(changed) if changed else model
@@ -80,7 +80,7 @@ def learned(form: type[Learned], axes: tuple[Axis, ...]) -> Effect:
     mixing = random.normal(size=(count, kept)) / np.sqrt(count)
     c = _SIZES.get(form.name, 1e-4) * random.normal(size=kept)
     if isinstance(axes[0], SignAxis):
-        # It opposes its rate, at least where the other axes' first function is large.
+        # The torque opposes its rate, at least where the other axes' first function is large.
         c *= np.sign(mixing[0] @ c) * (1.0 if form is LearnedMeshTorque else -1.0)
     return form.made_of(axes, mixing, c)
 
@@ -130,12 +130,12 @@ def models() -> dict[str, Model]:
     """The base models, each with every form: the catalogue's, the learned ones, and several at once."""
     base, reduced = TwoInertiaModel(DRIVE), ReducedModel(ReducedDrive(mu=3.0, omega_0=380.0, alpha=2e4, gain=20.0))
     found: dict[str, Model] = {"two inertias": base, "reduced": reduced}
-    found |= {form.name: of_some_strength(base.with_effects(proposed(form))) for form in CATALOGUE}
+    found |= {form.name: with_nonzero_strengths(base.with_effects(proposed(form))) for form in CATALOGUE}
     found |= {name: base.with_effects(effect) for name, effect in learned_effects().items()}
-    found |= {form.name: of_some_strength(base.with_effects(proposed(form))) for form in LEARNED_WITH_MEMORY}
-    found["several at once"] = of_some_strength(base.with_effects(*SEVERAL))
+    found |= {form.name: with_nonzero_strengths(base.with_effects(proposed(form))) for form in LEARNED_WITH_MEMORY}
+    found["several at once"] = with_nonzero_strengths(base.with_effects(*SEVERAL))
     for form in (QuadraticStiffness, CoulombFriction, BoucWen, TorqueBias):
-        found[f"reduced, {form.name}"] = of_some_strength(reduced.with_effects(proposed(form)))
+        found[f"reduced, {form.name}"] = with_nonzero_strengths(reduced.with_effects(proposed(form)))
     return found
 
 
@@ -149,7 +149,7 @@ def signals_of(model: Model) -> tuple[str, ...]:
 
 
 def by_jax(model: Model, paths: Sequence[str], signals: Sequence[str], acting: Sequence[int]):
-    """The parts of the equations as functions of numbers: free parameters, state, what surrounds, what is held."""
+    """The parts of the equations as functions of free parameters, state, surrounding signals and held friction."""
     free, others, joined = split_model(model, paths)
     names: list[str] = []
 
@@ -192,7 +192,7 @@ def by_jax(model: Model, paths: Sequence[str], signals: Sequence[str], acting: S
 
 
 def points_of(model: Model, signals: Sequence[str], acting: int, held: int, seed: int) -> tuple[np.ndarray, ...]:
-    """States, surroundings and what is held, by row, anywhere in the usual range."""
+    """States, surrounding signals and held friction by row, at random in the usual range."""
     random = np.random.default_rng(seed)
     normal = functools.partial(random.normal, size=POINTS)
     x, v = 1e-3 * normal(), 0.3 * normal()
@@ -207,17 +207,17 @@ def points_of(model: Model, signals: Sequence[str], acting: int, held: int, seed
     around = [0.4 * normal(), random.uniform(0, 2, POINTS), np.full(POINTS, 5e-4)]
     around += [{LOAD: 2.0 * normal(), TEMPERATURE: 303.0 + 3.0 * normal()}[name] for name in signals]
     around += [0.5 * normal() for _ in range(acting)]
-    # Signs, and how far they reach.
+    # Mean signs and reaches of held friction.
     rubbing = [random.uniform(-1, 1, POINTS) if i % 2 == 0 else random.uniform(0, 9, POINTS) for i in range(held)]
     return np.stack(columns, 1), np.stack(around, 1), np.stack(rubbing, 1) if held else np.zeros((POINTS, 0))
 
 
 def friction_reaches(model: Model, states: np.ndarray, surroundings: np.ndarray) -> np.ndarray:
-    """Whether the dry friction of every effect can change its rate in a step, and so as to slow it down."""
+    """Whether the dry friction of every effect can change its rate within a step, and slows it down."""
 
     def reach(state, surrounding):
         dry = [e for e in model.effects if isinstance(e, DryFriction)]
-        # Thermal effects want to know of a temperature.
+        # Thermal effects need a temperature.
         motion = model.motion(state, Conditions(time=surrounding[1], temperature=surrounding[-1]))
         moved = [model.mobility(e.opposes, e.opposes) * e.level(motion, model.drive) for e in dry]
         return surrounding[2] * jnp.stack(moved)
@@ -226,7 +226,7 @@ def friction_reaches(model: Model, states: np.ndarray, surroundings: np.ndarray)
 
 
 def evaluated(found: Equations, part: Part, free, others, state, surrounding, held) -> list[np.ndarray]:
-    """Values, and derivatives by free parameter, state and what is held, of a part."""
+    """Values of a part, and their derivatives by free parameters, state and held friction."""
     graph = found.graph
     leaves: dict = {("parameter", i): p for i, p in enumerate(free)}
     leaves |= {("constant", i): c for i, c in enumerate(np.concatenate([np.ravel(o) for o in [*others, []]]))}
@@ -253,8 +253,10 @@ def _leaves_of(graph: Graph, name: int, count: int) -> np.ndarray:
 
 
 def differentiated(function, free, points: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Values and derivatives by JAX' forward mode. (Its program is evaluated by numpy, one call for each operation:
-    compiled, this would take seconds for each form.)"""
+    """Values and derivatives by JAX' forward mode.
+
+    The program is evaluated by numpy, one call for each operation: compiling it would take seconds for each effect.
+    """
     arguments = (np.stack(free), *(p[0] for p in points))
 
     def moved(arguments, tangents):
@@ -280,8 +282,8 @@ def differentiated(function, free, points: Sequence[np.ndarray]) -> list[np.ndar
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_equations_and_their_derivatives_are_those_of_jax(name: str):
-    """Everywhere: how far a number is off, relative to the largest of its column."""
+def test_equations_and_derivatives_agree_with_jax(name: str):
+    """At random points; errors are relative to the largest value of a column."""
     model = models()[name]
     paths, signals = fitted_paths(model), signals_of(model)
     found = equations(model, paths, signals)
@@ -298,8 +300,8 @@ def test_equations_and_their_derivatives_are_those_of_jax(name: str):
         assert all(np.isfinite(w).all() for w in wanted)
         tolerance, clear = 1e-12, np.ones(POINTS, dtype=bool)
         if part_name == "held":
-            # The mean sign over a step is a small difference of rates, over how far friction reaches. Where friction
-            # drives, as a learned one may, the sign is all rounding, and of no effect.
+            # The mean sign over a step is a small difference of rates over the reach of friction. Where friction
+            # drives, as a learned one may, the sign is determined by rounding and has no effect.
             tolerance, clear = 1e-9, friction_reaches(model, *points[:2])
             assert clear.any()
         row = np.max(np.abs(wanted[0]), axis=0)
@@ -312,8 +314,8 @@ def test_equations_and_their_derivatives_are_those_of_jax(name: str):
             np.testing.assert_array_less(apart, np.broadcast_to(tolerance * bound + 1e-300, apart.shape))
 
 
-def test_models_of_one_structure_have_the_same_equations():
-    """Values are no part of it."""
+def test_equations_do_not_depend_on_parameter_values():
+    """Models of one structure have the same graph."""
     model = models()["kinematic_error"]
     paths, signals = fitted_paths(model), signals_of(model)
     other = model.replace({"K": 123.0, "kinematic_error.cos_2": 0.7, "N": 99.0})
@@ -321,8 +323,8 @@ def test_models_of_one_structure_have_the_same_equations():
     assert ours.graph.nodes == theirs.graph.nodes
 
 
-def test_derivatives_that_are_zero_are_left_out():
-    """Of the rates by state, an angle's is one speed; no rate depends on what stays the same."""
+def test_zero_derivatives_are_left_out_of_the_equations():
+    """The rate of an angle depends on one speed alone, and outputs on no free parameter."""
     found = equations(models()["two inertias"], ("K", "alpha", "B_sp"), ())
     assert [set(t) for t in found.rates.slopes[:2]] == [{("state", 2)}, {("state", 3)}]
     assert all(found.graph.known(t[d]) == 1.0 for t in found.rates.slopes[:2] for d in t)

@@ -1,95 +1,18 @@
-"""Each function that the engine translates is what JAX computes: as machine code, with its derivatives."""
+"""Functions that the engine translates to machine code, with their derivatives, against JAX."""
 
-import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-from llvmlite import ir
+from machine_function import LANES, MachineFunction
 
 from hdjax.elementary import cosine_and_sine, exponential, power
 from hdjax.engine.array_rules import UntranslatableError
-from hdjax.engine.derivatives import derivatives
-from hdjax.engine.emission import F64, I64, Vectors, emitted, is_truth
-from hdjax.engine.graph import PARAMETER, VARYING, Graph
-from hdjax.engine.machine import compiled
-from hdjax.engine.translate import traced, translated
-
-LANES = 8
-
-
-class MachineFunction:
-    """A function of some scalars as machine code, with its derivatives, for arrays of points.
-
-    Args:
-        function: of JAX scalars; gives one scalar.
-        arguments: how many.
-        lanes: points side by side; one is what the engine does with parameters.
-        constant: which arguments stay the same during a simulation.
-    """
-
-    def __init__(self, function: Callable[..., Any], arguments: int, lanes: int = LANES, constant: Sequence[int] = ()):
-        self.arguments, self.lanes = arguments, lanes
-        self.graph = graph = Graph()
-        levels = [PARAMETER if i in constant else VARYING for i in range(arguments)]
-        leaves = [graph.leaf(("x", i), level) for i, level in enumerate(levels)]
-        program = traced(function, *(np.float64(0.5) for _ in leaves))
-        (result,) = translated(graph, program, [np.array(n, dtype=object) for n in leaves])
-        (self.value,) = result.reshape(-1)
-        one = graph.constant(1.0)
-        (tangent,) = derivatives(graph, [self.value], {n: {i: one} for i, n in enumerate(leaves)}).values()
-        zero = graph.constant(0.0)
-        self.wanted = [self.value, *(tangent.get(i, zero) for i in range(arguments))]
-        self.address = self._compiled()
-
-    def _compiled(self) -> int:
-        pointer = F64.as_pointer()
-        module = ir.Module("function")
-        function = ir.Function(module, ir.FunctionType(ir.VoidType(), [pointer, pointer]), "function")
-        v = Vectors(ir.IRBuilder(function.append_basic_block()), self.lanes)
-        inputs, outputs = (v.builder.bitcast(a, v.numbers.as_pointer()) for a in function.args)
-
-        def place(base, index):
-            return v.builder.gep(base, [ir.Constant(I64, index)])
-
-        given = {
-            self.graph.leaf(("x", i)): lambda i=i: v.builder.load(place(inputs, i), align=8)
-            for i in range(self.arguments)
-        }
-        found = emitted(v, self.graph, self.wanted, given)
-        for i, node in enumerate(self.wanted):
-            value = found[node]
-            if is_truth(self.graph, node):
-                value = v.builder.uitofp(value, v.numbers)
-            v.builder.store(value, place(outputs, i), align=8)
-        v.builder.ret_void()
-        (address,) = compiled(module, "function")
-        return address
-
-    def __call__(self, *points: np.ndarray) -> np.ndarray:
-        """Value and derivatives by row."""
-        count = len(points[0])
-        pad = -count % self.lanes
-        blocks = np.stack([np.pad(np.asarray(p, dtype=float), (0, pad), mode="edge") for p in points])
-        blocks = np.ascontiguousarray(blocks.reshape(len(points), -1, self.lanes).transpose(1, 0, 2))
-        found = np.empty((len(blocks), len(self.wanted), self.lanes))
-        call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(self.address)
-        for block, result in zip(blocks, found, strict=True):
-            call(block.ctypes.data, result.ctypes.data)
-        return found.transpose(1, 0, 2).reshape(len(self.wanted), -1)[:, :count]
-
-    def by_numpy(self, *points: np.ndarray) -> np.ndarray:
-        """The same by [`Graph.evaluate`][hdjax.engine.graph.Graph.evaluate]."""
-        leaves = {("x", i): np.asarray(p, dtype=float) for i, p in enumerate(points)}
-        found = self.graph.evaluate(self.wanted, leaves)
-        return np.stack([np.broadcast_to(np.asarray(f, dtype=float), points[0].shape) for f in found])
-
+from hdjax.engine.graph import PARAMETER
 
 # -- points ------------------------------------------------------------------------------------------------------------
 
@@ -128,7 +51,7 @@ def _with_own_slope(x):
 
 @_with_own_slope.defjvp
 def _with_own_slope_jvp(primals, tangents):
-    # Another slope than the function's, so that one can tell which was taken.
+    # A slope other than the function's own shows which of the two was used.
     return _with_own_slope(*primals), 7.0 * primals[0] * tangents[0]
 
 
@@ -247,9 +170,9 @@ FUNCTIONS: dict[str, Case] = {
     "piecewise": (lambda x: jnp.select([x < -1.0, x < 1.3], [x * x, jnp.sin(x)], jnp.log(jnp.abs(x) + 1.0)), (_DENSE,)),
 }
 
-# Derivatives of these are one minus something close to one, in JAX as here: right to the last digit of one.
+# Derivatives of these are one minus a number close to one, in JAX as here: accurate to the last digit of one.
 NEAR_ONE = {"tanh": 4.0, "expm1": 1.0, "elementary exponential": 2.0, "logistic": 1.0, "softplus": 1.0}
-# What is left over a whole number of times, where the quotient is rounded.
+# Remainders err by the rounding of the quotient.
 LEFT_OVER = {"rem": 2e-11, "mod": 2e-11}
 
 
@@ -272,7 +195,7 @@ def by_jax() -> dict[str, np.ndarray]:
 
 
 def assert_same(name: str, found: np.ndarray, wanted: np.ndarray):
-    # What underflows is compared to the smallest numbers that are kept.
+    # Values that underflow are compared with the smallest numbers that are kept.
     np.testing.assert_allclose(found[0], wanted[0], rtol=1e-13, atol=LEFT_OVER.get(name, 1e-300), err_msg=name)
     atol = 2.3e-16 * NEAR_ONE.get(name, 0.0)
     for i in range(1, len(found)):
@@ -286,7 +209,7 @@ def machine_function(name: str, **how) -> MachineFunction:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_a_function_is_that_of_jax(name: str, by_jax):
+def test_machine_function_agrees_with_jax(name: str, by_jax):
     made = machine_function(name)
     points = FUNCTIONS[name][1]
     assert_same(name, made(*points), by_jax[name])
@@ -295,7 +218,7 @@ def test_a_function_is_that_of_jax(name: str, by_jax):
     assert_same(name, machine_function(name, lanes=1)(*points), by_jax[name])
 
 
-def test_what_stays_the_same_is_divided_by_once(by_jax):
+def test_division_by_a_constant_uses_one_inverse(by_jax):
     made = machine_function("div", constant=(1,))
     inverse = made.graph.apply("div", made.graph.constant(1.0), made.graph.leaf(("x", 1)))
     assert made.graph.level[inverse] == PARAMETER
@@ -311,8 +234,8 @@ INF, NAN = math.inf, math.nan
     "name, low, high",
     [("exp", -708.0, 709.0), ("expm1", -745.0, 709.0), ("log", 2.3e-308, 1.7e308), ("tanh", -1e308, 1e308)],
 )
-def test_elementary_functions_over_their_whole_range(name: str, low: float, high: float, lanes: int):
-    """Against the C library's, which is right to a digit or so in the last place; and at what is no usual number."""
+def test_elementary_functions_agree_with_the_c_library_over_their_range(name: str, low: float, high: float, lanes: int):
+    """Against the C library, which errs by about a unit in the last place; and at zeros, infinities and NaN."""
     made = MachineFunction(getattr(jnp, name), 1, lanes)
     if name == "log":
         points = np.append(np.geomspace(low, high, 20_001), 1.0 + np.geomspace(1e-16, 0.5, 999))
@@ -334,15 +257,15 @@ def test_elementary_functions_over_their_whole_range(name: str, low: float, high
     np.testing.assert_array_equal(np.signbit(made(np.array([-0.0]))[0]), name in ("tanh", "log"))
 
 
-def test_what_is_no_number_is_less_than_nothing():
+def test_comparisons_with_nan_are_false():
     points = np.array([1.0, NAN, INF]), np.array([NAN, NAN, NAN])
     for compare, always in ((jnp.less, False), (jnp.greater_equal, False), (jnp.equal, False), (jnp.not_equal, True)):
         made = MachineFunction(lambda x, y, compare=compare: jnp.where(compare(x, y), 1.0, 0.0), 2)
         np.testing.assert_array_equal(made(*points)[0], float(always))
 
 
-def test_a_choice_does_not_let_through_what_it_leaves_out():
-    """Neither in value nor in slope, however infinite that is."""
+def test_selection_ignores_value_and_slope_of_the_other_branch():
+    """Even where they are infinite or NaN."""
     made = MachineFunction(lambda x: jnp.where(x > 0, jnp.sqrt(x), 0.0), 1)
     np.testing.assert_array_equal(made(np.array([-1.0, 0.0, 4.0])), [[0.0, 0.0, 2.0], [0.0, 0.0, 0.25]])
 
@@ -359,94 +282,7 @@ def test_a_choice_does_not_let_through_what_it_leaves_out():
         (lambda x: jnp.real(jnp.exp(jax.lax.complex(x, x))), "`complex`"),
     ],
 )
-def test_what_is_not_known_is_named(function, says: str):
+def test_untranslatable_operation_is_named_in_the_error(function, says: str):
     with pytest.raises(UntranslatableError) as caught, jax.numpy_dtype_promotion("standard"):
         MachineFunction(function, 1)
     assert says in str(caught.value)
-
-
-# -- any function at all -----------------------------------------------------------------------------------------------
-
-# Functions that stay bounded however they are nested; a corner is where the last entry is zero.
-_ONE: dict[str, tuple[Callable, Callable | None]] = {
-    "neg": (lambda n, a: -a, None),
-    "abs": (lambda n, a: n.abs(a), lambda a: a),
-    "sign": (lambda n, a: n.sign(a), lambda a: a),
-    "tanh": (lambda n, a: n.tanh(a), None),
-    "sin": (lambda n, a: n.sin(a), None),
-    "cos": (lambda n, a: n.cos(a), None),
-    "asinh": (lambda n, a: n.arcsinh(a), None),
-    "atan": (lambda n, a: n.arctan(a), None),
-    "bell": (lambda n, a: n.exp(-a * a), None),
-    "expm1": (lambda n, a: n.expm1(-n.abs(a)), lambda a: a),
-    "log": (lambda n, a: n.log(1.5 + a * a), None),
-    "log1p": (lambda n, a: n.log1p(a * a), None),
-    "sqrt": (lambda n, a: n.sqrt(0.5 + a * a), None),
-    "cube": (lambda n, a: n.tanh(a) ** 3, None),
-    "round": (lambda n, a: n.round(a), lambda a: a - np.floor(a) - 0.5),
-    "floor": (lambda n, a: n.floor(a), lambda a: a - np.round(a)),
-    "clip": (lambda n, a: n.clip(a, -0.7, 0.8), lambda a: (a + 0.7) * (a - 0.8)),
-}
-_TWO: dict[str, tuple[Callable, Callable | None]] = {
-    "add": (lambda n, a, b: a + b, None),
-    "sub": (lambda n, a, b: a - b, None),
-    "mul": (lambda n, a, b: a * b, None),
-    "div": (lambda n, a, b: a / (1.0 + b * b), None),
-    "max": (lambda n, a, b: n.maximum(a, b), lambda a, b: a - b),
-    "min": (lambda n, a, b: n.minimum(a, b), lambda a, b: a - b),
-    "where": (lambda n, a, b: n.where(a < b, a * a, n.sin(b)), lambda a, b: a - b),
-    "both": (lambda n, a, b: n.where((a > 0.1) & ~(b > 0.2), a, b), lambda a, b: (a - 0.1) * (b - 0.2)),
-    "atan2": (lambda n, a, b: n.arctan2(a, 1.0 + b * b), None),
-    "pow": (lambda n, a, b: (1.0 + a * a) ** n.tanh(b), None),
-}
-
-expressions = st.recursive(
-    st.sampled_from(["x", "y", "z"]) | st.sampled_from([0.0, 1.0, -1.0, 2.0, 0.3, -1.7]),
-    lambda inner: (
-        st.tuples(st.sampled_from(sorted(_ONE)), inner) | st.tuples(st.sampled_from(sorted(_TWO)), inner, inner)
-    ),
-    max_leaves=12,
-)
-
-
-def evaluate(expression, library, values, corners: list | None = None):
-    """The expression by numpy or JAX; `corners` takes up how far each number is from the next corner."""
-    if isinstance(expression, str):
-        return values[expression]
-    if isinstance(expression, float):
-        return library.full_like(values["x"], expression)
-    name, *inner = expression
-    arguments = [evaluate(i, library, values, corners) for i in inner]
-    rule, corner = (_ONE if len(inner) == 1 else _TWO)[name]
-    if corners is not None:
-        corners.extend(np.abs(a) for a in arguments)
-        corners += [] if corner is None else [(corner(*arguments),)]
-    return rule(library, *arguments)
-
-
-@settings(max_examples=120)
-@given(expressions, st.integers(0, 2**32 - 1))
-def test_any_function_is_that_of_jax(expression, seed: int):
-    points = dict(zip("xyz", np.random.default_rng(seed).normal(scale=1.5, size=(3, 16)), strict=True))
-    noted: list = []
-    wanted = evaluate(expression, np, points, noted)
-    size = np.maximum(1.0, np.max([np.ones(16), *(a for a in noted if not isinstance(a, tuple))], axis=0))
-    assume(size.max() < 1e3)
-    # What rounding moves across a corner says nothing.
-    sharp = [np.abs(a[0]) > 1e-9 for a in noted if isinstance(a, tuple)]
-    clear = np.all([np.ones(16, dtype=bool), *sharp], axis=0)
-    assume(clear.any())
-
-    def function(x, y, z):
-        return evaluate(expression, jnp, {"x": x, "y": y, "z": z})
-
-    made = MachineFunction(function, 3)
-    rows = made(*points.values())
-    numbers = [jnp.asarray(p) for p in points.values()]
-    value, slopes = jax.vmap(function)(*numbers), jax.vmap(jax.jacfwd(function, (0, 1, 2)))(*numbers)
-    steep = np.maximum(size, np.max(np.abs(slopes), axis=0))
-    for found in (rows, made.by_numpy(*points.values())):
-        assert np.max((np.abs(found[0] - wanted) / size)[clear]) < 1e-12
-        assert np.max((np.abs(found[0] - np.asarray(value)) / size)[clear]) < 1e-12
-        # Slopes of what is nested lose a digit for each factor that is large.
-        assert np.max((np.abs(found[1:] - np.asarray(slopes)) / steep**2)[:, clear]) < 1e-12

@@ -13,7 +13,7 @@ from hdjax.engine.linear import linear_response
     sizes=st.tuples(*(st.integers(1, most) for most in (3, 7, 6, 3, 5, 21))),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_it_is_the_recursion(sizes: tuple[int, int, int, int, int, int], seed: int):
+def test_linear_response_agrees_with_the_recursion(sizes: tuple[int, int, int, int, int, int], seed: int):
     segments, samples, states, outputs, parts, columns = sizes
     random = np.random.default_rng(seed)
     transition = random.normal(size=(segments, samples, states, states))
@@ -29,7 +29,7 @@ def test_it_is_the_recursion(sizes: tuple[int, int, int, int, int, int], seed: i
     np.testing.assert_allclose(end, state, rtol=0, atol=1e-12 * (10.0 + np.abs(state).max()))
 
 
-def test_more_states_than_there_is_room_for():
+def test_linear_response_with_too_many_states_is_refused():
     many = 65
     with pytest.raises(ValueError, match="at most 64 states, but has 65"):
         linear_response(

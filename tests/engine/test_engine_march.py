@@ -1,4 +1,4 @@
-"""The march by machine code is that by XLA, however it is called and whatever its data are like."""
+"""The march by machine code against that by XLA: data, ways of calling, and diverging segments."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ SUBSTEPS, WHOLE, THREADS = SETTINGS
 def experiment(
     model: Model, *, hold: Hold = "zero-order", loaded: bool = False, warm: bool = False, jitter: float = 0.0
 ) -> Experiment:
-    """A record of a base drive; what the logs carry does not have to go together for two engines to agree."""
+    """A log of a base drive; its signals need not be consistent for two engines to agree."""
     random = np.random.default_rng(5)
     torque = rig.drive_torque(COUNT)
     stamps = rig.STEP * (np.arange(COUNT) + jitter * random.uniform(-1, 1, COUNT))
@@ -53,7 +53,7 @@ def experiment(
 def problem_of(
     model: Model, *, joined: bool = False, substeps: int = 1, missing: float = 0.0, **data
 ) -> tuple[Problem, Unknowns]:
-    """Posed by hand, away from any optimum."""
+    """A fitting problem away from its optimum, with random initial states."""
     record = experiment(model, **data)
     segments = cut([Stretch(record, 0, len(record))], LENGTH, halo=HALO)
     random = np.random.default_rng(7)
@@ -82,8 +82,8 @@ def problem_of(
 _blocks_by_xla = eqx.filter_jit(blocks)
 
 
-def apart(problem: Problem, unknowns: Unknowns) -> dict[str, np.ndarray]:
-    """How far machine code is from XLA, each number relative to the largest of its column."""
+def relative_differences(problem: Problem, unknowns: Unknowns) -> dict[str, np.ndarray]:
+    """Differences of machine code from XLA, each relative to the largest value of its column."""
     wanted, found = _blocks_by_xla(problem, unknowns), linearise(with_engine(problem), unknowns)
     result = {}
     for name in FIELDS:
@@ -91,23 +91,26 @@ def apart(problem: Problem, unknowns: Unknowns) -> dict[str, np.ndarray]:
         assert ours.shape == theirs.shape and np.isfinite(ours).all()
         size = np.max(np.abs(theirs), axis=(0, 1) if theirs.ndim == 3 else None, keepdims=True, initial=0.0)
         if name == "before_by_state":
-            # It was the identity at the segment's start: a state that is forgotten leaves the rounding of one.
+            # It is the identity at the segment's start: errors of a decayed state are relative to one.
             size = np.maximum(size, 1.0)
         result[name] = np.abs(ours - theirs) / np.where(size > 0, size, 1.0)
     return result
 
 
 def is_steep(model: Model) -> bool:
-    """Whether slopes change so fast that the rounding of a state shows in them: where a drive comes to rest within a
-    step, at the edge of a gap, and in a learned function that is dense near standstill."""
+    """Whether slopes change so fast that they depend on the rounding of a state.
+
+    They do where a drive comes to rest within a step, at the edge of a gap, and in a learned function whose knots are
+    dense near standstill.
+    """
     axes = (axis for effect in model.effects for axis in getattr(effect, "axes", ()))
     dense = any(getattr(axis, "bend", None) is not None for axis in axes)
     return dense or any(isinstance(e, DryFriction) or e.family == "backlash" for e in model.effects)
 
 
 def assert_agreement(problem: Problem, unknowns: Unknowns):
-    """All samples but those that rounding may put on the other side of a corner, of which there are few."""
-    found = apart(problem, unknowns)
+    """Of all samples but the few that rounding may move across a corner."""
+    found = relative_differences(problem, unknowns)
     bounds = {name: 1e-9 if "by" in name and is_steep(problem.model) else 1e-12 for name in FIELDS}
     off = {name: int(np.sum(d > bounds[name])) for name, d in found.items()}
     total = {name: max(d.size, 1) for name, d in found.items()}
@@ -125,12 +128,12 @@ TYPICAL = {
 }
 
 
-# A corner that no step resolves: a drive that comes to rest within one.
+# A corner that no step resolves: the drive comes to rest within one step.
 SHARP = {"motor_friction.transition": 2e-3, "motor_friction.T_c": 0.1}
 
 
 @pytest.mark.parametrize("name", TYPICAL)
-def test_it_agrees_with_xla(name: str):
+def test_march_of_typical_models_agrees_with_xla(name: str):
     model = models()[name]
     model = model.replace({path: value for path, value in SHARP.items() if path in model.parameters()})
     assert_agreement(*problem_of(model, **TYPICAL[name]))
@@ -139,7 +142,7 @@ def test_it_agrees_with_xla(name: str):
 @pytest.mark.slow
 @pytest.mark.parametrize("loaded", [False, True])
 @pytest.mark.parametrize("name", models())
-def test_every_form_agrees_with_xla(name: str, loaded: bool):
+def test_march_of_every_effect_agrees_with_xla(name: str, loaded: bool):
     model = models()[name]
     if loaded and isinstance(model, ReducedModel):
         pytest.skip("a reduced drive has no load torque")
@@ -151,18 +154,18 @@ def test_every_form_agrees_with_xla(name: str, loaded: bool):
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
 @pytest.mark.parametrize("hold", HOLDS)
 @pytest.mark.parametrize("name", ["stribeck_motor_friction", "input_delay", "input_lag", "several at once"])
-def test_every_hold_agrees_with_xla(name: str, hold: Hold, jitter: float):
+def test_march_under_every_hold_agrees_with_xla(name: str, hold: Hold, jitter: float):
     assert_agreement(*problem_of(models()[name], hold=hold, jitter=jitter, joined=True, missing=0.1))
 
 
-def test_all_forms_are_compared():
+def test_every_effect_of_the_catalogue_is_compared():
     named = set(models())
     assert {form.name for form in (*CATALOGUE, *LEARNED_WITH_MEMORY)} <= named
 
 
 @pytest.mark.parametrize("name", ["dahl_motor_friction", "lugre_load_friction"])
-def test_rows_of_the_prior_are_differentiated(name: str):
-    """Where hidden states are expected may depend on parameters, which move by their logarithm."""
+def test_derivatives_of_the_prior_rows_agree_with_differences(name: str):
+    """Expected hidden states may depend on parameters, which change by their logarithm."""
     problem, unknowns = problem_of(models()[name])
     ready = with_engine(problem)
     index = problem.free.paths.index(f"{name}.bend")
@@ -181,17 +184,17 @@ def test_rows_of_the_prior_are_differentiated(name: str):
     assert np.abs(found).max() > 0
 
 
-# -- how it is called --------------------------------------------------------------------------------------------------
+# -- ways of calling ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def several() -> tuple[Problem, Unknowns]:
-    """A drive with friction, a state of its own, and a torque sensor that is off."""
+def problem_of_several_effects() -> tuple[Problem, Unknowns]:
+    """A problem of a drive with frictions, hysteresis, a kinematic error and errors of the logged torque."""
     problem, unknowns = problem_of(models()["several at once"], joined=True, missing=0.1)
     return with_engine(problem, values=True), unknowns
 
 
-def equal(one, other):
+def assert_equal(one, other):
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -202,8 +205,8 @@ def with_setting(lanes, place: int, value: int):
     return eqx.tree_at(lambda s: s.settings, lanes, settings)
 
 
-def test_the_same_bits_whatever_the_number_of_threads(several):
-    problem, unknowns = several
+def test_march_is_bitwise_equal_for_any_number_of_threads(problem_of_several_effects):
+    problem, unknowns = problem_of_several_effects
     lanes = lanes_of(problem, unknowns, problem.kernel)
     found = [
         march_lanes(problem.kernel.jacobian, with_setting(lanes, THREADS, n), problem.kernel.hidden, "jacobian")
@@ -211,18 +214,18 @@ def test_the_same_bits_whatever_the_number_of_threads(several):
     ]
     assert np.abs(found[0].rows).max() > 0
     for other in found[1:]:
-        equal(found[0], other)
+        assert_equal(found[0], other)
 
 
-def test_inside_and_outside_of_programs(several):
-    """A call from Python, from JAX without and with `jit`, the address being data; and without derivatives."""
-    problem, unknowns = several
+def test_march_is_equal_with_and_without_jit(problem_of_several_effects):
+    """Called from Python, and from JAX with and without `jit`, the address being data; and without derivatives."""
+    problem, unknowns = problem_of_several_effects
     kernel = problem.kernel
     lanes = lanes_of(problem, unknowns, kernel)
     plain = march_lanes(kernel.jacobian, lanes, kernel.hidden, "jacobian")
     jitted = eqx.filter_jit(lambda address, lanes: march_lanes(address, lanes, kernel.hidden, "jacobian"))
-    equal(plain, jitted(kernel.jacobian, lanes))
-    equal(plain, march_arrays(kernel.jacobian, lanes, kernel.hidden, "jacobian"))
+    assert_equal(plain, jitted(kernel.jacobian, lanes))
+    assert_equal(plain, march_arrays(kernel.jacobian, lanes, kernel.hidden, "jacobian"))
     signals = lanes.signals[: len(lanes.signals) - len(kernel.acting)]
     values = march_lanes(kernel.values, dataclasses.replace(lanes, signals=signals), kernel.hidden, "values")
     np.testing.assert_allclose(values.rows, plain.rows, rtol=1e-12, atol=1e-12 * np.abs(plain.rows).max())
@@ -230,19 +233,19 @@ def test_inside_and_outside_of_programs(several):
     assert values.by_parameter is None
 
 
-def test_vmap_is_a_loop(several):
-    problem, unknowns = several
+def test_vmap_of_the_linearisation_equals_a_loop(problem_of_several_effects):
+    problem, unknowns = problem_of_several_effects
     points = [eqx.tree_at(lambda u: u.parameters, unknowns, unknowns.parameters + 0.01 * k) for k in range(3)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *points)
     together = eqx.filter_jit(lambda p, u: jax.vmap(lambda one: linearise(p, one))(u))(problem, stacked)
     for k, point in enumerate(points):
-        # Programs of JAX take exponentials of parameters otherwise than numpy: by the last digit.
+        # JAX and numpy differ in the last digit of exponentials of parameters.
         for found, wanted in zip(jax.tree.leaves(together), jax.tree.leaves(linearise(problem, point)), strict=True):
             np.testing.assert_allclose(found[k], wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
 
 
-def test_its_derivative_is_a_product_with_its_blocks(several):
-    problem, unknowns = several
+def test_jvp_of_the_residual_is_a_product_with_its_blocks(problem_of_several_effects):
+    problem, unknowns = problem_of_several_effects
     random = np.random.default_rng(3)
     tangent = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)) * jnp.abs(leaf), unknowns)
     along = eqx.filter_jit(lambda p, u, t: jax.jvp(lambda w: residual_with_blocks(w, p), (u,), (t,)))
@@ -259,8 +262,8 @@ def test_its_derivative_is_a_product_with_its_blocks(several):
     np.testing.assert_allclose(slope.gap, gap, rtol=0, atol=1e-12 * np.abs(gap).max())
 
 
-def test_simulated_outputs_are_measured_minus_residual(several):
-    problem, unknowns = several
+def test_simulated_outputs_are_measured_minus_residual(problem_of_several_effects):
+    problem, unknowns = problem_of_several_effects
     outputs, end = simulate(problem, unknowns)
     counts = np.asarray(problem.segments.weight) > 0
     rows = np.asarray(linearise(problem, unknowns).residual)[:, : 2 * LENGTH].reshape(*counts.shape, 2)
@@ -273,14 +276,14 @@ def test_simulated_outputs_are_measured_minus_residual(several):
 
 
 def products(found: Blocks, count: int) -> np.ndarray:
-    """Of a segment's columns, and the residual, with each other."""
+    """Inner products of a segment's columns and its residual."""
     columns = np.concatenate([found.by_parameter[..., :count], found.by_state, found.residual[..., None]], axis=2)
     return np.einsum("srp,srq->spq", columns, columns)
 
 
-def test_held_parameters_have_no_slope_and_change_no_other(several):
-    """Their tangents are left out where all of them are held."""
-    problem, unknowns = several
+def test_fixed_parameters_have_no_slope_and_change_no_other(problem_of_several_effects):
+    """Their tangents are left out where all parameters are fixed."""
+    problem, unknowns = problem_of_several_effects
     held = dataclasses.replace(problem, active=jnp.zeros_like(problem.active))
     found, other = linearise(held, unknowns), linearise(problem, unknowns)
     for name in ("residual", "by_state", "gap", "before_by_state"):
@@ -289,8 +292,8 @@ def test_held_parameters_have_no_slope_and_change_no_other(several):
 
 
 @pytest.mark.parametrize("name", ["two inertias", "maxwell_slip", "bouc_wen", "input_delay"])
-def test_products_are_those_of_the_jacobian(name: str):
-    """What a fit needs of the Jacobian, without ever writing it; and a column that depends on others does no harm."""
+def test_normal_products_agree_with_the_jacobian(name: str):
+    """Products are formed without the Jacobian; a linearly dependent column is allowed."""
     problem, unknowns = problem_of(models()[name], missing=0.1)
     free = np.array(problem.active)
     for active in (free, np.where(np.arange(free.size) == 1, 0.0, free), np.zeros_like(free)):
@@ -307,13 +310,13 @@ def test_products_are_those_of_the_jacobian(name: str):
         np.testing.assert_allclose(found.gap, full.gap, rtol=1e-12, atol=1e-12 * np.abs(full.gap).max())
 
 
-# -- what runs away ----------------------------------------------------------------------------------------------------
+# -- divergence --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("start", [1e200, np.inf, np.nan, -3e6])
-def test_a_segment_that_runs_away_is_lost_and_no_other(several, start: float):
-    """Its rows are as large as counts, with no slope; those beside it in the block are what they were, to the bit."""
-    problem, unknowns = several
+def test_diverged_segment_is_marked_and_changes_no_other(problem_of_several_effects, start: float):
+    """Its rows have the value of lost samples, with no slope. Other segments of its block are bitwise unchanged."""
+    problem, unknowns = problem_of_several_effects
     kernel = problem.kernel
     lost = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[2, 1].set(start))
     before, after = (
@@ -326,7 +329,7 @@ def test_a_segment_that_runs_away_is_lost_and_no_other(several, start: float):
         )
     counts = np.repeat(np.asarray(problem.segments.weight)[2] > 0, 2)
     rows = np.asarray(after.rows)[2, : 2 * LENGTH]
-    # The motor's encoder does not see at once where the load is.
+    # The first row, of the motor's encoder, does not depend on the load's angle.
     assert (rows[counts][1:] == LOST).all() and (rows[~counts] == 0).all()
     lost_rows = np.flatnonzero(rows == LOST)
     for slopes in (after.by_parameter, after.by_state):
@@ -335,23 +338,23 @@ def test_a_segment_that_runs_away_is_lost_and_no_other(several, start: float):
         assert np.isfinite(leaf).all()
 
 
-def test_one_that_runs_away_in_the_middle_is_sound_until_then():
-    """A spring that softens lets a drive go that is twisted too far."""
+def test_segment_diverging_midway_is_valid_until_then():
+    """A drive with a softening spring diverges where it is twisted too far."""
     model = TwoInertiaModel(rig.drive_model(alpha=-5e4).drive)
     problem, unknowns = problem_of(model)
     wild = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[4, 1].add(-8e-3))
-    found = apart(problem, wild)
+    found = relative_differences(problem, wild)
     rows = np.asarray(linearise(with_engine(problem), wild).residual)
     lost = np.abs(rows[4]) >= LOST
     assert 0 < lost.sum() < lost.size and not lost[0] and (np.abs(np.delete(rows, 4, axis=0)) < LOST).all()
     slopes = np.asarray(linearise(with_engine(problem), wild).by_parameter)[4]
     assert (slopes[lost] == 0).all() and np.isfinite(slopes).all()
-    # Up to where it is far away; beyond, errors grow as the motion does.
+    # The other segments; in the diverging one, errors grow as the motion does.
     assert all(np.delete(d, 4, axis=0).max(initial=0.0) < 1e-12 for d in (found["residual"], found["by_state"]))
 
 
 class SteepTorque(MeshTorqueEffect):
-    """A torque whose slope is infinite at no twist."""
+    """A torque whose slope is infinite at zero twist."""
 
     family = "unknown"
     name = "steep_torque"
@@ -366,18 +369,18 @@ class SteepTorque(MeshTorqueEffect):
         return self.k * jnp.sqrt(jnp.abs(motion.x))
 
 
-def test_a_slope_that_is_no_number_is_none():
-    """The motion is sound, and its derivative is infinite: no infinity gets out."""
+def test_infinite_slope_is_replaced_by_zero():
+    """The motion is finite and its derivative infinite: results are finite."""
     problem, unknowns = problem_of(rig.drive_model().with_effects(SteepTorque()))
     still = eqx.tree_at(lambda u: u.states, unknowns, jnp.zeros_like(unknowns.states))
     found = linearise(with_engine(problem), still)
     assert np.abs(np.asarray(found.residual)).max() < LOST
     for leaf in jax.tree.leaves(found):
         assert np.isfinite(leaf).all()
-    # By the torque's size, and by all that comes after the first sample.
+    # Slopes of the last sample are zero: they are invalid after the first one.
     assert (np.asarray(found.by_state)[:, 2 * LENGTH - 2 : 2 * LENGTH] == 0).all()
 
 
-def test_a_reduced_drive_agrees_with_xla():
+def test_march_of_a_reduced_drive_agrees_with_xla():
     drive = ReducedDrive(mu=rig.MU, omega_0=rig.OMEGA_0, alpha=rig.REDUCED_ALPHA, gain=rig.GAIN)
     assert_agreement(*problem_of(ReducedModel(drive), joined=True))

@@ -1,4 +1,4 @@
-"""Functions evaluated at many instants without compilation, against JAX; and what is left to JAX."""
+"""Functions evaluated at many instants without compilation, against JAX; and those that JAX has to evaluate."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from hdjax.engine.pointwise import at_instants, slopes_at_instants
 SHAPES = [(5,), (3, 7), (2, 9000), (3, 5000, 1)]
 
 
-def around(strengths, effect, point):
+def function_of_a_point(strengths, effect, point):
     size, name = effect
     assert name == "some"
     return {
@@ -24,7 +24,7 @@ def around(strengths, effect, point):
 
 
 def sorted_pair(strengths, point):
-    """With a primitive that the graph has no words for."""
+    """A function with a primitive that can't be translated."""
     return strengths * jnp.sort(point["pair"])
 
 
@@ -33,36 +33,36 @@ def points(shape: tuple[int, ...]) -> dict[str, np.ndarray]:
     return {"angle": draw.normal(size=shape), "pair": draw.normal(size=(*shape, 2))}
 
 
-def over(function, shape: tuple[int, ...]):
-    """By JAX, along the axes of the instants."""
+def mapped_over(function, shape: tuple[int, ...]):
+    """The function mapped by JAX over the axes of the instants."""
     for _ in shape:
         function = jax.vmap(function)
     return function
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_values_and_slopes_are_those_of_jax(shape: tuple[int, ...]):
+def test_values_and_slopes_at_instants_agree_with_jax(shape: tuple[int, ...]):
     looked_at, strengths, effect = points(shape), np.array([0.7, -1.3]), (np.array(1.1), "some")
-    found = at_instants(around, (strengths, 0), (effect, 0), (looked_at, len(shape)))
-    slopes = slopes_at_instants(around, (strengths, 0), (effect, 0), (looked_at, len(shape)))
-    wanted = over(lambda point: around(strengths, effect, point), shape)(looked_at)
-    linear = over(lambda point: jax.jacfwd(around)(strengths, effect, point), shape)(looked_at)
+    found = at_instants(function_of_a_point, (strengths, 0), (effect, 0), (looked_at, len(shape)))
+    slopes = slopes_at_instants(function_of_a_point, (strengths, 0), (effect, 0), (looked_at, len(shape)))
+    wanted = mapped_over(lambda point: function_of_a_point(strengths, effect, point), shape)(looked_at)
+    linear = mapped_over(lambda point: jax.jacfwd(function_of_a_point)(strengths, effect, point), shape)(looked_at)
     for name in wanted:
         np.testing.assert_allclose(found[name], wanted[name], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(slopes[name], linear[name], rtol=1e-12, atol=1e-12)
 
 
-def test_instants_broadcast():
+def test_arguments_broadcast_over_instants():
     """Each of two effects at each of four points."""
     sizes, looked_at = np.array([[0.5], [2.0]]), points((4,))
     strengths = np.array([[[1.0, 2.0]], [[3.0, 4.0]]])
-    found = at_instants(around, (strengths, 2), ((sizes, "some"), 2), (looked_at, 1))
+    found = at_instants(function_of_a_point, (strengths, 2), ((sizes, "some"), 2), (looked_at, 1))
     assert found["sine"].shape == (2, 4) and found["both"].shape == (2, 4, 3)
     expected = strengths[..., 0] * np.sin(sizes * looked_at["angle"]) + strengths[..., 1] ** 2
     np.testing.assert_allclose(found["sine"], expected, rtol=1e-12)
 
 
-def test_jax_takes_over_where_a_function_is_not_known():
+def test_untranslatable_function_is_evaluated_by_jax():
     looked_at, strengths = points((3, 4)), np.array([2.0, 3.0])
     found = at_instants(sorted_pair, (strengths, 0), (looked_at, 2))
     slopes = slopes_at_instants(sorted_pair, (strengths, 0), (looked_at, 2))
@@ -71,25 +71,25 @@ def test_jax_takes_over_where_a_function_is_not_known():
     np.testing.assert_allclose(slopes, ordered[..., None] * np.eye(2))
 
 
-def test_jax_takes_over_at_a_single_instant():
+def test_single_instant_is_evaluated_by_jax():
     looked_at = {"pair": np.array([2.0, 1.0])}
     found = at_instants(sorted_pair, (np.array([1.0, 3.0]), 0), (looked_at, 0))
     np.testing.assert_array_equal(found, [1.0, 6.0])
 
 
-def test_a_function_is_translated_once_for_all_numbers(monkeypatch: pytest.MonkeyPatch):
+def test_function_is_translated_once_for_all_values(monkeypatch: pytest.MonkeyPatch):
     looked_at, strengths = points((6,)), np.array([0.7, -1.3])
-    at_instants(around, (strengths, 0), ((np.array(1.1), "some"), 0), (looked_at, 1))
+    at_instants(function_of_a_point, (strengths, 0), ((np.array(1.1), "some"), 0), (looked_at, 1))
 
     def refused(*_):
         raise AssertionError("translated again")
 
     monkeypatch.setattr(pointwise, "translated", refused)
-    at_instants(around, (2.0 * strengths, 0), ((np.array(0.1), "some"), 0), (points((8,)), 1))
+    at_instants(function_of_a_point, (2.0 * strengths, 0), ((np.array(0.1), "some"), 0), (points((8,)), 1))
 
 
 @pytest.mark.parametrize("by_machine_code", [True, False])
-def test_own_states_along_a_straight_line(by_machine_code: bool):
+def test_hidden_states_along_a_ramp_agree_with_the_closed_form(by_machine_code: bool):
     """Creep's state follows a ramp of the twist with a lag, in closed form."""
     width, speed, taus = np.full((2, 40), 2e-3), np.array([0.3, -0.2]), np.array([0.01, 0.05])
     time = np.pad(np.cumsum(width, axis=1), ((0, 0), (1, 0)))

@@ -1,4 +1,4 @@
-"""Analytic amplitudes against the numerical routes, the verdicts on them, and the pictures."""
+"""Analytic amplitudes against the numerical routes, the verdicts on them, and the plots."""
 
 from functools import cache
 
@@ -41,7 +41,7 @@ DRIVE = ReducedDrive(mu=MU, omega_0=1.0, alpha=ALPHA)
 
 
 @pytest.mark.slow
-def test_slow_forcing_is_stable():
+def test_motion_far_below_resonance_is_stable_and_holds_to_one_percent():
     # A hundred natural oscillations within a period of the forcing.
     (row,) = check_amplitudes(DRIVE, 0.05, 0.01).rows
     assert row.stable
@@ -51,7 +51,7 @@ def test_slow_forcing_is_stable():
 @pytest.mark.parametrize(
     "omega", [pytest.param(0.34, marks=pytest.mark.slow), 0.5, 1.02, pytest.param(3.05, marks=pytest.mark.slow)]
 )
-def test_all_routes_agree_on_a_linear_drive(omega):
+def test_all_amplitude_routes_agree_on_a_linear_drive(omega):
     A = 0.05
     (row,) = check_amplitudes(ReducedDrive(mu=MU, omega_0=1.0), A, omega).rows
     truth = A / abs(1.0 - omega**2 + 1j * MU * omega)
@@ -105,7 +105,7 @@ def row(first: float, balance: float | None = 1.0, time: float | None = 1.0) -> 
         (row(1.0, balance=1.001), "undecided: the two numerical routes differ"),
     ),
 )
-def test_verdicts(made, verdict):
+def test_amplitude_row_reports_its_verdict(made, verdict):
     assert made.verdict == verdict
     assert made.second_order_error is None
 
@@ -125,7 +125,7 @@ def test_verdicts(made, verdict):
         (9.0, "off-resonance"),
     ),
 )
-def test_kinds(omega, kind):
+def test_resonance_kind_follows_the_frequency_ratio(omega, kind):
     assert resonance_kind(2.0, omega) == kind
 
 
@@ -134,17 +134,17 @@ def errors() -> ErrorMap:
     return error_map("primary", np.asarray([-0.02, 0.0, 0.02]), np.asarray([1e-3, 1e-2, 1e-1, 0.5]), 0.02, harmonics=5)
 
 
-def test_errors_are_small_where_the_drive_is_nearly_linear():
+def test_error_map_is_small_where_the_drive_is_nearly_linear():
     found = errors()
     first, second = np.asarray(found.first_order[0]), np.asarray(found.second_order[0])
     assert first.shape == (4, 3)
     assert first[0].max() < 0.02 and second[0].max() < 2e-3
-    # At resonance only the nonlinearity is left to be wrong about.
+    # At resonance the nonlinearity is the only source of error.
     assert (np.diff(first[:, 1]) > 0.0).all()
     assert (second[:3] < first[:3]).all()
 
 
-# -- pictures --
+# -- plots --
 
 
 @cache
@@ -153,7 +153,7 @@ def branch() -> Branch:
 
 
 @pytest.mark.slow
-def test_a_range_that_ends_within_the_fold_has_two_branches():
+def test_frequency_range_that_ends_between_folds_has_two_branches():
     def ends(fast: float) -> tuple[Branch, ...]:
         return from_both_ends(ReducedModel(DRIVE), harmonic_series(1.0, 0.05), 0.8, fast, points=150, harmonics=5)
 
@@ -167,7 +167,7 @@ def test_a_range_that_ends_within_the_fold_has_two_branches():
     assert float(above.omega[above.valid].min()) == pytest.approx(low, rel=1e-3)
 
 
-def test_time_integration_settles_onto_the_branch():
+def test_time_integration_settles_onto_the_stable_branch():
     found = settled(branch(), motions=8)
     omega, size = np.asarray(found.omega), np.asarray(found.amplitude)
     assert size.size >= 6 and not np.asarray(found.escaped).any()
@@ -184,7 +184,7 @@ def saved(figure, path) -> int:
     return path.stat().st_size
 
 
-def test_the_frequency_response_is_drawn_with_its_unstable_part(tmp_path):
+def test_frequency_response_plot_shows_the_unstable_part(tmp_path):
     omegas = jnp.linspace(0.9, 1.2, 31)
     analytic = jax.vmap(PrimaryResonance(DRIVE, 0.05).branches)(omegas)
     size = jnp.linspace(0.2, 0.4, 5)
@@ -208,7 +208,7 @@ def test_the_frequency_response_is_drawn_with_its_unstable_part(tmp_path):
     assert saved(figure, tmp_path / "response.png") > 1000
 
 
-def test_the_phase_portrait_is_drawn(tmp_path):
+def test_phase_portrait_plot_is_drawn(tmp_path):
     starts = jnp.asarray([[0.3, 0.0], [0.0, 0.5], [1.5, 1.5]])
     softening = ReducedDrive(mu=0.3, omega_0=1.5, alpha=-1.0)
     for name, drive in (("softening", softening), ("hardening", ReducedDrive(mu=0.3, omega_0=1.5, alpha=1.0))):
@@ -217,11 +217,11 @@ def test_the_phase_portrait_is_drawn(tmp_path):
         assert saved(figure, tmp_path / f"{name}.png") > 1000
 
 
-def test_sections_and_basins_are_drawn(tmp_path):
+def test_poincare_and_basin_plots_are_drawn(tmp_path):
     states = jnp.arange(24.0).reshape(2, 6, 2)
     section = PoincareSection(jnp.ones(2), states, jnp.ones(2), jnp.ones(2), jnp.asarray([False, True]))
     figure = poincare_plot(section)
-    assert len(figure.axes[0].get_lines()) == 1  # what escaped is not drawn
+    assert len(figure.axes[0].get_lines()) == 1  # the escaped motion is not drawn
     assert saved(figure, tmp_path / "section.png") > 1000
     grid = np.linspace(-1.0, 1.0, 3)
     found = (Attractor(1, np.asarray([[0.1, 0.2]]), 0.2, 0.5), Attractor(3, np.ones((3, 2)), 1.0, 0.3))
@@ -234,7 +234,7 @@ def test_sections_and_basins_are_drawn(tmp_path):
     assert saved(figure, tmp_path / "basins.png") > 1000
 
 
-def test_the_error_map_is_drawn(tmp_path):
+def test_error_map_plot_is_drawn(tmp_path):
     figure = error_map_plot(errors(), title="primary resonance", strength="$\\alpha a^2$")
     assert len(figure.axes) == 2
     assert saved(figure, tmp_path / "errors.png") > 1000

@@ -19,8 +19,8 @@ def basins() -> Basins:
 
 
 @pytest.mark.slow
-def test_coexisting_attractors_are_orbits(basins):
-    """Each is a stable orbit that shooting confirms, of just its period."""
+def test_attractors_are_stable_orbits_confirmed_by_shooting(basins):
+    """Each has the period that is reported."""
     assert sorted(a.period for a in basins.attractors) == [1, 1, 2, 2, 3, 5]
     for found in basins.attractors:
         orbit = shoot(RICH, harmonic_series(*SHAKEN), jnp.asarray(found.states[0]), periods=found.period)
@@ -29,7 +29,7 @@ def test_coexisting_attractors_are_orbits(basins):
         np.testing.assert_allclose(found.states[0], orbit.state, atol=5e-3)
 
 
-def test_shares_add_up(basins):
+def test_basin_shares_add_up_to_one(basins):
     shares = sum(a.fraction for a in basins.attractors) + basins.escaped + basins.unsettled
     assert shares == pytest.approx(1.0)
     for label, found in enumerate(basins.attractors):
@@ -37,8 +37,8 @@ def test_shares_add_up(basins):
     assert all(a.amplitude <= b.amplitude for a, b in zip(basins.attractors, basins.attractors[1:], strict=False))
 
 
-def test_basins_are_symmetric(basins):
-    """(x, v, t) -> (-x, -v, t + T/2) leaves the equation as it is: half a period later the basins are turned by pi."""
+def test_basins_have_the_symmetry_of_the_equation(basins):
+    """(x, v, t) -> (-x, -v, t + T/2) leaves the equation unchanged: half a period later the basins are turned by pi."""
     later = attractors(RICH, harmonic_series(*SHAKEN, jnp.pi), (-3.0, 3.0), (-6.0, 6.0), 40)
     assert len(later.attractors) == len(basins.attractors)
     # The mirrored pair is of one amplitude, in either order: compare amplitudes, not labels.
@@ -47,7 +47,7 @@ def test_basins_are_symmetric(basins):
     assert np.mean(np.abs(ours - theirs[::-1, ::-1]) > 1e-2) < 5e-3
 
 
-def test_a_softening_drive_escapes_from_part_of_the_plane():
+def test_softening_drive_escapes_from_part_of_the_plane():
     found = attractors(duffing(0.1, -1.0), harmonic_series(0.8, 0.05), (-1.5, 1.5), (-1.5, 1.5), 30)
     assert 0.1 < found.escaped < 0.9
     assert (found.labels[0, 0], found.labels[-1, -1]) == (ESCAPED, ESCAPED)

@@ -27,7 +27,7 @@ def response(p) -> tuple[Branch, Folds]:
 
 
 def assert_energy_balance(branch: Branch, mu: float, level: float):
-    """The first harmonic's power is what damping takes from all."""
+    """The power of the first harmonic equals the dissipation of all harmonics."""
     x = branch.steady_states.x
     rates = np.arange(1, x.harmonics + 1) * np.asarray(x.omega)[:, None]
     power_in = 0.5 * level * rates[:, 0] * np.asarray(x.sine)[:, 0]
@@ -61,28 +61,28 @@ NAMED = {
     "no start": np.array([0.05, 10.0, 1.0, 0.3, 1.0, 1.0]),
     **{f"{sign}{j}": AT + s * STEPS[j] for sign, s in (("+", 1), ("-", -1)) for j in range(4)},
 }
-DRAWN = 40
+RANDOM = 40
 
 
-def drawn() -> np.ndarray:
+def random_parameters() -> np.ndarray:
     """Both signs; alpha x^2 at the peak from 1e-3 to 0.2 and, where it hardens, 3."""
     rng = np.random.default_rng(5)
-    zeta = 10 ** rng.uniform(-3, -0.7, DRAWN)
-    softens = rng.random(DRAWN) < 0.5
-    strength = np.where(softens, -(10 ** rng.uniform(-3, -0.7, DRAWN)), 10 ** rng.uniform(-3, 0.5, DRAWN))
+    zeta = 10 ** rng.uniform(-3, -0.7, RANDOM)
+    softens = rng.random(RANDOM) < 0.5
+    strength = np.where(softens, -(10 ** rng.uniform(-3, -0.7, RANDOM)), 10 ** rng.uniform(-3, 0.5, RANDOM))
     end = 2.0 + 0.45 * np.maximum(strength, 0.0)
-    return np.stack([zeta, strength, 2 * zeta, np.full(DRAWN, 0.4), end, np.ones(DRAWN)], axis=1)
+    return np.stack([zeta, strength, 2 * zeta, np.full(RANDOM, 0.4), end, np.ones(RANDOM)], axis=1)
 
 
 @pytest.fixture(scope="module")
 def lanes() -> tuple[Branch, Folds]:
-    rows = jnp.asarray(np.concatenate([np.stack(list(NAMED.values())), drawn()]))
-    # As numpy arrays, whose slices cost nothing.
+    rows = jnp.asarray(np.concatenate([np.stack(list(NAMED.values())), random_parameters()]))
+    # As numpy arrays, which are sliced without compilation.
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(response))(rows))
 
 
 def lane(lanes, name: str | int):
-    """One lane by its name, or by its number among the drawn."""
+    """One lane by its name, or by its number among those of random parameters."""
     i = list(NAMED).index(name) if isinstance(name, str) else len(NAMED) + name
     return jax.tree.map(lambda leaf: leaf[i], lanes)
 
@@ -92,7 +92,7 @@ def hardening(lanes) -> Branch:
     return lane(lanes, "hardening")[0]
 
 
-def test_a_branch_passes_both_folds(hardening):
+def test_branch_of_a_hardening_drive_passes_both_folds(hardening):
     assert_whole(hardening, START, END)
     assert len(turns(hardening)) == 2
     assert left_over(hardening).max() < 1e-9
@@ -102,7 +102,7 @@ def test_a_branch_passes_both_folds(hardening):
     assert value[second] < value[first]
 
 
-def test_its_motions_are_what_time_integration_gives(hardening):
+def test_branch_motions_agree_with_time_integration(hardening):
     """Also on the unstable part, and beside the folds."""
     first, second = turns(hardening)
     stable = np.asarray(hardening.stable)
@@ -114,16 +114,16 @@ def test_its_motions_are_what_time_integration_gives(hardening):
         assert (
             period_error(duffing_rates(2 * ZETA, ALPHA, LEVEL, float(hardening.omega[i])), row(hardening, i)) < 1e-8
         ), i
-    # And they change there only.
+    # Stability changes at the folds only.
     changes = np.flatnonzero(np.diff(stable.astype(int)))
     assert changes.size == 2 and np.abs(changes - turns(hardening)).max() <= 1
 
 
-def test_its_energy_balance(hardening):
+def test_branch_satisfies_the_energy_balance(hardening):
     assert_energy_balance(hardening, 2 * ZETA, LEVEL)
 
 
-def test_the_other_direction_gives_the_same_curve(lanes, hardening):
+def test_branch_is_the_same_in_both_directions(lanes, hardening):
     back = path(lane(lanes, "backwards")[0])[::-1]
     a, b = back[:-1], back[1:]
     for point in path(hardening)[::7]:
@@ -133,7 +133,7 @@ def test_the_other_direction_gives_the_same_curve(lanes, hardening):
         assert distance < 5e-5
 
 
-def test_units_change_nothing(lanes, hardening):
+def test_branch_scales_with_the_units(lanes, hardening):
     """A drive of 385 rad/s with alpha 1e5 1/rad^2, whose forcing is scaled alike."""
     branch = lane(lanes, "in rad/s")[0]
     np.testing.assert_allclose(branch.value / 385.0, hardening.value, rtol=1e-8)
@@ -141,16 +141,16 @@ def test_units_change_nothing(lanes, hardening):
 
 
 @pytest.mark.parametrize("name", ["softening", "light", "light, backwards", "light and strong", "light, softening"])
-def test_branches_that_bend_far_or_are_thin(lanes, name):
+def test_branches_of_light_damping_or_softening_are_complete(lanes, name):
     zeta, alpha, level, start, end, _ = NAMED[name]
     branch = lane(lanes, name)[0]
     assert_whole(branch, start, end)
     assert_energy_balance(branch, 2 * zeta, level)
     assert len(turns(branch)) == 2
-    # A softening drive meets its own peak from above: the order in which the folds come.
+    # Of a hardening drive followed upwards, the fold of higher frequency comes first.
     first, second = np.asarray(branch.value)[turns(branch)]
     assert (first > second) == (end > start) or alpha < 0 or start > end
-    # The peak of one term, a = A / (mu omega); the third harmonic takes part of the energy.
+    # The peak of one term, a = A / (mu omega); the third harmonic dissipates part of the power.
     x = branch.steady_states.x
     i = int(np.argmax(np.asarray(x.amplitudes)[:, 0]))
     assert float(x.amplitudes[i, 0] * branch.omega[i]) == pytest.approx(level / (2 * zeta), rel=0.02)
@@ -159,31 +159,31 @@ def test_branches_that_bend_far_or_are_thin(lanes, name):
         assert period_error(duffing_rates(2 * zeta, alpha, level, float(branch.omega[j])), row(branch, j)) < 1e-7
 
 
-def test_strong_nonlinearity(lanes):
+def test_branch_of_a_strong_nonlinearity_is_complete(lanes):
     """alpha x^2 is 37 at the peak. From above, since below are super-harmonic resonances of every order."""
     branch = lane(lanes, "strong")[0]
     assert_whole(branch, 10.0, 1.5)
     assert len(turns(branch)) == 2 and float(10.0 * jnp.max(branch.amplitude) ** 2) > 35
     i = int(np.argmax(np.asarray(branch.amplitude)))
-    # Eleven harmonics leave a few 1e-7 there.
+    # Eleven harmonics err by a few 1e-7 there.
     assert period_error(duffing_rates(0.1, 10.0, 1.0, float(branch.omega[i])), row(branch, i)) < 1e-5
 
 
-def test_drawn_branches_are_whole(lanes):
+def test_branches_of_random_parameters_are_complete(lanes):
     several = 0
-    for i, (zeta, _, level, start, end, _) in enumerate(drawn()):
+    for i, (zeta, _, level, start, end, _) in enumerate(random_parameters()):
         branch = lane(lanes, i)[0]
         assert_whole(branch, start, end)
         several += len(turns(branch)) >= 2
         assert_energy_balance(branch, 2 * zeta, level)
         x = branch.steady_states.x
         j = int(np.argmax(np.asarray(x.amplitudes)[:, 0]))
-        # Quadrature, and so the peak, is that of one term up to the damping and the third harmonic.
+        # The amplitude in quadrature, and so the peak, agrees with one term up to damping and the third harmonic.
         assert float(x.amplitudes[j, 0] * branch.omega[j]) == pytest.approx(level / (2 * zeta), rel=0.05)
     assert several >= 15
 
 
-def test_no_start_is_told(lanes):
+def test_branch_without_a_first_motion_is_reported_as_incomplete(lanes):
     """Far below a strong nonlinearity's resonance, where Newton's method finds no motion."""
     branch, found = lane(lanes, "no start")
     assert not bool(branch.complete) and not np.asarray(branch.valid).any() and not np.asarray(found.exists).any()
@@ -193,7 +193,7 @@ def test_no_start_is_told(lanes):
 # -- folds --
 
 
-def test_a_multiplier_is_one_at_a_fold(lanes, hardening):
+def test_floquet_multiplier_is_one_at_a_fold(lanes, hardening):
     found = lane(lanes, "hardening")[1]
     assert np.asarray(found.exists).all()
     # As if the folds were rows of the branch.
@@ -207,14 +207,14 @@ def test_a_multiplier_is_one_at_a_fold(lanes, hardening):
     multipliers = np.asarray(at.multipliers)[:2]
     assert np.abs(multipliers - 1.0).min(axis=1).max() < 1e-7
     assert np.abs(np.asarray(hardening.multipliers)[0] - 1.0).min() > 1e-3
-    # Beyond a fold lies nothing, and the nearest motions lie just before.
+    # No motion lies beyond a fold, and the nearest ones lie just before it.
     value = np.asarray(hardening.value)
     first, second = turns(hardening)
     assert 0 <= float(found.value[0]) - value[:second].max() < 1e-4
     assert 0 <= value[first:].min() - float(found.value[1]) < 1e-4
 
 
-def test_derivatives_of_folds(lanes, hardening):
+def test_derivatives_of_folds_agree_with_differences(lanes, hardening):
     """By zeta, alpha, forcing and omega_0, against differences of lanes, each with a search of its own."""
 
     @eqx.filter_jit
@@ -229,8 +229,8 @@ def test_derivatives_of_folds(lanes, hardening):
 
 
 @pytest.mark.slow
-def test_derivatives_through_the_search_and_a_lane_alone(lanes, hardening):
-    """The whole way from the parameters to the folds; the lane is what a single run gives."""
+def test_derivatives_through_the_search_of_folds_agree_with_differences(lanes, hardening):
+    """From the parameters to the folds; a single run equals its lane of the batch."""
 
     def values(p):
         branch, found = response(p)
@@ -239,7 +239,7 @@ def test_derivatives_through_the_search_and_a_lane_alone(lanes, hardening):
     slope, (alone, found) = eqx.filter_jit(jax.jacrev(values, has_aux=True))(jnp.asarray(AT))
     ends = np.array([[lane(lanes, f"{sign}{j}")[1].value for j in range(4)] for sign in "+-"])
     np.testing.assert_allclose(np.asarray(slope)[:, [0, 1, 2, 5]], ((ends[0] - ends[1]) / 2e-6).T, rtol=1e-5, atol=1e-6)
-    # Where the range begins and ends does not matter.
+    # Folds do not depend on the ends of the range.
     np.testing.assert_allclose(np.asarray(slope)[:, 3:5], 0.0, atol=1e-9)
     np.testing.assert_allclose(found, lane(lanes, "hardening")[1].value, rtol=1e-10)
     np.testing.assert_allclose(alone.value, hardening.value, rtol=1e-8)
@@ -259,7 +259,7 @@ def one_term_folds(zeta: float, kappa: float, level: float) -> list[float]:
     return sorted(shifts)
 
 
-def test_folds_of_a_weak_nonlinearity_are_those_of_one_term(lanes):
+def test_folds_of_a_weak_nonlinearity_agree_with_one_term_theory(lanes):
     _, found = lane(lanes, "weak")
     shifts = np.sort(np.asarray(found.value)) - 1.0
     # Neglected: the shift itself, 5e-3, relative to one.
@@ -267,7 +267,7 @@ def test_folds_of_a_weak_nonlinearity_are_those_of_one_term(lanes):
 
 
 @pytest.mark.slow
-def test_folds_meet_in_the_cusp_of_one_term(lanes):
+def test_followed_folds_meet_at_the_cusp_of_one_term_theory(lanes):
     """At sigma = sqrt(3) zeta, kappa A^2 / 4 = 8 zeta^3 / (3 sqrt(3))."""
     branch, found = lane(lanes, "weak")
     for fold in (0, 1):
@@ -287,7 +287,7 @@ def test_folds_meet_in_the_cusp_of_one_term(lanes):
         assert back - 1.0 == pytest.approx(float(found.value[1 - fold]) - 1.0, rel=0.01)
 
 
-def test_response_is_loaded_without_the_libraries_of_pictures():
+def test_response_import_loads_neither_jaxcont_nor_matplotlib():
     """JaxCont and matplotlib take as long to load as JAX: they are loaded at their first use."""
     code = "import sys, hdjax.response; sys.exit(bool({'jaxcont', 'matplotlib'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0

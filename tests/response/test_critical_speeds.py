@@ -31,7 +31,7 @@ def closed_form(speed: np.ndarray) -> np.ndarray:
     return ERROR * np.abs((OMEGA_0**2 + 1j * mu * w) / (OMEGA_0**2 - w**2 + 1j * mu * w))
 
 
-def test_two_cycles_a_revolution_meet_the_natural_frequency_at_half_of_it():
+def test_critical_speeds_are_the_natural_frequency_over_the_order():
     found = critical_speeds(DRIVE)
     speeds = [c.speed for c in found]
     assert speeds == sorted(speeds) and len(found) == 9
@@ -42,14 +42,14 @@ def test_two_cycles_a_revolution_meet_the_natural_frequency_at_half_of_it():
     assert len(critical_speeds(DRIVE, (2,))) == 3
 
 
-def test_the_swing_is_the_closed_form_of_a_linear_drive():
+def test_swing_of_a_linear_drive_agrees_with_the_closed_form():
     found = branch()
     assert bool(found.complete)
     valid = np.asarray(found.valid)
     np.testing.assert_allclose(np.asarray(swing(found))[valid], closed_form(np.asarray(found.omega)[valid]), rtol=0.02)
 
 
-def test_one_band_lies_around_half_the_natural_frequency():
+def test_speed_band_to_avoid_lies_around_half_the_natural_frequency():
     limit = 6e-4
     (band,) = speeds_to_avoid(branch(), limit=limit)
     assert band.order == 2
@@ -62,13 +62,13 @@ def test_one_band_lies_around_half_the_natural_frequency():
     assert band.start == pytest.approx(speeds[size > limit][0], rel=2e-3)
 
 
-def test_the_band_ends_where_the_closed_form_does():
+def test_speed_band_ends_where_the_closed_form_meets_the_limit():
     (band,) = speeds_to_avoid(branch(), limit=6e-4)
     speeds = np.linspace(0.3, 0.8, 5001) * OMEGA_0
     assert band.end == pytest.approx(speeds[closed_form(speeds) > 6e-4][-1], rel=2e-3)
 
 
-def test_a_branch_that_comes_back_gives_one_band():
+def test_branch_with_folds_gives_one_speed_band():
     softening = branch(alpha=-1e5, B_sp=0.5)
     assert bool(softening.complete)
     speed, lasting = np.asarray(softening.omega), np.asarray(can_persist(softening))
@@ -83,11 +83,11 @@ def test_a_branch_that_comes_back_gives_one_band():
     assert can_persist(branch()).all()
 
 
-def test_no_band_above_the_peak():
+def test_limit_above_the_peak_gives_no_speed_band():
     assert speeds_to_avoid(branch(), limit=0.1) == []
 
 
-def test_the_bands_are_drawn(tmp_path):
+def test_speed_plot_shows_bands_and_both_branches(tmp_path):
     figure = speed_plot(branch(), bands=speeds_to_avoid(branch(), limit=6e-4), limit=6e-4)
     labels = figure.axes[0].get_legend_handles_labels()[1]
     assert {"steady motion", "limit", "avoid"} <= set(labels)

@@ -35,7 +35,7 @@ def subharmonic() -> Branch:
     return frequency_response(*system, points=200, harmonics=21, subharmonic=3, guess=wave)
 
 
-def test_a_subharmonic_closes_upon_itself(subharmonic):
+def test_subharmonic_branch_is_a_closed_curve(subharmonic):
     branch = subharmonic
     assert bool(branch.complete) and np.asarray(branch.valid).all()
     assert left_over(branch).max() < 1e-8
@@ -43,13 +43,13 @@ def test_a_subharmonic_closes_upon_itself(subharmonic):
     assert chords.max() < 1.2 * np.median(chords)
     assert np.linalg.norm(path(branch)[0] - path(branch)[-1]) < 1.5 * chords.max() + 0.1
     assert len(turns(branch)) == 2
-    # Half of it stable; nowhere the motion of the forcing's own period.
+    # About half of it is stable, and no motion has the period of the forcing.
     stable = np.asarray(branch.stable)
     assert 0.2 < stable.mean() < 0.8
     assert np.asarray(branch.steady_states.x.amplitudes)[:, 0].min() > 0.3
 
 
-def test_its_motions_and_multipliers_are_those_of_time_integration(subharmonic):
+def test_subharmonic_motions_and_multipliers_agree_with_time_integration(subharmonic):
     """Over three forcing periods, on the stable and the unstable side and beside the folds."""
     first, second = turns(subharmonic)
     sides = set()
@@ -69,8 +69,8 @@ K_2, K_5, OMEGA = 0.3, 0.4, 1.5
 
 
 @pytest.mark.slow
-def test_follow_the_forcing_amplitude_of_a_quintic_and_lopsided_spring():
-    """An S: two folds. The even term bends the motion to one side."""
+def test_branch_in_forcing_amplitude_of_an_asymmetric_quintic_spring_has_two_folds():
+    """The even term shifts the mean of the motion to one side."""
     model = duffing(MU, 0.3).with_effects(QuinticStiffness(k5=K_5), QuadraticStiffness(k2=K_2))
     system = balance(model, harmonic_series(1.0, 0.1), harmonics=21)
     branch = follow(system, "amplitude", 0.5, 12.0, omega=OMEGA, points=200)
@@ -97,8 +97,8 @@ def test_follow_the_forcing_amplitude_of_a_quintic_and_lopsided_spring():
 
 
 @pytest.mark.slow
-def test_follow_the_stiffness_of_two_inertias():
-    """Linear: a closed form."""
+def test_branch_in_stiffness_of_two_inertias_agrees_with_the_closed_form():
+    """Without a cubic term the response has a closed form."""
     drive = Drive(N=2.0, J_m=1.0, J_l=3.0, K=5.0, B_sp=0.6)
     system = balance(TwoInertiaModel(drive), harmonic_series(1.0, 0.8), harmonics=2)
     branch = follow(system, "K", 1.0, 9.0, omega=1.5, points=30)
@@ -110,7 +110,7 @@ def test_follow_the_stiffness_of_two_inertias():
 
 
 @pytest.mark.slow
-def test_follow_alpha():
+def test_branch_in_the_cubic_coefficient_agrees_with_time_integration():
     system = balance(duffing(0.1, 0.0), harmonic_series(1.0, 0.1), harmonics=11)
     branch = follow(system, "alpha", 0.0, 2.0, omega=0.9, points=40)
     assert bool(branch.complete) and np.asarray(branch.valid).all()
@@ -119,7 +119,7 @@ def test_follow_alpha():
 
 
 @pytest.mark.slow
-def test_too_few_steps_are_told():
+def test_branch_of_too_few_steps_is_reported_as_incomplete():
     branch = frequency_response(duffing(0.1, 1.0), harmonic_series(1.0, 0.08), 0.35, 2.0, points=20, steps=4)
     assert not bool(branch.complete)
     assert left_over(branch)[np.asarray(branch.valid)].max() < 1e-8

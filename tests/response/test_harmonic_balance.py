@@ -1,4 +1,4 @@
-"""Harmonic balance against time integration by scipy, closed forms and the two-inertia equations written out."""
+"""Harmonic balance against time integration by scipy and closed forms, for both kinds of drive."""
 
 from math import cos, sin
 
@@ -22,15 +22,15 @@ from hdjax.fourier import FourierSeries, harmonic_series
 from hdjax.response.harmonic_balance import SteadyState, balance, solve
 
 SUFFICES = 1e-10
-"""A defect below this says that the harmonics suffice for 1e-8: errors grow in a period, but by far less than 100."""
+"""A defect below this means that the harmonics suffice for 1e-8: errors grow in a period, but by far less than 100."""
 
 
-# -- drawn cases --
+# -- random cases --
 
 CASES = 60
 
 
-def draws() -> tuple[np.ndarray, ...]:
+def random_cases() -> tuple[np.ndarray, ...]:
     """mu, omega_0, alpha, omega, mean, cosines, sines; the first ten are a drive's, with its alpha."""
     rng = np.random.default_rng(0)
     omega_0 = 10 ** rng.uniform(-1, 3.5, CASES)
@@ -48,18 +48,18 @@ def draws() -> tuple[np.ndarray, ...]:
     return mu, omega_0, alpha, omega, rng.uniform(-0.5, 0.5, CASES) * level, waves[:, 0], waves[:, 1]
 
 
-def drawn(mu, omega_0, alpha, omega, mean, cosine, sine) -> SteadyState:
+def steady_state_of_case(mu, omega_0, alpha, omega, mean, cosine, sine) -> SteadyState:
     model = duffing(mu, alpha, omega_0)
     return solve(balance(model, FourierSeries(omega, mean, cosine, sine), harmonics=20), omega)
 
 
 @pytest.fixture(scope="module")
 def found() -> SteadyState:
-    return eqx.filter_jit(jax.vmap(drawn))(*(jnp.asarray(v) for v in draws()))
+    return eqx.filter_jit(jax.vmap(steady_state_of_case))(*(jnp.asarray(v) for v in random_cases()))
 
 
-def test_drawn_cases_are_what_time_integration_gives(found):
-    cases = draws()
+def test_steady_states_of_random_cases_agree_with_time_integration(found):
+    cases = random_cases()
     usable = np.asarray(found.converged) & (np.asarray(found.defect) < SUFFICES)
     assert usable.sum() >= 50 and usable[:10].sum() >= 8
     assert (cases[2][usable] < 0).sum() > 10
@@ -77,9 +77,9 @@ def test_drawn_cases_are_what_time_integration_gives(found):
         assert period_error(rates, x) < 1e-8, i
 
 
-def test_energy_balance_of_the_drawn_cases(found):
+def test_steady_states_of_random_cases_satisfy_the_energy_balance(found):
     """Mean of forcing times rate, and of mu times rate squared, by Parseval."""
-    mu, _, _, omega, _, cosine, sine = draws()
+    mu, _, _, omega, _, cosine, sine = random_cases()
     k = np.arange(1, 21)
     c, s = np.asarray(found.motion.cosine)[:, 0], np.asarray(found.motion.sine)[:, 0]
     rate_c, rate_s = omega[:, None] * k * s, -omega[:, None] * k * c
@@ -93,7 +93,7 @@ def test_energy_balance_of_the_drawn_cases(found):
 # -- closed forms --
 
 
-def test_linear_drive():
+def test_steady_state_of_a_linear_drive_agrees_with_the_closed_form():
     forcing = harmonic_series(43.0, np.array([300.0, 80.0]), np.array([0.4, -1.1]), mean=50.0)
     steady = solve(balance(duffing(3.0, 0.0, 50.0), forcing, harmonics=4), 43.0)
     rates = 43.0j * np.arange(3)
@@ -105,7 +105,7 @@ def test_linear_drive():
     assert float(steady.defect) < 1e-14
 
 
-def test_the_defect_falls_geometrically():
+def test_defect_falls_geometrically_with_the_number_of_harmonics():
     """The motion is analytic in time; only odd harmonics exist, so that two more multiply it by the same factor."""
     system = [balance(duffing(0.2, 1.0), harmonic_series(1.0, 1.0), harmonics=h) for h in (5, 9, 13)]
     steady = [solve(s, 1.2) for s in system]
@@ -115,7 +115,7 @@ def test_the_defect_falls_geometrically():
     np.testing.assert_allclose(ratios[0], ratios[1], rtol=0.15)
 
 
-def test_derivatives():
+def test_derivatives_of_a_steady_state_agree_with_differences():
     """By mu, omega_0, alpha, forcing and frequency, against central differences."""
 
     def wave(p):
@@ -137,7 +137,7 @@ TORQUE = harmonic_series(1.5, np.array([0.8, 0.2]), np.array([0.0, 0.5]), mean=7
 LOAD = harmonic_series(1.5, np.array([0.7, 0.1]), np.array([0.3, 1.0]), mean=0.9)
 
 
-def test_two_inertias_are_the_reduced_drive():
+def test_steady_state_of_two_inertias_equals_that_of_the_reduced_drive():
     whole = solve(balance(TwoInertiaModel(DRIVE), TORQUE, load_torque=LOAD), 1.5)
     # The load's mean torque is held by the motor: -T_l N at the output, and so the mesh carries it alone.
     mean = -0.9 / 3.0 - 0.9 / (2.0 * 2.0 * 1.0)
@@ -154,7 +154,7 @@ N, J_M, J_L, K, ALPHA, B, OMEGA = 50.0, 5.26e-4, 5.0e-2, 7160.0, 2e3, 1.7, 150.0
 K_2, C_2, FRICTION, COS_1, SIN_2 = 3.0, 0.8, 1e-3, 1e-4, 3e-4
 
 
-def turning_drive(c_2: float) -> TwoInertiaModel:
+def rotating_drive(c_2: float) -> TwoInertiaModel:
     drive = Drive(N=N, J_m=J_M, J_l=J_L, K=K, B_sp=B, alpha=ALPHA)
     effects = (
         QuadraticStiffness(k2=K_2),
@@ -166,14 +166,14 @@ def turning_drive(c_2: float) -> TwoInertiaModel:
 
 
 @pytest.mark.parametrize("c_2, tolerance", [pytest.param(0.0, 1e-9, marks=pytest.mark.slow), (C_2, 1e-6)])
-def test_a_turning_drive_with_effects(c_2, tolerance):
+def test_steady_state_of_a_rotating_drive_agrees_with_time_integration(c_2, tolerance):
     """`v |v|` has corners, for which the harmonics fall with a power only."""
     torque, load = harmonic_series(1.0, np.array([0.3, 0.5])), harmonic_series(1.0, 20.0, 0.4, mean=-30.0)
-    system = balance(turning_drive(c_2), torque, load_torque=load, harmonics=20, rotating=True)
+    system = balance(rotating_drive(c_2), torque, load_torque=load, harmonics=20, rotating=True)
     steady = solve(system, OMEGA)
     assert bool(steady.converged)
     drive_torque = float(steady.mean_torque)
-    # What holds the load, and the friction.
+    # The torque that holds the load, and the friction.
     assert drive_torque == pytest.approx(30.0 / N + FRICTION * OMEGA, rel=0.01)
 
     def rates(t, y):
@@ -191,7 +191,7 @@ def test_a_turning_drive_with_effects(c_2, tolerance):
         turned = [N * (x + theta_l) + OMEGA * t, theta_l + OMEGA * t / N]
         return np.stack([*turned, N * (v + rate) + OMEGA, rate + OMEGA / N], axis=1)
 
-    # The errors of the deviation from the rigid rotation, which is all that harmonic balance finds.
+    # Errors refer to the deviation from the rigid rotation, which harmonic balance solves for.
     start = state(*(np.asarray(s(jnp.zeros(1))) for s in (steady.motion, steady.motion.derivative())), np.zeros(1))[0]
     T = 2 * np.pi / OMEGA
     for part in (0.4, 1.0):
@@ -207,10 +207,10 @@ def test_a_turning_drive_with_effects(c_2, tolerance):
 
 
 @pytest.mark.slow
-def test_a_turning_drive_over_two_revolutions_is_that_over_one():
+def test_rotating_steady_state_over_two_revolutions_equals_that_over_one():
     torque, load = harmonic_series(1.0, np.array([0.3, 0.5])), harmonic_series(1.0, 20.0, 0.4, mean=-30.0)
     once, twice = (
-        solve(balance(turning_drive(0.0), torque, load_torque=load, harmonics=h, rotating=True, subharmonic=n), OMEGA)
+        solve(balance(rotating_drive(0.0), torque, load_torque=load, harmonics=h, rotating=True, subharmonic=n), OMEGA)
         for h, n in ((6, 1), (12, 2))
     )
     assert bool(once.converged) and bool(twice.converged)
@@ -220,10 +220,10 @@ def test_a_turning_drive_over_two_revolutions_is_that_over_one():
     assert float(twice.mean_torque) == pytest.approx(float(once.mean_torque), rel=1e-9)
 
 
-# -- what is refused --
+# -- refusals --
 
 
-def test_refusals():
+def test_unsupported_models_and_settings_are_refused():
     plain, whole = duffing(0.1, 0.0), TwoInertiaModel(DRIVE)
     with pytest.raises(ValueError, match="`bouc_wen` has memory"):
         balance(plain.with_effects(BoucWen(memory_twist=0.1)))
@@ -239,7 +239,7 @@ def test_refusals():
         solve(balance(whole, TORQUE), 1.5, guess=TORQUE)
 
 
-def test_what_is_not_solved_says_so():
+def test_unsolved_balance_is_reported_as_not_converged():
     steady = solve(balance(duffing(0.01, 1.0), harmonic_series(1.0, 1.0)), 1.1, max_steps=1)
     assert not bool(steady.converged)
     np.testing.assert_array_equal(steady.x.amplitudes, 0.0)

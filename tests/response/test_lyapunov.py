@@ -30,12 +30,12 @@ def ring(radius: float, n: int = 16) -> Array:
 
 
 @pytest.mark.parametrize("alpha", (0.0, 2.0, -0.5))
-def test_energy_only_falls_and_by_what_the_damper_takes(alpha):
+def test_energy_falls_by_the_work_of_the_damper(alpha):
     drive = oscillator(alpha)
     portrait = phase_portrait(drive, ring(0.7), TIMES)
     found = np.asarray(portrait.energy)
     assert not np.asarray(portrait.escaped).any()
-    # It stands still for an instant where v = 0: rounding of 1e-8 steps.
+    # It is stationary where v = 0: rounding of 1e-8 steps.
     assert np.diff(found, axis=1).max() < 1e-8
     lost = cumulative_simpson(np.asarray(energy_rate(drive, portrait.v)), x=np.asarray(TIMES), initial=0.0)
     # Simpson's rule at 0.1 rad a step.
@@ -43,7 +43,7 @@ def test_energy_only_falls_and_by_what_the_damper_takes(alpha):
 
 
 @pytest.mark.parametrize("alpha", (2.0, -0.5))
-def test_the_rate_is_the_gradient_along_the_motion(alpha):
+def test_energy_rate_is_the_gradient_along_the_motion(alpha):
     """`V' = dV/dx v + dV/dv v'` with the equation's own v'."""
     drive = oscillator(alpha)
     x, v = jnp.asarray(0.4), jnp.asarray(-0.7)
@@ -62,7 +62,7 @@ def test_saddles_are_equilibria_at_the_critical_energy():
         assert np.isposinf([saddle(oscillator(alpha)), critical_energy(oscillator(alpha))]).all()
 
 
-def test_motions_from_the_estimate_come_to_rest_and_some_from_outside_do_not():
+def test_all_motions_from_the_basin_estimate_come_to_rest():
     drive = oscillator(-1.0)
     x, v = jnp.meshgrid(jnp.linspace(-1.4, 1.4, 15), jnp.linspace(-2.1, 2.1, 15), indexing="ij")
     starts = jnp.stack([x.ravel(), v.ravel()], axis=-1)
@@ -76,7 +76,7 @@ def test_motions_from_the_estimate_come_to_rest_and_some_from_outside_do_not():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(portrait))
 
 
-def test_beyond_the_saddles_low_energy_means_nothing():
+def test_basin_estimate_excludes_low_energies_beyond_the_saddles():
     """V falls without bound there: the condition on x is needed."""
     drive = oscillator(-1.0)
     beyond, nothing = jnp.asarray([1.2, 3.0]), jnp.zeros(2)
@@ -84,14 +84,14 @@ def test_beyond_the_saddles_low_energy_means_nothing():
     assert not np.asarray(in_basin_estimate(drive, beyond, nothing)).any()
 
 
-def test_the_whole_plane_for_hardening_and_nothing_without_damping():
+def test_basin_estimate_is_the_plane_for_hardening_and_empty_without_damping():
     far, nothing = jnp.asarray([1e6, -1e6]), jnp.zeros(2)
     for alpha in (0.0, 1.0):
         assert np.asarray(in_basin_estimate(oscillator(alpha), far, far)).all()
         assert not np.asarray(in_basin_estimate(oscillator(alpha, mu=0.0), nothing, nothing)).any()
 
 
-def test_curves_of_the_portrait():
+def test_phase_portrait_has_the_critical_level_and_the_nullcline():
     drive = oscillator(-1.0)
     portrait = phase_portrait(drive, ring(0.5), TIMES)
     grid, level = np.asarray(portrait.grid), np.asarray(portrait.level)
@@ -105,7 +105,7 @@ def test_curves_of_the_portrait():
     np.testing.assert_allclose(undamped.energy, undamped.energy[:, :1] * jnp.ones_like(undamped.energy), rtol=1e-5)
 
 
-def test_a_drive_and_its_reduced_equation_agree():
+def test_energy_of_a_drive_equals_that_of_its_reduced_equation():
     drive: Drive = hdc_40_050()
     x, v = jnp.asarray([1e-3, 2e-3]), jnp.asarray([0.1, -0.3])
     np.testing.assert_allclose(energy(drive, x, v), energy(drive.reduced(), x, v), rtol=1e-14)
@@ -117,7 +117,7 @@ def test_a_drive_and_its_reduced_equation_agree():
     np.testing.assert_allclose(a.x, b.x, rtol=1e-12)
 
 
-def test_lanes_jit_and_slopes():
+def test_critical_energy_is_the_same_in_lanes_and_has_finite_gradients():
     alphas = jnp.asarray([-1.0, 0.0, 1.0])
 
     def estimate(alpha: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Multiple scales against frequency equations, linear limits, and steady states found by other means."""
+"""Multiple scales against frequency equations, linear limits, harmonic balance and scipy."""
 
 import jax
 import jax.numpy as jnp
@@ -78,7 +78,7 @@ def test_branches_solve_the_frequency_equation(kind, sign):
 
 @pytest.mark.parametrize("branch", [0, 1, 2])
 @pytest.mark.parametrize("kind", KINDS)
-def test_errors_fall_with_their_order(kind, branch):
+def test_errors_fall_with_the_order_of_the_expansion(kind, branch):
     epsilons = np.logspace(-1.5, -3.5, 5)
     errors = []
     for epsilon in epsilons:
@@ -89,14 +89,14 @@ def test_errors_fall_with_their_order(kind, branch):
         exact = balanced(made.drive, omega / made.forcing, {made.forcing: float(made.A)}, found[1])
         errors.append([np.linalg.norm(X - exact) / np.linalg.norm(exact) for X in found])
     slopes = np.diff(np.log(errors), axis=0) / np.diff(np.log(epsilons))[:, None]
-    # The next order's share at the largest epsilon, and harmonic balance's own precision at the smallest.
+    # Limited by the next order at the largest epsilon, and by the harmonic balance at the smallest.
     np.testing.assert_allclose(slopes[-1], [1, 2], atol=0.05)
     np.testing.assert_allclose(slopes.mean(axis=0), [1, 2], atol=0.25)
     assert errors[-1][1] < 1e-2 * errors[-1][0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_series_is_the_steady_motion(kind):
+def test_second_order_series_is_the_steady_motion(kind):
     """A solution of the equation of motion, started on the second-order series, stays on it for a period."""
     made, omega = resonance(kind, 1e-3)
     states = second_order(made, omega)
@@ -111,11 +111,11 @@ def test_series_is_the_steady_motion(kind):
     t = np.linspace(0.0, 2 * np.pi * made.forcing / omega, 9)
     start = [float(series(jnp.asarray(0.0))), float(rate(jnp.asarray(0.0)))]
     y = solve_ivp(motion, (0.0, t[-1]), start, "DOP853", t, rtol=1e-11, atol=1e-13).y[0]
-    # The force that order epsilon^2 leaves, over one period.
+    # The effect of the force neglected after order epsilon^2, over one period.
     np.testing.assert_allclose(jax.vmap(series)(jnp.asarray(t)), y, atol=3e-5)
 
 
-def test_linear_limit():
+def test_linear_limit_agrees_with_the_closed_form():
     errors = []
     for epsilon in (1e-2, 1e-3):
         drive = ReducedDrive(mu=0.2 * epsilon, omega_0=W0, alpha=0.0)
@@ -128,11 +128,11 @@ def test_linear_limit():
         branch = int(jnp.argmax(states[0].branches.exists))
         errors.append([abs(phasors(s.series(branch))[0] / exact - 1) for s in states])
     assert 9 < errors[0][0] / errors[1][0] < 11
-    # Off resonance nothing is left to expand: second order is exact.
+    # The second order is exact for a linear drive.
     assert max(errors[0][1], errors[1][1]) < 1e-12
 
 
-def test_linear_secondary_resonances_are_silent():
+def test_secondary_resonances_of_a_linear_drive_have_zero_amplitude():
     for kind in (SuperharmonicResonance, SubharmonicResonance):
         made = kind(ReducedDrive(mu=0.1, omega_0=W0, alpha=0.0), 1.0)
         omega = float(made.omega(0.1))
@@ -144,8 +144,8 @@ def test_linear_secondary_resonances_are_silent():
         np.testing.assert_allclose(series.cosine[made.forcing - 1], exact, rtol=1e-12)
 
 
-def test_peak():
-    # DESIGN 2.2: 10 N m on the motor of the seed's Table 1.
+def test_peak_agrees_with_the_closed_form_and_the_branches():
+    # DESIGN 2.2: 10 N m on the motor of the source document's Table 1.
     drive = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0, alpha=0.1, B_sp=0.017)
     A = 10.0 / (50.0 * 5.26e-4)
     made = PrimaryResonance(drive, A)
@@ -156,14 +156,14 @@ def test_peak():
     for kind in (PrimaryResonance, SuperharmonicResonance):
         made, _ = resonance(kind)
         sweep = jax.vmap(made.branches)(jnp.linspace(made.omega(-1.0), made.peak().omega, 400))
-        # The crest is met at the last frequency; it is a narrow one.
+        # The narrow peak lies at the last frequency.
         np.testing.assert_allclose(jnp.max(sweep.amplitude), made.peak().amplitude, rtol=1e-6)
     assert not bool(resonance(SubharmonicResonance)[0].peak().exists)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("kind", KINDS)
-def test_folds_are_where_the_curve_turns(kind, sign):
+def test_folds_lie_where_the_detuning_curve_turns(kind, sign):
     made, _ = resonance(kind, sign=sign)
     folds = made.folds()
     assert int(jnp.sum(folds.exists)) == (1 if kind is SubharmonicResonance else 2)
@@ -184,8 +184,8 @@ def test_folds_are_where_the_curve_turns(kind, sign):
         assert sorted(counts) == [1, 3]
 
 
-def test_no_fold_below_the_critical_forcing():
-    """Two folds are born at `|q| (A/2 omega_0)^2 = 8/(3 sqrt 3) (mu/2)^3`: Duffing's critical amplitude."""
+def test_folds_exist_only_above_the_critical_forcing():
+    """Two folds appear at `|q| (A/2 omega_0)^2 = 8/(3 sqrt 3) (mu/2)^3`: Duffing's critical amplitude."""
     drive = ReducedDrive(mu=0.2, omega_0=W0, alpha=3.0)
     critical = np.sqrt(8 / (3 * np.sqrt(3)) * 0.1**3 / (3 / 8 * W0 * 3.0)) * 2 * W0
     for factor, wanted in ((0.999, False), (1.001, True)):
@@ -195,7 +195,7 @@ def test_no_fold_below_the_critical_forcing():
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_subharmonic_exists_between_its_limits(sign):
+def test_subharmonic_exists_between_its_forcing_limits(sign):
     made, omega = resonance(SubharmonicResonance, sign=sign)
     limits = made.existence(omega)
     assert bool(limits.exists)
@@ -216,7 +216,7 @@ def test_subharmonic_exists_between_its_limits(sign):
     ("kind", "derivative"),
     [pytest.param(PrimaryResonance, jax.jacrev, marks=pytest.mark.slow), (SuperharmonicResonance, jax.jacfwd)],
 )
-def test_slopes_with_respect_to_parameters(kind, derivative):
+def test_derivatives_by_parameters_agree_with_differences(kind, derivative):
     mu, alpha, A, sigma = BENT[kind]
 
     def figures(p):
@@ -240,7 +240,7 @@ def test_slopes_with_respect_to_parameters(kind, derivative):
 
 @pytest.mark.parametrize("solve", [first_order, second_order])
 @pytest.mark.parametrize("kind", KINDS)
-def test_jit_and_vmap_change_nothing(kind, solve):
+def test_jit_and_vmap_do_not_change_the_solutions(kind, solve):
     made, omega = resonance(kind, 0.1)
     omegas = omega * jnp.array([0.9, 1.0, 1.01])
     loop = [solve(made, float(w)) for w in omegas]
@@ -251,7 +251,7 @@ def test_jit_and_vmap_change_nothing(kind, solve):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_is_ever_nan(kind):
+def test_results_are_finite_for_all_parameters(kind):
     for mu in (0.0, 0.1):
         for alpha in (-1.0, 0.0, 1.0):
             for A in (0.0, 1.0):
@@ -264,7 +264,7 @@ def test_nothing_is_ever_nan(kind):
                         assert bool(jnp.all(jnp.isfinite(leaf))), (mu, alpha, A, sigma)
 
 
-def test_printed_equations_say_what_they_say():
+def test_printed_equations_are_reproduced_as_printed():
     drive = Drive(N=50.0, J_m=5.26e-4, J_l=5.0e-2, K=7160.0, alpha=0.1, B_sp=0.017)
     np.testing.assert_allclose(
         printed_error_forcing(drive, 10.0, 0.0), drive.error_forcing(jnp.asarray(10.0), jnp.asarray(0.0)), rtol=1e-14

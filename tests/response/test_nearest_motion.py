@@ -27,7 +27,7 @@ def motion(found: NearestMotions, i: int) -> FourierSeries:
 
 
 @pytest.mark.slow
-def test_they_are_stable_motions(found):
+def test_nearest_motions_are_stable_periodic_solutions(found):
     assert np.asarray(found.exists).all()
     for i, omega in enumerate(OMEGA):
         assert period_error(duffing_rates(MU, ALPHA, A, omega), motion(found, i)) < 1e-5
@@ -35,7 +35,7 @@ def test_they_are_stable_motions(found):
         assert moduli.max() < 1.0
 
 
-def test_each_is_of_its_own_kind(found):
+def test_nearest_motions_lie_on_the_expected_branches(found):
     size, waves = np.asarray(found.size), np.asarray(found.motion.amplitudes)
     assert size[0] < 0.6 < size[2] < 1.0
     assert size[1] == size[3] > 4.0
@@ -45,5 +45,5 @@ def test_each_is_of_its_own_kind(found):
     assert size[4] == pytest.approx(A / 40.0**2, rel=1e-3)
 
 
-def test_the_size_is_the_largest_twist(found):
+def test_nearest_motion_size_is_the_largest_twist(found):
     np.testing.assert_allclose(found.size, jax.vmap(FourierSeries.largest)(found.motion), rtol=0.01)

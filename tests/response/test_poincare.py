@@ -19,7 +19,7 @@ from hdjax.response.shooting import period_map, shoot
 
 
 @pytest.mark.parametrize("omega", (0.4, 2.5))
-def test_default_steps_give_four_digits(omega):
+def test_default_steps_of_a_section_give_four_digits(omega):
     """Against tight adaptive steps, below and above the natural frequency."""
     model, forcing = duffing(0.2, 0.5), harmonic_series(omega, np.array([0.5, 0.3]), np.array([0.2, 1.0]), mean=0.1)
     state = jnp.asarray([0.5, -0.5])
@@ -27,7 +27,7 @@ def test_default_steps_give_four_digits(omega):
     np.testing.assert_allclose(section.states[0, 0], period_map(model, forcing, state), atol=2e-5)
 
 
-def test_marching_is_of_fourth_order():
+def test_integration_of_a_section_is_of_fourth_order():
     model, forcing, state = duffing(0.2, 0.5), harmonic_series(0.9, 0.5), jnp.asarray([0.5, -0.5])
     exact = period_map(model, forcing, state)
     errors = []
@@ -39,7 +39,7 @@ def test_marching_is_of_fourth_order():
     assert np.log2(errors[0] / errors[1]) / 2 == pytest.approx(4, abs=0.3)
 
 
-def test_amplitude_of_the_linear_drive():
+def test_section_amplitudes_of_a_linear_drive_agree_with_the_closed_form():
     """Both measures, of two harmonics: peak to peak between the steps, and the first harmonic alone."""
     model = duffing(0.2, 0.0)
     forcing = harmonic_series(0.7, np.array([0.5, 0.6]))
@@ -47,12 +47,12 @@ def test_amplitude_of_the_linear_drive():
     rates = 0.7j * np.array([1, 2])
     phasors = np.array([0.5, 0.6]) / (1 + 0.2 * rates + rates**2)
     x = (phasors[:, None] * np.exp(1j * np.outer([1, 2], np.linspace(0, 2 * np.pi, 20_001)))).real.sum(axis=0)
-    # A thousandth, were the largest of 128 samples taken for the peak.
+    # Taking the largest of 128 samples as the peak would err by a thousandth.
     assert float(section.amplitude[0]) == pytest.approx(np.ptp(x) / 2, rel=1e-5)
     assert float(section.fundamental[0]) == pytest.approx(abs(phasors[0]), rel=1e-5)
 
 
-def test_an_effect_with_memory_settles_where_shooting_finds_it():
+def test_hysteresis_settles_onto_the_orbit_found_by_shooting():
     model = duffing(0.1, 0.0).with_effects(BoucWen(k=0.5, memory_twist=0.05))
     forcing = harmonic_series(0.7, 0.5)
     section = poincare_section(model, forcing, model.rest()[None], steps_per_period=512)
@@ -67,7 +67,7 @@ def test_an_effect_with_memory_settles_where_shooting_finds_it():
 PARLITZ = duffing(0.2, 1.0)
 
 
-def test_period_doubling_to_chaos_and_a_window_of_three():
+def test_bifurcation_diagram_has_the_published_periods_and_chaos():
     """x'' + 0.2 x' + x + x^3 = f cos t: Parlitz, Lauterborn (1985), Phys. Lett. A 107, 351."""
     forces = jnp.asarray([30.0, 33.5, 34.75, 36.0, 36.85, 37.5, 42.0])
     forcings = jax.vmap(lambda f: harmonic_series(1.0, f))(forces)
@@ -77,7 +77,7 @@ def test_period_doubling_to_chaos_and_a_window_of_three():
 
 
 @pytest.mark.slow
-def test_the_doubling_is_where_a_multiplier_leaves_through_minus_one():
+def test_floquet_multiplier_passes_minus_one_at_period_doubling():
     def multiplier(force: float, guess: Array) -> tuple[float, Array]:
         orbit = shoot(PARLITZ, harmonic_series(1.0, force), guess)
         assert bool(orbit.converged)
@@ -111,7 +111,7 @@ def test_uedas_attractor_is_chaotic():
 # -- lanes, jit, refusals --
 
 
-def test_a_lane_is_what_a_loop_gives_and_jit_changes_nothing():
+def test_section_is_the_same_in_lanes_in_a_loop_and_under_jit():
     model, forcing = duffing(0.2, 0.5), harmonic_series(1.3, 0.4)
     starts = jnp.asarray([[0.0, 0.0], [1.0, -1.0], [2.0, 2.0]])
     options = {"transient_periods": 3, "kept_periods": 8, "steps_per_period": 64}
@@ -124,8 +124,8 @@ def test_a_lane_is_what_a_loop_gives_and_jit_changes_nothing():
     assert np.asarray(period_of(together, tolerance=1.0)).tolist() == [1, 1, 1]
 
 
-def test_slopes_are_those_of_differences():
-    """In reverse, and so forward, through the fixed steps."""
+def test_gradients_of_a_section_agree_with_differences():
+    """In reverse mode, through the fixed steps."""
     forcing = harmonic_series(1.3, 0.4)
     options = {"transient_periods": 2, "kept_periods": 1, "steps_per_period": 64}
 
@@ -138,7 +138,7 @@ def test_slopes_are_those_of_differences():
     assert float(jax.grad(end)(at)) == pytest.approx(float(difference), rel=1e-6)
 
 
-def test_what_it_refuses():
+def test_unsupported_models_and_settings_of_a_section_are_refused():
     forcing, starts = harmonic_series(1.3, 0.4), jnp.zeros((1, 2))
     with pytest.raises(ValueError, match="`model` must be a ReducedModel"):
         poincare_section(TwoInertiaModel(hdc_40_050()), forcing, jnp.zeros((1, 4)))

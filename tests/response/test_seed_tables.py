@@ -1,4 +1,4 @@
-"""The seed's tables recomputed: what is wrong in them, and that nothing fits the second."""
+"""Tables of the source document recomputed, the verdicts on their values, and fits of amplitudes."""
 
 import jax
 import numpy as np
@@ -31,18 +31,18 @@ def cells(tables, title: str, column: str) -> list[Cell]:
         (0.0, 0.0, "agrees"),
     ],
 )
-def test_verdicts(printed, recomputed, verdict):
+def test_cell_reports_its_verdict(printed, recomputed, verdict):
     assert Cell("row", "column", printed, recomputed, "rad").verdict == verdict
 
 
-def test_the_natural_frequency_is_not_what_is_printed(tables):
+def test_printed_natural_frequency_differs_from_the_recomputed_one(tables):
     (cell,) = cells(tables, "Table 1", "omega_0")
     assert cell.recomputed == pytest.approx(385.545, abs=1e-3)
     assert cell.verdict.startswith("differs by a factor")
 
 
-def test_table_2_by_the_linear_closed_form(tables):
-    """With alpha = 0.1 nothing nonlinear is visible, so that the closed form is the whole truth."""
+def test_recomputed_table_2_agrees_with_the_linear_closed_form(tables):
+    """With alpha = 0.1 the nonlinearity is negligible, so that the linear closed form holds."""
     drive = hdc_40_050()
     A = 10.0 / (50 * 5.26e-4)
     rows = cells(tables, "Table 2", "analytical amplitude")[::2]
@@ -55,7 +55,7 @@ def test_table_2_by_the_linear_closed_form(tables):
     assert all(c.verdict == "agrees" for c in cells(tables, "Table 2", "relative error"))
 
 
-def test_table_3_has_no_model_behind_it(tables):
+def test_table_3_is_inconsistent_with_the_stated_model(tables):
     assert [c.recomputed for c in cells(tables, "Table 3", "first peak over this")] == pytest.approx([5.0, 10.0])
     for cell in cells(tables, "Table 3", "half-power bandwidth"):
         assert cell.printed / cell.recomputed == pytest.approx(1.5, rel=2e-3)
@@ -64,21 +64,21 @@ def test_table_3_has_no_model_behind_it(tables):
     )
 
 
-def test_table_4_names_one_effect_of_the_stated_model(tables):
+def test_table_4_has_one_effect_of_the_stated_model(tables):
     verdicts = {c.row: c.verdict for c in tables["Table 4"]}
     stated = verdicts.pop("flexspline deformation")
     assert stated.startswith("differs by a factor")
     assert set(verdicts.values()) == {"does not follow from the stated model"}
 
 
-def test_the_figure_is_right_for_the_parameters_beside_it(tables):
+def test_figure_1_agrees_with_the_parameters_beside_it_only(tables):
     assert [c.verdict for c in tables["Figure 1"][:3]] == ["agrees"] * 3
     assert all(c.verdict.startswith("differs by a factor") for c in tables["Figure 1"][3:])
 
 
 @pytest.mark.slow
-def test_nothing_fits_table_2():
-    """Not even nearly undamped, with the most charitable motion at each frequency; which are motions indeed."""
+def test_no_parameters_fit_table_2():
+    """Not even with little damping and the nearest stable motion at each frequency, which scipy confirms."""
     fit = best_fit_of_table_2()
     assert fit.worst > 1.3 and fit.rms > 0.15
     for i, omega in enumerate(fit.omega):
@@ -86,14 +86,14 @@ def test_nothing_fits_table_2():
         equation = duffing_rates(fit.mu, fit.alpha, fit.A, omega, fit.omega_0)
         assert period_error(equation, x) < 1e-3
         moduli = np.abs(multipliers(equation, duffing_slope(fit.mu, fit.alpha, fit.omega_0), x))
-        # So little damping takes less than the motion's error.
+        # With so little damping, multipliers deviate from one by less than the motion's error.
         assert moduli.max() < 1.0 + 1e-4
     text = as_text((), fit)
     assert "no parameters of the stated model" in text and "a sub-harmonic motion" in text
 
 
 @pytest.mark.slow
-def test_a_consistent_table_is_fitted():
+def test_consistent_table_is_fitted():
     """Amplitudes of a linear response, far from its resonance: the same search finds parameters that give them."""
     omega = tuple(case.omega for case in TABLE_2)
     amplitude = tuple(500.0 / abs(complex(200.0**2 - w**2, 5.0 * w)) for w in omega)
@@ -104,6 +104,6 @@ def test_a_consistent_table_is_fitted():
     assert "the table is consistent" in as_text((), fit)
 
 
-def test_a_table_without_amplitudes_is_refused():
+def test_table_without_amplitudes_is_refused():
     with pytest.raises(ValueError, match="`omega` and `amplitude` must be of one length"):
         fit_amplitudes((100.0,), (0.0,))

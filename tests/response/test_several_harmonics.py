@@ -22,7 +22,7 @@ from hdjax.response.several_harmonics import (
 W0 = 2.0
 
 
-def test_transient_error_falls_with_epsilon():
+def test_error_of_the_off_resonance_transient_falls_with_epsilon():
     forcing = MultiHarmonic(jnp.array([1.5, 0.8]), jnp.array([1.1, 4.5]), jnp.array([0.3, -1.0]))
     errors = []
     epsilons = np.array([0.04, 0.02, 0.01])
@@ -58,7 +58,7 @@ def test_constant_load_shifts_the_frequency():
     ("multiples", "name"),
     [((3, 5), "2 w_1 + w_l"), ((3, 5, 7), "3 w_2 = w_1 + w_2 + w_l"), ((5, 17), "w_l - 2 w_1"), ((5, 9, 13), None)],
 )
-def test_combination_resonance(multiples, name):
+def test_combination_resonance_agrees_with_harmonic_balance(multiples, name):
     """Amplitude and phase against harmonic balance of the whole multi-frequency response, to O(epsilon)."""
     response = {(3, 5): 11, (3, 5, 7): 15, (5, 17): 7, (5, 9, 13): 1}[multiples]
     A = np.array({(5, 17): [1.5, 6.0]}.get(multiples, [3.0, 2.5, 2.0]))[: len(multiples)]
@@ -89,7 +89,7 @@ def test_combination_resonance(multiples, name):
     np.testing.assert_allclose(slopes, 1, atol=0.25)
 
 
-def test_list_of_combinations():
+def test_combination_resonances_are_listed_by_detuning():
     drive = ReducedDrive(mu=0.1, omega_0=10.0, alpha=0.1)
     forcing = harmonics_and_load(3.4, [1.0, 1.0], [0.0, 0.0], 30.5, 1.0)
     found = combination_resonances(drive, forcing, ["w_1", "w_2", "w_l"])

@@ -20,7 +20,7 @@ def duffing(alpha: float = 0.5, mu: float = 0.1, omega_0: float = 1.0, gain: flo
 
 
 def settled(model: ReducedModel, forcing: FourierSeries, state: Array, periods: int) -> Array:
-    """Where a long simulation ends, by another solver."""
+    """End state of a long simulation by another solver."""
     times = np.array([0.0, 2 * np.pi / float(forcing.omega) * periods])
     return simulate(model, forcing, times, state, solver=dfx.Tsit5(), rtol=1e-11, atol=1e-13).states[-1]
 
@@ -39,7 +39,7 @@ def linear_phasors() -> np.ndarray:
     return pushes / (OMEGA_0**2 + MU * rates + rates**2)
 
 
-def test_orbit_and_multipliers_of_the_linear_drive():
+def test_orbit_and_multipliers_of_a_linear_drive_agree_with_the_closed_form():
     orbit = shoot(LINEAR, TWO_TONES, REST)
     phasors = linear_phasors()
     start = [phasors.sum().real, (1j * OMEGA * np.arange(3) * phasors).sum().real]
@@ -53,7 +53,7 @@ def test_orbit_and_multipliers_of_the_linear_drive():
     np.testing.assert_allclose(monodromy(LINEAR, TWO_TONES, REST), orbit.monodromy, rtol=1e-7)
 
 
-def test_steady_series_of_the_linear_drive():
+def test_steady_series_of_a_linear_drive_agrees_with_the_closed_form():
     series = steady_series(LINEAR, TWO_TONES, shoot(LINEAR, TWO_TONES, REST))
     phasors = linear_phasors()
     assert float(series.mean) == pytest.approx(phasors[0].real, rel=1e-8)
@@ -86,7 +86,7 @@ def orbits() -> list[PeriodicOrbit]:
     return [shoot(duffing(), FORCING, jnp.asarray(harmonic_guess(a))) for a in branches()]
 
 
-def test_three_branches_and_the_middle_one_is_unstable(orbits):
+def test_middle_one_of_three_orbits_is_unstable(orbits):
     assert all(orbit.converged for orbit in orbits)
     assert [bool(orbit.stable) for orbit in orbits] == [True, False, True]
     assert max(float(orbit.residual) for orbit in orbits) < 1e-9
@@ -98,26 +98,26 @@ def test_three_branches_and_the_middle_one_is_unstable(orbits):
     np.testing.assert_allclose(found, branches(), rtol=0.02)
 
 
-def test_multipliers_multiply_to_the_damping_of_a_period(orbits):
+def test_product_of_multipliers_is_the_damping_over_a_period(orbits):
     """Liouville's formula: phase volume shrinks by exp(-mu T) whatever the orbit."""
     products = [np.prod(np.asarray(orbit.multipliers)) for orbit in orbits]
     np.testing.assert_allclose(products, np.exp(-0.1 * 2 * np.pi / 1.5), rtol=1e-9)
 
 
-def test_stable_orbits_are_where_long_simulations_end(orbits):
+def test_long_simulations_end_on_stable_orbits(orbits):
     """After 120 periods exp(-mu t / 2) = 1e-11."""
     for k, start in ((0, [0.0, 0.0]), (2, [1.3, 2.0])):
         end = settled(duffing(), FORCING, jnp.asarray(start), 120)
         np.testing.assert_allclose(orbits[k].state, end, atol=1e-7)
 
 
-def test_a_long_simulation_leaves_the_middle_branch(orbits):
+def test_long_simulation_leaves_the_unstable_orbit(orbits):
     ends = [settled(duffing(), FORCING, orbits[1].state + jnp.asarray([d, 0.0]), 120) for d in (1e-3, -1e-3)]
     states = np.stack([orbit.state for orbit in orbits])
     assert {int(np.argmin(np.abs(states - end).max(axis=1))) for end in np.asarray(ends)} == {0, 2}
 
 
-def test_an_orbit_under_a_mean_and_two_harmonics():
+def test_orbit_under_a_mean_and_two_harmonics_agrees_with_simulation():
     forcing = harmonic_series(1.1, np.array([0.3, 0.2]), np.array([0.0, 1.0]), mean=0.2)
     orbit = shoot(duffing(mu=0.3), forcing, REST)
     assert bool(orbit.stable)
@@ -128,8 +128,8 @@ def test_an_orbit_under_a_mean_and_two_harmonics():
     np.testing.assert_allclose(series(times), motion.dynamic_error, atol=1e-8)
 
 
-def test_a_subharmonic_of_order_three():
-    """And the harmonic motion beside it, which repeats after three periods too."""
+def test_subharmonic_orbit_repeats_after_three_periods():
+    """The harmonic motion at the same frequency repeats after three periods too."""
     model, forcing = duffing(1.0, 0.05), harmonic_series(3.6, 6.0).padded(2)
     orbit = shoot(model, forcing, jnp.asarray([-0.7, -0.5]), periods=3)
     assert bool(orbit.stable)
@@ -163,7 +163,7 @@ def orbit_slope(values: Array) -> Array:
 
 
 @pytest.mark.slow
-def test_derivatives_of_an_unstable_orbit():
+def test_derivatives_of_an_unstable_orbit_agree_with_differences():
     h = 1e-5
     ends = np.stack([[np.asarray(orbit_state(jnp.asarray(AT + s * h * e))) for s in (1, -1)] for e in np.eye(6)])
     differences = ((ends[:, 0] - ends[:, 1]) / (2 * h)).T
@@ -182,7 +182,7 @@ def lane(alpha: Array, omega: Array, start: Array) -> PeriodicOrbit:
     return shoot(duffing().replace({"alpha": alpha}), harmonic_series(omega, 0.1).padded(2), start)
 
 
-def test_lanes_are_what_a_loop_gives_and_a_failed_one_is_marked():
+def test_orbits_in_lanes_equal_a_loop_and_failures_are_marked():
     """Compiled and in lanes against one by one."""
     orbits = eqx.filter_jit(eqx.filter_vmap(lane))(ALPHAS, OMEGAS, STARTS)
     assert np.asarray(orbits.converged).tolist() == np.asarray(orbits.stable).tolist() == [True, False, True]
@@ -195,12 +195,12 @@ def test_lanes_are_what_a_loop_gives_and_a_failed_one_is_marked():
         np.testing.assert_allclose(orbits.monodromy[k], alone.monodromy, atol=1e-8)
 
 
-def test_an_escape_from_the_period_map_is_told():
+def test_period_map_of_an_escaping_motion_raises_an_error():
     with pytest.raises(SimulationError):
         period_map(duffing(-1.0), harmonic_series(0.5, 0.1).padded(2), STARTS[1])
 
 
-def test_two_inertias_have_no_orbit_but_a_period_map():
+def test_two_inertias_have_a_period_map_and_no_orbit():
     drive = Drive(N=2, J_m=1, J_l=3, K=5, B_sp=0.3, alpha=0.2)
     forcing, load = harmonic_series(1.5, 0.4), harmonic_series(1.5, 0.7, 0.3)
     with pytest.raises(ValueError, match=r"`model` must be a ReducedModel.* TwoInertiaModel"):

@@ -1,4 +1,4 @@
-"""Swept sines and their jumps against scipy and the frequency response's own folds."""
+"""Swept sines and their jumps against scipy and the peak of the frequency response."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def scipy_amplitude(k: int, start: np.ndarray) -> float:
     return float(np.ptp(found.y[0]) / 2)
 
 
-def test_a_hardening_drive_jumps_down_high_and_up_low(sweeps):
+def test_hardening_drive_jumps_at_a_higher_frequency_in_the_upward_sweep(sweeps):
     up, down = sweeps
     drop, rise = (np.asarray(OMEGAS)[np.flatnonzero(np.asarray(sweep.jumps()))] for sweep in sweeps)
     assert drop.size == rise.size == 1
@@ -42,13 +42,13 @@ def test_a_hardening_drive_jumps_down_high_and_up_low(sweeps):
 
 
 @pytest.mark.parametrize("k", (20, 60, 110))
-def test_sweeps_agree_with_scipy(sweeps, k):
+def test_swept_amplitudes_agree_with_scipy(sweeps, k):
     for sweep in sweeps:
         other = scipy_amplitude(k, np.asarray(sweep.states[k]))
         assert float(sweep.amplitude[k]) == pytest.approx(other, rel=1e-3)
 
 
-def test_sweeps_agree_with_scipy_on_both_branches(sweeps):
+def test_swept_amplitudes_on_both_branches_agree_with_scipy(sweeps):
     """From starts on either side of the unstable orbit, not from the sweep's own states."""
     k = 70
     assert float(sweeps[0].amplitude[k]) == pytest.approx(scipy_amplitude(k, np.array([1.3, 2.2])), rel=1e-2)
@@ -56,20 +56,20 @@ def test_sweeps_agree_with_scipy_on_both_branches(sweeps):
     assert sweeps[0].amplitude[k] > 4 * sweeps[1].amplitude[k]
 
 
-def test_a_weak_forcing_has_no_hysteresis():
+def test_weak_forcing_has_no_hysteresis_band():
     up, down = (swept_sine(SWEPT, 0.01, OMEGAS, direction) for direction in ("up", "down"))
     assert not np.asarray(up.jumps()).any()
     assert hysteresis_band(up, down) is None
 
 
-def test_a_softening_drive_that_escapes_in_a_sweep_is_marked():
+def test_escape_of_a_softening_drive_in_a_sweep_is_marked():
     sweep = swept_sine(duffing(0.1, -1.0), 0.4, OMEGAS, "up")
     assert np.asarray(sweep.escaped).any()
     assert np.isfinite(np.asarray(sweep.states)).all()
     assert (np.asarray(sweep.amplitude)[np.asarray(sweep.escaped)] == 0.0).all()
 
 
-def test_sweeps_in_lanes():
+def test_sweeps_in_lanes_equal_single_sweeps():
     amplitudes = jnp.asarray([0.05, 0.4])
     omegas = OMEGAS[:5]
     together = jax.vmap(lambda a: swept_sine(SWEPT, a, omegas, transient_periods=5))(amplitudes)
@@ -78,6 +78,6 @@ def test_sweeps_in_lanes():
         np.testing.assert_allclose(together.amplitude[k], alone.amplitude, rtol=1e-12)
 
 
-def test_a_traced_frequency_needs_the_number_of_periods():
+def test_traced_frequency_without_a_number_of_periods_is_refused():
     with pytest.raises(ValueError, match="`transient_periods` must be given where the drive .* is traced"):
         jax.jit(lambda omega: swept_sine(SWEPT, 0.1, omega[None]))(jnp.asarray(1.0))

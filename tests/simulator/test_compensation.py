@@ -25,7 +25,7 @@ def two_percent_off() -> TwoInertiaModel:
     return PLANT.replace({path: factor * float(PLANT.get(path)) for path, factor in OFF.items()})
 
 
-def swings(found: Trajectory, speed: float) -> dict[str, float]:
+def error_deviations(found: Trajectory, speed: float) -> dict[str, float]:
     """Standard deviations of the two errors once the transient has died out."""
     load = np.asarray(found.states[:, 1]) - speed * TIMES / float(DRIVE.N)
     errors = {"dynamic_error": np.asarray(found.dynamic_error), "output": load}
@@ -33,20 +33,20 @@ def swings(found: Trajectory, speed: float) -> dict[str, float]:
 
 
 @cache
-def without(speed: float, stiff: bool = False) -> dict[str, float]:
-    return swings(run_at_speed(PLANT, speed, TIMES, STIFF if stiff else SOFT), speed)
+def deviations_without_feedforward(speed: float, stiff: bool = False) -> dict[str, float]:
+    return error_deviations(run_at_speed(PLANT, speed, TIMES, STIFF if stiff else SOFT), speed)
 
 
 def reduction(correction: Feedforward, target: str, **options) -> float:
     speed = float(correction.speed)
     servo = options.pop("servo", SOFT)
-    found = swings(run_at_speed(PLANT, speed, TIMES, servo, correction=correction, **options), speed)
-    return without(speed, servo is STIFF)[target] / found[target]
+    found = error_deviations(run_at_speed(PLANT, speed, TIMES, servo, correction=correction, **options), speed)
+    return deviations_without_feedforward(speed, servo is STIFF)[target] / found[target]
 
 
 @pytest.mark.parametrize("speed", (60.0, 180.0))
 @pytest.mark.parametrize("target", ("dynamic_error", "output"))
-def test_the_error_vanishes_under_feedforward(target, speed):
+def test_feedforward_removes_the_error_and_tolerates_two_percent_of_model_error(target, speed):
     exact = feedforward(PLANT, speed, target=target)
     assert bool(exact.converged)
     assert reduction(exact, target) > 1e3
@@ -55,12 +55,12 @@ def test_the_error_vanishes_under_feedforward(target, speed):
     assert reduction(near, target) > 5.0
 
 
-def test_a_stiff_servo_needs_the_angle_alone():
+def test_feedforward_of_the_angle_alone_suffices_for_a_stiff_servo():
     correction = feedforward(PLANT, 60.0)
     assert reduction(correction, "dynamic_error", servo=STIFF, use=("motor_angle",)) > 10.0
 
 
-def test_what_is_held_stands_still():
+def test_feedforward_makes_its_target_error_zero():
     still = feedforward(PLANT, 60.0)
     assert float(jnp.max(still.dynamic_error.amplitudes)) == 0.0
     assert float(jnp.max(still.output_error.amplitudes)) > 0.0
@@ -73,7 +73,7 @@ def test_what_is_held_stands_still():
     np.testing.assert_allclose(uniform.correction(t), -float(DRIVE.N) * error, atol=1e-7)
 
 
-def test_without_kinematic_error_there_is_nothing_to_correct():
+def test_feedforward_without_a_kinematic_error_is_zero():
     for target in ("dynamic_error", "output"):
         found = feedforward(TwoInertiaModel(DRIVE), 60.0, target=target)
         assert bool(found.converged)
@@ -81,7 +81,7 @@ def test_without_kinematic_error_there_is_nothing_to_correct():
             np.testing.assert_allclose(series.values(64), 0.0, atol=1e-12)
 
 
-def test_a_load_is_carried():
+def test_feedforward_carries_a_constant_load():
     """The mesh is twisted against it, `K (x + alpha x^3) = -T_l`, and the motor gives `-T_l / N`."""
     found = feedforward(TwoInertiaModel(DRIVE), 60.0, load_torque=8.0)
     assert bool(found.converged)
@@ -91,7 +91,7 @@ def test_a_load_is_carried():
     np.testing.assert_allclose(found.correction.mean, 50.0 * x, rtol=1e-12)
 
 
-def test_effects_with_memory_and_few_samples_are_refused():
+def test_feedforward_refuses_effects_with_memory_and_few_samples():
     with pytest.raises(ValueError, match="bouc_wen"):
         feedforward(PLANT.with_effects(BoucWen(k=500.0, memory_twist=1e-4)), 60.0)
     with pytest.raises(ValueError, match="samples"):

@@ -1,4 +1,4 @@
-"""The drive's own numbers, and how its parameters are named, described and changed."""
+"""Derived quantities of a drive, and how its parameters are named, described and changed."""
 
 from dataclasses import fields, replace
 
@@ -37,8 +37,8 @@ KNOWN_FAMILIES = {
 }  # fmt: skip
 
 
-def test_the_preset_has_the_natural_frequency_that_its_table_implies():
-    """Not the 122.5 rad/s that the seed prints beside it (DESIGN 2.3). Digits as published."""
+def test_preset_has_the_natural_frequency_of_its_table():
+    """Not the 122.5 rad/s that the source document prints beside it (DESIGN 2.3). Digits as published."""
     drive = hdc_40_050()
     assert float(drive.omega_0) == pytest.approx(385.545, abs=5e-4)
     assert float(drive.mu) == pytest.approx(0.353, abs=5e-4)
@@ -47,8 +47,8 @@ def test_the_preset_has_the_natural_frequency_that_its_table_implies():
     assert PRESETS["HDC-40-050"]() == hdc_40_050()
 
 
-def test_peak_twist_of_the_preset():
-    """A/(mu omega_0) at resonance under 10 N m is 2.79 rad (DESIGN 2.2), where the seed prints 0.015."""
+def test_preset_has_the_closed_form_peak_twist():
+    """A/(mu omega_0) at resonance under 10 N m is 2.79 rad (DESIGN 2.2), where the source document prints 0.015."""
     drive = hdc_40_050()
     amplitude = drive.error_forcing(jnp.asarray(10.0), jnp.asarray(0.0))
     assert float(amplitude / (drive.mu * drive.omega_0)) == pytest.approx(2.79, abs=0.005)
@@ -58,7 +58,7 @@ positive = st.floats(0.1, 10.0)
 
 
 @given(N=st.floats(1.0, 200.0), J_m=positive, J_l=positive, K=positive, T_m=positive, T_l=positive)
-def test_the_error_equation_follows_from_the_two_inertias(N, J_m, J_l, K, T_m, T_l):
+def test_error_equation_follows_from_the_two_inertias(N, J_m, J_l, K, T_m, T_l):
     """x'' = theta_m''/N - theta_l'' with an unknown mesh torque tau: its factor is c, the rest is the forcing."""
     drive = Drive(N=N, J_m=J_m, J_l=J_l, K=K, B_sp=0.3)
 
@@ -73,7 +73,7 @@ def test_the_error_equation_follows_from_the_two_inertias(N, J_m, J_l, K, T_m, T
     assert float(drive.omega_0) == pytest.approx(np.sqrt(float(drive.c) * K), rel=1e-12)
 
 
-def test_the_printed_forcing_lacks_the_ratio_on_the_load_torque():
+def test_printed_forcing_lacks_the_ratio_on_the_load_torque():
     drive = hdc_40_050()
     T_m, T_l = 10.0, -7.0
     N, J_m, J_l = 50.0, 5.26e-4, 5.0e-2
@@ -84,7 +84,7 @@ def test_the_printed_forcing_lacks_the_ratio_on_the_load_torque():
     assert abs(found - printed) > 0.2 * abs(found)
 
 
-def test_reduced_drive():
+def test_reduced_drive_has_the_dynamics_of_the_full_drive():
     drive = eqx.tree_at(lambda d: d.alpha, hdc_40_050(), jnp.asarray(2e5))
     reduced = drive.reduced()
     assert float(reduced.mu) == pytest.approx(float(drive.mu))
@@ -102,7 +102,7 @@ OWNERS = (hdc_40_050(), hdc_40_050().reduced(), *(form.proposals(SCALES)[0] for 
 
 
 @pytest.mark.parametrize("owner", OWNERS, ids=lambda owner: type(owner).__name__)
-def test_every_parameter_says_what_it_is(owner):
+def test_every_parameter_has_unit_doc_source_and_bounds(owner):
     infos = dict(own_parameters(owner))
     assert infos
     for name, info in infos.items():
@@ -110,12 +110,12 @@ def test_every_parameter_says_what_it_is(owner):
         assert info.doc.strip(), name
         assert info.source.strip(), name
         assert info.bounds[0] < info.bounds[1], name
-    # Nothing physical is declared behind their back; what is known of the numbers beforehand is none of them.
+    # Every field is a declared parameter, except what is known about parameters beforehand.
     assert set(infos) == {field.name for field in fields(owner)} - {"priors"}
 
 
 @pytest.mark.parametrize("form", CATALOGUE)
-def test_every_effect_of_the_catalogue_is_complete(form):
+def test_every_effect_has_a_known_family_and_valid_starting_values(form):
     assert form.family in KNOWN_FAMILIES
     proposals = form.proposals(SCALES)
     assert proposals
@@ -125,7 +125,7 @@ def test_every_effect_of_the_catalogue_is_complete(form):
             value = float(getattr(effect, name))
             assert np.isfinite(value)
             if info.role == "strength":
-                # An input delay stays a hair above zero.
+                # An input delay starts slightly above zero.
                 assert abs(value) <= 1e-9 * SCALES.time_step
             else:
                 assert info.bounds[0] < value < info.bounds[1], name
@@ -142,12 +142,12 @@ def test_names_in_the_catalogue_are_unique():
 # -- the model: dotted paths and changes --
 
 
-def a_model() -> TwoInertiaModel:
+def example_model() -> TwoInertiaModel:
     return TwoInertiaModel(hdc_40_050(), (KinematicError(cos_2=1e-4), CoulombFriction(T_c=0.5, v_0=0.01)))
 
 
-def test_dotted_paths():
-    model = a_model()
+def test_parameters_are_accessed_by_dotted_path():
+    model = example_model()
     parameters = model.parameters()
     assert list(parameters)[:6] == ["N", "J_m", "J_l", "K", "alpha", "B_sp"]
     assert {"kinematic_error.cos_2", "coulomb_friction.T_c", "coulomb_friction.v_0"} < set(parameters)
@@ -157,8 +157,8 @@ def test_dotted_paths():
     assert parameters["coulomb_friction.T_c"][1].role == "strength"
 
 
-def test_replace_changes_what_is_named_and_nothing_else():
-    model = a_model()
+def test_replace_changes_only_the_named_parameters():
+    model = example_model()
     changed = model.replace({"K": 9000.0, "coulomb_friction.T_c": 0.7})
     expected = {path: float(value) for path, (value, _) in model.parameters().items()}
     expected |= {"K": 9000.0, "coulomb_friction.T_c": 0.7}
@@ -166,8 +166,8 @@ def test_replace_changes_what_is_named_and_nothing_else():
     assert float(model.get("K")) == 7160.0
 
 
-def test_effects_come_and_go():
-    model = a_model()
+def test_effects_are_added_and_removed():
+    model = example_model()
     more = model.with_effects(Backlash(b=1e-5))
     assert [e.name for e in more.effects] == ["kinematic_error", "coulomb_friction", "backlash"]
     assert float(more.get("backlash.b")) == 1e-5
@@ -178,7 +178,7 @@ def test_effects_come_and_go():
 
 
 @pytest.mark.parametrize("form", CATALOGUE)
-def test_states_follow_the_effects(form):
+def test_state_names_include_the_states_of_effects(form):
     effect = form.proposals(SCALES)[0]
     model = TwoInertiaModel(hdc_40_050()).with_effects(Backlash(), effect)
     assert model.state_names[:4] == ("theta_m", "theta_l", "omega_m", "omega_l")
@@ -189,7 +189,7 @@ def test_states_follow_the_effects(form):
 
 
 @pytest.mark.parametrize("form", CATALOGUE)
-def test_a_reduced_drive_refuses_what_needs_the_motor(form):
+def test_reduced_drive_refuses_effects_that_need_the_motor(form):
     effect = form.proposals(SCALES)[0]
     drive = ReducedDrive(mu=1.0, omega_0=20.0)
     if not form.needs_motor:
@@ -201,7 +201,7 @@ def test_a_reduced_drive_refuses_what_needs_the_motor(form):
         ReducedModel(drive).with_effects(effect)
 
 
-def test_numbers_become_arrays():
+def test_parameters_are_converted_to_arrays():
     drive = replace(hdc_40_050(), N=np.int64(100))
     assert drive.N.dtype == jnp.asarray(1.0).dtype
     assert drive.N.shape == ()

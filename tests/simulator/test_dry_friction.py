@@ -1,4 +1,4 @@
-"""Dry friction in a solver's steps: stopping, sticking and turning back, against closed forms and fine integration."""
+"""Dry friction in a solver's steps: stopping, sticking and reversal, against closed forms and fine integration."""
 
 from dataclasses import replace
 
@@ -33,8 +33,8 @@ def mean_sign(rate, change, reach, corner=0.0):
 
 @given(rate=rates, change=rates, reach=st.floats(0.05, 3.0), corner=st.sampled_from([0.1, 1.0]))
 @settings(max_examples=40, deadline=None)
-def test_mean_sign_is_that_of_an_even_acceleration_with_friction(rate, change, reach, corner):
-    """Against small steps of `rate' = change - reach clip(rate / ramp)`, whose corner leaves away what tanh does."""
+def test_mean_sign_agrees_with_fine_integration_under_constant_acceleration(rate, change, reach, corner):
+    """Against small steps of `rate' = change - reach clip(rate / ramp)`, with a ramp in place of the tanh."""
     ramp, steps = 2 * np.log(2) * corner, 4000
     now, total = rate, 0.0
     for _ in range(steps):
@@ -46,28 +46,28 @@ def test_mean_sign_is_that_of_an_even_acceleration_with_friction(rate, change, r
 
 @given(rate=rates, change=rates, reach=st.floats(0.05, 3.0), corner=st.sampled_from([0.0, 1e-3, 0.3]))
 @settings(max_examples=60, deadline=None)
-def test_mean_sign_is_odd_bounded_and_opposes(rate, change, reach, corner):
+def test_mean_sign_is_odd_bounded_and_opposes_the_rate(rate, change, reach, corner):
     sign = mean_sign(rate, change, reach, corner)
     assert abs(sign) <= 1.0 + 1e-9
     assert mean_sign(-rate, -change, reach, corner) == pytest.approx(-sign, abs=1e-9)
-    # It never speeds up what nothing else drives.
+    # Friction alone never increases the rate.
     assert abs(rate - reach * mean_sign(rate, 0.0, reach, corner)) <= abs(rate) + 1e-9
 
 
-def test_a_sharp_corner_slides_stops_sticks_and_turns_back():
+def test_mean_sign_of_a_sharp_corner_agrees_with_slip_stick_and_reversal():
     assert mean_sign(5.0, -1.0, 2.0) == pytest.approx(1.0)
-    # At rest after half the step, and held there against a third of what the friction bears.
+    # At rest after half the step, and held there against a third of the friction.
     assert mean_sign(1.0, 1.0, 3.0) == pytest.approx(0.5 + 0.5 / 3, abs=1e-3)
     assert mean_sign(0.0, 1.0, 3.0) == pytest.approx(1 / 3, abs=1e-3)
-    # At rest after a quarter, then backwards.
+    # At rest after a quarter of the step, then backwards.
     assert mean_sign(1.0, -3.0, 1.0) == pytest.approx(0.25 - 0.75, abs=3e-3)
     assert mean_sign(0.0, 4.0, 1.0) == pytest.approx(1.0, abs=1e-2)
 
 
 @pytest.mark.parametrize("corner", [0.0, 0.2])
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 1.0), (0.0, 1.0, 1e-12)])
-def test_derivatives_of_the_mean_sign_stay_numbers(at, corner):
-    """Also at rest, without friction, and where the pull just overcomes it; forwards and backwards."""
+def test_derivatives_of_the_mean_sign_are_finite(at, corner):
+    """Also at rest, without friction, and at the limit of sticking; in forward and reverse mode."""
 
     def found(rate, change, reach, corner):
         return mean_signs([rate], [change], [[reach]], [corner])[0]
@@ -77,8 +77,8 @@ def test_derivatives_of_the_mean_sign_stay_numbers(at, corner):
         assert np.all(np.isfinite(slopes))
 
 
-def test_two_rates_that_are_held_are_held_together():
-    """Friction on the motor and in the mesh, as strong as they need to be: both rates end at rest."""
+def test_mean_signs_bring_two_coupled_rates_to_rest_together():
+    """Sufficiently strong friction on the motor and in the mesh: both rates end at zero."""
     mobility = np.array([[1.0, 0.5], [0.5, 1.0]])
     rate, change = np.array([0.2, -0.1]), np.array([0.3, 0.4])
     reaches = [[jnp.asarray(5.0 * m) for m in row] for row in mobility]
@@ -97,7 +97,7 @@ def friction_of(name: str, width: float):
 
 
 @pytest.mark.parametrize("name", ["motor", "mesh", "load", "ripple", "motor and mesh"])
-def test_one_step_a_sample_simulates_a_drive_that_sticks(name):
+def test_one_step_a_sample_suffices_for_stick_slip(name):
     """A corner far sharper than the steps, and one about as sharp, to 2 % of the twist and better with finer steps."""
     count, dt = 600, 1e-3
     t = dt * np.arange(count)
@@ -117,9 +117,11 @@ def test_one_step_a_sample_simulates_a_drive_that_sticks(name):
 
 
 @pytest.mark.parametrize("substeps", [1, 4])
-def test_a_motor_without_a_spring_stops_whatever_the_step(substeps):
-    """After J_m omega / T_c, having turned J_m omega^2 / (2 T_c), to within what a step takes off; and there it stays,
-    and its derivatives stay finite, though its corner is a millionth of that."""
+def test_free_motor_with_friction_stops_at_the_closed_form_angle(substeps):
+    """It stops after `J_m omega / T_c`, having turned by `J_m omega^2 / (2 T_c)`, to within the change of one step.
+
+    It stays at rest with finite derivatives, although the transition is a millionth of that rate.
+    """
     count, dt, level, omega = 400, 1e-3, 0.05, 20.0
     sharp = TwoInertiaModel(LOOSE).with_effects(MotorFriction(T_c=level, transition=1e-6))
     torque = sampled(dt * np.arange(count), np.zeros(count), hold="zero-order")
@@ -138,7 +140,7 @@ def test_a_motor_without_a_spring_stops_whatever_the_step(substeps):
     np.testing.assert_allclose(slope[late:, 0], J_M * omega / level, rtol=2 * a_step / omega)
 
 
-def test_a_motor_sticks_below_the_friction_and_slides_above_it():
+def test_motor_sticks_below_the_friction_level_and_slides_above_it():
     count, dt, level = 200, 1e-3, 0.05
     model = TwoInertiaModel(LOOSE).with_effects(MotorFriction(T_c=level, transition=1e-6))
 
@@ -150,8 +152,8 @@ def test_a_motor_sticks_below_the_friction_and_slides_above_it():
     assert end(1.5 * level)[2] == pytest.approx(0.5 * level / J_M * dt * count, rel=1e-4)
 
 
-def test_frictions_on_one_rate_stick_as_one():
-    """What warmth takes off the motor's friction is taken off what holds it."""
+def test_frictions_on_one_rate_stick_with_their_sum():
+    """A temperature that reduces the motor's friction reduces the torque at which it slips."""
     warm = ThermalMotorFriction(T_c_T=0.003, transition=1e-6, T_0=300.0)
     model = TwoInertiaModel(LOOSE).with_effects(MotorFriction(T_c=0.05, transition=1e-6), warm)
     t = 1e-3 * np.arange(200)
@@ -164,7 +166,7 @@ def test_frictions_on_one_rate_stick_as_one():
     assert rate_under(0.022) == pytest.approx(0.002 / J_M * 0.2, rel=1e-3)
 
 
-def test_steps_that_resolve_a_corner_leave_it_as_it_is():
+def test_friction_law_is_unchanged_where_steps_resolve_its_transition():
     motion = Motion(x=jnp.zeros(()), v=jnp.asarray(0.01), omega_m=jnp.asarray(0.5))
     friction = MotorFriction(T_c=0.05, transition=0.5)
 

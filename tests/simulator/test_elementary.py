@@ -11,21 +11,21 @@ from hdjax.elementary import cosine_and_sine, cosines_and_sines, exponential, po
 
 
 @given(turns=st.integers(-250_000, 250_000), rest=st.floats(-4.0, 4.0))
-def test_cosine_and_sine(turns: int, rest: float):
+def test_cosine_and_sine_agree_with_numpy(turns: int, rest: float):
     angle = 2 * np.pi * turns + rest
     cosine, sine = cosine_and_sine(jnp.asarray(angle))
     assert float(cosine) == pytest.approx(np.cos(angle), abs=3e-16)
     assert float(sine) == pytest.approx(np.sin(angle), abs=3e-16)
 
 
-def test_of_many_angles_at_every_quarter():
+def test_cosine_and_sine_of_an_array_agree_with_numpy():
     angles = np.arange(-40, 41) * (np.pi / 4)
     cosine, sine = cosine_and_sine(jnp.asarray(angles))
     np.testing.assert_allclose(cosine, np.cos(angles), atol=3e-16)
     np.testing.assert_allclose(sine, np.sin(angles), atol=3e-16)
 
 
-def test_derivatives_turn_one_into_the_other():
+def test_derivatives_of_cosine_and_sine_agree_with_the_closed_form():
     angle = jnp.asarray(0.7)
     for mode in (jax.jacfwd, jax.jacrev):
         by_angle = mode(lambda a: jnp.stack(cosine_and_sine(a)))(angle)
@@ -38,14 +38,14 @@ ORDERS = (4, 1, 3, 6)
 
 
 @given(st.floats(-1e3, 1e3))
-def test_multiples(angle: float):
+def test_cosines_and_sines_of_multiples_agree_with_numpy(angle: float):
     for order, (cosine, sine) in zip(ORDERS, cosines_and_sines(jnp.asarray(angle), ORDERS), strict=True):
-        # Numpy is given the angle that counts: a rounded multiple is another one.
+        # The multiple is formed by a power, since a rounded multiple of the angle is another angle.
         turned = np.exp(1j * angle) ** order
         np.testing.assert_allclose([cosine, sine], [turned.real, turned.imag], atol=3e-15)
 
 
-def test_derivatives_of_multiples():
+def test_derivatives_of_multiples_agree_with_the_closed_form():
     angle = jnp.asarray(-2.3)
     wanted = [(-n * np.sin(n * angle), n * np.cos(n * angle)) for n in ORDERS]
     for mode in (jax.jacfwd, jax.jacrev):
@@ -54,13 +54,13 @@ def test_derivatives_of_multiples():
 
 
 @given(st.floats(-700.0, 50.0))
-def test_exponential(exponent: float):
+def test_exponential_agrees_with_numpy(exponent: float):
     expected = np.exp(exponent)
     assert float(exponential(jnp.asarray(exponent))) == pytest.approx(expected, rel=1e-15, abs=3e-16)
 
 
 @given(base=st.floats(1e-30, 1e3), exponent=st.floats(0.0, 3.0))
-def test_power(base: float, exponent: float):
+def test_power_agrees_with_python(base: float, exponent: float):
     expected = base**exponent
     found = float(power(jnp.asarray(base), jnp.asarray(exponent)))
     assert found == pytest.approx(expected, rel=1e-13, abs=3e-16)

@@ -1,4 +1,4 @@
-"""Torques as functions of time, against what defines them."""
+"""Torques as functions of time against their definitions."""
 
 import equinox as eqx
 import jax
@@ -19,14 +19,14 @@ def evaluate(forcing, times):
 
 
 @given(amplitude=number, omega=st.floats(0.0, 400.0), phase=number, offset=number, t=st.floats(0.0, 10.0))
-def test_harmonic(amplitude, omega, phase, offset, t):
+def test_harmonic_agrees_with_its_formula(amplitude, omega, phase, offset, t):
     forcing = Harmonic(amplitude, omega, phase, offset)
     found = evaluate(forcing, jnp.asarray([t]))
     # Phases of up to 4000 rad are known to 4000 * 2e-16.
     np.testing.assert_allclose(found, [amplitude * np.cos(omega * t + phase) + offset], atol=1e-11)
 
 
-def test_harmonic_of_whole_numbers():
+def test_harmonic_accepts_integers():
     np.testing.assert_allclose(evaluate(Harmonic(2, 3), jnp.asarray([0.5])), [2 * np.cos(1.5)], atol=1e-15)
 
 
@@ -42,7 +42,7 @@ def test_multiharmonic_is_the_sum_of_its_lines():
 
 @settings(max_examples=20)
 @given(start=st.floats(1.0, 200.0), end=st.floats(1.0, 200.0), duration=st.floats(1.0, 10.0), share=st.floats(0.0, 1.0))
-def test_chirp_has_the_instantaneous_frequency_it_promises(start, end, duration, share):
+def test_chirp_has_its_stated_instantaneous_frequency(start, end, duration, share):
     """The signal and its derivative give phase and frequency: y = a sin(phi), y' = a omega cos(phi)."""
     forcing = Chirp(2.0, start, end, duration)
     t = share * duration
@@ -54,7 +54,7 @@ def test_chirp_has_the_instantaneous_frequency_it_promises(start, end, duration,
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1), rms=st.floats(0.1, 5.0), first=st.integers(0, 5), more=st.sampled_from((0, 30)))
-def test_multisine_has_its_rms_its_period_and_only_lines_in_its_band(seed, rms, first, more):
+def test_multisine_has_its_rms_period_and_band(seed, rms, first, more):
     period = 0.7
     line = 2 * np.pi / period
     last = max(first, 1) + more
@@ -74,20 +74,20 @@ def test_multisine_has_its_rms_its_period_and_only_lines_in_its_band(seed, rms, 
     np.testing.assert_allclose(spectrum[~inside], 0.0, atol=1e-12 * n)
 
 
-def test_multisines_differ_by_their_key():
+def test_multisine_phases_depend_on_the_key():
     band = {"rms": 1.0, "omega_min": 1.0, "omega_max": 50.0, "period": 2.0}
     one, same, other = (random_phase_multisine(**band, key=jax.random.key(k)) for k in (0, 0, 1))
     np.testing.assert_array_equal(one.phases, same.phases)
     assert np.abs(np.asarray(one.phases - other.phases)).min() > 0
 
 
-def test_a_gradient_reaches_a_whole_number():
+def test_harmonic_of_integers_has_a_gradient():
     slope = eqx.filter_grad(lambda forcing: forcing(jnp.asarray(0.5)))(Harmonic(2, 3))
     np.testing.assert_allclose(slope.amplitude, np.cos(1.5), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("low", "high"), ((3.2, 6.2), (50.0, 40.0), (0.0, 0.0)))
-def test_a_band_without_a_line_is_refused(low, high):
+def test_multisine_band_without_a_line_is_refused(low, high):
     """Lines at multiples of 2 pi."""
     with pytest.raises(ValueError, match="`period` must be long enough"):
         random_phase_multisine(rms=1.0, omega_min=low, omega_max=high, period=1.0, key=jax.random.key(0))

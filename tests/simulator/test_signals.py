@@ -1,4 +1,4 @@
-"""What a sampled signal does between its samples, and what a delay keeps of it."""
+"""Inter-sample behaviour of sampled signals, and delays of them."""
 
 import inspect
 
@@ -54,7 +54,7 @@ def at(signal: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("hold", HOLDS)
 @settings(max_examples=20)
 @given(seed=seeds, jitter=jitters)
-def test_a_hold_reproduces_the_samples(hold, seed, jitter):
+def test_hold_reproduces_the_samples(hold, seed, jitter):
     time, values = record(seed, jitter)
     np.testing.assert_allclose(at(sampled(time, values, hold=hold), time), values, atol=1e-12)
 
@@ -62,7 +62,7 @@ def test_a_hold_reproduces_the_samples(hold, seed, jitter):
 @pytest.mark.parametrize("hold", ("linear", "cubic", "band-limited"))
 @settings(max_examples=20)
 @given(seed=seeds, jitter=jitters)
-def test_a_smooth_hold_is_continuous(hold, seed, jitter):
+def test_smooth_hold_is_continuous(hold, seed, jitter):
     """From the left, too; at twice the largest slope of such samples, a picosecond makes 1e-8."""
     time, values = record(seed, jitter)
     signal = sampled(time, values, hold=hold)
@@ -72,7 +72,7 @@ def test_a_smooth_hold_is_continuous(hold, seed, jitter):
 @pytest.mark.parametrize("hold", ("cubic", "band-limited"))
 @settings(max_examples=10)
 @given(seed=seeds, jitter=jitters)
-def test_a_smooth_hold_has_a_continuous_slope(hold, seed, jitter):
+def test_smooth_hold_has_a_continuous_slope(hold, seed, jitter):
     """In units of samples, where curvatures are of order ten: 1e-9 of an interval makes 1e-8."""
     time, values = record(seed, jitter)
     signal = sampled(time, values, hold=hold)
@@ -82,7 +82,7 @@ def test_a_smooth_hold_has_a_continuous_slope(hold, seed, jitter):
 
 @settings(max_examples=20)
 @given(seed=seeds, jitter=jitters, fraction=st.floats(min_value=0.0, max_value=0.99))
-def test_zero_order_keeps_the_sample_and_linear_joins_them(seed, jitter, fraction):
+def test_zero_order_hold_is_constant_and_linear_hold_interpolates(seed, jitter, fraction):
     time, values = record(seed, jitter)
     when = between(time, fraction)
     np.testing.assert_array_equal(at(sampled(time, values, hold="zero-order"), when), values[:-1])
@@ -94,7 +94,7 @@ def test_zero_order_keeps_the_sample_and_linear_joins_them(seed, jitter, fractio
 
 @settings(max_examples=20)
 @given(seed=seeds, jitter=jitters, fraction=st.floats(min_value=0.0, max_value=1.0))
-def test_cubic_is_the_cubic_spline(seed, jitter, fraction):
+def test_cubic_hold_agrees_with_scipys_cubic_spline(seed, jitter, fraction):
     time, values = record(seed, jitter)
     when = between(time, fraction)
     expected = CubicSpline(time, values)(when)
@@ -102,7 +102,7 @@ def test_cubic_is_the_cubic_spline(seed, jitter, fraction):
 
 
 @pytest.mark.parametrize("hold", HOLDS)
-def test_the_last_sample_is_held(hold):
+def test_last_sample_is_held_beyond_the_record(hold):
     time, values = record(3)
     beyond = time[-1] + STEP * np.array([0.3, 0.9, 20.0])
     np.testing.assert_allclose(at(sampled(time, values, hold=hold), beyond), values[-1], atol=1e-12)
@@ -110,7 +110,7 @@ def test_the_last_sample_is_held(hold):
 
 @settings(max_examples=15)
 @given(seed=seeds, share=st.floats(min_value=0.05, max_value=0.7))
-def test_band_limited_finds_a_multisine_between_the_samples(seed, share):
+def test_band_limited_hold_interpolates_a_multisine(seed, share):
     """Up to 0.7 of the Nyquist frequency, 60 samples away from the ends.
 
     A quintic through exact values, slopes and curvatures errs by up to w^6 / (6! 4^3) of a line's amplitude, with w
@@ -132,7 +132,7 @@ def test_band_limited_finds_a_multisine_between_the_samples(seed, share):
         np.testing.assert_allclose(at(signal, when), multisine(when), atol=bound)
 
 
-def test_band_limited_beats_a_cubic_spline_where_it_should():
+def test_band_limited_hold_is_more_accurate_than_others_at_high_frequency():
     time = STEP * np.arange(400)
     omega = 0.6 * np.pi / STEP
     when = between(time, 0.5)[60:-60]
@@ -143,7 +143,7 @@ def test_band_limited_beats_a_cubic_spline_where_it_should():
 
 @pytest.mark.parametrize("hold", HOLDS)
 @pytest.mark.parametrize("rows", (3, 30, 200))
-def test_a_constant_stays_a_constant(hold, rows):
+def test_hold_of_a_constant_is_constant(hold, rows):
     """Short records, too. 1e-10: the band-limited filters sum to zero to rounding, times 1/STEP scales cancel."""
     time = STEP * np.arange(rows)
     signal = sampled(time, np.full(rows, 3.25), hold=hold)
@@ -151,7 +151,7 @@ def test_a_constant_stays_a_constant(hold, rows):
 
 
 @pytest.mark.parametrize("hold", ("linear", "cubic", "band-limited"))
-def test_a_line_stays_a_line(hold):
+def test_hold_of_a_ramp_is_a_ramp(hold):
     """The band-limited slope of a line carries the window's error at zero frequency, 2e-4."""
     time = STEP * np.arange(200)
     when = between(time, 0.37)
@@ -162,7 +162,7 @@ def test_a_line_stays_a_line(hold):
 @pytest.mark.parametrize("hold", HOLDS)
 @settings(max_examples=10)
 @given(seed=seeds, gain=st.floats(-3, 3), offset=st.floats(-3, 3))
-def test_affine(hold, seed, gain, offset):
+def test_affine_applies_gain_and_offset(hold, seed, gain, offset):
     time, values = record(seed)
     signal = sampled(time, values, hold=hold)
     when = between(time, 0.6)
@@ -171,14 +171,14 @@ def test_affine(hold, seed, gain, offset):
 
 
 @pytest.mark.parametrize("hold", HOLDS)
-def test_a_gap_is_bridged_without_an_excursion(hold):
+def test_hold_bridges_a_gap_without_overshoot(hold):
     time, values = record(5)
     time = np.concatenate([time[:20], time[20:] + 6.3 * STEP])
     when = np.linspace(time[19], time[20], 50)[:-1]
     assert np.abs(at(sampled(time, values, hold=hold), when)).max() < 4 * np.abs(values).max()
 
 
-def test_an_unknown_hold_is_refused():
+def test_unknown_hold_is_refused():
     """Without the test suite's type checker, which refuses it earlier."""
     time, values = record(0)
     with pytest.raises(ValueError, match="`hold` must be one of .* but is 'sinc'"):
@@ -207,7 +207,7 @@ def moments(signal, knots: np.ndarray, shift: float, breaks: np.ndarray) -> np.n
 
 
 def numpy_signal(signal: PiecewisePolynomial):
-    """The same piecewise polynomial, written down independently."""
+    """The same piecewise polynomial by an independent implementation."""
     knots, coefficients = np.asarray(signal.knots), np.asarray(signal.coefficients)
 
     def value(t):
@@ -221,7 +221,7 @@ def numpy_signal(signal: PiecewisePolynomial):
 @settings(max_examples=5)
 @example(seed=1, jitter=0.15, intervals=0.93)  # intervals that lie on three pieces
 @given(seed=seeds, jitter=jitters, intervals=delays)
-def test_a_delay_keeps_the_moments_of_every_interval(hold, seed, jitter, intervals):
+def test_delay_keeps_the_moments_of_every_interval(hold, seed, jitter, intervals):
     time, values = record(seed, jitter)
     signal = sampled(time, values, hold=hold)
     knots, by = np.asarray(signal.knots), intervals * STEP
@@ -235,7 +235,7 @@ def test_a_delay_keeps_the_moments_of_every_interval(hold, seed, jitter, interva
 @pytest.mark.parametrize("hold", CUBIC_HOLDS)
 @settings(max_examples=10)
 @given(seed=seeds, jitter=jitters)
-def test_no_delay_changes_nothing(hold, seed, jitter):
+def test_zero_delay_does_not_change_the_signal(hold, seed, jitter):
     time, values = record(seed, jitter)
     signal = sampled(time, values, hold=hold)
     when = between(time, 0.3)
@@ -245,7 +245,7 @@ def test_no_delay_changes_nothing(hold, seed, jitter):
 @pytest.mark.parametrize("hold", CUBIC_HOLDS)
 @settings(max_examples=10)
 @given(seed=seeds, samples=st.integers(1, 7))
-def test_a_delay_by_whole_samples_is_a_shift(hold, seed, samples):
+def test_delay_by_whole_samples_is_a_shift(hold, seed, samples):
     time, values = record(seed)
     signal = sampled(time, values, hold=hold)
     late = delay(signal, jnp.asarray(samples * STEP))
@@ -254,7 +254,7 @@ def test_a_delay_by_whole_samples_is_a_shift(hold, seed, samples):
         np.testing.assert_allclose(at(late, when)[samples:], at(signal, when)[:-samples], atol=1e-10)
 
 
-def test_before_the_record_the_first_piece_continues():
+def test_delayed_signal_begins_with_the_first_sample():
     time, values = record(2)
     late = delay(sampled(time, values, hold="zero-order"), jnp.asarray(3.4 * STEP))
     np.testing.assert_allclose(at(late, between(time, 0.5)[:3]), values[0], atol=1e-12)
@@ -267,7 +267,7 @@ def delay_slope(signal: PiecewisePolynomial, by: jax.Array) -> jax.Array:
 
 @pytest.mark.parametrize("hold", HOLDS)
 @pytest.mark.parametrize("intervals", (0.05, 0.6, 2.31))
-def test_the_derivative_with_respect_to_the_delay(hold, intervals):
+def test_derivative_by_the_delay_agrees_with_differences(hold, intervals):
     time, values = record(11, 0.1)
     signal = sampled(time, values, hold=hold)
     by, h = intervals * STEP, 1e-5 * STEP

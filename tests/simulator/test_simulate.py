@@ -53,24 +53,24 @@ def decay(t: np.ndarray, x: float, v: float) -> np.ndarray:
 # Tolerances of tight simulations below: some 100 steps that each err by 1e-11 of motions of order one.
 
 
-def test_free_decay_of_the_linear_drive():
+def test_free_decay_of_a_linear_drive_agrees_with_the_closed_form():
     found = simulate(duffing(), constant(0.0), TIMES, jnp.asarray([0.8, -11.0]), **TIGHT)
     np.testing.assert_allclose(found.dynamic_error, decay(TIMES - TIMES[0], 0.8, -11.0), atol=1e-9)
 
 
-def test_step_response_of_the_linear_drive():
+def test_step_response_of_a_linear_drive_agrees_with_the_closed_form():
     """From rest towards gain u / omega_0^2."""
     end = GAIN * 900.0 / OMEGA_0**2
     found = simulate(duffing(), constant(900.0), TIMES, **TIGHT)
     np.testing.assert_allclose(found.dynamic_error, end + decay(TIMES - TIMES[0], -end, 0.0), atol=1e-9)
 
 
-def test_default_tolerances_give_seven_digits():
+def test_default_tolerances_err_below_1e_6():
     found = simulate(duffing(), constant(0.0), TIMES, jnp.asarray([0.8, -11.0]))
     np.testing.assert_allclose(found.dynamic_error, decay(TIMES - TIMES[0], 0.8, -11.0), atol=1e-6)
 
 
-def test_duffing_against_scipy():
+def test_duffing_motion_agrees_with_scipy():
     alpha, amplitude, omega = 0.7, 1500.0, 43.0
 
     def rates(t, y):
@@ -135,8 +135,8 @@ def test_energy_is_kept_without_damping_and_torque():
     np.testing.assert_allclose(found, found[0], rtol=1e-8)
 
 
-def test_energy_only_falls_with_damping():
-    """And by what the damper takes: the integral of B_sp x'^2."""
+def test_energy_falls_by_the_work_of_the_damper():
+    """The work is the integral of B_sp x'^2."""
     drive = Drive(N=50, J_m=5.26e-4, J_l=5e-2, K=7160, alpha=3e5, B_sp=1.5)
     times = np.linspace(0.0, 0.02, 101)
     states = simulate(TwoInertiaModel(drive), NOTHING, times, SPRUNG, load_torque=NOTHING, **TIGHT).states
@@ -173,14 +173,14 @@ def exact_hold(values: np.ndarray) -> np.ndarray:
     return np.array(states)
 
 
-def test_a_held_torque_is_integrated_exactly():
+def test_held_torque_is_integrated_exactly():
     values = rough()
     found = simulate(duffing(), sampled(TIMES, values, hold="zero-order"), TIMES, **TIGHT)
     np.testing.assert_allclose(found.dynamic_error, exact_hold(values)[:, 0], atol=1e-9)
 
 
-def test_a_held_load_torque_is_integrated_exactly():
-    """The solver is told of its jumps, too: a rigid load of 1 under a soft mesh moves by sums."""
+def test_held_load_torque_is_integrated_exactly():
+    """The solver steps to its jumps too: the rate of a load of inertia 1 on a soft mesh is the sum of torques."""
     drive = Drive(N=1, J_m=1, J_l=1, K=1e-9)
     values = rough(2)
     trajectory = simulate(
@@ -190,7 +190,7 @@ def test_a_held_load_torque_is_integrated_exactly():
     np.testing.assert_allclose(trajectory.states[:, 3], rates, atol=1e-7)
 
 
-def test_an_actuator_acts_on_a_sampled_torque_and_on_nothing_else():
+def test_actuator_effect_acts_on_sampled_torques_only():
     values = rough()
     biased = duffing().with_effects(TorqueBias(bias=100.0))
     found = simulate(biased, sampled(TIMES, values, hold="zero-order"), TIMES, **TIGHT)
@@ -199,7 +199,7 @@ def test_an_actuator_acts_on_a_sampled_torque_and_on_nothing_else():
         simulate(biased, constant(1.0), TIMES)
 
 
-# -- the lean path --
+# -- march: fixed steps from sample to sample --
 
 
 @eqx.filter_jit
@@ -217,7 +217,7 @@ def test_march_agrees_with_simulate(hold):
     np.testing.assert_allclose(found[:, 0], exact[:, 0], atol=1e-8)
 
 
-def test_march_under_a_load_torque():
+def test_march_under_a_load_torque_agrees_with_scipy():
     """Two linear inertias under torques that are linear between samples, which scipy's lsim integrates exactly."""
     drive = Drive(N=2, J_m=1, J_l=3, K=2000, B_sp=1)
     values = np.stack([rough(1), rough(2)], axis=1)
@@ -255,13 +255,13 @@ def test_march_refuses_an_implicit_solver():
 # -- endings --
 
 
-def test_every_ending_names_itself():
+def test_every_ending_has_its_own_message():
     messages = [ending.message for ending in Ending]
     assert len(set(messages)) == len(messages)
     assert str(SimulationError(Ending.step_limit)) == Ending.step_limit.message
 
 
-def test_too_few_steps_are_told():
+def test_step_limit_is_reported():
     with pytest.raises(SimulationError, match="raise max_steps") as caught:
         simulate(duffing(), constant(1.0), TIMES, max_steps=7)
     assert caught.value.ending == Ending.step_limit
@@ -269,7 +269,7 @@ def test_too_few_steps_are_told():
     assert int(kept.ending) == Ending.step_limit
 
 
-def test_an_escape_is_told():
+def test_diverging_simulation_is_reported():
     """Beyond the saddle of a softening drive, in steps that can't shrink."""
     with pytest.raises(SimulationError, match="alpha") as caught:
         simulate(duffing(-1.0), constant(0.0), TIMES, jnp.asarray([1.5, 0.0]), step_size=2e-3)
@@ -295,7 +295,7 @@ def test_each_lane_keeps_its_own_ending():
     np.testing.assert_allclose(good[0, :, 0], decay(TIMES - TIMES[0], 1.5, 0.0), atol=1e-6)
 
 
-def test_a_lane_is_what_a_loop_gives():
+def test_simulation_in_lanes_equals_a_loop():
     found = lanes(ALPHAS)
     for k in (0, 2):
         alone = lane(ALPHAS[k])
@@ -307,7 +307,7 @@ def test_a_lane_is_what_a_loop_gives():
 # -- jit, gradients, steps, progress --
 
 
-def test_jit_changes_nothing():
+def test_jit_does_not_change_the_simulation():
     start = jnp.asarray([0.4, 0.0])
     plain = simulate(duffing(0.7), constant(300.0), TIMES, start)
     compiled = eqx.filter_jit(simulate)(duffing(0.7), constant(300.0), TIMES, start)
@@ -323,7 +323,7 @@ AT = np.array([MU, OMEGA_0, 0.7, GAIN, 0.5, -3.0])
 
 
 def last_twist(values: Array, adjoint: dfx.AbstractAdjoint) -> Array:
-    """What depends on every parameter and on the initial state."""
+    """A value that depends on every parameter and on the initial state."""
     model = duffing(0.7).replace(dict(zip(PATHS, values[:4], strict=True)))
     forcing = Harmonic(1500.0, 43.0)
     trajectory = simulate(model, forcing, TIMES, values[4:], rtol=1e-10, atol=1e-12, max_steps=4096, adjoint=adjoint)
@@ -345,7 +345,7 @@ def last_twists(values: Array) -> Array:
     return jax.vmap(lambda v: last_twist(v, dfx.ForwardMode()))(values)
 
 
-def test_gradients_forward_and_reverse():
+def test_forward_and_reverse_gradients_agree_with_differences():
     h = 1e-4 * np.abs(AT)
     ends = np.asarray(last_twists(jnp.asarray(np.concatenate([AT + np.diag(h), AT - np.diag(h)]))))
     differences = (ends[:6] - ends[6:]) / (2 * h)
@@ -355,7 +355,7 @@ def test_gradients_forward_and_reverse():
     assert np.abs(differences * weight).min() > 3e-3
     forward = forward_gradient(jnp.asarray(AT))
     np.testing.assert_allclose(forward * weight, differences * weight, atol=1e-4, rtol=1e-4)
-    # In company: a lane that escapes to infinity spoils no other's gradient.
+    # In lanes: one that diverges does not affect the gradient of another.
     escaping = np.where(np.array(PATHS + ("x", "v")) == "alpha", -1.0, AT)
     reverse = reverse_gradients(jnp.asarray(np.stack([AT, escaping, 1.01 * AT])))
     assert not np.isfinite(float(last_twists(jnp.asarray(np.tile(escaping, (12, 1))))[0]))
@@ -363,7 +363,7 @@ def test_gradients_forward_and_reverse():
     assert np.isfinite(np.asarray(reverse[2])).all()
 
 
-def test_fixed_steps():
+def test_fixed_steps_have_the_order_of_the_solver():
     """Twice the steps, 2^5 times less error."""
     start = jnp.asarray([0.8, -11.0])
     exact = decay(TIMES - TIMES[0], 0.8, -11.0)
@@ -375,12 +375,12 @@ def test_fixed_steps():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(5, abs=0.5)
 
 
-def test_another_solver():
+def test_other_solver_agrees_with_the_closed_form():
     found = simulate(duffing(), constant(0.0), TIMES, START, solver=dfx.Dopri8(), **TIGHT)
     np.testing.assert_allclose(found.dynamic_error, decay(TIMES - TIMES[0], 1.5, 0.0), atol=1e-9)
 
 
-def test_progress_is_shown_only_when_asked_for(capsys):
+def test_progress_is_shown_on_request_only(capsys):
     simulate(duffing(), constant(1.0), TIMES)
     silent = capsys.readouterr()
     assert silent.out == silent.err == ""
@@ -389,7 +389,7 @@ def test_progress_is_shown_only_when_asked_for(capsys):
     assert "100" in shown.out + shown.err
 
 
-def test_a_trajectory_fits_together():
+def test_trajectory_has_consistent_fields():
     torque: PiecewisePolynomial = sampled(TIMES, rough(), hold="linear")
     found = simulate(duffing(), torque, TIMES, **TIGHT)
     np.testing.assert_array_equal(found.time, TIMES)

@@ -1,4 +1,4 @@
-"""Random torque: simulated motions against the exact laws, and the laws against closed forms and scipy."""
+"""Simulated motions under random torque against their exact stationary laws."""
 
 import diffrax as dfx
 import equinox as eqx
@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
-from scipy.special import gamma, kve
+from noisy_oscillator import GAIN, MU, OMEGA_0, S, oscillator, pair
+from scipy.linalg import expm, solve_discrete_lyapunov
 
 from hdjax import (
     Drive,
@@ -25,194 +24,14 @@ from hdjax.effects.actuation import TorqueBias
 from hdjax.effects.hysteresis import BoucWen
 from hdjax.effects.kinematic import KinematicError
 from hdjax.noise import ColouredNoise, WhiteNoise
-from hdjax.stationary import coloured_variance, linearised_variance, stationary_density, stationary_variance
+from hdjax.stationary import coloured_variance, stationary_variance
 from hdjax.stochastic import AdditiveRK4, simulate_noisy
-
-MU, OMEGA_0, GAIN = 12.0, 50.0, 2.0
-S = 2 * MU * OMEGA_0**2  # the linear drive's x has unit variance
-
-
-def oscillator(alpha: float = 0.0, mu: float = MU) -> ReducedDrive:
-    return ReducedDrive(mu=mu, omega_0=OMEGA_0, alpha=alpha, gain=GAIN)
-
-
-def pair(variance) -> np.ndarray:
-    return np.array([variance.x, variance.v])
-
-
-# -- exact laws --
-
-
-def test_linear_drive_has_its_textbook_variances():
-    np.testing.assert_allclose(pair(stationary_variance(oscillator(), 3.0)), [3 / (2 * MU * 2500), 3 / (2 * MU)])
-
-
-def potential(x, alpha):
-    return OMEGA_0**2 * (x**2 / 2 + alpha * x**4 / 4)
-
-
-def average(g, alpha: float) -> float:
-    """Mean of g(x) under the unnormalised law, by scipy; at S, alpha is also the nonlinearity alpha sigma^2."""
-    end = 9.0 * min(1.0, max(alpha, 1e-9) ** -0.25)
-
-    def integral(h):
-        return quad(lambda x: h(x) * np.exp(-2 * MU / S * potential(x, alpha)), -end, end, epsabs=0, epsrel=1e-12)[0]
-
-    return integral(g) / integral(lambda x: 1.0)
-
-
-@pytest.mark.parametrize("alpha", (0.0, 1e-3, 1.0, 1e3, 1e8))
-def test_variance_is_scipys_and_obeys_equipartition_and_virial(alpha):
-    found = stationary_variance(oscillator(alpha), S)
-    assert float(found.x) == pytest.approx(average(lambda x: x**2, alpha), rel=1e-10)
-    assert float(found.v) == pytest.approx(S / (2 * MU), rel=1e-13)
-    # <x V'(x)> = <v^2>, with the fourth moment from scipy.
-    virial = OMEGA_0**2 * (float(found.x) + alpha * average(lambda x: x**4, alpha))
-    assert virial == pytest.approx(S / (2 * MU), rel=1e-9)
-
-
-def test_variance_of_a_purely_cubic_spring():
-    """sigma^2/sqrt(epsilon) 2 Gamma(3/4)/Gamma(1/4) is the limit; what is left goes with 1/sqrt(epsilon)."""
-    limit = 2 * gamma(0.75) / gamma(0.25)
-    assert float(stationary_variance(oscillator(1e16), S).x) * 1e8 == pytest.approx(limit, rel=1e-7)
-    linearised = float(linearised_variance(oscillator(1e16), S).x) * 1e8
-    assert linearised / limit - 1 == pytest.approx(-0.146, abs=1e-3)  # the 15 % of its docstring
-
-
-def test_linearisation_is_right_to_second_order():
-    """1 - 3 eps + 18 eps^2 against the exact 1 - 3 eps + 24 eps^2."""
-    epsilon = 1e-3
-    exact, linearised = (float(f(oscillator(epsilon), S).x) for f in (stationary_variance, linearised_variance))
-    assert exact == pytest.approx(1 - 3 * epsilon + 24 * epsilon**2, abs=400 * epsilon**3)
-    assert linearised == pytest.approx(1 - 3 * epsilon + 18 * epsilon**2, abs=400 * epsilon**3)
-    np.testing.assert_allclose(linearised_variance(oscillator(epsilon), S).v, S / (2 * MU))
-
-
-@pytest.mark.parametrize("alpha", (1e-3, 0.3, 1.0, 1e2))
-def test_density_is_normalised_by_bessels_function(alpha):
-    norm = kve(0.25, 1 / (8 * alpha)) / np.sqrt(2 * alpha) * np.sqrt(2 * np.pi) * OMEGA_0
-    x, v = jnp.asarray([0.0, 0.4, -1.3]), jnp.asarray([0.0, -60.0, 20.0])
-    exact = np.exp(-2 * MU / S * (np.asarray(v) ** 2 / 2 + potential(np.asarray(x), alpha))) / norm
-    np.testing.assert_allclose(stationary_density(oscillator(alpha), S, x, v), exact, rtol=1e-12)
-
-
-@pytest.mark.parametrize("alpha", (0.0, 2.0))
-def test_density_holds_one_in_all_and_its_own_variances(alpha):
-    # The trapezoidal rule on a grid that the density leaves at 1e-18: exact to rounding.
-    x, v = np.meshgrid(np.linspace(-9, 9, 181), np.linspace(-9, 9, 181) * OMEGA_0, indexing="ij")
-    weight = np.asarray(stationary_density(oscillator(alpha), S, x, v)) * 0.1 * 0.1 * OMEGA_0
-    assert weight.sum() == pytest.approx(1.0, rel=1e-12)
-    moments = [(weight * x**2).sum(), (weight * v**2).sum()]
-    np.testing.assert_allclose(pair(stationary_variance(oscillator(alpha), S)), moments, rtol=1e-12)
-
-
-def test_density_is_zero_far_out_and_never_nan():
-    for alpha in (0.0, 1.0):
-        found = stationary_density(oscillator(alpha), S, jnp.asarray([1e200, 0.0]), jnp.asarray([0.0, -1e300]))
-        np.testing.assert_array_equal(found, 0.0)
-
-
-def linear_covariance(rms: float, correlation_time: float) -> np.ndarray:
-    A = np.array([[0, 1, 0], [-(OMEGA_0**2), -MU, 1], [0, 0, -1 / correlation_time]])
-    return solve_continuous_lyapunov(A, -np.diag([0, 0, 2 * rms**2 / correlation_time]))
-
-
-@pytest.mark.parametrize("correlation_time", (1e-4, 0.02, 3.0))
-def test_coloured_variance_solves_the_lyapunov_equation(correlation_time):
-    exact = linear_covariance(7.0, correlation_time)
-    np.testing.assert_allclose(
-        pair(coloured_variance(oscillator(), 7.0, correlation_time)), np.diag(exact)[:2], rtol=1e-9
-    )
-
-
-def test_coloured_noise_becomes_white_with_a_short_memory():
-    for time in (1e-4, 1e-5):
-        noise = ColouredNoise(rms=3.0, correlation_time=time)
-        white = pair(stationary_variance(oscillator(), noise.white.error_intensity(oscillator())))
-        coloured = pair(coloured_variance(oscillator(), noise.error_rms(oscillator()), time))
-        # To first order in t_c, x keeps its variance and v loses mu t_c; (omega_0 t_c)^2 follows.
-        np.testing.assert_allclose(coloured / white, [1.0, 1.0 - MU * time], rtol=2 * (OMEGA_0 * time) ** 2)
-
-
-def test_gradients_of_the_variance():
-    values = jnp.asarray([MU, OMEGA_0, 0.8, S])
-
-    def variances(p):
-        found = stationary_variance(ReducedDrive(mu=p[0], omega_0=p[1], alpha=p[2]), p[3])
-        return jnp.stack([found.x, found.v])
-
-    # Central differences of relative step 1e-5: errors of 1e-10 from the step and 1e-11 from rounding.
-    h = 1e-5 * np.asarray(values)
-    differences = [(variances(values + d) - variances(values - d)) / (2 * d.sum()) for d in np.diag(h)]
-    found = jax.jacfwd(variances)(values)
-    scale = np.asarray(values)[None, :] / np.asarray(variances(values))[:, None]
-    np.testing.assert_allclose(found * scale, np.stack(differences, axis=1) * scale, atol=1e-8)
-    np.testing.assert_allclose(jax.jacrev(variances)(values), found, rtol=1e-10, atol=1e-13)
-    for p in (values.at[2].set(0.0), values.at[3].set(0.0)):
-        assert np.isfinite(np.asarray(jax.jacrev(variances)(p))).all()
-    # alpha = 0: <x^2> = sigma^2 (1 - 3 alpha sigma^2).
-    assert float(jax.jacrev(variances)(values.at[2].set(0.0))[0, 2]) == pytest.approx(-3.0, rel=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("drive", "intensity", "message"),
-    (
-        (oscillator(-0.1), S, "`drive.alpha` must not be negative for a stationary law, but is -0.1"),
-        (oscillator(mu=0.0), S, "`drive.mu` must be above zero"),
-        (oscillator(), -1.0, "`S` must not be negative"),
-    ),
-)
-def test_where_nothing_is_stationary(drive, intensity, message):
-    """Refused where the values are known; told by an infinity, never a NaN, where not."""
-    with pytest.raises(ValueError, match=message):
-        stationary_variance(drive, intensity)
-    with pytest.raises(ValueError, match="`"):
-        stationary_density(drive, intensity, 0.0, 0.0)
-
-    def lane(mu, alpha, s):
-        bare = ReducedDrive(mu=mu, omega_0=OMEGA_0, alpha=alpha)
-        found, linear = stationary_variance(bare, s), linearised_variance(bare, s)
-        return jnp.stack([found.x, found.v, linear.x, linear.v]), stationary_density(bare, s, 0.1, 0.1)
-
-    columns = [
-        jnp.stack([jnp.asarray(bad, dtype=float), good])
-        for bad, good in zip((drive.mu, drive.alpha, intensity), jnp.asarray([MU, 0.5, S]), strict=True)
-    ]
-    variances, density = jax.jit(jax.vmap(lane))(*columns)
-    np.testing.assert_array_equal(variances[0], np.inf)
-    assert float(density[0]) == 0.0
-    assert np.isfinite(np.asarray(variances[1])).all() and float(density[1]) > 0.0
-    slopes = jax.vmap(jax.grad(lambda *p: lane(*p)[0][0], argnums=(0, 1, 2)))(*columns)
-    assert np.isfinite(np.asarray(slopes)).all()
-
-
-def test_without_noise_nothing_varies():
-    np.testing.assert_array_equal(pair(stationary_variance(oscillator(1.0), 0.0)), 0.0)
-    with pytest.raises(ValueError, match="`S` must be above zero"):
-        stationary_density(oscillator(), 0.0, 0.0, 0.0)
-
-
-def test_coloured_variance_is_the_linear_drives():
-    with pytest.raises(ValueError, match="`drive.alpha` must be zero"):
-        coloured_variance(oscillator(0.1), 1.0, 1.0)
-    with pytest.raises(ValueError, match="`drive.mu` must be above zero"):
-        coloured_variance(oscillator(mu=0.0), 1.0, 1.0)
-
-
-def test_noise_refuses_what_makes_no_sense():
-    with pytest.raises(ValueError, match="`intensity` must not be negative, but is -1"):
-        WhiteNoise(intensity=-1)
-    with pytest.raises(ValueError, match="`load_rms` must not be negative"):
-        ColouredNoise(load_rms=-1, correlation_time=1)
-    with pytest.raises(ValueError, match="`correlation_time` must be above zero"):
-        ColouredNoise(rms=1, correlation_time=0)
-
 
 # -- the solver --
 
 
 def one_step(tableau, L: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
-    """What one step of a solver makes of `y' = L y + (0, w)`: its matrix, and the covariance it adds."""
+    """One step of a solver on `y' = L y + (0, w)`: its matrix, and the covariance that it adds."""
     identity = np.eye(2)
     # Columns: y, the increment W and its Levy area H.
     own, noise = np.eye(2, 4), np.zeros((2, 4))
@@ -231,7 +50,7 @@ def exact_step(L: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
     return block[2:, 2:].T, block[2:, 2:].T @ block[:2, 2:]
 
 
-def test_one_step_has_the_exact_law_to_its_order():
+def test_one_step_has_the_exact_mean_and_covariance_to_its_order():
     L = np.array([[0.0, 1.0], [-1.0, -0.3]])
     errors = []
     for h in (0.1, 0.05):
@@ -242,7 +61,7 @@ def test_one_step_has_the_exact_law_to_its_order():
     # The motion errs by h^5 a step; the covariance would by h^3 for weak order 2, but is better for linear motion.
     assert orders[0] == pytest.approx(5.0, abs=0.2)
     assert orders[1] > 3.8
-    # The mean that a curved drift makes of the noise; linear motion can't tell.
+    # The mean under a curved drift; a linear motion does not depend on this coefficient.
     weights, w = AdditiveRK4.tableau.b_sol, AdditiveRK4.tableau.coeffs_w.a
     assert weights @ (w**2 + 1 / 12) == pytest.approx(0.5, rel=1e-14)
     assert AdditiveRK4().order(None) == 4 and AdditiveRK4().strong_order(None) == 1.5
@@ -256,7 +75,7 @@ def stationary_bias(solver, z: float) -> float:
     return solve_discrete_lyapunov(matrix, added)[0, 0] / 500.0 - 1.0
 
 
-def test_light_damping_needs_a_solver_that_keeps_energy():
+def test_variance_bias_at_light_damping_is_least_for_additive_rk4():
     assert stationary_bias(AdditiveRK4(), 0.1) == pytest.approx(-(0.1**5) / 72 / 1e-3, rel=0.05)
     assert stationary_bias(AdditiveRK4(), 0.2) == pytest.approx(-(0.2**5) / 72 / 1e-3, rel=0.05)
     for solver in (dfx.ShARK(), dfx.SRA1()):
@@ -267,7 +86,7 @@ def test_light_damping_needs_a_solver_that_keeps_energy():
 # -- simulated variances --
 
 TIMES = np.linspace(0.3, 3.3, 31)
-LATE = 10  # saves after 1 s, when the start has died to exp(-12) of its energy
+LATE = 10  # saves after 1 s, when the transient has decayed to exp(-12) of its energy
 
 
 @eqx.filter_jit
@@ -292,15 +111,15 @@ def white(intensity: float) -> WhiteNoise:
 
 
 @pytest.mark.parametrize(("alpha", "solver"), ((0.0, AdditiveRK4()), (1.0, AdditiveRK4()), (1.0, dfx.ShARK())))
-def test_stationary_variance_is_what_a_simulation_settles_to(alpha, solver):
+def test_simulation_settles_to_the_stationary_variance(alpha, solver):
     # Steps of 0.1 rad, at which ShARK's energy gain of 0.1^3/4 omega_0 is 1e-3 of the damping.
     found = motions(ReducedModel(oscillator(alpha)), white(S), jax.random.split(jax.random.key(1), 2048), 50, solver)
     np.testing.assert_array_equal(found.ending, int(Ending.successful))
     assert_variances(np.asarray(found.states)[:, LATE:], pair(stationary_variance(oscillator(alpha), S)))
 
 
-def test_coarse_steps_have_the_law_that_the_tableau_predicts():
-    """At 1.25 rad a step that law is far from the exact one, and feels increment and Levy area alike."""
+def test_coarse_steps_have_the_variance_that_the_tableau_predicts():
+    """At 1.25 rad a step that law is far from the exact one, and depends on increments and Levy areas."""
     L = np.array([[0.0, 1.0], [-(OMEGA_0**2), -MU]])
     matrix, added = one_step(AdditiveRK4.tableau, L, 0.025)
     law = np.diag(solve_discrete_lyapunov(matrix, S * added))
@@ -309,7 +128,7 @@ def test_coarse_steps_have_the_law_that_the_tableau_predicts():
     assert_variances(np.asarray(found.states)[:, LATE:], law)
 
 
-def test_a_wrong_variance_is_noticed():
+def test_comparison_of_variances_detects_a_wrong_one():
     found = motions(
         ReducedModel(oscillator(1.0)), white(1.1 * S), jax.random.split(jax.random.key(1), 2048), 50, AdditiveRK4()
     )
@@ -317,19 +136,19 @@ def test_a_wrong_variance_is_noticed():
         assert_variances(np.asarray(found.states)[:, LATE:], pair(stationary_variance(oscillator(1.0), S)))
 
 
-def test_coloured_noise_settles_to_its_closed_form():
+def test_simulation_under_coloured_noise_settles_to_the_closed_form():
     noise = ColouredNoise(rms=500.0, correlation_time=0.02)
     found = motions(ReducedModel(oscillator()), noise, jax.random.split(jax.random.key(2), 2048), 25, None)
     states = np.asarray(found.states)[..., :3]  # without the load torque's noise, which is zero
     exact = pair(coloured_variance(oscillator(), noise.error_rms(oscillator()), 0.02))
     assert_variances(states[:, LATE:], np.append(exact, 500.0**2))
-    # The noise itself is stationary from the start, with the memory it should have.
+    # The noise itself is stationary from the start.
     torque = states[..., 2]
     assert np.mean(torque[:, 0] ** 2) == pytest.approx(500.0**2, rel=4 * np.sqrt(2 / 2048))
     np.testing.assert_array_equal(np.asarray(found.states)[..., 3], 0.0)
 
 
-def test_coloured_noise_forgets_exponentially():
+def test_coloured_noise_has_an_exponential_autocorrelation():
     noise = ColouredNoise(rms=1.0, load_rms=3.0, correlation_time=0.1)
 
     @jax.jit
@@ -352,8 +171,8 @@ def test_coloured_noise_forgets_exponentially():
 PAIR = Drive(N=3, J_m=0.2, J_l=2.0, K=2250, alpha=300.0, B_sp=10.8)  # reduced: omega_0 = 48.7 rad/s, mu = 11.4 1/s
 
 
-def test_two_inertias_settle_to_the_law_of_the_error_equation():
-    """Noise on motor and load, in comparable parts; angles drift away, the dynamic error does not."""
+def test_two_inertias_settle_to_the_variance_of_the_error_equation():
+    """Comparable noise on motor and load; the angles drift without bound, the dynamic error does not."""
     noise = WhiteNoise(intensity=20.0, load_intensity=150.0)
     motor, load = 20.0 / (3 * 0.2) ** 2, 150.0 / 2.0**2
     intensity = float(noise.error_intensity(PAIR))
@@ -366,7 +185,7 @@ def test_two_inertias_settle_to_the_law_of_the_error_equation():
     assert_variances(np.stack([twist, states[..., 2] / 3 - states[..., 3]], axis=-1)[:, LATE:], exact)
 
 
-def test_the_same_torque_moves_both_models_alike():
+def test_same_noise_gives_the_same_error_in_both_models():
     """A Runge-Kutta method commutes with the linear map to (x, v): to rounding, not only in law."""
     hysteresis, reduced_hysteresis = (BoucWen(k=k, memory_twist=0.05) for k in (300.0, 300.0 * float(PAIR.c)))
     noise, forcing, key = ColouredNoise(rms=30.0, correlation_time=0.02), Harmonic(20.0, 40.0), jax.random.key(5)
@@ -379,17 +198,17 @@ def test_the_same_torque_moves_both_models_alike():
         assert float(strength(PAIR)) == pytest.approx(float(strength(PAIR.reduced())), rel=1e-14)
 
 
-# -- as simulate --
+# -- agreement with simulate --
 
 
-def test_without_noise_it_is_simulate():
+def test_noisy_simulation_without_noise_agrees_with_simulate():
     drive = hdc_40_050()
     model = TwoInertiaModel(drive, (KinematicError(cos_2=1e-3), BoucWen(k=700.0, memory_twist=2e-3)))
     times = np.linspace(0.1, 0.2, 21)
     motor, load = Harmonic(4.0, 300.0, 0.3, 1.0), Harmonic(5.0, 170.0, 1.1, -2.0)
     exact = simulate(model, motor, times, load_torque=load, rtol=1e-10, atol=1e-13)
     found = simulate_noisy(model, WhiteNoise(), times, jax.random.key(0), forcing=motor, load_torque=load, substeps=40)
-    # RK4 at 0.05 rad a step errs by some 1e-6; where the hysteresis turns over, steps straddle a kink.
+    # RK4 at 0.05 rad a step errs by some 1e-6; where the hysteresis reverses, a step contains a kink.
     scale = np.abs(np.asarray(exact.states)).max(axis=0)
     np.testing.assert_allclose(found.states / scale[None, :], exact.states / scale[None, :], atol=1e-4)
     np.testing.assert_allclose(found.outputs[:, 1], exact.outputs[:, 1], atol=1e-4 * scale[1])
@@ -399,7 +218,7 @@ SHORT = TIMES[:6]
 KEYS = jax.random.split(jax.random.key(6), 3)
 
 
-def test_a_key_gives_one_motion_in_a_lane_in_a_jit_and_alone():
+def test_key_gives_the_same_motion_in_a_lane_under_jit_and_alone():
     model = ReducedModel(oscillator(1.0))
     lanes = motions(model, white(S), KEYS, 10, None)
     for k, key in enumerate(KEYS):
@@ -411,7 +230,7 @@ def test_a_key_gives_one_motion_in_a_lane_in_a_jit_and_alone():
 
 
 @pytest.mark.slow
-def test_gradients_along_one_motion():
+def test_gradients_of_a_noisy_motion_agree_with_differences():
     """Of the last twist, in everything; forward, reverse and by differences, at the same noise."""
     values = np.array([MU, OMEGA_0, 0.8, S / GAIN**2])
 
@@ -432,8 +251,8 @@ def test_gradients_along_one_motion():
     assert np.isfinite(np.asarray(reverse(jnp.asarray(values).at[3].set(0.0)))).all()
 
 
-def test_an_escape_is_told():
-    """Noise takes a softening drive over its saddle."""
+def test_diverging_noisy_simulation_is_reported():
+    """Noise drives a softening drive beyond its saddle."""
     model = ReducedModel(oscillator(-0.3))
     with pytest.raises(SimulationError, match="alpha"):
         simulate_noisy(model, white(4 * S), TIMES, KEYS[0])
@@ -441,7 +260,7 @@ def test_an_escape_is_told():
     assert int(lanes.ending[0]) == Ending.not_finite
 
 
-def test_wrong_arguments_are_told():
+def test_invalid_arguments_of_a_noisy_simulation_are_refused():
     model = ReducedModel(oscillator())
     with pytest.raises(ValueError, match="`substeps` must be at least 1, but is 0"):
         simulate_noisy(model, white(S), TIMES, KEYS[0], substeps=0)

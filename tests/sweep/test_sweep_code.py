@@ -1,4 +1,4 @@
-"""Transients of any effects by machine code, against adaptive steps of diffrax."""
+"""Transients of drives with effects by machine code, against adaptive steps of diffrax."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ SCALES = Scales(
 )
 POINTS = Points({"K": np.linspace(6e3, 8e3, 3), "forcing.phase": np.linspace(0.0, 1.5, 5)})
 HARMONIC = Harmonic(2.0, 385.0, 0.3, 0.1)
-# Those of actuators change what was logged, which a sweep's forcing is not; those of temperature need one.
+# Actuator effects change a logged torque, which a sweep's forcing is not; thermal effects need a temperature.
 FORMS = [f for f in CATALOGUE if not issubclass(f, ActuatorEffect) and f.proposals(SCALES)]
 FEW = ("motor_friction", "quadratic_damping", "bouc_wen", "kinematic_harmonic", "load_disturbance")
 
@@ -30,7 +30,7 @@ SHARP = ("three_slope_stiffness", "load_dependent_friction", "backlash", "undamp
 
 
 def case_with(form: type[Effect]) -> Case:
-    """A drive with an effect that has a say in its motion."""
+    """A drive with an effect that changes its motion."""
     effect = (*form.typical(SCALES), *form.proposals(SCALES))[0]
     model = TwoInertiaModel(DRIVE, (effect,))
     own = {path: float(value) for path, (value, _) in model.parameters().items() if path.startswith(effect.name)}
@@ -43,7 +43,7 @@ def requested(**options) -> Request:
 
 
 def difference(case: Case, request: Request, route: TransientRoute) -> float:
-    """From adaptive steps, as a part of the largest twist."""
+    """Difference from adaptive steps, relative to the largest twist."""
     values = request.points.values(np.arange(request.points.size))
     exact, reached = transients(case, request, TransientRoute("adaptive", 200, tolerance=1e-11), values)
     found, finite = transients(case, request, route, values)
@@ -56,28 +56,28 @@ def difference(case: Case, request: Request, route: TransientRoute) -> float:
 @pytest.mark.parametrize(
     "form", [pytest.param(f, marks=[] if f.name in FEW else pytest.mark.slow, id=f.name) for f in FORMS]
 )
-def test_any_effect_moves_as_by_adaptive_steps(form: type[Effect]):
+def test_transient_of_every_effect_agrees_with_adaptive_steps(form: type[Effect]):
     steps, bound = (1000, 5e-3) if form.name in SHARP else (100, 2e-5)
     assert difference(case_with(form), requested(), TransientRoute("dopri8", steps, by_code=True)) < bound
 
 
 @pytest.mark.parametrize("method", ["tsit5", "dopri8"])
-def test_forcings_other_than_a_harmonic_one(method):
+def test_transient_under_a_chirp_agrees_with_adaptive_steps(method):
     chirp = Chirp(amplitude=2.0, omega_start=200.0, omega_end=600.0, duration=0.1)
     request = dataclasses.replace(requested(), points=Points({"K": POINTS.axes["K"]}))
     case = Case(TwoInertiaModel(DRIVE), chirp)
     assert difference(case, request, TransientRoute(method, 400, by_code=True)) < 1e-7
 
 
-def test_so_many_periods_of_each_point_s_own_forcing():
+def test_duration_in_periods_follows_the_forcing_of_each_point():
     points = Points({"forcing.omega": np.linspace(300.0, 450.0, 5)})
     request = dataclasses.replace(requested(), points=points, duration=None, periods=5.0)
     case = Case(TwoInertiaModel(DRIVE), HARMONIC)
     assert difference(case, request, TransientRoute("dopri8", 100, by_code=True)) < 1e-8
 
 
-def test_a_point_s_bits_are_its_own():
-    """Whatever points are beside it, and however many threads there are."""
+def test_point_is_bitwise_independent_of_other_points_and_threads():
+    """Results are compared with those of fewer points, and of one thread."""
     case, request = case_with(next(f for f in FORMS if f.name == "motor_friction")), requested()
     route = TransientRoute("tsit5", 40, by_code=True)
     whole, _ = transients(case, request, route, request.points.values(np.arange(15)))
@@ -89,7 +89,7 @@ def test_a_point_s_bits_are_its_own():
         np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
 
 
-def test_without_machine_code_xla_does_it(monkeypatch: pytest.MonkeyPatch):
+def test_transients_fall_back_to_xla_without_machine_code(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(machine_code, "_MADE", {})
     monkeypatch.setattr(machine_code, "unusable", lambda: "llvmlite is not installed")
     case, request = case_with(next(f for f in FORMS if f.name == "quadratic_damping")), requested()
@@ -99,7 +99,7 @@ def test_without_machine_code_xla_does_it(monkeypatch: pytest.MonkeyPatch):
         transients(case, request, TransientRoute("dopri8", 10, by_code=True), request.points.values(np.arange(2)))
 
 
-def test_an_effect_on_the_logged_torque_is_refused():
+def test_effect_on_the_logged_torque_is_refused():
     case = Case(TwoInertiaModel(DRIVE, (BY_NAME["torque_bias"](),)), HARMONIC)
     with pytest.raises(ValueError, match="torque_bias"):
         case.require(requested())

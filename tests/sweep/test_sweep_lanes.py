@@ -35,7 +35,7 @@ def posed(case: str) -> tuple[ReducedModel, Harmonic]:
     return ReducedModel(drive), Harmonic(amplitude, omega, phase, offset)
 
 
-def truth(case: str) -> Windows:
+def scipy_solution(case: str) -> Windows:
     mu, omega_0, alpha, amplitude, omega, phase, offset = CASES[case]
 
     def field(t, y):
@@ -59,7 +59,7 @@ def run(model, forcing, state, duration, substeps, method) -> Windows:
 
 
 def error(case: str, method, substeps: int) -> float:
-    start, exact = jnp.asarray([0.2, -0.1]), truth(case)
+    start, exact = jnp.asarray([0.2, -0.1]), scipy_solution(case)
     found = run(*posed(case), start, jnp.asarray(DURATION), jnp.asarray(substeps), method)
     size = float(jnp.max(exact.peak))
     return max(float(jnp.max(jnp.abs(a - b))) for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(exact))) / size  # noqa: B905
@@ -67,32 +67,32 @@ def error(case: str, method, substeps: int) -> float:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("method", [ABA864, None], ids=["splitting", "Tsit5"])
-def test_lanes_agree_with_scipy(case, method):
-    # What is left is the dense look for the largest |x| on SciPy's side, (omega dt)^2 / 8 = 1e-7, and the steps.
+def test_sweep_lanes_agree_with_scipy(case, method):
+    # Errors are those of the dense search for the largest |x| on SciPy's side, (omega dt)^2 / 8 = 1e-7, and the steps.
     assert error(case, method, 100) < 1e-6
 
 
 @pytest.mark.parametrize(("method", "factor"), [(STRANG, 3.0), (ABA864, 10.0), (SRKN14, 30.0)])
-def test_halved_steps_show_the_order(method, factor):
+def test_halved_steps_reduce_the_error_by_the_order_of_the_method(method, factor):
     # Orders 2, 4 and 6, where alpha x^2 is not small. The largest |x| comes from an interpolant of its own.
     coarse, fine = (
         run(*posed("hardening"), jnp.asarray([0.2, -0.1]), jnp.asarray(DURATION), jnp.asarray(n), method).x
         for n in ((5, 10) if method is SRKN14 else (16, 32))
     )
-    exact = truth("hardening").x
+    exact = scipy_solution("hardening").x
     assert jnp.max(jnp.abs(coarse - exact)) > factor * jnp.max(jnp.abs(fine - exact))
 
 
 @pytest.mark.parametrize("case", ["hardening", "undamped at resonance"])
-def test_single_precision_stays_single(case):
+def test_single_precision_input_gives_single_precision_results(case):
     model, forcing = jax.tree.map(lambda a: a.astype(jnp.float32), posed(case))
     start = jnp.asarray([0.2, -0.1], dtype=jnp.float32)
     found = run(model, forcing, start, jnp.asarray(DURATION, dtype=jnp.float32), jnp.asarray(50), ABA864)
     assert {a.dtype for a in jax.tree.leaves(found)} == {jnp.dtype(jnp.float32)}
-    assert jnp.max(jnp.abs(found.x.astype(float) - truth(case).x)) < 1e-4
+    assert jnp.max(jnp.abs(found.x.astype(float) - scipy_solution(case).x)) < 1e-4
 
 
-def test_largest_between_finds_the_top_of_a_cosine():
+def test_largest_between_finds_the_maximum_of_a_cosine():
     h, t = 0.5, 0.2 - 0.5
     ends = [(np.cos(s), -np.sin(s), -np.cos(s)) for s in (t, t + h)]
     found = largest_between(*[tuple(map(jnp.asarray, e)) for e in ends], jnp.asarray(h))
@@ -120,7 +120,7 @@ def requested(tolerance: float, outputs=("final",)) -> Request:
     ],
     ids=["next to linear, loosely", "nonlinear a little", "strongly nonlinear", "damping by the rate"],
 )
-def test_the_cheapest_route_keeps_the_tolerance(case, tolerance, method):
+def test_cheapest_route_keeps_the_tolerance(case, tolerance, method):
     # The others cost at least half as much again; alpha x^2 is 1e-6, 1e-4 and about 1.
     route, check = choose(case, requested(tolerance))
     assert route.method == method
@@ -128,7 +128,7 @@ def test_the_cheapest_route_keeps_the_tolerance(case, tolerance, method):
     assert 0.0 < check.error <= tolerance
 
 
-def test_two_inertias_by_splitting_are_two_inertias_by_adaptive_steps():
+def test_splitting_of_two_inertias_agrees_with_adaptive_steps():
     case, request = drive_case(BY_NAME["quadratic_stiffness"](k2=2.0)), requested(1e-6)
     values = request.points.values(np.arange(70))
     exact, reached = transients(case, request, TransientRoute("adaptive", 40), values)

@@ -45,11 +45,11 @@ def test_one_harmonic_amplitudes_are_the_roots_of_the_cubic():
 
 
 @pytest.mark.parametrize("effects", [(), (BY_NAME["quadratic_damping"](c2=0.1),)], ids=["cubic", "damped by the rate"])
-def test_points_solve_the_harmonic_balance_of_the_drive(effects):
+def test_points_agree_with_the_harmonic_balance_of_one_drive(effects):
     given, request = case(*effects), request_of(9)
     values = request.points.values(np.arange(request.points.size))
     found = steady_states(given, SteadyRoute(9, True, 0.0), values)
-    # A one-harmonic motion beyond the saddles of a softening spring, or with less damping, has no relative.
+    # One-harmonic motions beyond the saddles of a softening spring have no counterpart with more harmonics.
     assert found.exists.any(axis=1).all()
     # Samples of a force with corners are not exact.
     tolerance = 1e-3 if effects else 1e-9
@@ -58,12 +58,12 @@ def test_points_solve_the_harmonic_balance_of_the_drive(effects):
         one = solve(balance(model, harmonic_series(1.0, AMPLITUDE), harmonics=9), values["forcing.omega"][i])
         assert bool(one.converged)
         true = np.asarray(one.x.cosine)[::2]
-        # That solver finds one of the motions.
+        # That solver finds one of several motions.
         nearest = np.nanmin(np.max(np.abs(found.cosine[i] - true), axis=-1))
         assert nearest < tolerance
 
 
-def test_the_motion_between_the_folds_is_unstable_and_the_series_is_the_motion():
+def test_steady_motion_between_the_folds_is_unstable():
     given, request = case(), request_of(150)
     route, check = choose_steady(given, request)
     assert 0.0 < check.error <= request.tolerance
@@ -73,7 +73,7 @@ def test_the_motion_between_the_folds_is_unstable_and_the_series_is_the_motion()
     assert not found.stable[several, 1].any() and found.stable[several][:, [0, 2]].all()
 
 
-def test_phases_turn_with_the_forcing():
+def test_harmonic_phases_follow_the_phase_of_the_forcing():
     request = Request(Points({"forcing.phase": np.array([0.0, 0.7]), "forcing.omega": np.array([0.6, 1.9])}))
     request = Request(request.points, outputs=("harmonics",))
     found = answers(case(), request, plan(case(), request), request.points.values(np.arange(4)))
@@ -85,7 +85,7 @@ def test_phases_turn_with_the_forcing():
 
 
 @pytest.mark.parametrize("name", ["bouc_wen", "input_delay"])
-def test_what_balance_can_not_carry_is_refused(name):
+def test_effects_without_a_harmonic_balance_are_refused(name):
     from hdjax.effects.catalogue import BY_NAME as forms
     from hdjax.effects.effect import Scales
 

@@ -1,4 +1,4 @@
-"""A sweep's result, its store, and what is left of it when processes are killed. Needs the extra `sweep`."""
+"""Result and store of a sweep, and its continuation after killed processes. Needs the extra `sweep`."""
 
 import json
 import os
@@ -44,19 +44,19 @@ def steady_request() -> Request:
 
 
 def slow_request() -> Request:
-    """Many short steps: a program that is soon compiled and then works for a fraction of a second on each chunk."""
+    """Many short steps: a program that compiles fast and then computes for a fraction of a second on each chunk."""
     points = Points({"forcing.omega": np.linspace(0.5, 2.0, CHUNK * CHUNKS)})
     return Request(points, "transient", ("final",), duration=500.0, windows=1)
 
 
-def begun(folder: Path) -> Store:
+def started_store(folder: Path) -> Store:
     """A store of slow chunks, without the search for a route."""
     store = Store(folder, CASE, slow_request(), chunk=CHUNK)
     store.begin(Plan(TransientRoute("strang", 10_000), Check(0, 0, 0.0, 0.0, "none")))
     return store
 
 
-def test_a_sweep_has_names_units_and_the_points_own_values():
+def test_sweep_result_has_names_units_and_the_values_of_its_points():
     found = sweep(CASE.model, CASE.forcing, steady_request())
     assert found.peak.dims == ("alpha", "forcing.omega", "motion") and found.peak.units == "rad"
     assert found["forcing.omega"].units == "rad/s" and "harmonic balance" in found.route
@@ -71,7 +71,7 @@ def test_a_sweep_has_names_units_and_the_points_own_values():
 
 
 @pytest.mark.slow
-def test_a_settled_transient_has_the_steady_peak_and_a_settling_time():
+def test_transient_sweep_has_the_steady_peak_and_a_settling_time():
     points = Points({"forcing.omega": np.array([0.4, 0.6, 1.9])})
     request = Request(points, "transient", ("peak", "settling_time", "trace"), periods=40.0, windows=40)
     found = sweep(CASE.model, CASE.forcing, request)
@@ -83,7 +83,7 @@ def test_a_settled_transient_has_the_steady_peak_and_a_settling_time():
     assert (found.peak >= 0.99 * steady.peak.max("motion")).all()
 
 
-def test_a_finished_chunk_is_never_worked_out_again(tmp_path, monkeypatch):
+def test_finished_chunk_is_not_computed_again(tmp_path, monkeypatch):
     first = sweep(CASE.model, CASE.forcing, steady_request(), store=tmp_path)
     monkeypatch.setattr("hdjax.sweep.run.work", lambda *_: pytest.fail("a finished chunk was worked out"))
     again = sweep(CASE.model, CASE.forcing, steady_request(), store=tmp_path)
@@ -105,13 +105,13 @@ def test_a_finished_chunk_is_never_worked_out_again(tmp_path, monkeypatch):
         ("mu", {}, "needs damping"),
     ],
 )
-def test_points_that_make_no_sense_are_refused(column, settings, words):
+def test_invalid_sweep_points_are_refused(column, settings, words):
     request = Request(Points({column: np.array([-1.0, 0.0, 1.0])}), **settings)
     with pytest.raises(ValueError, match=words):
         sweep(CASE.model, CASE.forcing, request)
 
 
-def started(*arguments: str) -> subprocess.Popen:
+def started_process(*arguments: str) -> subprocess.Popen:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu"}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
     return subprocess.Popen([sys.executable, *arguments], **quiet)
@@ -126,26 +126,26 @@ def wait_for(what: Callable[[], bool], *needed: subprocess.Popen, seconds: float
 
 
 def marks(store: Store) -> dict[str, tuple[int, int]]:
-    """By chunk: the process that worked it out, and when [ns]."""
+    """By chunk: the process that computed it, and the time of completion [ns]."""
     found = [p for p in (store.path / "finished").iterdir() if p.name.isdigit()]
     return {p.name: (int(p.read_text().split()[-1]), p.stat().st_mtime_ns) for p in found}
 
 
 @pytest.mark.slow
-def test_killed_workers_and_a_killed_client_leave_the_same_bits(tmp_path):
-    store, address_file = begun(tmp_path / "store"), tmp_path / "scheduler.json"
+def test_sweep_after_killed_workers_and_client_is_bitwise_equal(tmp_path):
+    store, address_file = started_store(tmp_path / "store"), tmp_path / "scheduler.json"
     module, joins = "distributed.cli.dask_", ("--scheduler-file", str(address_file))
-    processes = [started("-m", module + "scheduler", "--port", "0", "--no-dashboard", *joins)]
+    processes = [started_process("-m", module + "scheduler", "--port", "0", "--no-dashboard", *joins)]
     worker = ("-m", module + "worker", *joins, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--preload", "hdjax")
-    processes += [started(*worker) for _ in range(2)]
+    processes += [started_process(*worker) for _ in range(2)]
     _, first, second = processes
     try:
         wait_for(address_file.exists, *processes)
         address = json.loads(address_file.read_text())["address"]
         ask = ("-c", CLIENT, str(Path(__file__).parent), str(tmp_path / "store"), address)
-        client = started(*ask, "2")
+        client = started_process(*ask, "2")
         processes.append(client)
-        # Both are at work.
+        # Both workers have finished a chunk.
         wait_for(lambda: {pid for pid, _ in marks(store).values()} == {first.pid, second.pid}, *processes)
         first.send_signal(signal.SIGKILL)
         first.wait()
@@ -153,11 +153,11 @@ def test_killed_workers_and_a_killed_client_leave_the_same_bits(tmp_path):
         wait_for(lambda: len(marks(store)) >= killed + 3, second, client)
         client.send_signal(signal.SIGKILL)
         client.wait()
-        # What the other worker is at may still be finished.
+        # The other worker may still finish its chunk.
         time.sleep(1.0)
         left = marks(store)
         assert killed < len(left) < store.chunks
-        client = started(*ask, "1")
+        client = started_process(*ask, "1")
         processes.append(client)
         assert client.wait(timeout=240) == 0
     finally:
