@@ -1,4 +1,4 @@
-"""From the log alone to the right minimum, where the way there is hard."""
+"""The base fit reaches the right minimum from the log alone, also in hard cases."""
 
 import dataclasses
 
@@ -43,16 +43,16 @@ def found(clean) -> Fit:
 TRUTH = {"mu": rig.MU, "omega_0": rig.OMEGA_0, "alpha": rig.REDUCED_ALPHA, "gain": rig.GAIN}
 
 
-def test_a_plain_log(found: Fit):
+def test_base_fit_recovers_all_parameters_of_a_log_with_white_noise(found: Fit):
     assert found.converged
     assert_recovered(found, TRUTH)
     assert found.principal_std == pytest.approx(NOISE, rel=0.1)
-    # Gaussian noise has no outliers: the data are the very ones that were given.
+    # Gaussian noise has no outliers, so that the data are unchanged.
     assert left_out(found.stretches) == 0
     assert found.stretches[0].experiment.weight is None
 
 
-def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
+def test_residual_is_white_at_the_minimum_and_not_at_a_wrong_frequency(found: Fit, clean):
     assert leaves_white_noise(found)
     off = fit(
         rig.reduced_model(omega_0=1.01 * rig.OMEGA_0),
@@ -64,16 +64,16 @@ def test_the_right_minimum_leaves_white_noise(found: Fit, clean):
     assert not leaves_white_noise(off)
 
 
-def test_many_initial_states_leave_white_noise_white(found: Fit, clean):
-    """A state every 32 samples follows some of the noise; that is no sign of a wrong minimum."""
+def test_whiteness_check_passes_with_many_initial_states(found: Fit, clean):
+    """An initial state every 32 samples follows some of the noise, which does not mean a wrong minimum."""
     short = fit(found.model, whole(clean), base_paths(PLACEHOLDER), Segmentation(32, substeps=found.substeps))
     assert leaves_white_noise(short)
 
 
-def test_horizons_grow_step_by_step(clean):
+def test_growing_horizons_reach_the_minimum_from_a_far_frequency(clean):
     far = rig.reduced_model(omega_0=0.5 * rig.OMEGA_0, gain=0.25 * rig.GAIN, alpha=0.0)
     paths = base_paths(far)
-    # At once over six periods, a frequency 50 % off ends in a wrong minimum, from which windows that grow lead out.
+    # A fit over six periods at once ends in a wrong minimum if the frequency is 50 % off; growing windows avoid it.
     direct = fit(
         far,
         whole(clean),
@@ -91,9 +91,9 @@ def test_horizons_grow_step_by_step(clean):
 
 
 @pytest.mark.parametrize("size", [15 * NOISE, 20.0])
-def test_spikes_cost_no_more_than_their_samples(found: Fit, clean, size: float):
+def test_outliers_get_weight_zero_and_do_not_bias_estimates(found: Fit, clean, size: float):
     random = np.random.default_rng(3)
-    # One sample in a hundred, never two beside each other; the twist itself is of order 1.
+    # One sample in a hundred, never two adjacent ones; the twist itself is of order 1.
     rows = 7 + 100 * np.arange(COUNT // 100) + random.integers(0, 80, COUNT // 100)
     measured = clean.measured.copy()
     measured[rows] += size * random.choice([-1.0, 1.0], rows.size)[:, None]
@@ -109,9 +109,8 @@ def test_spikes_cost_no_more_than_their_samples(found: Fit, clean, size: float):
 
 
 @pytest.mark.slow
-def test_a_frequency_that_the_torque_has_does_not_pass_for_the_drive_s_own():
-    """An undriven oscillator at the frequency of a harmonic torque follows the log better, at first sight, than the
-    drive with a damping that is far off."""
+def test_torque_frequency_is_not_taken_for_the_natural_frequency():
+    """An undriven oscillator at the torque's frequency fits the log better than the drive with a wrong damping."""
     zeta, step = 0.018, PERIOD / 8.6
     forcing = 3 * rig.GAIN * np.cos(0.46 * rig.OMEGA_0 * np.arange(1500) * step)
     x = rig.reduced_motion(forcing, mu=2 * zeta * rig.OMEGA_0, alpha=0.0, step=step)[:, 0]
@@ -127,8 +126,8 @@ def test_a_frequency_that_the_torque_has_does_not_pass_for_the_drive_s_own():
 
 
 @pytest.mark.slow
-def test_a_noisy_oversampled_softening_drive():
-    """Speeds guessed from a few noisy samples would throw the simulation over its saddle."""
+def test_base_fit_recovers_a_noisy_oversampled_softening_drive():
+    """Initial speeds from a few noisy samples would make the simulation pass the saddle and diverge."""
     step, count = PERIOD / 150, 1500
     forcing = 10.0 * np.sign(np.sin(0.37 * rig.OMEGA_0 * np.arange(count) * step))
     motion = rig.reduced_motion(forcing, alpha=0.0, mu=10.0, step=step)[:, 0]
@@ -143,8 +142,8 @@ def test_a_noisy_oversampled_softening_drive():
 
 
 @pytest.mark.slow
-def test_a_large_load_that_is_not_logged():
-    """A weight outweighs the motor's torque, and no minimum of the base model is near the drive's parameters."""
+def test_base_fit_fixes_parameters_under_a_large_unlogged_load():
+    """Gravity exceeds the motor torque, and no minimum of the base model is near the true parameters."""
     torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
     log = rig.drive_log(rig.drive_motion(torque, gravity=20.0), torque, noise=0.1)
     stretches = whole(experiment_from_log(log, hold="zero-order", N=rig.N))
@@ -154,6 +153,6 @@ def test_a_large_load_that_is_not_logged():
     assert float(found.model.get("K")) == pytest.approx(rig.K, rel=0.02)
     assert float(found.model.get("alpha")) == pytest.approx(rig.ALPHA, rel=0.2)
     assert found.model.effects == ()
-    # Set free, they run away.
+    # Free parameters diverge.
     loose = fit(found.model, stretches, base_paths(found.model), Segmentation(found.horizon, halo=4))
     assert abs(np.log(float(loose.model.get("K")) / rig.K)) > 1.0

@@ -1,4 +1,4 @@
-"""Time and temperature reach the effects of a fit: from the log's own clock and channel."""
+"""Effects of a fit receive the time and temperature of the log."""
 
 import dataclasses
 
@@ -21,16 +21,16 @@ COUNT, LATE, GAP = 240, 1000.0, (100, 140)
 TIME = rig.STEP * np.arange(COUNT)
 
 
-def warmth(t):
+def temperature_at(t):
     return 300.0 + 50.0 * t
 
 
 def motion() -> np.ndarray:
-    """A drive let go from a twist, under a torque on the load that the log does not hold, while it warms up."""
+    """Free vibration from an initial twist, with an unlogged load torque and a rising temperature."""
 
     def rates(t, y):
         x, v = y[0] / rig.N - y[1], y[2] / rig.N - y[3]
-        tau = rig.K * (1 - 0.01 * (warmth(t) - 303.0)) * (x + rig.ALPHA * x**3) + rig.B_SP * v
+        tau = rig.K * (1 - 0.01 * (temperature_at(t) - 303.0)) * (x + rig.ALPHA * x**3) + rig.B_SP * v
         load = 0.5 + 2.0 * np.cos(150.0 * t) - np.sin(150.0 * t)
         return [y[2], y[3], -tau / rig.N / rig.J_M, (tau + load) / rig.J_L]
 
@@ -43,8 +43,8 @@ def states() -> np.ndarray:
     return motion()
 
 
-def log_of(states: np.ndarray, temperature: np.ndarray | None) -> Log:
-    """Its clock starts at 1000 s, and it has a gap."""
+def log_with_gap(states: np.ndarray, temperature: np.ndarray | None) -> Log:
+    """A log with one gap, whose time starts at 1000 s."""
     log = rig.drive_log(states, np.zeros(COUNT), noise=0.0)
     return dataclasses.replace(log, time=LATE + TIME, temperature=temperature, pieces=((0, GAP[0]), (GAP[1], COUNT)))
 
@@ -53,13 +53,13 @@ def whole(experiments: tuple[Experiment, ...]) -> tuple[Stretch, ...]:
     return tuple(Stretch(e, 0, len(e)) for e in experiments)
 
 
-def test_the_truth_leaves_nothing_on_either_side_of_a_gap(states: np.ndarray):
-    experiments = experiments_from_log(log_of(states, warmth(TIME)), hold="zero-order", N=rig.N)
+def test_true_model_has_zero_residual_before_and_after_a_gap(states: np.ndarray):
+    experiments = experiments_from_log(log_with_gap(states, temperature_at(TIME)), hold="zero-order", N=rig.N)
     model = rig.drive_model().with_effects(
         LoadDisturbance(constant=0.5, cosine=2.0, sine=-1.0, omega=150.0), ThermalStiffness(k_T=-0.01, T_0=303.0)
     )
     segments = cut(whole(experiments), 50, halo=4)
-    # Segments start anew at rows 0 and 50, then 140 and 190.
+    # Segments start at rows 0 and 50, then 140 and 190.
     starts = jnp.asarray(states[[0, 50, 140, 190]])
     problem = Problem(
         model, free_parameters(model, (), {}), segments, jnp.eye(2), jnp.zeros(0), jnp.ones(4), substeps=4
@@ -71,9 +71,9 @@ def test_the_truth_leaves_nothing_on_either_side_of_a_gap(states: np.ndarray):
     assert np.abs(error[..., 1]).max() < 1e-7 * np.abs(segments.measured[..., 1]).max()
 
 
-def test_scales_know_the_temperature_and_the_length_of_the_log(states: np.ndarray):
-    temperature = warmth(TIME)
-    experiments = experiments_from_log(log_of(states, temperature), hold="zero-order", N=rig.N)
+def test_scales_include_temperature_and_duration_of_the_log(states: np.ndarray):
+    temperature = temperature_at(TIME)
+    experiments = experiments_from_log(log_with_gap(states, temperature), hold="zero-order", N=rig.N)
     found = scales(whole(experiments), rig.drive_model())
     first = temperature[: GAP[0]]
     both = np.concatenate([first, temperature[GAP[1] :]])
@@ -84,17 +84,17 @@ def test_scales_know_the_temperature_and_the_length_of_the_log(states: np.ndarra
     assert found.natural_frequency == pytest.approx(float(rig.drive_model().drive.omega_0))
 
 
-def test_a_log_without_temperature_leaves_all_without(states: np.ndarray):
-    warm = experiments_from_log(log_of(states, warmth(TIME)), hold="zero-order", N=rig.N)
-    cold = experiments_from_log(log_of(states, None), hold="zero-order", N=rig.N)
+def test_temperature_is_dropped_if_one_of_several_logs_lacks_it(states: np.ndarray):
+    warm = experiments_from_log(log_with_gap(states, temperature_at(TIME)), hold="zero-order", N=rig.N)
+    cold = experiments_from_log(log_with_gap(states, None), hold="zero-order", N=rig.N)
     assert cut(whole(warm), 50).temperature is not None
     assert cut(whole(warm + cold), 50).temperature is None
     assert scales(whole(warm + cold)).temperature is None
 
 
-def test_a_log_without_load_torque_beside_one_that_has_it(states: np.ndarray):
-    """Nothing acts there."""
-    bare = log_of(states, None)
+def test_load_torque_is_zero_for_logs_that_lack_it(states: np.ndarray):
+    """A log without load torque is simulated with a load torque of zero."""
+    bare = log_with_gap(states, None)
     loaded = dataclasses.replace(bare, load_torque=np.full(COUNT, 3.0))
     experiments = [e for log in (loaded, bare) for e in experiments_from_log(log, hold="zero-order", N=rig.N)]
     found = cut(whole(tuple(experiments)), 50).load_torque

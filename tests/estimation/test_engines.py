@@ -1,4 +1,4 @@
-"""Which engine evaluates a residual, and that all give the same drive."""
+"""Choice of the engine that evaluates a residual; all engines give the same estimates."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ from hdjax.parameters import Scalar, parameter
 
 
 class BesselTorque(MeshTorqueEffect):
-    """A torque by a function that the translator does not know."""
+    """A torque with a function that the translator to machine code does not support."""
 
     family = "unknown"
     name = "bessel_torque"
@@ -47,7 +47,7 @@ def stretches() -> tuple[Stretch, ...]:
 SEGMENTATION = Segmentation(128, halo=4, substeps=1)
 
 
-def test_a_function_that_is_not_known_is_named_and_left_to_xla(stretches: tuple[Stretch, ...]):
+def test_unsupported_function_is_reported_and_evaluated_by_xla(stretches: tuple[Stretch, ...]):
     model = TwoInertiaModel(rig.drive_model().drive, (BesselTorque(),))
     problem, unknowns = pose(model, stretches, fitted_paths(model), SEGMENTATION)
     assert problem.kernel is None
@@ -55,7 +55,7 @@ def test_a_function_that_is_not_known_is_named_and_left_to_xla(stretches: tuple[
     assert np.isfinite(np.asarray(engines.linearise(problem, unknowns).residual)).all()
 
 
-def test_without_llvmlite_xla_does_it(stretches: tuple[Stretch, ...], monkeypatch: pytest.MonkeyPatch):
+def test_engine_falls_back_to_xla_without_llvmlite(stretches: tuple[Stretch, ...], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "hdjax.engine.handler", None)
     engines.unusable.cache_clear()
     try:
@@ -68,7 +68,7 @@ def test_without_llvmlite_xla_does_it(stretches: tuple[Stretch, ...], monkeypatc
 
 
 @pytest.mark.parametrize("engine", ["XLA", "diffrax"])
-def test_all_routes_give_one_drive(shared: Path, engine: Engine):
+def test_all_engines_give_the_same_estimates(shared: Path, engine: Engine):
     """Machine code, the same steps by XLA, and `diffrax.diffeqsolve` with adaptive steps, on a practice log."""
     folder = shared / "logs" / "clean_multisine-7"
     logs = read_rig([folder / "train_1.csv"], folder / "drive.toml")

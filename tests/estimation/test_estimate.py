@@ -1,4 +1,4 @@
-"""The fit finds what an independent simulation was made with, from far away and from several sides."""
+"""The fit recovers the parameters of an independent simulation from several far starting values."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def whole(*experiments) -> list[Stretch]:
 
 
 def drive_fit(model, stretches, **options) -> Fit:
-    """All with the same shapes, so that they share one program."""
+    """Fit with the same shapes in all tests, so that they share one compiled program."""
     return fit(model, stretches, PATHS, Segmentation(HORIZON, substeps=1, count=8), **options)
 
 
@@ -59,15 +59,15 @@ def found(stretches) -> Fit:
     return drive_fit(rig.drive_model(K=0.9 * rig.K, alpha=0.0, B_sp=1.0), stretches)
 
 
-def test_a_drive_is_recovered(found: Fit):
+def test_fit_recovers_the_parameters_of_a_drive(found: Fit):
     assert found.converged
     assert_recovered(found, TRUTH)
     estimates = uncertainty(found).estimates
-    # The start was far, by hundreds of standard errors, and the log tells all three.
+    # The start was hundreds of standard errors away, and the log determines all three parameters.
     assert 0.1 * rig.K > 100 * estimates["K"].std
     assert rig.ALPHA > 10 * estimates["alpha"].std
     assert 0.7 > 10 * estimates["B_sp"].std
-    # Nothing but the encoders' noise is left (2000 samples: 1.6 % of a standard deviation).
+    # Only the encoders' noise remains (2000 samples: 1.6 % of a standard deviation).
     assert found.principal_std == pytest.approx(X_NOISE, rel=0.06)
     assert float(np.sqrt(found.covariance[0, 0])) == pytest.approx(rig.MOTOR_NOISE / rig.N, rel=0.06)
 
@@ -77,17 +77,17 @@ def test_other_starts_reach_the_same_minimum(found: Fit, stretches, K: float, al
     other = drive_fit(rig.drive_model(K=K * rig.K, alpha=alpha, B_sp=B_sp), stretches)
     estimates = uncertainty(found).estimates
     for path in PATHS:
-        # The iteration stops at a change of 1e-4 of an entry; far below what the noise leaves open.
+        # The iteration stops at a change of 1e-4 in an entry of the vector, far below a standard error.
         assert abs(float(other.model.get(path)) - estimates[path].value) < 0.1 * estimates[path].std, path
     assert other.objective == pytest.approx(found.objective, abs=1e-4)
 
 
-def test_what_is_not_free_stays(found: Fit):
+def test_fixed_parameters_keep_their_values(found: Fit):
     for path, value in {"N": rig.N, "J_m": rig.J_M, "J_l": rig.J_L}.items():
         assert float(found.model.get(path)) == value
 
 
-def test_error_and_covariance_go_together(found: Fit, stretches):
+def test_covariance_and_objective_follow_from_the_residual(found: Fit, stretches):
     segments = cut(stretches, HORIZON, count=8)
     error = np.asarray(found.error)[np.asarray(segments.weight) > 0]
     assert error.shape == (COUNT, 2)
@@ -95,7 +95,7 @@ def test_error_and_covariance_go_together(found: Fit, stretches):
     assert found.objective == pytest.approx(0.5 * np.log(np.linalg.det(found.covariance)), abs=1e-9)
 
 
-def test_held_parameters_do_not_move(found: Fit, stretches):
+def test_fit_with_held_parameters_estimates_initial_states_only(found: Fit, stretches):
     wrong = rig.drive_model(K=1.02 * rig.K)
     held = drive_fit(wrong, stretches, strategy=Strategy(hold_parameters=True))
     for path in PATHS:
@@ -106,7 +106,7 @@ def test_held_parameters_do_not_move(found: Fit, stretches):
     assert right.principal_std == pytest.approx(found.principal_std, rel=0.02)
 
 
-def test_several_logs_jointly(found: Fit):
+def test_joint_fit_of_two_logs_reduces_standard_errors(found: Fit):
     logs = whole(*(rig.drive_experiment(1000, seed=s, name=f"log {s}") for s in (3, 4)))
     joint = drive_fit(rig.drive_model(K=0.9 * rig.K, alpha=0.0), logs)
     assert_recovered(joint, TRUTH)
@@ -116,8 +116,8 @@ def test_several_logs_jointly(found: Fit):
     assert 1.1 < gain < 2.2
 
 
-def test_a_channel_that_the_model_cannot_follow_loses_its_say():
-    # Unmodelled friction takes the motor a thousand times further off than its encoder's noise.
+def test_output_with_large_model_error_is_down_weighted():
+    # Unmodelled friction gives the motor angle an error of a thousand times its encoder's noise.
     spoiled = whole(rig.drive_experiment(COUNT, motor_friction=(0.05, 0.5)))
     weighed = drive_fit(rig.drive_model(K=0.93 * rig.K), spoiled)
     assert float(weighed.model.get("K")) == pytest.approx(rig.K, rel=0.01)
@@ -129,7 +129,7 @@ def test_a_channel_that_the_model_cannot_follow_loses_its_say():
 
 
 @pytest.mark.parametrize(("omega_0", "mu", "gain"), [(1.04, 10.0, 1.5), (0.96, 0.5, 0.7)])
-def test_a_reduced_drive_is_recovered(omega_0: float, mu: float, gain: float):
+def test_fit_recovers_the_parameters_of_a_reduced_log(omega_0: float, mu: float, gain: float):
     reduced = whole(rig.reduced_experiment(REDUCED_COUNT, noise=1e-3))
     start = rig.reduced_model(omega_0=omega_0 * rig.OMEGA_0, mu=mu, alpha=0.0, gain=gain * rig.GAIN)
     result = reduced_fit(start, reduced)
@@ -140,7 +140,7 @@ def test_a_reduced_drive_is_recovered(omega_0: float, mu: float, gain: float):
     assert result.principal_std == pytest.approx(1e-3, rel=0.1)
 
 
-def test_steps_follow_the_accuracy_of_the_log():
+def test_solver_steps_are_finer_for_a_more_accurate_log():
     needed = {}
     for noise in (1e-3, 1e-8):
         stretches = whole(rig.reduced_experiment(REDUCED_COUNT, noise=noise, substeps=30))
@@ -153,7 +153,7 @@ def test_steps_follow_the_accuracy_of_the_log():
 
 
 @pytest.mark.slow
-def test_steps_follow_a_sharp_friction():
+def test_solver_steps_are_finer_for_sharp_friction():
     needed = {}
     for name, sharpness in (("smooth", 5.0), ("sharp", 0.02)):
         friction = (150.0, sharpness)
@@ -166,8 +166,8 @@ def test_steps_follow_a_sharp_friction():
 
 
 @pytest.mark.slow
-def test_a_dead_zone_is_recovered_from_afar():
-    """Long segments of a nonsmooth drive have many minima; windows that grow lead past them."""
+def test_backlash_is_recovered_from_a_far_start():
+    """Long segments of a nonsmooth drive have many minima; growing windows avoid them."""
     gap = 1.5e-4
     logged = whole(rig.drive_experiment(COUNT, gap=gap))
     start = rig.drive_model(K=0.7 * rig.K, alpha=0.0).with_effects(Backlash(b=jnp.asarray(3e-5)))
@@ -182,9 +182,8 @@ def test_a_dead_zone_is_recovered_from_afar():
     assert_recovered(found, TRUTH | {"backlash.b": gap})
 
 
-def test_a_segment_that_stands_out_is_begun_anew():
-    """Beside right parameters one segment whose motor starts 200 rad/s too slow ends in a wrong minimum, and holds the
-    parameters off."""
+def test_segment_in_a_wrong_minimum_is_started_again():
+    """One segment that starts 200 rad/s too slow ends in a wrong minimum and biases the parameters."""
     gap = 1.5e-4
     logged = whole(rig.drive_experiment(COUNT, gap=gap))
     model = rig.drive_model().with_effects(Backlash(b=jnp.asarray(gap)))
@@ -199,7 +198,7 @@ def test_a_segment_that_stands_out_is_begun_anew():
     assert mended.objective == pytest.approx(right.objective, abs=1e-3)
 
 
-def test_a_start_that_is_no_number_explains_nothing(found: Fit, stretches):
+def test_fit_from_nan_states_does_not_converge(found: Fit, stretches):
     nowhere = found.unknowns.states * np.nan
     strategy = Strategy(begin_anew_above=np.inf, retry_states=False)
     got = drive_fit(found.model, stretches, start=Start(states=nowhere), strategy=strategy)
@@ -211,7 +210,7 @@ def test_whitening_inverts_the_covariance():
     np.testing.assert_allclose(W @ np.asarray(NOISE) @ W.T, np.eye(2), atol=1e-9)
 
 
-def test_a_segment_that_runs_away_is_lost(found: Fit):
+def test_diverged_segments_are_detected(found: Fit):
     assert not lost(found).any()
     error = np.array(found.error)
     error[1, 5, 0] = np.nan

@@ -1,4 +1,4 @@
-"""Logs are cut into segments without losing, doubling or inventing a sample."""
+"""Logs become experiments and segments in which each sample occurs exactly once."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def experiment(hold: str = "linear", *, load: bool = False, count: int = COUNT) 
     return experiment_from_log(logged, hold=hold, N=rig.N)
 
 
-def test_a_drive_log_is_measured_as_motor_angle_at_the_output_and_twist():
+def test_outputs_of_a_drive_log_are_motor_angle_over_ratio_and_twist():
     found = experiment()
     logged = log()
     assert len(found) == COUNT
@@ -39,13 +39,13 @@ def test_a_drive_log_is_measured_as_motor_angle_at_the_output_and_twist():
     assert found.time_step == pytest.approx(rig.STEP, rel=1e-12)
 
 
-def test_a_reduced_log_has_one_output_and_no_motor():
+def test_reduced_log_has_one_output_and_no_motor_angle():
     found = rig.reduced_experiment(40)
     assert found.measured.shape == (40, 1)
     assert found.motor_angle is None
 
 
-def test_padding_has_no_weight_and_segments_reassemble_the_record():
+def test_segments_reassemble_the_log_and_padding_has_weight_zero():
     source = experiment()
     segments = cut([Stretch(source, 0, COUNT)], 10)
     weight = np.asarray(segments.weight)
@@ -63,7 +63,7 @@ def test_padding_has_no_weight_and_segments_reassemble_the_record():
     length=st.integers(1, COUNT + 5),
     halo=st.integers(0, 12),
 )
-def test_every_sample_keeps_its_torque_and_outputs(start: int, extent: int, length: int, halo: int):
+def test_segments_keep_torque_and_outputs_of_each_sample(start: int, extent: int, length: int, halo: int):
     source = experiment(load=True)
     stop = min(start + extent, COUNT)
     segments = cut([Stretch(source, start, stop)], length, halo=halo)
@@ -80,7 +80,7 @@ def test_every_sample_keeps_its_torque_and_outputs(start: int, extent: int, leng
     np.testing.assert_array_equal(np.asarray(load.knots), knots[:, halo:])
 
 
-def test_the_halo_is_the_torque_before_the_segment():
+def test_halo_holds_the_torque_before_each_segment():
     source = experiment()
     halo = 4
     segments = cut([Stretch(source, 20, 40)], 10, halo=halo)
@@ -91,7 +91,7 @@ def test_the_halo_is_the_torque_before_the_segment():
     np.testing.assert_allclose(segments.torque.knots[0], source.time[16:31], atol=1e-15)
 
 
-def test_before_the_record_the_first_torque_was_held():
+def test_first_torque_is_held_before_the_log_starts():
     source = experiment("linear")
     segments = cut([Stretch(source, 0, 20)], 20, halo=6)
     knots = np.asarray(segments.torque.knots[0])
@@ -103,7 +103,7 @@ def test_before_the_record_the_first_torque_was_held():
     assert (coefficients[7:, 1] != 0).all()
 
 
-def test_beyond_the_record_the_last_torque_is_held():
+def test_last_torque_is_held_after_the_log_ends():
     segments = cut([Stretch(experiment("cubic"), 40, COUNT)], 20)
     beyond = np.asarray(segments.torque.coefficients)[0, COUNT - 40 :]
     assert (beyond[:, 1:] == 0).all()
@@ -111,7 +111,7 @@ def test_beyond_the_record_the_last_torque_is_held():
     np.testing.assert_allclose(np.diff(segments.torque.knots[0]), rig.STEP, rtol=1e-9)
 
 
-def test_stretches_of_several_logs_do_not_mix():
+def test_segments_of_several_logs_stay_separate():
     first, second = experiment(count=COUNT), experiment(count=31)
     segments = cut([Stretch(first, 5, COUNT), Stretch(second, 0, 31)], 10)
     present = np.asarray(segments.weight) > 0
@@ -121,7 +121,7 @@ def test_stretches_of_several_logs_do_not_mix():
     )
 
 
-def test_superfluous_segments_have_no_weight():
+def test_segments_beyond_the_data_have_weight_zero():
     source = experiment()
     segments = cut([Stretch(source, 0, COUNT)], 10, count=7, halo=2)
     assert segments.weight.shape == (7, 10)
@@ -138,7 +138,7 @@ def test_segment_count_is_exact_up_to_eight_and_then_a_multiple_of_sixteen(lengt
     assert cut([stretch], length).weight.shape[0] == expected
 
 
-def test_split_holds_out_the_end_of_each_log():
+def test_split_selects_the_end_of_each_log():
     experiments = [experiment(), experiment(count=30)]
     training, selection = split(experiments, held_out=0.2)
     assert [(s.start, s.stop) for s in training] == [(0, 38), (0, 24)]
@@ -147,7 +147,7 @@ def test_split_holds_out_the_end_of_each_log():
     assert len(training[0]) + len(selection[0]) == COUNT
 
 
-def test_scales_of_a_sine():
+def test_scales_match_the_closed_form_of_a_sine():
     time = np.arange(4000) * rig.STEP
     omega, twist, swing = 40.0, 2e-3, 0.3
     load = swing * np.sin(3.0 * time)
@@ -155,7 +155,7 @@ def test_scales_of_a_sine():
     motion = np.stack([rig.N * (load + x), load], axis=1)
     logged = rig.drive_log(motion, np.zeros(time.size), noise=0.0)
     found = scales([Stretch(experiment_from_log(logged, hold="linear", N=rig.N), 0, 4000)])
-    # The record holds no whole number of periods, and slopes are taken over eight samples.
+    # The log has no whole number of periods, and slopes are taken over eight samples.
     assert found.x == pytest.approx(twist / np.sqrt(2), rel=0.01)
     assert found.x_max == pytest.approx(twist, rel=0.05)
     assert found.v == pytest.approx(omega * twist / np.sqrt(2), rel=0.01)
@@ -165,7 +165,7 @@ def test_scales_of_a_sine():
     assert found.time_step == pytest.approx(rig.STEP)
 
 
-def test_scales_look_at_their_own_stretch_only():
+def test_scales_use_only_samples_of_their_stretch():
     source = experiment(count=200)
     spoiled = source.measured.copy()
     spoiled[100:] = np.nan
@@ -174,16 +174,16 @@ def test_scales_look_at_their_own_stretch_only():
     assert blind == clean
 
 
-def gapped(kept: np.ndarray, count: int = 1000, **changes):
+def log_without_rows(kept: np.ndarray, count: int = 1000, **changes):
     """A log of smooth motion and torque without some of its rows."""
     logged = replace(log(count), motor_torque=np.sin(0.05 * np.arange(count)))
     columns = {k: v[kept] for k, v in vars(logged).items() if isinstance(v, np.ndarray)}
     return replace(logged, **columns, **changes), logged
 
 
-def test_missing_samples_are_put_in_without_weight():
+def test_missing_samples_are_interpolated_with_weight_zero():
     kept = np.delete(np.arange(1000), [300, 301, 700])
-    short, whole = gapped(kept)
+    short, whole = log_without_rows(kept)
     found = experiment_from_log(short, hold="zero-order", N=rig.N)
     np.testing.assert_allclose(found.time, whole.time, atol=1e-12)
     np.testing.assert_array_equal(np.flatnonzero(found.weight == 0), [300, 301, 700])
@@ -196,26 +196,26 @@ def test_missing_samples_are_put_in_without_weight():
     assert np.isfinite(np.asarray(segments.measured)).all()
 
 
-def test_a_log_without_gaps_is_the_same_with_and_without_the_machinery():
+def test_log_without_gaps_is_unchanged_and_has_no_weights():
     plain = experiment()
     assert plain.weight is None and plain.rows is None
     np.testing.assert_array_equal(plain.time, log().time)
 
 
-def test_pieces_become_experiments_that_do_not_know_each_other():
-    short, _ = gapped(np.delete(np.arange(1000), np.arange(400, 500)), pieces=((0, 400), (400, 900)))
+def test_pieces_of_a_log_become_independent_experiments():
+    short, _ = log_without_rows(np.delete(np.arange(1000), np.arange(400, 500)), pieces=((0, 400), (400, 900)))
     first, second = experiments_from_log(short, hold="cubic", N=rig.N)
     assert (first.name, second.name) == ("log, part 1", "log, part 2")
     assert (len(first), len(second)) == (400, 500)
-    alone = experiment_from_log(gapped(np.arange(500, 1000))[0], hold="cubic", N=rig.N)
+    alone = experiment_from_log(log_without_rows(np.arange(500, 1000))[0], hold="cubic", N=rig.N)
     np.testing.assert_array_equal(second.torque.coefficients, alone.torque.coefficients)
     np.testing.assert_array_equal(second.measured, alone.measured)
 
 
-def test_samples_that_are_not_believed_have_no_weight_and_no_say():
+def test_invalid_samples_have_weight_zero_and_are_replaced():
     trusted = np.ones(1000, dtype=bool)
     trusted[[5, 6, 990]] = False
-    logged, whole = gapped(np.arange(1000), trusted=trusted)
+    logged, whole = log_without_rows(np.arange(1000), trusted=trusted)
     wild = np.where(trusted, logged.dynamic_error, 1e3)
     found = experiment_from_log(replace(logged, dynamic_error=wild), hold="zero-order", N=rig.N)
     np.testing.assert_array_equal(np.flatnonzero(found.weight == 0), [5, 6, 990])
@@ -227,8 +227,8 @@ def test_samples_that_are_not_believed_have_no_weight_and_no_say():
     assert len(Stretch(found, 0, 8).beginning(10)) == 8
 
 
-def test_only_known_outputs_of_a_prediction_have_weight():
-    logged, _ = gapped(np.arange(1000), outputs_until=50)
+def test_samples_after_the_last_known_output_have_weight_zero():
+    logged, _ = log_without_rows(np.arange(1000), outputs_until=50)
     found = experiment_from_log(logged, hold="zero-order", N=rig.N)
     np.testing.assert_array_equal(np.flatnonzero(found.weight), np.arange(50))
     whole = Stretch(found, 0, 1000)
@@ -236,14 +236,14 @@ def test_only_known_outputs_of_a_prediction_have_weight():
     assert np.ptp(found.measured[50:, 1]) == 0
 
 
-def test_a_log_that_is_mostly_a_gap_is_refused():
-    short, _ = gapped(np.arange(1000))
+def test_log_of_mostly_gaps_is_refused():
+    short, _ = log_without_rows(np.arange(1000))
     late = short.time + 10.0 * (np.arange(1000) > 500)
     with pytest.raises(DataError, match="mostly gaps"):
         experiment_from_log(replace(short, time=late), hold="zero-order", N=rig.N)
 
 
-def test_the_load_torque_is_held_where_the_motor_torque_is():
+def test_load_torque_hold_is_constant_for_zero_order_else_linear():
     held, lines = (experiment(hold, load=True).load_torque for hold in ("zero-order", "cubic"))
     assert held is not None and lines is not None
     step = np.diff(np.asarray(lines.knots))[:-1]

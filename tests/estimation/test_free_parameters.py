@@ -1,4 +1,4 @@
-"""The vector that a fit moves stands for the model's values, and no value leaves its domain."""
+"""The vector of a fit maps to the free parameters of the model, which stay in their domains."""
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ def model(K: float = 7000.0, alpha: float = 1e4, B_sp: float = 0.2, T_c: float =
 )
 def test_unpack_inverts_pack(K: float, alpha: float, B_sp: float, T_c: float):
     wanted = model(K, alpha, B_sp, T_c)
-    # The units come from another model, as they do once a fit has moved.
+    # The scales come from another model, as they do after the first iteration of a fit.
     free = free_parameters(model(), PATHS, SCALE)
     back = free.unpack(model(), free.pack(wanted))
     for path in PATHS:
@@ -61,17 +61,17 @@ def test_positive_parameters_stay_positive_and_finite(vector: list[float]):
             assert float(moved.get(path)) > 0
 
 
-def test_entries_are_of_order_one():
+def test_scale_of_a_parameter_is_its_value_or_a_typical_one():
     free = free_parameters(model(alpha=0.0), PATHS, SCALE)
     np.testing.assert_allclose(free.scale[1:3], [2e4, 0.2])
     far = free_parameters(model(alpha=-5e5), PATHS, SCALE)
     assert float(far.scale[1]) == 5e5
-    # Neither a value nor a typical one: plain units.
+    # Without a value and a typical one, the scale is 1.
     assert float(free_parameters(model(alpha=0.0), ("alpha",), {}).scale[0]) == 1.0
 
 
-def test_slopes_are_derivatives_of_the_values():
-    # Not at the model that the units come from.
+def test_slopes_are_derivatives_of_parameters_by_the_vector():
+    # Not at the model that the scales come from.
     start = model(K=9000.0, alpha=3e4, B_sp=0.5, T_c=0.2, v_0=0.05)
     free = free_parameters(model(), PATHS, SCALE)
     vector = free.pack(start)
@@ -85,7 +85,7 @@ def test_slopes_are_derivatives_of_the_values():
     np.testing.assert_allclose(jacobian, np.diag(free.slopes(start)), rtol=1e-12)
 
 
-def test_nothing_free():
+def test_empty_list_of_free_parameters_leaves_the_model_unchanged():
     start = model()
     free = free_parameters(start, (), {})
     assert free.pack(start).shape == (0,)
@@ -94,24 +94,24 @@ def test_nothing_free():
 
 
 @pytest.mark.parametrize("path", ["k", "friction.T_c", "coulomb_friction.T", "coulomb_friction", ""])
-def test_unknown_path(path: str):
+def test_unknown_parameter_path_is_refused(path: str):
     with pytest.raises(ValueError, match=f"^`{path}` must be one of .*'alpha'"):
         free_parameters(model(), ("K", path), {})
 
 
 @pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
-def test_a_positive_parameter_that_is_not(value: float):
+def test_nonpositive_value_of_a_positive_parameter_is_refused(value: float):
     with pytest.raises(ValueError, match="^`K` must be positive, but is"):
         free_parameters(model(K=value), ("K",), {})
 
 
-def test_base_paths():
+def test_base_paths_are_those_of_the_base_model():
     assert base_paths(model()) == ("K", "alpha", "B_sp")
     assert base_paths(rig.reduced_model()) == ("mu", "omega_0", "alpha", "gain")
 
 
 @pytest.mark.parametrize("form", CATALOGUE, ids=lambda form: form.name)
-def test_paths_of_every_form(form: type[Effect]):
+def test_effect_paths_of_every_form_can_be_freed(form: type[Effect]):
     for effect in form.proposals(SCALES):
         everything = effect_paths(effect)
         strengths = strength_paths(effect)
@@ -121,7 +121,7 @@ def test_paths_of_every_form(form: type[Effect]):
         known = whole.parameters()
         assert all(p in known and known[p][1].role != "base" for p in everything)
         assert {p for p in known if p.startswith(f"{form.name}.") and known[p][1].role == "strength"} == set(strengths)
-        # All of it can be freed once the strengths are off zero, and comes back as it was.
+        # All parameters can be freed once the strengths differ from zero, and unpack inverts pack.
         filled = whole.replace({p: 0.3 for p in strengths})
         free = free_parameters(filled, everything, {})
         back = free.unpack(whole, free.pack(filled))
@@ -129,7 +129,7 @@ def test_paths_of_every_form(form: type[Effect]):
             np.testing.assert_allclose(back.get(path), filled.get(path), rtol=1e-14)
 
 
-def test_paths_of_bouc_wen_by_hand():
+def test_effect_paths_of_bouc_wen_are_as_listed():
     effect = BoucWen(k=1.0, memory_twist=1e-3)
     assert strength_paths(effect) == ("bouc_wen.k",)
     assert effect_paths(effect) == ("bouc_wen.k", "bouc_wen.memory_twist", "bouc_wen.ratio")

@@ -1,4 +1,4 @@
-"""A free run takes its start from fifty samples and nothing else, and then follows the truth."""
+"""A free run takes its initial state from fifty samples only, and then follows the true motion."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ MOVING = (20.0, 0.4003, 30.0, 0.7)
 
 
 def run(experiment: Experiment, model: Model | None = None, start: int = 0) -> FreeRun:
-    # Always two, so that all tests share one program.
+    # Always two stretches, so that all tests share one compiled program.
     stretches = [Stretch(experiment, start, start + n) for n in (COUNT, COUNT // 2)]
     found, half = free_run(model or rig.drive_model(), stretches, covariance=NOISE, substeps=1)
     np.testing.assert_array_equal(half.predicted, found.predicted[: COUNT // 2])
@@ -32,7 +32,7 @@ def moving() -> Experiment:
     return rig.drive_experiment(COUNT + 40, state=MOVING)
 
 
-def test_the_truth_is_reproduced(moving: Experiment):
+def test_free_run_of_the_true_model_follows_the_true_motion(moving: Experiment):
     found = run(moving)
     truth = rig.drive_motion(rig.drive_torque(COUNT + 40), state=MOVING)[:COUNT]
     x = truth[:, 0] / rig.N - truth[:, 1]
@@ -41,18 +41,18 @@ def test_the_truth_is_reproduced(moving: Experiment):
     assert np.std(x) > 100 * X_NOISE
     assert found.rmse == pytest.approx(np.sqrt(np.mean((found.measured - found.predicted) ** 2)), rel=1e-12)
     assert found.rmse < 2.0 * X_NOISE
-    # The free motor drifts off with the error of its rate.
+    # The free motor drifts with the error of its initial rate.
     assert np.max(np.abs(found.motor_angle - truth[:, 0])) < 0.02
     drift = np.sqrt(np.mean((moving.motor_angle[:COUNT] - found.motor_angle) ** 2))
     assert rms_error((found,), "motor_angle") == pytest.approx(drift, rel=1e-9)
     np.testing.assert_array_equal(found.time, moving.time[:COUNT])
 
 
-def test_a_wrong_model_is_not(moving: Experiment):
+def test_free_run_of_a_wrong_model_has_a_large_error(moving: Experiment):
     assert run(moving, rig.drive_model(K=1.1 * rig.K)).rmse > 30 * X_NOISE
 
 
-def test_only_the_first_fifty_outputs_are_looked_at(moving: Experiment):
+def test_free_run_uses_only_outputs_of_the_initial_state_window(moving: Experiment):
     measured, motor = moving.measured.copy(), moving.motor_angle.copy()
     measured[WINDOW:] = np.nan
     motor[WINDOW:] = np.nan
@@ -60,20 +60,20 @@ def test_only_the_first_fifty_outputs_are_looked_at(moving: Experiment):
     seeing = run(moving)
     np.testing.assert_array_equal(blind.predicted, seeing.predicted)
     np.testing.assert_array_equal(blind.motor_angle, seeing.motor_angle)
-    # And the fifty do matter.
+    # The outputs of the window do matter.
     measured[WINDOW - 1, 1] += 20 * X_NOISE
     assert np.any(run(dataclasses.replace(moving, measured=measured)).predicted != seeing.predicted)
     assert blind.rmse == np.inf
 
 
-def test_a_run_may_begin_inside_a_log(moving: Experiment):
+def test_free_run_may_start_inside_a_log(moving: Experiment):
     found = run(moving, start=40)
     assert found.rmse < 2.0 * X_NOISE
     np.testing.assert_array_equal(found.measured, moving.measured[40:, 1])
 
 
-def test_rest_is_recognised():
-    # Half a second at rest, then the torque sets in.
+def test_free_run_of_a_drive_at_rest_does_not_drift():
+    # At rest for the window and 20 samples more, then the torque starts.
     torque = rig.drive_torque(COUNT)
     torque[: WINDOW + 20] = 0.0
     resting = (1.0, 1.0 / rig.N, 0.0, 0.0)
@@ -93,7 +93,7 @@ def at_rest(noise: float) -> Experiment:
     return experiment_from_log(rig.drive_log(motion, torque, noise=noise), hold="zero-order", N=rig.N)
 
 
-def test_rates_are_exactly_zero_at_rest_and_not_in_motion(moving: Experiment, monkeypatch: pytest.MonkeyPatch):
+def test_initial_rates_are_exactly_zero_only_at_rest(moving: Experiment, monkeypatch: pytest.MonkeyPatch):
     starts = []
     simulate = module.simulate
 
@@ -110,12 +110,12 @@ def test_rates_are_exactly_zero_at_rest_and_not_in_motion(moving: Experiment, mo
     np.testing.assert_allclose(starts[1][:, 2:], [[30.0, 0.7]] * 2, rtol=0.01)
 
 
-def test_an_encoder_that_stands_still_to_the_last_bit():
+def test_free_run_stays_at_rest_for_noiseless_encoders():
     found = run(at_rest(0.0))
     np.testing.assert_array_equal(found.motor_angle, found.motor_angle[0])
 
 
-def test_several_stretches_of_different_length(moving: Experiment):
+def test_free_run_accepts_stretches_of_different_length(moving: Experiment):
     stretches = [Stretch(moving, 0, COUNT), Stretch(moving, 100, 400)]
     first, second = free_run(rig.drive_model(), stretches, covariance=NOISE, substeps=1)
     assert (first.predicted.size, second.predicted.size) == (COUNT, 300)
@@ -125,7 +125,7 @@ def test_several_stretches_of_different_length(moving: Experiment):
     assert rms_error((first, second)) == pytest.approx(np.sqrt(np.mean(both**2)), rel=1e-12)
 
 
-def test_a_run_that_leaves_the_numbers_is_infinitely_bad(moving: Experiment):
+def test_rms_error_of_a_diverged_free_run_is_infinite(moving: Experiment):
     found = run(moving)
     lost = dataclasses.replace(found, predicted=np.where(np.arange(COUNT) > 300, np.nan, found.predicted))
     assert rms_error((found, lost)) == np.inf

@@ -1,5 +1,7 @@
-"""Lanes shared among devices: the same fit, on two devices and on one. The number of devices is set when JAX starts,
-so another process does it."""
+"""Segments distributed over devices give the same fit on two devices as on one.
+
+The number of devices is set when JAX starts, so that each fit runs in a process of its own.
+"""
 
 import json
 import subprocess
@@ -29,7 +31,7 @@ print(json.dumps([devices, found.unknowns.parameters.tolist(), float(found.princ
 
 
 @pytest.fixture(scope="module")
-def fits(request):
+def fits_by_device_count(request):
     folder = str(request.path.parents[1])
 
     def fitted(devices: int):
@@ -40,11 +42,11 @@ def fits(request):
     return {n: fitted(n) for n in (1, 2)}
 
 
-def test_lanes_are_shared(fits):
-    assert (fits[1][0], fits[2][0]) == (1, 2)
+def test_segments_are_distributed_over_all_devices(fits_by_device_count):
+    assert (fits_by_device_count[1][0], fits_by_device_count[2][0]) == (1, 2)
 
 
-def test_the_fit_does_not_depend_on_the_devices(fits):
+def test_fit_does_not_depend_on_the_number_of_devices(fits_by_device_count):
     # Sums in another order; the iteration ends within a small part of a standard error, which is 1e-5 or so.
-    assert fits[2][1] == pytest.approx(fits[1][1], rel=1e-8)
-    assert fits[2][2] == pytest.approx(fits[1][2], rel=1e-8)
+    assert fits_by_device_count[2][1] == pytest.approx(fits_by_device_count[1][1], rel=1e-8)
+    assert fits_by_device_count[2][2] == pytest.approx(fits_by_device_count[1][2], rel=1e-8)

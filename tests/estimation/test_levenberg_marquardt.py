@@ -1,4 +1,4 @@
-"""Elimination by segments takes the same steps as dense least squares, to the same minimum."""
+"""Elimination by segments gives the steps and the minimum of dense least squares."""
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ SEGMENTS, ROWS, PARAMETERS, STATES = 4, 11, 3, 2
 
 def random_blocks(seed: int = 0) -> Blocks:
     random = np.random.default_rng(seed)
-    # Columns of very different length, as those of K and of an angle.
+    # Columns of very different norm, as those of K and of an angle.
     by_parameter = random.normal(size=(SEGMENTS, ROWS, PARAMETERS)) * np.array([1e3, 1.0, 1e-4])
     by_state = random.normal(size=(SEGMENTS, ROWS, STATES)) * np.array([1e5, 1e-2])
     r = random.normal(size=(SEGMENTS, ROWS))
@@ -61,7 +61,7 @@ def flat(step: Unknowns) -> np.ndarray:
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0, 1e4])
-def test_the_step_is_that_of_dense_least_squares(damping: float):
+def test_step_equals_that_of_dense_least_squares(damping: float):
     found = random_blocks()
     jacobian, r = dense(found)
     # Damping relative to the diagonal: rows that hold each unknown in units of its own column.
@@ -75,7 +75,7 @@ def test_the_step_is_that_of_dense_least_squares(damping: float):
     assert np.max(np.abs(step * length)) > (1e-3 if damping < 10 else 1e-5)
 
 
-def test_where_a_parameter_may_not_go_far_all_else_suits_where_it_goes():
+def test_other_unknowns_adapt_to_a_parameter_with_limited_step():
     found = random_blocks()
     jacobian, r = dense(found)
     free = flat(take_step(found, jnp.asarray(0.0)))
@@ -89,7 +89,7 @@ def test_where_a_parameter_may_not_go_far_all_else_suits_where_it_goes():
 
 
 def closed(found: Blocks) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and right-hand side of the conditions that the gaps of joined segments close."""
+    """Rows and right-hand side of the conditions that close the gaps of joined segments."""
     rows, right = [], []
     for s in np.flatnonzero(JOINED):
         row = np.zeros((STATES, PARAMETERS + SEGMENTS * STATES))
@@ -101,13 +101,13 @@ def closed(found: Blocks) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows), np.concatenate(right)
 
 
-def test_the_step_of_joined_segments_closes_their_gaps_at_least_residual():
+def test_step_of_joined_segments_closes_gaps_with_least_residual():
     found = random_blocks()
     jacobian, r = dense(found)
     length = np.linalg.norm(jacobian, axis=0)
     condition, right = closed(found)
     condition = condition * (1 / length)
-    # Another route: any solution of the conditions, and the best change along their null space.
+    # Reference: any solution of the conditions, and the best change in their null space.
     particular = np.linalg.lstsq(condition, right, rcond=None)[0]
     free = np.linalg.svd(condition)[2][len(right) :].T
     scaled = jacobian / length
@@ -116,17 +116,17 @@ def test_the_step_of_joined_segments_closes_their_gaps_at_least_residual():
     np.testing.assert_allclose(step, expected, atol=1e-8 * np.max(np.abs(expected)))
 
 
-def test_heavy_damping_holds_joined_segments_back():
+def test_large_damping_makes_the_step_of_joined_segments_small():
     step = take_step(random_blocks(), jnp.asarray(1e12), JOINED)
     assert np.max(np.abs(step.parameters)) < 1e-6
     assert np.max(np.abs(np.asarray(step.states) / np.array([1e-5, 1e2]))) < 1e-4
 
 
-def test_projected_columns_are_orthogonal_to_what_the_first_states_can_do():
+def test_projected_columns_are_orthogonal_to_those_of_initial_states():
     found = random_blocks()
     jacobian, _ = dense(found)
     condition, _ = closed(found)
-    # Changes of the states alone that keep the gaps as they are.
+    # Changes of the states alone that leave the gaps unchanged.
     states = np.linalg.svd(condition[:, PARAMETERS:])[2][condition.shape[0] :].T
     columns = np.asarray(project(found, JOINED)).reshape(-1, PARAMETERS)
     against = (jacobian[:, PARAMETERS:] @ states).T @ columns
@@ -134,7 +134,7 @@ def test_projected_columns_are_orthogonal_to_what_the_first_states_can_do():
     assert np.max(np.abs(against / scale)) < 1e-6
 
 
-def test_a_direction_without_information_does_not_move():
+def test_unknowns_without_information_have_a_zero_step():
     found = random_blocks()
     blind = eqx.tree_at(
         lambda b: (b.by_parameter, b.by_state),
@@ -150,7 +150,7 @@ def test_a_direction_without_information_does_not_move():
         assert (others != 0).all()
 
 
-def test_a_segment_without_weight_does_not_matter():
+def test_segment_without_weight_does_not_change_the_step():
     found = random_blocks()
     padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.zeros((1, *leaf.shape[1:]))]), found)
     wanted = take_step(found, jnp.asarray(1e-3))
@@ -160,7 +160,7 @@ def test_a_segment_without_weight_does_not_matter():
 
 
 @pytest.fixture(scope="module")
-def small() -> tuple[Problem, Unknowns]:
+def small_problem() -> tuple[Problem, Unknowns]:
     """A noisy reduced log in four segments, and a start that is 10 % wrong."""
     experiment = rig.reduced_experiment(160, noise=2e-3)
     model = rig.reduced_model(omega_0=0.95 * rig.OMEGA_0, mu=6.0, alpha=0.0)
@@ -187,7 +187,7 @@ def solve(problem: Problem, start: Unknowns) -> optx.Solution:
     )
 
 
-def assert_same_minimum(rows, found: np.ndarray, peer, unknowns: int):
+def assert_minimum_equals_that_of_peer(rows, found: np.ndarray, peer, unknowns: int):
     """Sum of squares, and unknowns in units of their standard errors."""
     assert np.sum(np.asarray(rows) ** 2) == pytest.approx(2 * peer.cost, rel=1e-9)
     spread = np.sqrt(np.diag(np.linalg.inv(peer.jac.T @ peer.jac)))
@@ -196,8 +196,8 @@ def assert_same_minimum(rows, found: np.ndarray, peer, unknowns: int):
     assert 2 * peer.cost == pytest.approx(160 - unknowns, rel=0.4)
 
 
-def test_a_simulation_that_runs_away_can_be_squared(small):
-    problem, start = small
+def test_normal_equations_of_a_diverged_simulation_are_finite(small_problem):
+    problem, start = small_problem
     softening = start.parameters.at[2].set(-5.0)
     beyond = Unknowns(softening, start.states.at[1].set(jnp.asarray([3.0, 0.0])))
     found = eqx.filter_jit(blocks)(problem, beyond)
@@ -206,8 +206,8 @@ def test_a_simulation_that_runs_away_can_be_squared(small):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(system))
 
 
-def test_a_simulation_may_run_away_where_there_are_no_data(small):
-    problem, start = small
+def test_diverged_segment_without_data_has_zero_residual(small_problem):
+    problem, start = small_problem
     softening = start.parameters.at[2].set(-5.0)
     lost = Unknowns(softening, start.states.at[3].set(jnp.asarray([3.0, 0.0])))
     empty = eqx.tree_at(lambda p: p.segments.weight, problem, problem.segments.weight.at[3].set(0.0))
@@ -217,14 +217,14 @@ def test_a_simulation_may_run_away_where_there_are_no_data(small):
     assert np.isfinite(np.asarray(found.residual)).all()
 
 
-def test_steps_of_a_program_of_their_own_end_where_those_of_one_program_do(small):
-    problem, start = small
+def test_solver_of_separate_steps_reaches_the_minimum_of_the_compiled_loop(small_problem):
+    problem, start = small_problem
     whole, stepped = solve(problem, start), solve_by_steps(problem, start, 60, 1e-3)
     assert stepped.success
     system = normal_equations(Products.of(eqx.filter_jit(blocks)(problem, whole.value)), problem.segments.joined)
     information, _, _, _ = system.eliminate(jnp.zeros(()), jnp.ones(()))
     spread = np.sqrt(np.diag(np.linalg.inv(np.asarray(information))))
-    # It ends where less than a thousandth of what one more parameter explains of noise is promised.
+    # It ends where the predicted decrease is below a thousandth of what one more parameter explains of noise.
     difference = np.asarray(stepped.unknowns.parameters - whole.value.parameters) / spread
     assert np.max(np.abs(difference)) < 0.05
     rows = np.asarray(residual(problem, stepped.unknowns)[0])
@@ -232,15 +232,15 @@ def test_steps_of_a_program_of_their_own_end_where_those_of_one_program_do(small
     assert np.sum(rows**2) == pytest.approx(float(whole.state.rows), rel=1e-4)
 
 
-def test_a_fit_that_has_no_time_to_converge_says_so(small):
-    problem, start = small
+def test_solver_reports_failure_when_its_steps_are_used_up(small_problem):
+    problem, start = small_problem
     got = solve_by_steps(problem, start, 2, 1e-3)
     assert not got.success and got.steps == 2
     assert float(jnp.sum(got.left_over.squares)) < float(jnp.sum(evaluate(problem, start).squares))
 
 
-def test_the_minimum_is_that_of_scipy(small):
-    problem, start = small
+def test_minimum_equals_that_of_scipy(small_problem):
+    problem, start = small_problem
     segments, states = start.states.shape
     run = eqx.filter_jit(residual)
     jacobian = eqx.filter_jit(blocks)
@@ -259,11 +259,11 @@ def test_the_minimum_is_that_of_scipy(small):
     assert solution.result == optx.RESULTS.successful
     # The start was far: hundreds of times the final sum of squares.
     assert np.sum(np.asarray(run(problem, start)[0]) ** 2) > 20 * 2 * peer.cost
-    assert_same_minimum(run(problem, solution.value)[0], flat(solution.value), peer, flat(start).size)
+    assert_minimum_equals_that_of_peer(run(problem, solution.value)[0], flat(solution.value), peer, flat(start).size)
 
 
-def test_the_minimum_of_joined_segments_is_that_of_one_simulation(small):
-    problem, start = small
+def test_minimum_of_joined_segments_equals_that_of_one_simulation(small_problem):
+    problem, start = small_problem
     joined = eqx.tree_at(lambda p: p.segments.joined, problem, jnp.asarray([False, True, True, True]))
     joined = eqx.tree_at(lambda p: p.gap_weight, joined, 3.0 / 2e-3 / jnp.asarray([1.0, rig.OMEGA_0]))
     whole = cut([Stretch(rig.reduced_experiment(160, noise=2e-3), 0, 160)], 160)
@@ -284,10 +284,10 @@ def test_the_minimum_of_joined_segments_is_that_of_one_simulation(small):
     assert solution.result == optx.RESULTS.successful
     rows, gap = run(joined, solution.value)
     np.testing.assert_allclose(np.asarray(gap) * np.asarray(joined.gap_weight), 0.0, atol=1e-9)
-    # Also from the segments' own minima, with gaps that count so little that to close them looks like a loss.
+    # Also from the segments' own minima, with gap weights so small that closing the gaps raises the objective.
     light = eqx.tree_at(lambda p: p.gap_weight, joined, 0.1 * joined.gap_weight)
     closed = solve(light, solve(problem, start).value)
     assert closed.result == optx.RESULTS.successful
     np.testing.assert_allclose(closed.value.parameters, solution.value.parameters, rtol=1e-6)
     found = np.concatenate([np.asarray(solution.value.parameters), np.asarray(solution.value.states)[0]])
-    assert_same_minimum(rows, found, peer, found.size)
+    assert_minimum_equals_that_of_peer(rows, found, peer, found.size)

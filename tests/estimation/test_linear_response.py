@@ -1,4 +1,4 @@
-"""The linear response along a motion: against differences of simulations that know nothing of it."""
+"""The linear response along a motion, compared with differences of independent simulations."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ SCALES = Scales(x=1e-3, x_max=3e-3, v=0.2, omega_m=5.0, omega_l=0.1, time_step=r
 
 @pytest.fixture(scope="module")
 def found() -> Fit:
-    """Two segments, of which the second is joined to the first where the horizon says so."""
+    """A fit that starts at the true model, over segments of 64 samples."""
     training, _ = split([rig.drive_experiment(COUNT)], held_out=0.02)
     model = rig.drive_model()
     return fit(model, training, base_paths(model), Segmentation(64, halo=4, substeps=3))
@@ -45,7 +45,7 @@ def followed(found: Fit) -> Followed:
 
 
 def simulated(found: Fit, effect: Effect) -> np.ndarray:
-    """What the encoders read with the effect, by the program of the fit; its own states start at rest."""
+    """Outputs of the simulation with the effect; its hidden states start at rest."""
     model = found.model.with_effects(effect)
     rest = jnp.broadcast_to(model.rest()[4:], (found.unknowns.states.shape[0], len(effect.states)))
     unknowns = replace(found.unknowns, states=jnp.concatenate([found.unknowns.states, rest], axis=1))
@@ -60,13 +60,13 @@ CASES = {
     "displacement damping": (DisplacementDamping(), {"c_x": 1.0}, 5e-3),
     "kinematic error": (KinematicError(), {"cos_2": 1e-8}, 2e-3),
     "gravity": (GravityLoad(), {"sine": 1e-3}, 1e-3),
-    # Beginning late, the torque makes a jump inside the interval; a line has its impulse and its first moment only.
+    # A delayed torque jumps inside the interval; a straight line keeps only its impulse and first moment.
     "delay": (InputDelay.proposals(SCALES)[0], {"delay": 1e-7}, 2e-2),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Followed, case: str):
+def test_regressor_equals_the_derivative_of_the_simulation(found: Fit, followed: Followed, case: str):
     effect, strength, tolerance = CASES[case]
     (name, size), *_ = strength.items()
     start = float(getattr(effect, name))
@@ -83,9 +83,11 @@ def test_a_column_is_the_derivative_of_the_simulation(found: Fit, followed: Foll
     assert np.abs(off).max() < tolerance * np.abs(np.where(real, slope, 0.0)).max()
 
 
-def test_a_motion_of_a_model_that_knows_time_and_temperature(found: Fit, followed: Followed):
-    """What a unit of torque does is the same at any time and temperature; an error of the mesh acts through the
-    stiffness, which is larger by 1e-3 of itself for each of 6.85 K."""
+def test_responses_along_a_motion_allow_for_temperature(found: Fit, followed: Followed):
+    """The response to a unit of torque is the same at any time and temperature.
+
+    An error of the mesh acts through the stiffness, which is larger by 1e-3 of itself for each of 6.85 K.
+    """
     model = found.model.with_effects(LoadDisturbance(omega=30.0, cosine=1e-3), ThermalStiffness(k_T=1e-3))
     segments = found.problem.segments
     knots = segments.torque.knots[:, segments.halo :]
@@ -102,8 +104,8 @@ def test_a_motion_of_a_model_that_knows_time_and_temperature(found: Fit, followe
             np.testing.assert_allclose(seen.pushes[name], factor * push, rtol=1e-12, atol=0.0)
 
 
-def test_own_states_follow_the_motion_and_go_on():
-    """Creep's state is the twist behind a lag; the stretch that comes next takes it over."""
+def test_hidden_states_follow_the_motion_and_continue_into_the_next_stretch():
+    """The state of creep is the lagged twist; the next stretch starts from its last value."""
     tau = 0.03
     creep = Creep(tau=tau, span=1e-3)
     model = rig.drive_model()
@@ -133,7 +135,7 @@ def test_own_states_follow_the_motion_and_go_on():
     assert abs(afresh.at_starts[0, 0, 0] - z[border]) > 0.1 * size
 
 
-def test_xla_follows_where_there_is_no_machine_code(found: Fit, followed: Followed):
+def test_xla_linearisation_equals_that_of_machine_code(found: Fit, followed: Followed):
     again = follow(replace(found.problem, model=found.model, kernel=None), found.unknowns)
     for name, values in vars(followed).items():
         size = np.maximum(np.abs(values).max(axis=(0, 1)), 1e-12)

@@ -1,4 +1,4 @@
-"""Springs that slip, of a drive simulated here: what they remember follows from the motion, not from each segment."""
+"""Hidden states of slipping springs follow from the whole motion instead of a free start in each segment."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,10 @@ SPRINGS = ((900.0, 0.06), (1800.0, 0.025), (1800.0, 0.008))
 
 
 def slipping(forcing: np.ndarray, *, substeps: int = 20) -> np.ndarray:
-    """Dynamic error of `x'' = gain u - mu x' - omega_0^2 (x + alpha x^3) - sum k_i z_i`, where each z_i follows x and
-    is cut at its limit after every step."""
+    """Dynamic error of `x'' = gain u - mu x' - omega_0^2 (x + alpha x^3) - sum k_i z_i`.
+
+    Each z_i follows x and is cut at its limit after every step.
+    """
     h = rig.REDUCED_STEP / substeps
     x = v = 0.0
     z = [0.0] * len(SPRINGS)
@@ -38,9 +40,11 @@ def slipping(forcing: np.ndarray, *, substeps: int = 20) -> np.ndarray:
     return kept
 
 
-def test_what_springs_remember_comes_from_the_whole_motion():
-    """On short segments many starts of the springs explain as much, and hold the fit; over the whole log it comes near,
-    but for what half a sampling interval makes of sharp corners at this coarse sampling."""
+def test_carried_hidden_states_recover_the_springs_of_maxwell_slip():
+    """On short segments, many initial states of the springs fit equally well and keep the fit from the truth.
+
+    Over the whole log it comes near the truth. The rest is the error of sharp corners within half a sampling interval.
+    """
     forcing = rig.reduced_forcing(COUNT)
     logged = experiment_from_log(rig.reduced_log(slipping(forcing), forcing, noise=NOISE), hold="zero-order")
     truth = {"k_1": 900.0, "k_2": 1800.0, "k_3": 1800.0, "yield_twist": 0.06, "share_2": 25 / 60, "share_3": 8 / 60}

@@ -15,12 +15,12 @@ ROUNDING = {"Lanczos1": 1e-2}
 
 
 def sum_of_squares(parameters, data: Regression) -> float:
-    """Of physical parameters."""
+    """Sum of squared residuals at physical parameters."""
     plain = eqx.tree_at(lambda d: d.logarithmic, data, jnp.zeros_like(data.logarithmic))
     return float(jnp.sum(residual(Unknowns(parameters, jnp.zeros((1, 1))), plain)[0].rows ** 2))
 
 
-def test_all_27_problems_are_here():
+def test_table_holds_all_27_problems():
     assert len(TABLE) == 27
     assert set(TABLE) == set(MODELS)
     assert {
@@ -33,8 +33,8 @@ def test_all_27_problems_are_here():
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_the_data_have_the_certified_sum_of_squares(name: str):
-    """An error in a table or a model would show here, whatever the fit does."""
+def test_certified_parameters_give_the_certified_sum_of_squares(name: str):
+    """Detect an error in a table or a model, independently of the fit."""
     entry = TABLE[name]
     found = sum_of_squares(padded(entry["certified"]), regression(name))
     # Certified to eleven digits; rounding of the residual leaves two or three of Lanczos1's.
@@ -43,7 +43,7 @@ def test_the_data_have_the_certified_sum_of_squares(name: str):
 
 @pytest.mark.parametrize("start", [1, 2])
 @pytest.mark.parametrize("name", TABLE)
-def test_certified_values(name: str, start: int):
+def test_solver_reaches_certified_values_and_standard_errors(name: str, start: int):
     entry = TABLE[name]
     certified, errors = np.asarray(entry["certified"]), np.asarray(entry["standard_errors"])
     count = certified.size
@@ -60,12 +60,12 @@ def test_certified_values(name: str, start: int):
     np.testing.assert_allclose(np.sqrt(variance * np.diag(inverse)), errors, rtol=ROUNDING.get(name, DIGITS))
 
 
-def test_what_a_problem_lacks_does_not_move():
+def test_padded_parameters_do_not_move():
     found = solve(regression("Misra1a"), padded(TABLE["Misra1a"]["starts"][1]))
     np.testing.assert_array_equal(found.parameters[2:], 1.0)
 
 
-def test_a_wrong_answer_would_be_seen():
+def test_sum_of_squares_detects_wrong_parameters():
     data, entry = regression("Misra1a"), TABLE["Misra1a"]
     vector = padded(entry["certified"]) * (1 + 1e-4)
     assert sum_of_squares(vector, data) > (1 + 10 * DIGITS) * entry["sum_of_squares"]

@@ -1,4 +1,4 @@
-"""A drive seen by some of its sensors: starting values, first states, fits and reports of any subset of outputs."""
+"""Starting values, initial states, fits and reports of logs with any subset of the outputs."""
 
 from collections.abc import Sequence
 
@@ -43,7 +43,7 @@ def stretches_of(joint: joints.Joint, sensors: Sequence[str], *, noise: float = 
 
 
 def model_of(stretches: Sequence[Stretch], *, free: bool = False, K: float = 1.0) -> TwoInertiaModel:
-    """The joint's model, its inertias known or not at all."""
+    """Model of the joint with known or entirely free inertias."""
     priors = (Prior("J_m", 1.0, np.inf), Prior("J_l", 1.0, np.inf)) if free else ()
     own = {"J_m": 1.0, "J_l": 1.0} if free else {"J_m": JOINT.J_m, "J_l": JOINT.J_l}
     return TwoInertiaModel(Drive(N=JOINT.N, K=K, priors=priors, **own), measured=stretches[0].experiment.outputs)
@@ -56,7 +56,7 @@ def true_model(measured: tuple[str, ...]) -> TwoInertiaModel:
 
 @pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
 @pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
-def test_stiffness_and_inertias_follow_from_any_subset(sensors: tuple[str, ...], free: bool):
+def test_base_fit_recovers_stiffness_and_inertias_from_any_outputs(sensors: tuple[str, ...], free: bool):
     stretches = stretches_of(JOINT, sensors)
     found = base_fit(model_of(stretches, free=free), stretches)
     estimates = uncertainty(found).estimates
@@ -65,7 +65,7 @@ def test_stiffness_and_inertias_follow_from_any_subset(sensors: tuple[str, ...],
         assert abs(estimates[path].value - getattr(JOINT, path)) < 4.0 * estimates[path].std, (path, estimates[path])
 
 
-def test_friction_of_the_motor_does_not_mislead_what_sees_no_twist():
+def test_fit_without_twist_is_unbiased_under_motor_friction():
     stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
     found = base_fit(model_of(stretches, free=True), stretches)
     told = fit_behind_fixed_values(found)
@@ -76,7 +76,7 @@ def test_friction_of_the_motor_does_not_mislead_what_sees_no_twist():
         assert abs(float(found.model.get(path)) - getattr(JOINT, path)) < 4.0 * estimates[path].std
 
 
-def test_starting_values_are_near_although_friction_takes_half_of_the_torque():
+def test_starting_values_are_near_the_truth_under_strong_motor_friction():
     stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
     model = model_of(stretches, free=True)
     starts = starting_models(model, stretches)
@@ -86,23 +86,23 @@ def test_starting_values_are_near_although_friction_takes_half_of_the_torque():
 
 @given(st.floats(1.0, 30.0), st.floats(0.01, 3.0))
 @settings(max_examples=20, deadline=None)
-def test_load_answers_a_sinusoid_as_its_transfer_function_says(omega: float, damping: float):
+def test_load_response_to_a_sinusoid_equals_its_transfer_function(omega: float, damping: float):
     step, c_K, s = 1e-3, 100.0, 1j * omega
     time = step * np.arange(40_000)
     found = through_load(np.sin(omega * time), c_K, damping + 0.5, step)[-5000:]
     gain = (c_K + (damping + 0.5) * s) / (s**2 + (damping + 0.5) * s + c_K)
     expected = np.imag(gain * np.exp(s * time[-5000:]))
-    # Straight lines between samples, and what is left of the start.
+    # Error of straight lines between samples, and the remaining transient.
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(gain) + 1e-3)
 
 
-def test_the_linear_drive_reads_what_the_model_reads():
+def test_output_matrix_of_the_linear_drive_equals_that_of_the_model():
     model = true_model(tuple(OUTPUTS))
     np.testing.assert_allclose(readings(model), readout(model, model.rest()), rtol=1e-12)
 
 
 @pytest.mark.parametrize("sensors", [*SUBSETS, ("load_angle",)], ids="+".join)
-def test_first_states_are_those_of_the_motion(sensors: tuple[str, ...]):
+def test_observed_initial_states_equal_the_true_motion(sensors: tuple[str, ...]):
     (stretch,) = stretches_of(JOINT, sensors, noise=0.0)
     segments = Segmentation(256).of([stretch])
     found = observed_states(true_model(sensors), segments)
@@ -113,14 +113,14 @@ def test_first_states_are_those_of_the_motion(sensors: tuple[str, ...]):
 
 
 @pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
-def test_an_unseen_twist_is_known_by_its_size(sensors: tuple[str, ...]):
+def test_twist_estimated_without_load_angle_has_the_true_size(sensors: tuple[str, ...]):
     (stretch,) = stretches_of(JOINT, sensors)
     motion = joints.motion_of(JOINT, joints.torque_of(JOINT, count=COUNT))
     x = motion[:, 0] / JOINT.N - motion[:, 1]
     assert np.std(twist(stretch, true_model(sensors))) == pytest.approx(np.std(x), rel=0.05)
 
 
-def test_reports_tell_each_output_in_its_unit():
+def test_report_states_each_output_in_its_unit():
     stretches = stretches_of(JOINT, ("motor_angle", "joint_torque"))
     experiments = {"zero-order": tuple(s.experiment for s in stretches)}
     report = report_dict(fit_only(model_of(stretches), experiments, hold="zero-order"))
@@ -133,7 +133,7 @@ def test_reports_tell_each_output_in_its_unit():
     assert "joint torque" in report["frequency_response"]["says"][0]
 
 
-def test_reports_of_the_motor_alone_tell_of_its_antiresonance():
+def test_report_of_a_motor_only_log_states_the_antiresonance():
     stretches = stretches_of(JOINT, ("motor_angle",))
     found = fit_only(model_of(stretches), {"zero-order": (stretches[0].experiment,)}, hold="zero-order")
     response = report_dict(found)["frequency_response"]
@@ -143,7 +143,7 @@ def test_reports_of_the_motor_alone_tell_of_its_antiresonance():
     assert "antiresonance" in str(picture.figure["layout"]["annotations"])
 
 
-def test_a_joint_torque_is_that_of_the_mesh():
+def test_joint_torque_output_equals_the_mesh_torque():
     model = true_model(("joint_torque",))
     state = jnp.array([1.0, 0.018, 5.0, 0.03])
     assert float(model.outputs(state)[0]) == pytest.approx(JOINT.K * 0.002 + JOINT.B_sp * 0.07, rel=1e-12)

@@ -1,4 +1,4 @@
-"""Inertias and torque constant that are known to a tolerance, or not at all."""
+"""Inertias and torque factor with a Gaussian prior, or entirely free."""
 
 import math
 
@@ -16,7 +16,7 @@ from hdjax import Drive, TwoInertiaModel
 from hdjax.drive import Prior
 
 JOINT = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, alpha=300.0, rms=0.05)
-RUBBING = joints.with_friction(JOINT, 0.2, 0.2)
+WITH_FRICTION = joints.with_friction(JOINT, 0.2, 0.2)
 FREE = (Prior("J_m", 1.0, math.inf), Prior("J_l", 1.0, math.inf))
 
 
@@ -38,30 +38,32 @@ def fitted(stretches: tuple[Stretch, ...], *priors: Prior) -> Fit:
     return base_fit(model_of(*priors), stretches)
 
 
-def test_free_inertias_are_found(stretches):
+def test_free_inertias_are_recovered(stretches):
     for path, estimate in uncertainty(fitted(stretches, *FREE)).estimates.items():
         truth = getattr(JOINT, path)
         assert abs(estimate.value - truth) < 4.0 * estimate.std, (path, estimate)
         assert path in ("alpha",) or estimate.std < 0.01 * truth
 
 
-@pytest.mark.parametrize("joint", [JOINT, RUBBING], ids=["smooth", "rubbing"])
-def test_their_starting_values_follow_from_the_torque(joint):
+@pytest.mark.parametrize("joint", [JOINT, WITH_FRICTION], ids=["smooth", "rubbing"])
+def test_starting_inertias_follow_from_the_torque(joint):
     begun = with_starting_inertias(model_of(*FREE), stretches_of(joint))
     assert float(begun.get("J_m")) == pytest.approx(joint.J_m, rel=0.1)
     assert float(begun.get("J_l")) == pytest.approx(joint.J_l, rel=0.1)
 
 
-def test_a_wrong_value_gives_way_to_the_log(stretches):
-    """Angles and torque know the inertias far better than 10 %."""
+def test_wrong_prior_value_is_corrected_by_the_log(stretches):
+    """Angles and torque determine the inertias far better than 10 %."""
     found = fitted(stretches, Prior("J_m", 1.15 * JOINT.J_m, 0.1), Prior("J_l", 0.9 * JOINT.J_l, 0.1))
     assert float(found.model.get("J_m")) == pytest.approx(JOINT.J_m, rel=1e-3)
     assert float(found.model.get("K")) == pytest.approx(JOINT.K, rel=1e-3)
 
 
-def test_what_the_log_does_not_tell_stays_as_it_was_known(stretches):
-    """A log of angles knows everything in proportion to the torque: of the common factor only the priors tell, and
-    their Gaussian law is that of two measurements of one number."""
+def test_common_torque_factor_is_determined_by_the_priors(stretches):
+    """A log of angles determines all parameters only in proportion to the torque.
+
+    The priors alone determine the common factor, as two Gaussian measurements of one number.
+    """
     motor, constant = Prior("J_m", 1.04 * JOINT.J_m, 0.05), Prior("k_T", 1.0, 0.1)
     found = fitted(stretches, motor, Prior("J_l", JOINT.J_l, math.inf), constant)
     estimates = uncertainty(found).estimates
@@ -74,14 +76,14 @@ def test_what_the_log_does_not_tell_stays_as_it_was_known(stretches):
     assert estimates["k_T"].value == pytest.approx(factor, rel=1e-3)
 
 
-def test_the_likelihoods_profile_holds_the_prior(stretches):
+def test_profile_likelihood_includes_the_prior(stretches):
     found = fitted(stretches, Prior("J_m", JOINT.J_m, 0.05), Prior("J_l", JOINT.J_l, math.inf), Prior("k_T", 1.0, 0.1))
     known = uncertainty(found)
     low, high = profile(found, "J_m", known).ci95
-    # A Gaussian of the logarithm.
+    # The priors are Gaussian in the logarithm.
     assert math.log(high / low) == pytest.approx(2 * 1.96 * (0.05**-2 + 0.1**-2) ** -0.5, rel=0.1)
 
 
-def test_a_current_whose_constant_is_free(stretches):
+def test_free_torque_factor_is_recovered(stretches):
     found = fitted(stretches, Prior("k_T", 1.0, math.inf))
     assert float(found.model.get("k_T")) == pytest.approx(1.0, rel=1e-3)

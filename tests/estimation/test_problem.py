@@ -1,4 +1,4 @@
-"""How a fit is posed: starting states, steps and horizons, and the program that it will run."""
+"""Set-up of a fit: initial states, solver steps and horizons."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ def whole(*experiments) -> list[Stretch]:
     return [Stretch(e, 0, len(e)) for e in experiments]
 
 
-def test_initial_states_of_a_smooth_motion():
+def test_initial_states_of_a_smooth_motion_equal_the_truth():
     torque = rig.drive_torque(200)
     segments = cut(whole(rig.drive_experiment(200, noise=0.0)), 50)
     states = initial_states(rig.drive_model(), segments)
@@ -25,7 +25,7 @@ def test_initial_states_of_a_smooth_motion():
     np.testing.assert_array_less(off, [0.01, 0.01, 0.15, 0.15])
 
 
-def test_initial_speeds_of_a_noisy_oversampled_motion():
+def test_initial_speeds_of_a_noisy_oversampled_motion_are_near_the_truth():
     forcing = np.repeat(rig.reduced_forcing(100), 20)
     step = rig.REDUCED_STEP / 20
     motion = rig.reduced_motion(forcing, step=step)
@@ -33,11 +33,11 @@ def test_initial_speeds_of_a_noisy_oversampled_motion():
     segments = cut(whole(experiment_from_log(log, hold="zero-order")), 200, count=10)
     states = np.asarray(initial_states(rig.reduced_model(), segments))
     off = np.sqrt(np.mean((states - motion[::200]) ** 2, axis=0)) / np.std(motion, axis=0)
-    # 87 samples in a quarter period; from nine of them the speed would be mere noise.
+    # 87 samples in a quarter period; a speed from nine of them would be noise.
     np.testing.assert_array_less(off, [0.2, 0.5])
 
 
-def test_horizon_and_steps_follow_the_frequency():
+def test_horizon_and_solver_steps_follow_the_natural_frequency():
     stretches = whole(rig.drive_experiment(400))
     slow, fast = rig.drive_model(K=rig.K / 100, alpha=0.0), rig.drive_model(K=100 * rig.K, alpha=0.0)
     assert suggested_substeps(slow, stretches) == 1
@@ -48,14 +48,14 @@ def test_horizon_and_steps_follow_the_frequency():
     assert short_horizon(rig.drive_model(alpha=0.0), stretches) == 256
 
 
-def test_states_of_another_model_are_taken_by_name():
+def test_states_are_transferred_between_models_by_name():
     bare = rig.drive_model()
     moving = jnp.asarray(np.random.default_rng(0).normal(size=(8, 4)) * [10.0, 0.1, 5.0, 0.1])
     hidden = BoucWen(k=10.0, memory_twist=1e-3)
     model = bare.with_effects(hidden)
     states = np.asarray(states_from(model, bare, moving))
     np.testing.assert_array_equal(states[:, :4], moving)
-    # What has long moved as it does has no memory of anything else.
+    # A new hidden state starts at zero, as in a steady motion.
     np.testing.assert_array_equal(states[:, 4], 0.0)
     creeping = bare.with_effects(Creep(tau=0.1, k=700.0, span=1e-3), hidden)
     mixed = np.asarray(states_from(creeping, model, jnp.asarray(states + 1.0)))

@@ -1,4 +1,4 @@
-"""The residual is zero at the truth, and its Jacobian is the derivative of it."""
+"""The residual is zero at the truth, and its Jacobian equals finite differences."""
 
 import equinox as eqx
 import jax
@@ -41,7 +41,7 @@ def first_states(motion: np.ndarray, length: int = LENGTH) -> jnp.ndarray:
     return jnp.asarray(motion[::length])
 
 
-def test_zero_at_the_truth_of_a_reduced_drive():
+def test_residual_of_a_reduced_log_is_zero_at_the_truth():
     forcing = rig.reduced_forcing(COUNT)
     experiment = rig.reduced_experiment(COUNT)
     model = rig.reduced_model()
@@ -52,9 +52,11 @@ def test_zero_at_the_truth_of_a_reduced_drive():
     assert np.max(np.abs(error)) < 1e-6 * np.max(np.abs(experiment.measured))
 
 
-def test_what_no_sample_asks_for_is_not_simulated():
-    """With the later samples masked the drive stops there, and all that counts is as before; joined segments go on to
-    their ends."""
+def test_simulation_stops_after_the_last_sample_with_weight():
+    """With the later samples masked, the simulation stops early and weighted samples keep their residual.
+
+    Joined segments are simulated to their ends.
+    """
     model = rig.reduced_model()
     whole = problem_of(rig.reduced_experiment(COUNT), model, base_paths(model), substeps=2)
     start = Unknowns(whole.free.pack(model), first_states(rig.reduced_motion(rig.reduced_forcing(COUNT))))
@@ -69,7 +71,7 @@ def test_what_no_sample_asks_for_is_not_simulated():
     _, end = simulate_segments(whole, start)
     np.testing.assert_allclose(gaps.gap[1:], start.states[1:] - end[:-1], rtol=1e-12)
     _, stopped = simulate_segments(whole, start, jnp.asarray(10))
-    # It stands still once nothing is asked for, which is not where it would have been.
+    # The state stays constant after the last weighted sample, unlike the full simulation.
     assert np.abs(np.asarray(stopped - end)).max() > 1e-3 * np.abs(np.asarray(end)).max()
 
 
@@ -82,7 +84,7 @@ EFFECTS = (
 )
 
 
-def test_zero_at_the_truth_of_a_drive_with_effects_on_every_side():
+def test_residual_of_a_drive_with_several_effects_is_zero_at_the_truth():
     start = (0.5, 0.009, 10.0, 0.3)
     torque = rig.drive_torque(COUNT)
     motion = rig.drive_motion(torque, state=start, substeps=12, **PHYSICS)
@@ -101,8 +103,8 @@ def test_zero_at_the_truth_of_a_drive_with_effects_on_every_side():
 
 
 @pytest.fixture(scope="module")
-def hidden() -> tuple[Problem, Unknowns]:
-    """A drive with two effects, one of which has a state of its own, away from any optimum."""
+def drive_problem() -> tuple[Problem, Unknowns]:
+    """A drive with two effects, one of which has a hidden state, away from any optimum."""
     experiment = rig.drive_experiment(COUNT)
     effects = (CoulombFriction(T_c=0.5, v_0=0.1), BoucWen(k=900.0, memory_twist=4e-4, n=1.5))
     model = rig.drive_model(K=6500.0, alpha=1e4).with_effects(*effects)
@@ -115,8 +117,8 @@ def hidden() -> tuple[Problem, Unknowns]:
 
 
 @pytest.fixture(scope="module")
-def hidden_blocks(hidden):
-    return eqx.filter_jit(blocks)(*hidden)
+def drive_blocks(drive_problem):
+    return eqx.filter_jit(blocks)(*drive_problem)
 
 
 _residual = eqx.filter_jit(residual)
@@ -139,44 +141,44 @@ def assert_column(found, expected):
     assert np.max(np.abs(expected)) > 0
 
 
-def test_blocks_by_parameter_are_differences(hidden, hidden_blocks):
-    problem, unknowns = hidden
+def test_jacobian_by_parameter_equals_central_differences(drive_problem, drive_blocks):
+    problem, unknowns = drive_problem
     count = unknowns.parameters.size
     assert count == 8
     for i in range(count):
         change = Unknowns(jnp.eye(count)[i], jnp.zeros_like(unknowns.states))
         expected = difference(problem, unknowns, change)
-        assert_column(hidden_blocks.by_parameter[:, :, i], expected)
+        assert_column(drive_blocks.by_parameter[:, :, i], expected)
 
 
-def test_blocks_by_state_are_differences(hidden, hidden_blocks):
-    problem, unknowns = hidden
+def test_jacobian_by_initial_state_equals_central_differences(drive_problem, drive_blocks):
+    problem, unknowns = drive_problem
     scale = np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])
     for i in range(5):
         own = np.zeros(unknowns.states.shape)
         own[:, i] = scale[i]
         expected = difference(problem, unknowns, Unknowns(jnp.zeros(8), jnp.asarray(own)))
-        assert_column(hidden_blocks.by_state[:, :, i] * scale[i], expected)
+        assert_column(drive_blocks.by_state[:, :, i] * scale[i], expected)
 
 
-def test_a_segment_depends_on_its_own_state_only(hidden):
-    problem, unknowns = hidden
+def test_residual_of_a_segment_depends_only_on_its_initial_state(drive_problem):
+    problem, unknowns = drive_problem
     moved = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[1].add(jnp.asarray([0, 1e-4, 0, 0, 0.0])))
     changed = np.any(np.asarray(_residual(problem, moved)[0]) != np.asarray(_residual(problem, unknowns)[0]), axis=1)
     np.testing.assert_array_equal(changed, [False, True, False])
 
 
-def test_hidden_states_have_a_prior(hidden, hidden_blocks):
-    _, unknowns = hidden
-    rows = np.asarray(hidden_blocks.residual)
+def test_hidden_states_have_a_prior(drive_problem, drive_blocks):
+    _, unknowns = drive_problem
+    rows = np.asarray(drive_blocks.residual)
     assert rows.shape == (3, 2 * LENGTH + 1)
     np.testing.assert_allclose(rows[:, -1], unknowns.states[:, 4] / 4e-4, rtol=1e-12)
-    np.testing.assert_allclose(hidden_blocks.by_state[:, -1, 4], 1 / 4e-4, rtol=1e-12)
-    assert (np.asarray(hidden_blocks.by_parameter)[:, -1] == 0).all()
+    np.testing.assert_allclose(drive_blocks.by_state[:, -1, 4], 1 / 4e-4, rtol=1e-12)
+    assert (np.asarray(drive_blocks.by_parameter)[:, -1] == 0).all()
 
 
-def test_the_derivative_is_a_product_with_the_blocks(hidden, hidden_blocks):
-    problem, unknowns = hidden
+def test_jvp_of_the_residual_is_a_product_with_its_blocks(drive_problem, drive_blocks):
+    problem, unknowns = drive_problem
     random = np.random.default_rng(3)
     change = Unknowns(
         jnp.asarray(random.normal(size=8)),
@@ -186,22 +188,22 @@ def test_the_derivative_is_a_product_with_the_blocks(hidden, hidden_blocks):
         problem, unknowns, change
     )
     np.testing.assert_allclose(value.rows, _residual(problem, unknowns)[0], rtol=1e-12)
-    expected = np.einsum("srp,p->sr", hidden_blocks.by_parameter, change.parameters)
-    expected += np.einsum("srq,sq->sr", hidden_blocks.by_state, change.states)
+    expected = np.einsum("srp,p->sr", drive_blocks.by_parameter, change.parameters)
+    expected += np.einsum("srq,sq->sr", drive_blocks.by_state, change.states)
     np.testing.assert_allclose(slope.rows, expected, atol=1e-9 * np.max(np.abs(expected)))
     assert_column(slope.rows, difference(problem, unknowns, change))
 
 
 @pytest.fixture(scope="module")
-def joined(hidden) -> tuple[Problem, Unknowns]:
-    """The second and third segments continue the one before, and do not start where it ends."""
-    problem, unknowns = hidden
+def joined(drive_problem) -> tuple[Problem, Unknowns]:
+    """The second and third segments are joined to the one before, with gaps between them."""
+    problem, unknowns = drive_problem
     segments = eqx.tree_at(lambda s: s.joined, problem.segments, jnp.asarray([False, True, True]))
     weight = jnp.asarray([1e2, 1e5, 1.0, 1e2, 1e3])
     return eqx.tree_at(lambda p: (p.segments, p.gap_weight), problem, (segments, weight)), unknowns
 
 
-def test_gaps_are_starts_minus_ends(joined, hidden_blocks):
+def test_gap_is_the_start_minus_the_end_of_the_previous_segment(joined, drive_blocks):
     problem, unknowns = joined
     rows, gap = (np.asarray(part) for part in _residual(problem, unknowns))
     np.testing.assert_array_equal(gap[0], 0.0)
@@ -218,10 +220,10 @@ def test_gaps_are_starts_minus_ends(joined, hidden_blocks):
     np.testing.assert_allclose(outputs - (measured - through[0, LENGTH]), moved, rtol=1e-9)
     # Joined segments inherit their hidden states: only the first has a prior.
     np.testing.assert_array_equal(rows[1:, -1], 0.0)
-    np.testing.assert_allclose(rows[0], np.asarray(hidden_blocks.residual)[0], rtol=1e-12)
+    np.testing.assert_allclose(rows[0], np.asarray(drive_blocks.residual)[0], rtol=1e-12)
 
 
-def test_slopes_of_gaps_are_differences(joined):
+def test_jacobian_of_gaps_equals_central_differences(joined):
     problem, unknowns = joined
     found = eqx.filter_jit(blocks)(problem, unknowns)
     scale = np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])
@@ -240,7 +242,7 @@ def test_slopes_of_gaps_are_differences(joined):
     assert (np.asarray(found.before_by_state)[0] == 0).all()
 
 
-def test_the_derivative_of_weighted_gaps(joined):
+def test_jvp_of_weighted_gaps_equals_central_differences(joined):
     problem, unknowns = joined
     random = np.random.default_rng(4)
     scale = np.array([1e-1, 2e-3, 5.0, 0.1, 1e-4])
@@ -254,26 +256,26 @@ def test_the_derivative_of_weighted_gaps(joined):
     np.testing.assert_allclose(slope.gap, expected, atol=1e-5 * np.max(np.abs(expected)))
 
 
-def test_padding_does_not_matter(hidden, hidden_blocks):
-    problem, unknowns = hidden
+def test_padding_does_not_change_the_residual_or_its_jacobian(drive_problem, drive_blocks):
+    problem, unknowns = drive_problem
     measured = problem.segments.measured.at[2, 20:].add(7.0)
     spoiled = eqx.tree_at(lambda p: p.segments.measured, problem, measured)
     found = eqx.filter_jit(blocks)(spoiled, unknowns)
-    np.testing.assert_array_equal(found.residual, hidden_blocks.residual)
-    assert (np.asarray(hidden_blocks.by_parameter)[2, 40:80] == 0).all()
-    assert (np.asarray(hidden_blocks.residual)[2, 40:80] == 0).all()
+    np.testing.assert_array_equal(found.residual, drive_blocks.residual)
+    assert (np.asarray(drive_blocks.by_parameter)[2, 40:80] == 0).all()
+    assert (np.asarray(drive_blocks.residual)[2, 40:80] == 0).all()
 
 
-def test_a_held_parameter_has_no_column(hidden, hidden_blocks):
-    problem, unknowns = hidden
+def test_jacobian_column_of_an_inactive_parameter_is_zero(drive_problem, drive_blocks):
+    problem, unknowns = drive_problem
     held = eqx.tree_at(lambda p: p.active, problem, problem.active.at[1].set(0.0))
     found = eqx.filter_jit(blocks)(held, unknowns)
     assert (np.asarray(found.by_parameter)[:, :, 1] == 0).all()
-    np.testing.assert_array_equal(found.by_parameter[:, :, 2], hidden_blocks.by_parameter[:, :, 2])
+    np.testing.assert_array_equal(found.by_parameter[:, :, 2], drive_blocks.by_parameter[:, :, 2])
 
 
-def test_a_simulation_that_leaves_the_numbers_is_a_large_residual(hidden):
-    problem, unknowns = hidden
+def test_diverged_simulation_has_a_large_finite_residual(drive_problem):
+    problem, unknowns = drive_problem
     lost = eqx.tree_at(lambda u: u.states, unknowns, unknowns.states.at[0].set(jnp.inf))
     found = eqx.filter_jit(blocks)(problem, lost)
     for leaf in jax.tree.leaves((found.residual[:, :-1], found.by_parameter, found.by_state, found.gap)):

@@ -1,4 +1,4 @@
-"""Sample rates that rounded stamps leave open: refined by the fit, and part of its standard errors."""
+"""Sample rates that rounded time stamps leave uncertain: refined by the fit, and part of its standard errors."""
 
 from dataclasses import replace
 
@@ -36,14 +36,14 @@ def wrong() -> Fit:
     return fitted(*experiments(0, rate_std=STD, factor=WRONG))
 
 
-def test_exact_stamps_leave_nothing_open():
+def test_sample_rate_is_fixed_with_exact_time_stamps():
     found = fitted(*experiments(0, rate_std=0.0))
     assert rate_columns(found) is None and refined_intervals(found) == {}
 
 
-def test_a_fit_refines_the_rate(wrong: Fit):
+def test_fit_refines_a_wrong_sample_rate(wrong: Fit):
     (factor,) = refined_intervals(wrong).values()
-    # The data know the rate to a fraction of what the stamps leave open; the prior pulls by their ratio squared.
+    # The data determine the rate far better than the stamps; the prior biases it by the squared ratio of both errors.
     assert abs(factor * WRONG - 1.0) < 0.2 * (WRONG - 1.0)
     experiment = wrong.stretches[0].experiment
     (mended,) = with_intervals({"zero-order": [experiment]}, {experiment.log: factor})["zero-order"]
@@ -54,14 +54,14 @@ def test_a_fit_refines_the_rate(wrong: Fit):
     assert abs(float(again.model.drive.K) / rig.K - 1.0) < abs(float(wrong.model.drive.K) / rig.K - 1.0) + 1e-5
 
 
-def test_standard_errors_allow_for_the_rate(wrong: Fit):
+def test_standard_errors_allow_for_the_uncertain_sample_rate(wrong: Fit):
     known = replace(wrong.stretches[0].experiment, rate_std=0.0)
     without = uncertainty(fitted(known), torque_noise=False).estimates["K"].std
     beside = uncertainty(wrong, torque_noise=False).estimates["K"].std
     assert beside > 1.05 * without
 
 
-def test_the_rate_is_one_of_each_log_across_its_gaps():
+def test_pieces_of_one_log_share_one_sample_rate():
     pieces = ((0, 5 * SHORTEST), (6 * SHORTEST, COUNT))
     parts = experiments(1, rate_std=STD, factor=1.0 / WRONG, pieces=pieces)
     found = fitted(*parts, *experiments(2, rate_std=0.0))

@@ -1,4 +1,4 @@
-"""Steps are as fine as what the data tell of the parameters asks for."""
+"""Solver steps are as fine as the standard errors of the parameters require."""
 
 from dataclasses import replace
 
@@ -21,18 +21,18 @@ def refitted(found: Fit, substeps: int) -> Fit:
 
 
 def distance(one: Fit, other: Fit) -> float:
-    """Between the parameters of two fits: the largest in standard errors."""
+    """Largest difference between the parameters of two fits, in standard errors."""
     apart = np.asarray(one.unknowns.parameters) - np.asarray(other.unknowns.parameters)
     return float(np.max(np.abs(apart) / np.sqrt(np.diag(uncertainty(one).unit_covariance))))
 
 
-def test_the_shift_of_the_parameters_is_what_a_refit_with_finer_steps_shows():
-    """Where segments are joined, what a step leaves at the end of one goes on through all that follow."""
+def test_predicted_parameter_shift_equals_that_of_a_refit_with_finer_steps():
+    """The solver error at the end of a joined segment propagates through all later segments."""
     log = rig.drive_experiment(COUNT)
     segmentation = Segmentation(COUNT, SEGMENT, substeps=1)
     found = fit(rig.drive_model(), [Stretch(log, 0, COUNT)], PATHS, segmentation)
     found = refitted(found, 1)
     shift = distance(found, refitted(found, 2))
-    # Second orders of the shift, and where the iteration ends.
+    # The tolerance of 10 % covers second-order terms of the shift and the end of the iteration.
     assert needed_substeps(found, tolerance=np.inf, shift=1.1 * shift) == 1
     assert needed_substeps(found, tolerance=np.inf, shift=0.9 * shift) > 1

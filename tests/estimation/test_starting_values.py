@@ -1,4 +1,4 @@
-"""From no start at all: the weak form brings a fit within reach of the truth."""
+"""Starting values from the weak form, without any prior values, are near the truth."""
 
 import numpy as np
 import pytest
@@ -33,12 +33,12 @@ def drawn_drive(stiffness: float, zeta: float, seed: int) -> tuple[Experiment, f
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5])
 @pytest.mark.parametrize("zeta", [0.003, 0.02, 0.1])
-def test_stiffness_is_within_reach(stiffness: float, zeta: float):
+def test_starting_stiffness_is_within_ten_percent_of_the_truth(stiffness: float, zeta: float):
     experiment, _ = drawn_drive(stiffness, zeta, seed=int(1e4 * zeta))
     found = starting_models(PLACEHOLDER, whole(experiment))
     away = [abs(float(m.get("K")) / stiffness - 1.0) for m in found]
     assert min(away) < 0.1, away
-    # One fit for each: a handful, and no two of them the same.
+    # Each start costs one fit, so that there are few and no two are equal.
     assert len(found) <= 12
     K = np.sort([float(m.get("K")) for m in found])
     assert (np.diff(np.log(K)) > 0.03).all()
@@ -47,7 +47,7 @@ def test_stiffness_is_within_reach(stiffness: float, zeta: float):
         assert float(model.get("J_m")) == rig.J_M
 
 
-def test_hardening_and_damping_are_seen():
+def test_starting_alpha_and_damping_have_the_right_size():
     stiffness, zeta = 1e4, 0.03
     experiment, alpha = drawn_drive(stiffness, zeta, seed=5)
     found = starting_models(PLACEHOLDER, whole(experiment))
@@ -57,7 +57,7 @@ def test_hardening_and_damping_are_seen():
     assert 0.3 * damping < float(best.get("B_sp")) < 3.0 * damping
 
 
-def test_an_offset_of_both_angles_does_not_matter():
+def test_starting_values_do_not_depend_on_an_offset_of_both_angles():
     torque = rig.drive_torque(COUNT)
     motion = rig.drive_motion(torque)
     motion[:, :2] += np.array([rig.N * 3.0, 3.0])
@@ -66,7 +66,7 @@ def test_an_offset_of_both_angles_does_not_matter():
     assert min(abs(float(m.get("K")) / rig.K - 1.0) for m in found) < 0.1
 
 
-def test_the_load_tells_without_the_torque():
+def test_load_equation_gives_stiffness_without_the_motor_torque():
     log = rig.drive_log(rig.drive_motion(rig.drive_torque(COUNT)), rig.drive_torque(COUNT, rms=1.5, seed=9))
     stretches = whole(experiment_from_log(log, hold="zero-order", N=rig.N))
     found = _weak_form(PLACEHOLDER, stretches, 96, "load")
@@ -75,7 +75,7 @@ def test_the_load_tells_without_the_torque():
 
 
 @pytest.mark.parametrize("gain", [rig.GAIN, -rig.GAIN])
-def test_reduced_log(gain: float):
+def test_starting_values_of_a_reduced_log_are_near_the_truth(gain: float):
     experiment = rig.reduced_experiment(COUNT, noise=1e-4, gain=gain)
     found = starting_models(REDUCED_PLACEHOLDER, whole(experiment))
     best = min(found, key=lambda m: abs(np.log(float(m.get("omega_0")) / rig.OMEGA_0)))
@@ -85,14 +85,14 @@ def test_reduced_log(gain: float):
     assert float(best.get("alpha")) == pytest.approx(rig.REDUCED_ALPHA, rel=0.5)
 
 
-def test_several_logs_serve_together():
+def test_starting_values_use_several_logs_together():
     parts = [Stretch(rig.drive_experiment(700, seed=s), 0, 700) for s in (1, 2)]
     found = starting_models(PLACEHOLDER, parts)
     assert min(abs(float(m.get("K")) / rig.K - 1.0) for m in found) < 0.1
 
 
-def test_a_log_without_a_spring_is_refused():
-    # A mesh that pushes instead of pulling: every weak form sees a negative stiffness.
+def test_log_with_negative_stiffness_is_refused():
+    # Every weak form estimates a negative stiffness.
     torque = rig.drive_torque(COUNT)
     motion = rig.drive_motion(torque, stiffness=-1.0, alpha=0.0, damping=0.0)
     log = rig.drive_log(motion, torque, noise=0.0, name="runaway")
@@ -100,21 +100,21 @@ def test_a_log_without_a_spring_is_refused():
         starting_models(PLACEHOLDER, whole(experiment_from_log(log, hold="zero-order", N=rig.N)))
 
 
-def test_a_runaway_reduced_log_is_refused():
+def test_reduced_log_with_exponential_growth_is_refused():
     time = np.arange(COUNT) * rig.REDUCED_STEP
     log = rig.reduced_log(np.cosh(2.0 * (time - time.mean())), rig.reduced_forcing(COUNT))
     with pytest.raises(DataError, match="reduced: the dynamic error does not follow"):
         starting_models(REDUCED_PLACEHOLDER, whole(experiment_from_log(log, hold="zero-order")))
 
 
-def test_a_log_shorter_than_the_windows_is_refused():
+def test_log_shorter_than_the_windows_is_refused():
     experiment = rig.reduced_experiment(30)
     with pytest.raises(DataError):
         starting_models(REDUCED_PLACEHOLDER, whole(experiment))
 
 
-def test_forms_that_see_no_steady_load_see_through_a_weight():
-    """Under a weight that outweighs the motor's torque the others see a tenth of the stiffness, or noise."""
+def test_weak_forms_blind_to_steady_load_give_stiffness_under_gravity():
+    """Where gravity exceeds the motor torque, other weak forms give a far too small stiffness or none."""
     torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
     log = rig.drive_log(rig.drive_motion(torque, gravity=20.0), torque, noise=0.1)
     stretches = whole(experiment_from_log(log, hold="zero-order", N=rig.N))

@@ -1,4 +1,4 @@
-"""A load that is another in each segment: a state that acts as a constant torque does."""
+"""A steady load with a free value in each segment: a hidden state that acts as a constant torque."""
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from hdjax.effects.load import ConstantLoad
 from hdjax.simulate import march
 
 
-def test_its_state_is_a_share_of_its_reach():
+def test_steady_load_acts_as_its_state_times_its_reach():
     torque = sampled(rig.STEP * np.arange(200), rig.drive_torque(200), hold="zero-order")
 
     def motion(effect, *own):

@@ -1,4 +1,4 @@
-"""Test data: nothing but the final figures looks at them."""
+"""Test data are used by the final figures only."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,7 @@ torque_hold = "zero-order"
 
 
 def write_logs(folder: Path, scrambled: bool, offset: float = 0.0) -> tuple[Path, Path]:
-    """A log of a drive with motor friction, its last fifth of the outputs in any order where asked for."""
+    """Write a log of a drive with motor friction; if scrambled, its last fifth of outputs is permuted."""
     torque = rig.drive_torque(COUNT)
     log = rig.drive_log(rig.drive_motion(torque, motor_friction=(0.03, 0.05)), torque)
     order = np.arange(COUNT)
@@ -45,7 +45,7 @@ def write_logs(folder: Path, scrambled: bool, offset: float = 0.0) -> tuple[Path
 
 
 def without_test(found: dict) -> dict:
-    """A report without what tells of test data, of the health of logs, and of the time that it took."""
+    """A report without test figures, health of logs and computing time."""
     kept = {k: v for k, v in found.items() if k not in ("health", "seconds", "summary", "extrapolation")}
     for stage in ("before", "after"):
         for parts in (kept[stage]["rmse"], kept[stage]["rmse_motor_angle"], *kept[stage]["rmse_of_outputs"].values()):
@@ -54,7 +54,7 @@ def without_test(found: dict) -> dict:
     return kept
 
 
-def test_scrambled_test_data_change_nothing_but_the_test_figures(tmp_path: Path):
+def test_scrambled_test_data_change_only_the_test_figures(tmp_path: Path):
     found = []
     for scrambled in (False, True):
         folder = tmp_path / str(scrambled)
@@ -70,7 +70,7 @@ def test_scrambled_test_data_change_nothing_but_the_test_figures(tmp_path: Path)
     assert models[0] == models[1]
 
 
-def test_both_parts_are_counted_from_the_zero_of_the_first(tmp_path: Path):
+def test_both_parts_of_a_log_share_one_zero_of_twist(tmp_path: Path):
     path, drive = write_logs(tmp_path, False, offset=0.3)
     drive_file = read_drive_file(drive)
     whole = read_log(path, drive_file)
@@ -80,7 +80,7 @@ def test_both_parts_are_counted_from_the_zero_of_the_first(tmp_path: Path):
     np.testing.assert_allclose(test.dynamic_error + test.zero, whole.dynamic_error[-TEST:], rtol=0, atol=1e-12)
 
 
-def test_a_short_log_keeps_all_of_its_data(tmp_path: Path):
+def test_short_log_has_no_test_data(tmp_path: Path):
     path, drive = write_logs(tmp_path, False)
     drive_file = read_drive_file(drive)
     short = read_log(path, drive_file).rows(0, 400)
@@ -88,7 +88,7 @@ def test_a_short_log_keeps_all_of_its_data(tmp_path: Path):
     assert len(known) == 400 and test is None
 
 
-def test_another_log_is_test_data_from_beginning_to_end(tmp_path: Path):
+def test_log_named_as_test_data_is_used_whole(tmp_path: Path):
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
     path, drive = write_logs(tmp_path / "one", False)

@@ -1,4 +1,4 @@
-"""The fit over whole logs is taken where it tells more, and only there."""
+"""The fit over whole logs is accepted only where simulations follow them."""
 
 import jax.numpy as jnp
 import pytest
@@ -27,15 +27,15 @@ def found(request: pytest.FixtureRequest) -> Fit:
     return fit(start, [Stretch(logged, 0, COUNT)], PATHS, Segmentation(HORIZON, substeps=2))
 
 
-def test_a_chaotic_motion_keeps_the_fit_of_short_segments(found: Fit):
+def test_long_fit_keeps_short_segments_for_a_chaotic_motion(found: Fit):
     kept = long_fit(found)
     assert found.converged and kept.horizon == HORIZON and kept.objective < found.objective + 1e-3
-    # A long one would promise errors forty times as small, and not move.
+    # A long fit would report errors forty times as small without moving.
     K = uncertainty(kept).estimates["K"]
     assert abs(K.value - rig.K) < 4.0 * K.std
 
 
-def test_a_long_simulation_tells_more_of_a_smooth_motion():
+def test_long_fit_reduces_standard_errors_for_a_smooth_motion():
     logged = rig.drive_experiment(COUNT)
     short = fit(rig.drive_model(), [Stretch(logged, 0, COUNT)], PATHS[:3], Segmentation(HORIZON, substeps=1))
     long = long_fit(short)
