@@ -1,4 +1,4 @@
-"""What a log can't tell: against logs that can, refits with other values, and structure known on paper."""
+"""Identifiability, compared with other logs, with refits at other values and with closed-form structure."""
 
 import re
 
@@ -37,50 +37,50 @@ def drive_fit(model, paths=("K", "alpha", "B_sp"), **options) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def faint() -> tuple[Fit, Estimate]:
-    """A log whose twist is too small for its alpha."""
+def small_twist_fit() -> tuple[Fit, Estimate]:
+    """A log whose twist is too small to determine alpha."""
     found = reduced_fit(rig.reduced_experiment(COUNT, noise=NOISE, rms=0.5), alpha=0.0)
     return found, uncertainty(found).estimates["alpha"]
 
 
-def test_alpha_needs_the_twist_that_it_is_said_to_need(faint: tuple[Fit, Estimate]):
-    _, alpha = faint
+def test_alpha_becomes_identifiable_above_the_needed_twist(small_twist_fit: tuple[Fit, Estimate]):
+    _, alpha = small_twist_fit
     assert not alpha.identifiable
     x_max = 0.5 / 10.0 * np.max(np.abs(rig.reduced_experiment(COUNT).measured))
-    # At the true alpha's needed twist its interval would just touch zero: well below and well above are clear cases.
+    # At the needed twist, the interval of alpha just reaches zero; both cases are well below and well above it.
     factor = needed_twist(alpha, rig.REDUCED_ALPHA, x_max=1.0)
     seen = {}
     for share in (0.6, 1.7):
         experiment = rig.reduced_experiment(COUNT, noise=NOISE, rms=0.5 * share * factor)
         seen[share] = uncertainty(reduced_fit(experiment, alpha=0.0)).estimates["alpha"]
     assert not seen[0.6].identifiable and seen[1.7].identifiable
-    # The cube of the twist, as long as the motion is nearly linear; the two know their noise to some 20 %.
+    # The error falls with the cube of the twist while the motion is nearly linear; noise estimates differ by 20 %.
     assert seen[0.6].std_classical / seen[1.7].std_classical == pytest.approx((1.7 / 0.6) ** 3, rel=0.2)
     assert f"{max(map(abs, alpha.ci95)) * x_max**2:.2g}" in reason(alpha, x_max=x_max, x_unit="[x]")
 
 
-def test_samples_add_up_as_their_square_root(faint: tuple[Fit, Estimate]):
-    _, alpha = faint
+def test_needed_samples_grow_with_the_square_of_the_standard_error(small_twist_fit: tuple[Fit, Estimate]):
+    _, alpha = small_twist_fit
     assert needed_samples(alpha, 0.5 * alpha.std) == pytest.approx(4 * needed_samples(alpha, alpha.std))
     assert needed_samples(alpha, 0.0) == np.inf == needed_twist(alpha, 0.0, x_max=1.0)
 
 
-def test_sentences_of_a_faint_log(faint: tuple[Fit, Estimate]):
-    found, _ = faint
+def test_report_of_a_log_with_small_twist_states_that_alpha_is_not_identifiable(small_twist_fit: tuple[Fit, Estimate]):
+    found, _ = small_twist_fit
     result = identifiability(found, uncertainty(found))
     assert set(result.reasons) == {"alpha"}
     assert result.reasons["alpha"].startswith("alpha is not identifiable from these logs: |alpha| is at most")
     assert "they would need a twist above" in result.reasons["alpha"]
     assert result.note("alpha") == result.reasons["alpha"] and result.note("mu") is None
     assert result.bounds == {} and not any(d.sentence for d in result.directions)
-    # One direction is weak, and it is that of alpha.
+    # The only weak direction is that of alpha.
     weakest = result.directions[0]
     assert abs(weakest.weights["alpha"]) > 0.99
     assert [d.std for d in result.directions] == sorted((d.std for d in result.directions), reverse=True)
 
 
-def test_a_slow_log_knows_ratios_only():
-    """Far below its resonance the oscillator follows `gain u / omega_0^2`, late by `mu / omega_0^2`."""
+def test_slow_log_determines_only_ratios_to_the_squared_natural_frequency():
+    """Far below its resonance, the oscillator follows `gain u / omega_0^2` with the delay `mu / omega_0^2`."""
     time = np.arange(COUNT) * rig.REDUCED_STEP
     forcing, omega = 300.0 * np.sin(2 * np.pi * 0.25 * time), 2 * np.pi * 0.25
     start = (0.0, 300.0 * rig.GAIN / rig.OMEGA_0**2 * omega)
@@ -88,7 +88,7 @@ def test_a_slow_log_knows_ratios_only():
     experiment = experiment_from_log(rig.reduced_log(motion[:, 0], forcing, noise=5e-3), hold="zero-order")
     found = reduced_fit(experiment, mu=30.0)
     (weak,) = [d for d in identifiability(found, uncertainty(found)).directions if d.sentence is not None]
-    # Twice the logarithm of omega_0 goes with one of the gain and of mu; the damping alone is seen in the delay.
+    # In the weak direction, log gain and log mu change by twice log omega_0; only the delay depends on mu.
     for path in ("gain", "mu"):
         relative = weak.weights[path] * weak.units[path] / float(found.model.get(path))
         assert relative / weak.weights["omega_0"] == pytest.approx(2.0, rel=0.05), path
@@ -98,18 +98,18 @@ def test_a_slow_log_knows_ratios_only():
 
 
 @pytest.fixture(scope="module")
-def drive() -> Fit:
+def fitted_drive() -> Fit:
     return drive_fit(rig.drive_model(K=0.9 * rig.K, alpha=0.0))
 
 
-def test_what_an_error_of_an_inertia_does(drive: Fit):
-    found = uncertainty(drive)
-    result = identifiability(drive, found)
+def test_sensitivity_to_a_fixed_inertia_equals_that_of_a_refit(fitted_drive: Fit):
+    found = uncertainty(fitted_drive)
+    result = identifiability(fitted_drive, found)
     assert [h.path for h in result.held] == ["J_m", "J_l"]
     for held in result.held:
         # A step small enough to be linear, at the same weights.
-        moved = drive.model.replace({held.path: (1 + 1e-4) * held.value})
-        wrong = drive_fit(moved, start=Start(drive.covariance), strategy=Strategy(reweigh=False))
+        moved = fitted_drive.model.replace({held.path: (1 + 1e-4) * held.value})
+        wrong = drive_fit(moved, start=Start(fitted_drive.covariance), strategy=Strategy(reweigh=False))
         for path in ("K", "alpha", "B_sp"):
             value = found.estimates[path].value
             change = float(wrong.model.get(path)) / value - 1.0
@@ -121,28 +121,28 @@ def test_what_an_error_of_an_inertia_does(drive: Fit):
 
 
 @pytest.mark.slow
-def test_stiffness_where_an_inertia_is_fitted_too(drive: Fit):
-    result = identifiability(drive, uncertainty(drive))
-    wider = uncertainty(drive_fit(drive.model, ("K", "alpha", "B_sp", "J_l"))).estimates
-    held = uncertainty(drive).estimates
+def test_predicted_errors_with_a_free_inertia_equal_those_of_a_refit(fitted_drive: Fit):
+    result = identifiability(fitted_drive, uncertainty(fitted_drive))
+    wider = uncertainty(drive_fit(fitted_drive.model, ("K", "alpha", "B_sp", "J_l"))).estimates
+    held = uncertainty(fitted_drive).estimates
     told = result.held[1].std_if_free
     for path in ("K", "B_sp"):
-        # By how much the classical errors grow; the robust ones know themselves to some 20 %.
+        # Growth of the classical errors; robust errors are themselves uncertain by 20 %.
         growth = wider[path].std_classical / held[path].std_classical
         assert told[path] * held[path].value / held[path].std == pytest.approx(growth, rel=0.35), path
     assert told["K"] > held["K"].std / held["K"].value
 
 
-def test_a_parameter_that_ran_to_zero(drive: Fit):
-    gone = eqx.tree_at(lambda f: f.model, drive, drive.model.replace({"K": 1e-5 * rig.K}))
-    result = identifiability(gone, uncertainty(drive))
+def test_parameter_near_zero_is_reported_at_its_bound(fitted_drive: Fit):
+    gone = eqx.tree_at(lambda f: f.model, fitted_drive, fitted_drive.model.replace({"K": 1e-5 * rig.K}))
+    result = identifiability(gone, uncertainty(fitted_drive))
     assert set(result.bounds) == {"K"}
     assert result.bounds["K"].startswith("K went from") and "its bound at zero" in result.bounds["K"]
     assert result.note("K") == result.bounds["K"]
-    assert identifiability(drive, uncertainty(drive)).bounds == {}
+    assert identifiability(fitted_drive, uncertainty(fitted_drive)).bounds == {}
 
 
-def test_bounds_in_si_units_say_nothing_of_a_reduced_log():
+def test_bounds_in_si_units_are_ignored_for_a_reduced_log():
     stretches = [Stretch(rig.reduced_experiment(COUNT, noise=NOISE), 0, COUNT)]
     model = rig.reduced_model().with_effects(BoucWen(k=0.01, memory_twist=0.2))
     found = fit(
@@ -170,7 +170,9 @@ def test_bounds_in_si_units_say_nothing_of_a_reduced_log():
         (0.5, (0.5, 2.0), 1.0, True),
     ],
 )
-def test_bounds(value: float, bounds: tuple[float, float], start: float, stopped: bool):
+def test_at_bound_depends_on_value_bounds_and_start(
+    value: float, bounds: tuple[float, float], start: float, stopped: bool
+):
     info = ParameterInfo(unit="1", doc="", source="", bounds=bounds, plausible=(0.0, np.inf), role="base")
     assert (at_bound("K", value, info, start=start) is not None) is stopped
 
@@ -190,17 +192,17 @@ def test_bounds(value: float, bounds: tuple[float, float], start: float, stopped
         ),
     ],
 )
-def test_reasons_of_open_intervals(path: str, ci95: tuple[float, float], words: str):
+def test_reason_states_the_interval_of_an_unidentifiable_parameter(path: str, ci95: tuple[float, float], words: str):
     estimate = Estimate(path, 1.0, 2.0, 2.0, ci95, "rad", False)
     assert words in reason(estimate, x_max=2.0, x_unit="V")
 
 
-def test_a_reduced_log_holds_nothing(faint: tuple[Fit, Estimate]):
-    found, _ = faint
+def test_reduced_log_has_no_fixed_inertias(small_twist_fit: tuple[Fit, Estimate]):
+    found, _ = small_twist_fit
     assert identifiability(found, uncertainty(found)).held == ()
 
 
-def test_an_inertia_that_the_logs_hang_on_has_to_be_right(drive: Fit):
-    """Along a motor that turns far, an error of its inertia is beyond what derivatives tell."""
-    held = _held_one(drive, "J_m", {"K": -0.23, "alpha": 0.1, "B_sp": 3.8}, {})
+def test_inertia_with_very_large_sensitivity_is_reported_as_critical(fitted_drive: Fit):
+    """Where the motor turns far, an error of its inertia is beyond the range of first-order sensitivities."""
+    held = _held_one(fitted_drive, "J_m", {"K": -0.23, "alpha": 0.1, "B_sp": 3.8}, {})
     assert held.sentence.endswith("must be correct there: K and B_sp can't compensate an error of 1 %.")

@@ -1,4 +1,4 @@
-"""Noise of the logged torque: what it does to estimates, against simulations of the rig itself."""
+"""Effect of noise of the logged torque on estimates, compared with simulations of the rig."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from fitting.uncertainty.input_noise import nonnegative, torque_noise_covariance
 from fitting.uncertainty.sandwich import covariance, linearised
 
 COUNT, DRAWS = 700, 48
-# Little damping: what the noise leaves is nearly a line at the resonance, and there are few periods of it.
+# With little damping, the response to noise is nearly a line at the resonance with few correlation times.
 PHYSICS = {"mu": 1.0, "alpha": 0.0}
 
 
@@ -36,19 +36,19 @@ def standard_errors(found: Fit) -> np.ndarray | None:
 
 
 @pytest.fixture(scope="module")
-def noisy() -> Fit:
+def fit_with_torque_noise() -> Fit:
     return fitted(torque=0.05, output=1e-4)
 
 
-def test_standard_errors_are_the_scatter_of_estimates(noisy: Fit):
-    described = standard_errors(noisy)
+def test_standard_errors_under_torque_noise_equal_the_scatter_of_estimates(fit_with_torque_noise: Fit):
+    described = standard_errors(fit_with_torque_noise)
     assert described is not None
-    # The residual that fresh torque noise would leave, by the rig; least squares turns it into a change of estimates.
-    regression = linearised(noisy)
+    # The residual of new torque noise, by the rig; least squares gives the change of estimates.
+    regression = linearised(fit_with_torque_noise)
     (record,), inverse = regression.records, covariance(regression).unit
     logged = rig.reduced_forcing(COUNT)
     silent = rig.reduced_motion(logged, **PHYSICS)[:, 0]
-    white = float(noisy.problem.whitening[0, 0])
+    white = float(fit_with_torque_noise.problem.whitening[0, 0])
     random = np.random.default_rng(5)
     moved = []
     for _ in range(DRAWS):
@@ -56,14 +56,14 @@ def test_standard_errors_are_the_scatter_of_estimates(noisy: Fit):
         disturbance = white * (motion - silent)[: record.residual.shape[0], None]
         moved.append(inverse @ np.einsum("nop,no->p", record.slopes, disturbance))
     scatter = np.std(moved, axis=0)
-    # 48 draws know a standard deviation to 10 %, and the log's own noise level is known from some 30 periods.
+    # 48 draws determine a standard deviation to 10 %; the noise level follows from some 30 periods.
     np.testing.assert_allclose(described, scatter, rtol=0.4)
-    # White noise would have promised far too much of the damping.
+    # Under the assumption of white noise, the error of the damping is far too small.
     classical = np.sqrt(np.diag(covariance(regression).classical))
     assert described[0] > 2.0 * classical[0]
 
 
-def test_white_noise_of_the_encoder_is_as_in_textbooks():
+def test_standard_errors_under_white_encoder_noise_equal_classical_ones():
     found = fitted(output=2e-3)
     described = standard_errors(found)
     if described is not None:
@@ -72,7 +72,7 @@ def test_white_noise_of_the_encoder_is_as_in_textbooks():
 
 
 @pytest.mark.slow
-def test_another_colour_is_not_torque_noise():
+def test_random_walk_is_not_described_as_torque_noise():
     found = fitted(output=2e-3, count=2000)
     drift = np.cumsum(np.random.default_rng(1).normal(size=found.error.shape[:2]).ravel())
     walk = 1e-3 * drift.reshape(found.error.shape[:2])[..., None]
@@ -89,7 +89,7 @@ def test_another_colour_is_not_torque_noise():
 
 
 @pytest.mark.parametrize("sources", [1, 2, 3])
-def test_nonnegative_coefficients_are_those_of_nnls(sources: int):
+def test_nonnegative_coefficients_equal_those_of_scipy_nnls(sources: int):
     random = np.random.default_rng(sources)
     bound = 0
     for _ in range(100):
@@ -97,14 +97,14 @@ def test_nonnegative_coefficients_are_those_of_nnls(sources: int):
         power = shapes @ (random.normal(size=sources) / shapes.mean(axis=0)) + random.normal(size=60)
         expected, _ = nnls(shapes, power)
         bound += int((expected == 0.0).any())
-        # Both work with the columns' products, which have twice the digits of the answer.
+        # Both work with products of the columns, whose condition number is squared.
         np.testing.assert_allclose(nonnegative(shapes, power), expected, rtol=1e-6, atol=1e-9 * expected.max())
-    # Of a hundred, chance puts neither all nor none on the bound.
+    # Some but not all of the hundred draws have a coefficient at its bound.
     assert 10 < bound < 100
 
 
 @pytest.mark.parametrize(("count", "power"), [(100, 0.7), (1000, 1.0), (9000, 0.97), (20000, 1.01)])
-def test_uniformity_is_that_of_kolmogorov(count: int, power: float):
+def test_uniformity_p_value_equals_that_of_the_kolmogorov_smirnov_test(count: int, power: float):
     values = np.random.default_rng(count).uniform(size=count) ** power
     expected = kstest(values, "uniform").pvalue
     # The correction for few values errs by some per cent of the p-value where that is below 0.1 (Stephens 1970).

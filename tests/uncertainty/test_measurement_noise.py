@@ -1,4 +1,4 @@
-"""The noise of the outputs, beside models that are right, off, or lack a force."""
+"""Measurement noise of the outputs, estimated with a true model, a wrong one and one that lacks a force."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ NOISE = 1e-3
 CLOSE = 0.08
 
 
-def held(*, noise: float = NOISE, omega_0: float = rig.OMEGA_0, **physics) -> Fit:
-    """A fit whose parameters are held, along a log that may have physics which it lacks."""
+def fit_with_held_parameters(*, noise: float = NOISE, omega_0: float = rig.OMEGA_0, **physics) -> Fit:
+    """Fit the initial states only, to a log that may contain physics missing from the model."""
     experiment = rig.reduced_experiment(COUNT, noise=noise, **physics)
     model = rig.reduced_model(omega_0=omega_0)
     stretches = [Stretch(experiment, 0, len(experiment))]
@@ -37,30 +37,30 @@ def rms(first: Fit, *others: Fit) -> float:
     return float(np.sqrt(noise.covariance[0, 0]))
 
 
-def test_no_good_model_is_needed():
-    right, off = held(), held(omega_0=1.02 * rig.OMEGA_0)
+def test_measurement_noise_is_estimated_despite_a_wrong_frequency():
+    right, off = fit_with_held_parameters(), fit_with_held_parameters(omega_0=1.02 * rig.OMEGA_0)
     assert rms(right) == pytest.approx(NOISE, rel=CLOSE)
-    # A frequency 2 % off leaves much more over many periods than over half of one.
+    # A frequency error of 2 % leaves a far larger residual over many periods than over half of one.
     assert off.principal_std > 1e-2
     assert rms(off) < 0.2 * off.principal_std
 
 
 @pytest.mark.parametrize(("bias", "most"), [(0.0, 1.0), (1.0, _MOTION), (5.0, 1.0)])
-def test_a_force_that_the_model_lacks_is_no_noise(bias: float, most: float):
-    """Within half a period the strongest moves the drive by sixty times the noise; a weak one may pass for some."""
-    assert (1.0 - CLOSE) * NOISE < rms(held(bias=bias)) < (1.0 + CLOSE) * most * NOISE
+def test_measurement_noise_excludes_a_missing_force(bias: float, most: float):
+    """Within half a period, the strongest force moves the drive by sixty times the noise; a weak one may pass."""
+    assert (1.0 - CLOSE) * NOISE < rms(fit_with_held_parameters(bias=bias)) < (1.0 + CLOSE) * most * NOISE
 
 
-def test_the_model_that_leaves_the_least_tells():
-    right, off = held(), held(omega_0=1.2 * rig.OMEGA_0)
+def test_measurement_noise_is_the_smallest_over_models():
+    right, off = fit_with_held_parameters(), fit_with_held_parameters(omega_0=1.2 * rig.OMEGA_0)
     assert rms(off, right) == rms(right, off) == min(rms(right), rms(off))
     noise = measurement_noise(right).and_beside(off)
     assert noise.and_beside(right) is noise is noise.and_beside(off)
 
 
 @pytest.mark.parametrize("samples", [6, 12, 24])
-def test_noise_of_any_colour_stays(samples: int):
-    """Two more powers of time take less off a random walk than what counts as motion."""
+def test_measurement_noise_keeps_coloured_noise(samples: int):
+    """Two more powers of time reduce a random walk by less than the factor that is taken for motion."""
     walks = np.cumsum(np.random.default_rng(0).normal(size=(20000, samples)), axis=1)
     time = np.linspace(-1.0, 1.0, samples)
     left = []

@@ -1,4 +1,4 @@
-"""Noise of sensors and torque channel, from innovations: against what the rig was given."""
+"""Noise of sensors and torque estimated from innovations, compared with the noise of the simulated log."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ from hdjax.effects.sensing import LoadEncoderEccentricity
 
 COUNT, STD = 3000, 0.01
 OUTPUTS = np.array([[1.0, 1.0], [1.0, 1.0]]) * (rig.MOTOR_NOISE / rig.N) ** 2 + np.diag([0.0, rig.LOAD_NOISE**2])
-# Of noise with a memory, of the motor's and of the load's encoder [rad].
+# Standard deviation of correlated noise of the motor's and of the load's encoder [rad].
 SIZES = 3.0 * np.array([rig.MOTOR_NOISE, rig.LOAD_NOISE])
 TWIST = float(np.hypot(SIZES[0] / rig.N, SIZES[1]))
 
@@ -49,19 +49,19 @@ def noisy_experiment(
     load: bool = True,
     **physics: Any,
 ) -> Experiment:
-    """A log whose torque was logged with noise, and where asked for whose encoders' noise has a memory."""
+    """A log with noise of the logged torque and, with `correlation`, correlated noise of the encoders."""
     acting = rig.drive_torque(count, seed=seed)
     motion = rig.drive_motion(acting, **physics)
     if correlation is not None:
-        motion[:, :2] += slow_noise(correlation, count) * SIZES
+        motion[:, :2] += correlated_noise(correlation, count) * SIZES
     log = rig.drive_log(motion, acting, seed=seed, noise=1.0 if correlation is None else 0.0)
     logged = acting + std * np.random.default_rng(seed + 7).normal(size=count)
     seen = replace(log, motor_torque=logged) if load else replace(log, motor_torque=logged, load_angle=None)
     return experiment_from_log(seen, hold="zero-order", N=rig.N)
 
 
-def slow_noise(correlation: float, count: int) -> Float[np.ndarray, "samples encoders"]:
-    """Of unit variance, each sample correlated with the one before."""
+def correlated_noise(correlation: float, count: int) -> Float[np.ndarray, "samples encoders"]:
+    """Noise of unit variance, each sample correlated with the one before."""
     pushed = np.random.default_rng(5).normal(size=(count, 2))
     pushed[1:] *= np.sqrt(1.0 - correlation**2)
     return np.asarray(lfilter([1.0], [1.0, -correlation], pushed, axis=0))
@@ -72,7 +72,7 @@ def fitted(experiment: Experiment) -> Fit:
     return fit(model, whole([experiment]), base_paths(model), Segmentation(128))
 
 
-def left(found: Fit) -> NoiseModel:
+def noise_model_of(found: Fit) -> NoiseModel:
     outputs = measurement_noise(found).covariance
     return noise_model(found, outputs, predictable=RULES.innovations)
 
@@ -82,7 +82,7 @@ def noisy() -> Fit:
     return fitted(noisy_experiment())
 
 
-def test_the_noise_is_that_of_the_log(noisy: Fit):
+def test_torque_noise_is_estimated_with_its_true_size(noisy: Fit):
     found = noise_model(noisy, OUTPUTS, predictable=RULES.innovations)
     assert found.std == pytest.approx(STD, rel=0.05)
     assert found.size == pytest.approx(1.0, abs=0.05)
@@ -90,25 +90,25 @@ def test_the_noise_is_that_of_the_log(noisy: Fit):
     assert noise_of_torque(found) == found.std
 
 
-def test_the_noise_is_known_from_the_motor_alone():
-    """The first state of the load, which no sensor shows, is free in each segment."""
-    found = left(fitted(noisy_experiment(load=False)))
+def test_torque_noise_is_estimated_from_the_motor_angle_alone():
+    """The initial state of the load, which no sensor measures, is free in each segment."""
+    found = noise_model_of(fitted(noisy_experiment(load=False)))
     assert is_noise(found) and found.sensors.memory(rig.STEP) is None
     assert noise_of_torque(found) == pytest.approx(STD, rel=0.1)
 
 
-def test_noise_said_to_be_far_too_large_is_found_out(noisy: Fit):
+def test_torque_noise_is_estimated_despite_overrated_sensor_noise(noisy: Fit):
     found = noise_model(noisy, 1e5 * OUTPUTS, predictable=RULES.innovations)
     assert found.std == pytest.approx(STD, rel=0.1) and np.isfinite(found.likelihood)
 
 
 @pytest.mark.parametrize("correlation, std", [(0.8, 0.0), (0.98, 0.0), (0.8, STD), (0.98, STD)])
-def test_noise_of_the_sensors_is_known_with_its_memory_and_its_size(correlation: float, std: float):
-    found = left(fitted(noisy_experiment(correlation=correlation, std=std, count=8000)))
+def test_sensor_noise_is_estimated_with_its_memory_and_size(correlation: float, std: float):
+    found = noise_model_of(fitted(noisy_experiment(correlation=correlation, std=std, count=8000)))
     assert is_noise(found)
     memory = found.sensors.memory(rig.STEP)
     assert memory is not None and memory == pytest.approx(-rig.STEP / np.log(correlation), rel=0.4)
-    # So many samples of white noise would tell as much as those that are looked at.
+    # Number of white samples with the same information as the samples that are used.
     counts = 12 * 128 * (1.0 - correlation) / (1.0 + correlation)
     assert found.sensors.covariance[-1, -1] ** 0.5 == pytest.approx(TWIST, rel=3.0 / np.sqrt(2.0 * counts))
     torque = noise_of_torque(found)
@@ -126,12 +126,12 @@ def test_noise_of_the_sensors_is_known_with_its_memory_and_its_size(correlation:
     ],
     ids=lambda missing: next(iter(missing)),
 )
-def test_what_is_missing_does_not_pass_for_noise(missing: dict[str, Any]):
-    assert not is_noise(left(fitted(noisy_experiment(correlation=0.95, std=0.0, count=8000, **missing))))
+def test_missing_effect_is_not_explained_as_noise(missing: dict[str, Any]):
+    assert not is_noise(noise_model_of(fitted(noisy_experiment(correlation=0.95, std=0.0, count=8000, **missing))))
 
 
-def test_noise_that_the_torque_makes_in_short_pieces_is_not_the_sensors():
-    """Short pieces take the motor's answer to a very noisy torque for noise of its encoder."""
+def test_response_to_torque_noise_is_not_assigned_to_the_sensors():
+    """Short pieces assign the motor's response to a very noisy torque to the noise of its encoder."""
     found = fitted(noisy_experiment(std=10.0 * STD, count=8000))
     known = measurement_noise(found).covariance
     assert known[0, 0] > 2.0 * OUTPUTS[0, 0]
@@ -140,8 +140,8 @@ def test_noise_that_the_torque_makes_in_short_pieces_is_not_the_sensors():
     assert np.sqrt(np.diag(seen.sensors.covariance)) == pytest.approx(np.sqrt(np.diag(OUTPUTS)), rel=0.2)
 
 
-def test_a_log_without_noise_is_explained():
-    """Its model is off by the solver's error alone."""
+def test_noise_model_of_a_noiseless_log_is_finite():
+    """The residual of the model is the solver's error alone."""
     acting = rig.drive_torque(COUNT)
     log = rig.drive_log(rig.drive_motion(acting), acting, noise=0.0)
     found = fitted(experiment_from_log(log, hold="zero-order", N=rig.N))
@@ -152,8 +152,8 @@ def test_a_log_without_noise_is_explained():
     assert np.isfinite([seen.std, seen.size, seen.predictable, seen.likelihood]).all()
 
 
-def test_the_likelihood_is_that_of_the_gaussian_law():
-    """By the covariance of all samples at once."""
+def test_likelihood_of_innovations_equals_the_gaussian_density_of_all_samples():
+    """The reference density is that of all samples at once, with their covariance."""
     random = np.random.default_rng(0)
     samples, size, std = 40, 2, 0.3
     transition = np.array([[0.9, 0.2], [-0.2, 0.9]])
@@ -186,8 +186,8 @@ def test_the_likelihood_is_that_of_the_gaussian_law():
     assert likelihood == pytest.approx(law.logpdf(error[:, 0, :, 0].ravel()), rel=1e-9)
 
 
-def test_the_spread_is_that_of_simulations(noisy: Fit):
-    """By the rig: the same motion under fresh noise of the torque."""
+def test_spread_by_torque_noise_equals_the_scatter_of_simulations(noisy: Fit):
+    """The reference is the rig: the same motion under new draws of the torque noise."""
     count, draws = 300, 60
     torque = rig.drive_torque(count)
     silent = rig.drive_motion(torque)
@@ -199,27 +199,27 @@ def test_the_spread_is_that_of_simulations(noisy: Fit):
     problem = fit(model, whole([experiment]), (), Segmentation(count, length=count, substeps=4)).problem
     states = jnp.asarray(silent[:1, :4])
     found = spread_by_torque(with_engine(problem), Unknowns(jnp.zeros(0), states), STD)[0]
-    # 60 draws know a standard deviation to 9 %; over all samples the ratio's median is known better.
+    # 60 draws determine a standard deviation to 9 %; the median of the ratio over all samples is more accurate.
     assert np.median(scatter[20:] / found[20:count]) == pytest.approx(1.0, abs=0.1)
 
 
-def test_bands_hold_what_noise_of_the_torque_drives(noisy: Fit):
+def test_prediction_bands_with_torque_noise_cover_95_percent(noisy: Fit):
     unseen = whole([noisy_experiment(seed=seed, count=600) for seed in (3, 4, 5, 6)])
     options = {"noise": jnp.asarray(OUTPUTS), "halo": noisy.problem.segments.halo}
     blind, wide = (
         prediction_bands(noisy, uncertainty(noisy), unseen, torque_noise=std, **options) for std in (0.0, STD)
     )
     assert np.mean([band.inside[50:] for band in blind]) < 0.8
-    # What the drive answers is a line at the resonance: four runs know the share to some per cent.
+    # The response is a line at the resonance, so that four runs determine the share to some per cent.
     assert np.mean([band.inside[50:] for band in wide]) == pytest.approx(0.95, abs=0.05)
 
 
 # One form for each place in the equations and on the sensors.
-FEW = (CoulombFriction, KinematicError, GravityLoad, TorqueBias, LoadEncoderEccentricity)
+SOME_FORMS = (CoulombFriction, KinematicError, GravityLoad, TorqueBias, LoadEncoderEccentricity)
 
 
-@pytest.mark.parametrize("catalogue", [FEW, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["few", "all"])
-def test_the_loop_says_that_the_model_suffices_and_the_torque_is_noisy(catalogue: Sequence[type[Effect]]):
+@pytest.mark.parametrize("catalogue", [SOME_FORMS, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["few", "all"])
+def test_loop_reports_model_sufficient_and_torque_noise(catalogue: Sequence[type[Effect]]):
     data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (noisy_experiment(count=COUNT),)}
     begun = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     loop = close_loop(begun, data, hold="zero-order", catalogue=catalogue)

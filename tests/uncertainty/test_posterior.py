@@ -1,4 +1,4 @@
-"""Draws against the Gaussian limit, and against quadrature."""
+"""Posterior draws, compared with the Gaussian limit and with quadrature."""
 
 import importlib.util
 import sys
@@ -30,7 +30,7 @@ def reduced_fit(paths: tuple[str, ...], noise: float) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def gaussian() -> tuple[Fit, Uncertainty]:
+def well_identified() -> tuple[Fit, Uncertainty]:
     found = reduced_fit(("mu", "omega_0", "alpha", "gain"), 2e-3)
     return found, uncertainty(found)
 
@@ -41,13 +41,13 @@ def flat(found: Posterior) -> np.ndarray:
 
 @pytest.mark.slow
 @needs_blackjax
-def test_a_well_identified_fit_has_the_laplace_posterior(gaussian: tuple[Fit, Uncertainty]):
-    found, known = gaussian
+def test_posterior_of_a_well_identified_fit_equals_the_laplace_approximation(well_identified: tuple[Fit, Uncertainty]):
+    found, known = well_identified
     white = posterior(found, known, seed=0, coloured=False)
     assert white.settled, (white.r_hat, white.divergences)
     draws = flat(white)
     expected = np.sqrt(np.diag(known.unit_covariance))
-    # So many effective draws know a mean to 1/sqrt(n), a standard deviation to 1/sqrt(2 n); the curvature adds some.
+    # n effective draws determine a mean to 1/sqrt(n), a standard deviation to 1/sqrt(2 n); the curvature adds some.
     count = white.effective_samples.min()
     assert count > 400
     offset = (draws.mean(axis=0) - np.asarray(found.unknowns.parameters)) / expected
@@ -56,7 +56,7 @@ def test_a_well_identified_fit_has_the_laplace_posterior(gaussian: tuple[Fit, Un
     low, high = np.array(list(white.quantiles(0.025, 0.975).values())).T
     value = np.array([known.estimates[p].value for p in white.paths])
     assert (low < value).all() and (value < high).all()
-    # Stretched by the residual's colour, draws have the robust covariance.
+    # Scaled for the residual's colour, draws have the robust covariance.
     coloured = posterior(found, known, seed=0)
     ratio = flat(coloured).std(axis=0) / np.sqrt(np.diag(known.covariance))
     np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * count) + 0.08)
@@ -64,8 +64,8 @@ def test_a_well_identified_fit_has_the_laplace_posterior(gaussian: tuple[Fit, Un
 
 @pytest.mark.slow
 @needs_blackjax
-def test_one_parameter_by_quadrature():
-    """A damping that a noisy log hardly tells; initial states by scipy at every node."""
+def test_posterior_of_one_parameter_equals_quadrature():
+    """A damping that a noisy log hardly determines; scipy fits the initial states at every node."""
     found = reduced_fit(("mu",), 0.1)
     known = uncertainty(found)
     drawn = posterior(found, known, seed=1, coloured=False, draws=400, warmup=200)
@@ -102,7 +102,9 @@ def test_one_parameter_by_quadrature():
     np.testing.assert_allclose(drawn.values[..., 0], drawn.vectors[..., 0] * float(found.free.scale[0]), rtol=1e-12)
 
 
-def test_without_the_extra_it_says_so(gaussian: tuple[Fit, Uncertainty], monkeypatch: pytest.MonkeyPatch):
+def test_missing_blackjax_raises_an_import_error_that_names_the_extra(
+    well_identified: tuple[Fit, Uncertainty], monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "blackjax", None)
     with pytest.raises(ImportError, match=r"hdjax\[posterior\]"):
-        posterior(*gaussian, seed=0)
+        posterior(*well_identified, seed=0)

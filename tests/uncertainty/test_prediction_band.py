@@ -1,4 +1,4 @@
-"""Bands against repetition: other parameters within their covariance, other noise in the window."""
+"""Prediction bands, compared with free runs over draws of the parameters and of the noise in the window."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from fitting.uncertainty.prediction_band import PredictionBand, prediction_bands
 from fitting.uncertainty.standard_errors import Uncertainty, uncertainty
 
 COUNT, HORIZON, NOISE = 600, 128, 2e-3
-# From a moving drive on: one that begins at rest has no rate to be uncertain of.
+# The stretch starts in motion, because the initial rate of a drive at rest is not uncertain.
 START, STOPS = 80, (COUNT, 330)
 COVARIANCE = jnp.asarray([[NOISE**2]])
 PATHS = ("mu", "omega_0", "alpha", "gain")
@@ -31,7 +31,7 @@ def fitted() -> tuple[Fit, Uncertainty]:
 
 @pytest.fixture(scope="module")
 def bands(fitted: tuple[Fit, Uncertainty]) -> tuple[PredictionBand, ...]:
-    """Of a whole stretch and of its first half."""
+    """Prediction bands of a whole stretch and of its first half."""
     unseen = rig.reduced_experiment(COUNT, noise=NOISE, seed=5)
     return prediction_bands(*fitted, [Stretch(unseen, START, n) for n in STOPS], noise=COVARIANCE)
 
@@ -59,50 +59,52 @@ def repeated(fitted: Fit, covariance: np.ndarray, noise: float, draws: int) -> n
 
 
 def assert_same_spread(found: np.ndarray, expected: np.ndarray, draws: int):
-    # What so many draws know of a standard deviation, three times; neighbouring samples share their draws.
+    # Three standard errors of a standard deviation from so many draws; neighbouring samples share their draws.
     known = 3.0 / np.sqrt(2 * draws)
     assert np.sqrt(np.mean(found**2)) == pytest.approx(np.sqrt(np.mean(expected**2)), rel=known)
     large = expected > 0.3 * expected.max()
     np.testing.assert_allclose(found[large] / expected[large], 1.0, atol=2 * known)
 
 
-def test_by_repetition(fitted: tuple[Fit, Uncertainty], band: PredictionBand):
+def test_band_equals_the_scatter_of_repeated_free_runs(fitted: tuple[Fit, Uncertainty], band: PredictionBand):
     found, known = fitted
     assert_same_spread(band.std_predicted, repeated(found, known.covariance, NOISE, 50), 50)
 
 
 @pytest.mark.slow
-def test_parameters_and_state_by_repetition(fitted: tuple[Fit, Uncertainty], band: PredictionBand):
+def test_parts_of_the_band_by_parameters_and_state_equal_repetition(
+    fitted: tuple[Fit, Uncertainty], band: PredictionBand
+):
     found, known = fitted
     assert_same_spread(band.std_parameters, repeated(found, known.covariance, 0.0, 150), 150)
     assert_same_spread(band.std_state, repeated(found, 1e-20 * known.covariance, NOISE, 150), 150)
 
 
-def test_the_band_holds_the_log(band: PredictionBand):
+def test_band_covers_the_measured_output(band: PredictionBand):
     assert band.std_noise == pytest.approx(NOISE, rel=1e-9)
     np.testing.assert_allclose(band.std_measured**2, band.std_predicted**2 + NOISE**2, rtol=1e-12)
     low, high = band.band95
     inside = np.mean((low < band.run.measured) & (band.run.measured < high))
     assert inside > 0.9
-    # The state is forgotten, the parameters are not.
+    # The influence of the initial state decays, that of the parameters does not.
     assert np.max(band.std_state[-100:]) < 0.2 * np.max(band.std_state)
     assert np.max(band.std_parameters[-100:]) > 0.2 * np.max(band.std_parameters)
 
 
-def test_several_stretches_are_taken_apart(bands: tuple[PredictionBand, ...]):
+def test_bands_of_several_stretches_are_independent(bands: tuple[PredictionBand, ...]):
     whole, half = bands
     assert half.std_state.shape == (STOPS[1] - START,)
     np.testing.assert_allclose(half.std_predicted, whole.std_predicted[: STOPS[1] - START], rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_a_drive_has_two_outputs():
+def test_band_of_a_drive_log_with_two_outputs():
     experiment = rig.drive_experiment(512)
     found = fit(rig.drive_model(), [Stretch(experiment, 0, 512)], ("K", "B_sp"), Segmentation(256, substeps=1, count=2))
     known = uncertainty(found)
     (result,) = prediction_bands(found, known, [Stretch(experiment, 0, 512)], noise=found.covariance)
     assert result.std_noise == pytest.approx(found.principal_std, rel=1e-9)
-    # A certain model leaves the window's noise alone.
+    # With exact parameters, only the noise of the window remains.
     certain = eqx.tree_at(lambda u: u.covariance, known, 0.0 * known.covariance)
     (sure,) = prediction_bands(found, certain, [Stretch(experiment, 0, 512)], noise=found.covariance)
     np.testing.assert_array_equal(sure.std_parameters, 0.0)

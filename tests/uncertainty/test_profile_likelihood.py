@@ -1,4 +1,4 @@
-"""Profiles against a closed form, against a search by another route, and where a parabola fails."""
+"""Profile likelihood, compared with a closed form and an independent search, and where a parabola fails."""
 
 import dataclasses
 
@@ -29,21 +29,21 @@ def reduced_fit(*, noise: float = NOISE, rms: float = 10.0, physics: dict | None
 
 
 def with_freedom(found: Uncertainty, freedom: float) -> Uncertainty:
-    """The same with other degrees of freedom of every interval, and the covariance of white noise."""
+    """Replace the degrees of freedom of every interval, and the covariance by that of white noise."""
     estimates = {p: dataclasses.replace(e, degrees_of_freedom=freedom) for p, e in found.estimates.items()}
     return dataclasses.replace(found, estimates=estimates, covariance=found.unit_covariance)
 
 
 @pytest.fixture(scope="module")
-def linear() -> tuple[Fit, Uncertainty]:
-    """So faint that the oscillator is linear, and so well seen that gain is as good as linear too."""
+def linear_fit() -> tuple[Fit, Uncertainty]:
+    """A motion so small that the oscillator is linear, with noise so small that gain is nearly linear too."""
     found = reduced_fit(noise=1e-5, rms=0.5, alpha=0.0)
     return found, uncertainty(found)
 
 
-def test_a_linear_parameter_has_a_parabola(linear: tuple[Fit, Uncertainty]):
-    """The closed form: where everything is linear, the rise is the squared distance in standard errors."""
-    found, known = linear
+def test_profile_of_a_linear_parameter_is_a_parabola(linear_fit: tuple[Fit, Uncertainty]):
+    """In a linear problem, the rise is the squared distance in standard errors."""
+    found, known = linear_fit
     for path in ("gain", "mu"):
         estimate = known.estimates[path]
         result = profile(found, path, known)
@@ -55,16 +55,16 @@ def test_a_linear_parameter_has_a_parabola(linear: tuple[Fit, Uncertainty]):
         assert result.value == estimate.value and (np.diff(result.values) > 0).all()
 
 
-def test_the_colour_of_the_residual_widens_it(linear: tuple[Fit, Uncertainty]):
-    found, known = linear
+def test_profile_interval_is_wider_for_a_coloured_residual(linear_fit: tuple[Fit, Uncertainty]):
+    found, known = linear_fit
     wide = dataclasses.replace(known, covariance=4.0 * known.unit_covariance)
     narrow = dataclasses.replace(known, covariance=known.unit_covariance)
     lengths = [np.diff(profile(found, "gain", k).ci95)[0] for k in (narrow, wide)]
     assert lengths[1] == pytest.approx(2.0 * lengths[0], rel=0.02)
 
 
-def test_a_grid_search_by_another_route():
-    """Plain Runge-Kutta and scipy, one grid point after the other, on a log that says little of its damping."""
+def test_profile_interval_equals_that_of_an_independent_search():
+    """The reference uses the rig's Runge-Kutta and scipy, on a log that hardly determines its damping."""
     noise = 0.05
     found = reduced_fit(noise=noise, rms=10.0)
     known = with_freedom(uncertainty(found), np.inf)
@@ -95,12 +95,12 @@ def test_a_grid_search_by_another_route():
 
     lowest = cost(result.value)
     for end in result.ci95:
-        # 1.96 squared at the ends; a fit's own tolerance and the two integrators differ by some hundredths.
+        # 1.96 squared at the ends; tolerances of the fits and of both integrators are some hundredths.
         assert cost(end) - lowest == pytest.approx(3.8415, abs=0.15)
 
 
-def test_a_parameter_that_the_log_hardly_bounds():
-    """A faint log: a softening spring would let go at some twist, a hardening one is excluded only late."""
+def test_profile_interval_of_a_weakly_identified_parameter_is_asymmetric():
+    """A log of small twist: it excludes a softening spring, which fails at some twist, before a hardening one."""
     found = reduced_fit(noise=0.02, rms=1.0, alpha=0.0)
     known = uncertainty(found)
     parabola = known.estimates["alpha"]
@@ -109,18 +109,18 @@ def test_a_parameter_that_the_log_hardly_bounds():
     low, high = better.estimates["alpha"].ci95
     assert not better.estimates["alpha"].identifiable
     assert low < 0.0 < rig.REDUCED_ALPHA < high
-    # The sides differ by far, where the parabola's are the same.
+    # The sides differ by far, while those of the parabola are equal.
     assert high - parabola.value > 1.3 * (parabola.ci95[1] - parabola.value)
-    # Beyond -1/x^2 the spring has no way back; the segments' own states leave some room.
+    # Below -1/x^2 the spring force changes sign; free states of the segments allow somewhat less.
     x_max = np.max(np.abs(rig.reduced_experiment(COUNT, rms=1.0).measured))
     assert -2.0 / x_max**2 < low
     assert better.estimates["alpha"].interval == "profile" and better.estimates["omega_0"].interval == "curvature"
     # Correlations are in the order of the estimates.
     assert list(better.estimates) == list(known.estimates)
-    # What is well known keeps its interval.
+    # A well-identified parameter keeps its interval.
     assert better.estimates["omega_0"].ci95 == known.estimates["omega_0"].ci95
 
 
-def test_unknown_path(linear: tuple[Fit, Uncertainty]):
+def test_unknown_path_is_refused(linear_fit: tuple[Fit, Uncertainty]):
     with pytest.raises(ValueError, match="^`path` must be one of"):
-        profile(linear[0], "K", linear[1])
+        profile(linear_fit[0], "K", linear_fit[1])

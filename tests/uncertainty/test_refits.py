@@ -1,4 +1,4 @@
-"""Refits with sensitivities computed once, against fits of the same data."""
+"""Refits with sensitivities that are computed once, compared with full fits of the same data."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,12 +28,12 @@ def fitted(experiment: Experiment) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def found() -> Fit:
+def original_fit() -> Fit:
     return fitted(rig.reduced_experiment(COUNT, noise=NOISE))
 
 
 @pytest.fixture(scope="module")
-def others() -> list[Experiment]:
+def repetitions() -> list[Experiment]:
     return [rig.reduced_experiment(COUNT, noise=NOISE, seed=0)] + [noisy(seed) for seed in range(1, DRAWS)]
 
 
@@ -44,23 +44,23 @@ def noisy(seed: int) -> Experiment:
     return eqx.tree_at(lambda e: e.measured, clean, clean.measured + NOISE * random.normal(size=clean.measured.shape))
 
 
-def test_refits_agree_with_fits(found: Fit, others: list[Experiment]):
-    measured = jnp.stack([e.measured.reshape(found.problem.segments.measured.shape) for e in others])
-    vectors, moved = refits(found, measured)
-    free, estimates = found.free, uncertainty(found).estimates
+def test_refits_with_fixed_sensitivities_equal_full_fits(original_fit: Fit, repetitions: list[Experiment]):
+    measured = jnp.stack([e.measured.reshape(original_fit.problem.segments.measured.shape) for e in repetitions])
+    vectors, moved = refits(original_fit, measured)
+    free, estimates = original_fit.free, uncertainty(original_fit).estimates
     assert np.asarray(moved).max() < 1e-3
     apart = []
-    for vector, experiment in zip(vectors, others, strict=True):
+    for vector, experiment in zip(vectors, repetitions, strict=True):
         again = fitted(experiment)
         for path in free.paths:
-            value = float(free.unpack(found.model, vector).get(path))
+            value = float(free.unpack(original_fit.model, vector).get(path))
             assert value == pytest.approx(float(again.model.get(path)), abs=0.02 * estimates[path].std), path
-            apart.append(abs(value - float(found.model.get(path))) / estimates[path].std)
-    # The data do differ: else a refit that does nothing would pass.
+            apart.append(abs(value - float(original_fit.model.get(path))) / estimates[path].std)
+    # The data differ, so that a refit without any effect would fail.
     assert np.median(apart[len(free.paths) :]) > 0.3
 
 
-def test_the_same_data_change_nothing(found: Fit):
-    vectors, moved = refits(found, found.problem.segments.measured[None])
-    np.testing.assert_allclose(vectors[0], found.unknowns.parameters, rtol=1e-6)
+def test_refit_of_the_same_data_changes_nothing(original_fit: Fit):
+    vectors, moved = refits(original_fit, original_fit.problem.segments.measured[None])
+    np.testing.assert_allclose(vectors[0], original_fit.unknowns.parameters, rtol=1e-6)
     assert moved[0] < 0.05

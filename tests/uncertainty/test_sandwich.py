@@ -1,4 +1,4 @@
-"""Intervals cover what they promise, whatever the colour of the noise: thousands of linear regressions."""
+"""Sandwich intervals have nominal coverage for noise of any colour, over thousands of linear regressions."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Noise = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 
 
 def resonance(series: np.ndarray, damping: float = 0.02) -> np.ndarray:
-    """A lightly damped oscillator's answer along the first axis; its memory is some seventeen periods."""
+    """Response of a lightly damped oscillator along the first axis, with a memory of some seventeen periods."""
     angle = 2 * np.pi / PERIOD
     decay = np.exp(-damping * angle)
     return lfilter([1.0], [1.0, -2 * decay * np.cos(angle), decay**2], series, axis=0)
@@ -43,7 +43,7 @@ def first_order(periods: float) -> Noise:
 
 
 def torque(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """What torque noise makes of the dynamic error, less damped than it is fast, and some encoder noise."""
+    """Response of the dynamic error to torque noise, lightly damped, and white encoder noise."""
     driven = resonance(random.normal(size=(600 + shape[0], *shape[1:])), damping=0.05)[600:]
     return driven + random.normal(size=shape)
 
@@ -83,7 +83,7 @@ def with_noise(given: Linearised, noise: np.ndarray) -> tuple[np.ndarray, Linear
 
 
 def free_decay(samples: int, outputs: int) -> np.ndarray:
-    """What an initial state does to the outputs."""
+    """Response of the outputs to an initial state."""
     n = np.arange(samples)
     waves = np.exp(-0.02 * 2 * np.pi / PERIOD * n)[:, None] * np.stack(
         [np.cos(2 * np.pi / PERIOD * n), np.sin(2 * np.pi / PERIOD * n)], axis=1
@@ -92,7 +92,7 @@ def free_decay(samples: int, outputs: int) -> np.ndarray:
 
 
 def broadband(outputs: int, count: int = COUNT, simulations: int = 1) -> Linearised:
-    """Three parameters of a shaken oscillator, simulated anew `simulations` times."""
+    """A regression of three parameters of an excited oscillator, in `simulations` separate simulations."""
     random = np.random.default_rng(1)
     slopes = resonance(random.normal(size=(count + 400, outputs, 3)))[400:]
     length = count // simulations
@@ -100,8 +100,10 @@ def broadband(outputs: int, count: int = COUNT, simulations: int = 1) -> Lineari
     return regression(slopes, states)
 
 
-def covered(given: Linearised, noise: Noise, *, draws: int = DRAWS, of: str = "robust", seed: int = 7) -> np.ndarray:
-    """How many 95 % intervals hold the truth, by parameter."""
+def covered_counts(
+    given: Linearised, noise: Noise, *, draws: int = DRAWS, of: str = "robust", seed: int = 7
+) -> np.ndarray:
+    """Number of 95 % intervals that include the truth, by parameter."""
     random = np.random.default_rng(seed)
     shape = given.records[0].residual.shape
     hits = np.zeros(given.information.shape[0], dtype=int)
@@ -113,37 +115,37 @@ def covered(given: Linearised, noise: Noise, *, draws: int = DRAWS, of: str = "r
     return hits
 
 
-def assert_honest(hits: np.ndarray, draws: int = DRAWS, *, least: float = 0.93, most: float = 0.97):
-    """Between `least` and `most`, up to what so many draws know (99.9 % bands)."""
+def assert_nominal_coverage(hits: np.ndarray, draws: int = DRAWS, *, least: float = 0.93, most: float = 0.97):
+    """Check a coverage between `least` and `most`, within the 99.9 % bands of so many draws."""
     low, high = binom.ppf(0.0005, draws, least), binom.ppf(0.9995, draws, most)
     assert (hits >= low).all() and (hits <= high).all(), (low, hits, high)
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("noise", NOISES)
-def test_intervals_of_one_long_simulation(noise: str, outputs: int):
-    assert_honest(covered(broadband(outputs), NOISES[noise]))
+def test_intervals_of_one_long_simulation_have_nominal_coverage(noise: str, outputs: int):
+    assert_nominal_coverage(covered_counts(broadband(outputs), NOISES[noise]))
 
 
-def test_the_check_sees_intervals_that_are_too_short():
-    # Twice the noise at the resonance that a white residual would have.
-    hits = covered(broadband(1), torque, of="classical")
+def test_coverage_check_fails_for_classical_intervals_under_torque_noise():
+    # Noise at the resonance is twice that of a white residual.
+    hits = covered_counts(broadband(1), torque, of="classical")
     with pytest.raises(AssertionError):
-        assert_honest(hits)
+        assert_nominal_coverage(hits)
 
 
-def test_many_short_simulations_are_clusters():
-    """Torque noise since the start of each simulation is not stationary: it grows from nothing."""
+def test_intervals_of_many_short_simulations_have_nominal_coverage():
+    """The response to torque noise grows from zero in each simulation and is not stationary."""
     given = broadband(1, count=40 * 64, simulations=40)
 
     def grown(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         each = resonance(random.normal(size=(64, 40, 1)), damping=0.05)
         return np.swapaxes(each, 0, 1).reshape(shape)
 
-    assert_honest(covered(given, grown))
+    assert_nominal_coverage(covered_counts(given, grown))
 
 
-def test_noise_that_comes_with_the_signal():
+def test_intervals_cover_under_noise_proportional_to_the_slope():
     """Errors in proportion to the slope have three times the variance that stationary ones would give."""
     given = regression(np.random.default_rng(2).normal(size=(4 * COUNT, 1, 1)), (), chunk=4 * COUNT // 64)
 
@@ -152,27 +154,27 @@ def test_noise_that_comes_with_the_signal():
 
     draws = 200
     # 1.96 of a standard error that is the square root of three too small: 74 %.
-    assert covered(given, proportional, draws=draws, of="classical")[0] < binom.ppf(0.9995, draws, 0.75)
-    assert covered(given, proportional, draws=draws)[0] >= binom.ppf(0.0005, draws, 0.93)
+    assert covered_counts(given, proportional, draws=draws, of="classical")[0] < binom.ppf(0.9995, draws, 0.75)
+    assert covered_counts(given, proportional, draws=draws)[0] >= binom.ppf(0.0005, draws, 0.93)
 
 
-def test_a_single_sine_takes_the_noise_of_its_neighbours():
+def test_intervals_of_a_single_sine_use_noise_at_neighbouring_lines():
     phase = 2 * np.pi * 50 * np.arange(COUNT) / COUNT
     given = regression(np.stack([np.cos(phase), np.sin(phase)], axis=1)[:, None], (), chunk=COUNT)
-    # The line holds nothing but the fit. Four numbers tell its noise, so that intervals are long.
-    assert_honest(covered(given, first_order(1.0)), most=0.985)
+    # The fit takes the whole line. Its noise is estimated from four numbers, so that intervals are long.
+    assert_nominal_coverage(covered_counts(given, first_order(1.0)), most=0.985)
 
 
-def test_missing_samples():
+def test_intervals_with_missing_samples_have_nominal_coverage():
     given = broadband(1)
     present = np.random.default_rng(3).uniform(size=COUNT) > 0.25
     slopes = given.records[0].slopes * present[:, None, None]
     states = ((0, given.records[0].states[0][1] * present[:, None, None]),)
     holed = eqx.tree_at(lambda g: g.records[0].present, regression(slopes, states), float(present.mean()))
-    assert_honest(covered(holed, lambda random, shape: random.normal(size=shape) * present[:, None]))
+    assert_nominal_coverage(covered_counts(holed, lambda random, shape: random.normal(size=shape) * present[:, None]))
 
 
-def test_classical_is_the_textbook():
+def test_classical_covariance_equals_that_of_ordinary_least_squares():
     given = broadband(2)
     _, drawn = with_noise(given, np.random.default_rng(0).normal(size=(COUNT, 2)))
     record = drawn.records[0]
@@ -182,7 +184,7 @@ def test_classical_is_the_textbook():
 
 
 @pytest.mark.parametrize("simulations", [1, 40])
-def test_units_change_nothing_but_the_numbers(simulations: int):
+def test_covariance_scales_with_the_units_of_parameters(simulations: int):
     given = broadband(1, count=40 * 64, simulations=simulations)
     _, drawn = with_noise(given, np.random.default_rng(0).normal(size=given.records[0].residual.shape))
     units = np.array([1.0, 1e90, 1e-90])
@@ -194,10 +196,10 @@ def test_units_change_nothing_but_the_numbers(simulations: int):
     np.testing.assert_allclose(other.degrees_of_freedom, wanted.degrees_of_freedom, rtol=1e-9)
 
 
-def test_what_the_data_do_not_see_is_not_known():
+def test_unobserved_parameters_have_huge_variance():
     given = broadband(1)
     slopes = given.records[0].slopes
-    # The third parameter is blind; the first two in the next one do the same.
+    # First the third parameter has no effect; then the first two have the same effect.
     for blind in (slopes * np.array([1.0, 1.0, 0.0]), slopes[:, :, [0, 0, 2]]):
         _, drawn = with_noise(given, np.random.default_rng(0).normal(size=(COUNT, 1)))
         record = dataclasses.replace(drawn.records[0], slopes=blind)
@@ -208,7 +210,7 @@ def test_what_the_data_do_not_see_is_not_known():
         assert np.isfinite(found.robust).all()
 
 
-# The rig: the same, with Jacobians of real fits, and with real refits.
+# The same with Jacobians of fits to the rig's logs, and with refits of them.
 
 PATHS = ("K", "alpha", "B_sp")
 
@@ -219,7 +221,7 @@ def drive_fit(experiment, horizon: int) -> Fit:
 
 
 @pytest.mark.slow
-def test_a_fit_is_put_back_in_the_order_of_time():
+def test_linearised_fit_is_in_the_order_of_time():
     """A log of one and a half segments, fitted as one simulation."""
     found = drive_fit(rig.drive_experiment(384), 10**6)
     given = linearised(found)
@@ -229,7 +231,7 @@ def test_a_fit_is_put_back_in_the_order_of_time():
     np.testing.assert_allclose(record.residual, error @ np.asarray(found.problem.whitening).T, atol=1e-6)
     ((start, columns),) = record.states
     assert start == 0 and columns.shape == (384, 2, 4)
-    # One simulation's states: the slopes hold nothing of them, and everything together is a minimum.
+    # The slopes are orthogonal to the columns of the initial states, as at a minimum.
     size = np.linalg.norm(columns.reshape(-1, 4), axis=0)[:, None] * np.linalg.norm(
         record.slopes.reshape(-1, 3), axis=0
     )
@@ -241,19 +243,19 @@ def test_a_fit_is_put_back_in_the_order_of_time():
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("horizon", [256, 10**6])
-def test_study_with_the_jacobian_of_a_drive(noise: str, horizon: int):
-    """Linearised fits of a log of four seconds, fifty natural periods of which torque noise remembers three."""
+def test_intervals_with_the_jacobian_of_a_drive_have_nominal_coverage(noise: str, horizon: int):
+    """Linearised fits of a log of four seconds, or fifty natural periods; torque noise has a memory of three."""
     draws = 1000
     given = linearised(drive_fit(rig.drive_experiment(8000), horizon))
-    # Short simulations under torque noise: neighbours share some of it, and few hold what tells alpha.
+    # Short simulations under torque noise are correlated with their neighbours, and few of them determine alpha.
     least = 0.88 if noise == "torque noise" and horizon == 256 else 0.93
-    assert_honest(covered(given, NOISES[noise], draws=draws), draws, least=least, most=0.975)
+    assert_nominal_coverage(covered_counts(given, NOISES[noise], draws=draws), draws, least=least, most=0.975)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", ["white", "encoder, half a period", "torque, half a period"])
-def test_study_with_refits(colour: str):
-    """Real fits of noisy logs of a drive."""
+def test_intervals_of_refitted_drive_logs_have_nominal_coverage(colour: str):
+    """Full fits of noisy logs of a drive."""
     draws, count = 150, 4000
     excitation = rig.drive_torque(count)
     truth = {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}
@@ -275,4 +277,4 @@ def test_study_with_refits(colour: str):
         experiment = experiment_from_log(log, hold="zero-order", N=rig.N)
         estimates = uncertainty(drive_fit(experiment, 10**6)).estimates
         hits += [estimates[p].ci95[0] < truth[p] < estimates[p].ci95[1] for p in PATHS]
-    assert_honest(hits, draws, most=0.98)
+    assert_nominal_coverage(hits, draws, most=0.98)

@@ -1,4 +1,4 @@
-"""Standard errors by repetition: what they promise is how the estimates scatter."""
+"""Standard errors, compared with the scatter of estimates over repeated experiments."""
 
 import equinox as eqx
 import numpy as np
@@ -59,11 +59,11 @@ def z_scores(found: list[Uncertainty], error: str) -> np.ndarray:
 
 
 def assert_chi_squared(z: np.ndarray, slack: float = 1.0):
-    """Second moments about the truth, in the 99.9 % band that all parameters together hold (Bonferroni).
+    """Check second moments about the truth against their joint 99.9 % band (Bonferroni).
 
     Args:
         z: deviations in standard errors.
-        slack: what the scatter of the standard errors themselves adds.
+        slack: factor that allows for the scatter of the standard errors themselves.
     """
     draws = z.shape[0]
     low, high = chi2.ppf([0.0005 / len(PATHS), 1 - 0.0005 / len(PATHS)], draws) / draws
@@ -86,51 +86,51 @@ def white_draws(clean: Experiment) -> list[Uncertainty]:
 
 
 def assert_covered(found: list[Uncertainty]):
-    """Between 93 % and 97 %, up to what so many draws know (99.9 % band)."""
+    """Check a coverage between 93 % and 97 %, within the 99.9 % band of so many draws."""
     draws, covered = len(found), coverage(found)
     assert (covered >= binom.ppf(0.0005, draws, 0.93)).all(), covered
     assert covered.mean() <= binom.ppf(0.9995, draws, 0.97), covered
 
 
-def test_white_noise(white_draws: list[Uncertainty]):
+def test_standard_errors_under_white_noise_equal_the_scatter_of_estimates(white_draws: list[Uncertainty]):
     for error in ("std_classical", "std"):
         assert_chi_squared(z_scores(white_draws, error), slack=1.0 if error == "std_classical" else 1.15)
-    # No bias: the mean of so many is a standard normal over their root.
+    # No bias: the mean of n standard normal values has the standard deviation 1/sqrt(n).
     z = z_scores(white_draws, "std_classical")
     assert np.max(np.abs(z.mean(axis=0))) * np.sqrt(DRAWS) < 4.0
     assert_covered(white_draws)
 
 
-def test_the_check_itself_sees_a_wrong_factor(white_draws: list[Uncertainty]):
+def test_chi_squared_check_detects_errors_wrong_by_a_factor_of_two(white_draws: list[Uncertainty]):
     z = z_scores(white_draws, "std_classical")
     for factor in (0.5, 2.0):
         with pytest.raises(AssertionError):
             assert_chi_squared(factor * z)
 
 
-def test_coloured_noise(clean: Experiment):
+def test_robust_errors_hold_under_coloured_noise_and_classical_ones_do_not(clean: Experiment):
     draws = 40
     found = repeated(clean, coloured, draws)
     classical = np.mean(z_scores(found, "std_classical") ** 2, axis=0)
-    # Noise with more power below the resonance than white: classical errors promise too much, of every parameter.
+    # With more noise power below the resonance than white noise, classical errors of all parameters are too small.
     high = chi2.ppf(0.9995, draws) / draws
     assert (classical > high).all(), (classical, high)
     assert_chi_squared(z_scores(found, "std"), slack=1.15)
     assert_covered(found)
 
 
-def test_correlations(white_draws: list[Uncertainty]):
+def test_correlation_matrix_equals_that_of_the_scatter_of_estimates(white_draws: list[Uncertainty]):
     correlation = white_draws[0].correlation
     np.testing.assert_allclose(np.diag(correlation), 1.0, rtol=1e-12)
     np.testing.assert_allclose(correlation, correlation.T, atol=1e-12)
     assert (np.linalg.eigvalsh(correlation) > 0).all()
-    # They are those of the scatter: 60 draws know a correlation to 0.13 or better.
+    # The scatter has the same correlations: 60 draws determine a correlation to 0.13 or better.
     values = np.array([[u.estimates[p].value for p in PATHS] for u in white_draws])
     np.testing.assert_allclose(np.corrcoef(values.T), correlation, atol=0.5)
     assert tuple(white_draws[0].estimates) == PATHS
 
 
-def test_intervals_and_units(white_draws: list[Uncertainty]):
+def test_intervals_are_those_of_student_and_estimates_have_units(white_draws: list[Uncertainty]):
     estimates = white_draws[0].estimates
     for path, estimate in estimates.items():
         assert estimate.path == path
@@ -138,8 +138,8 @@ def test_intervals_and_units(white_draws: list[Uncertainty]):
         assert 0.3 < estimate.std / estimate.std_classical < 3.0
         assert estimate.ci95[0] < estimate.value < estimate.ci95[1]
         width = estimate.ci95[1] - estimate.ci95[0]
-        # The larger of the normal law's interval and Student's; of a positive parameter one of its logarithm, which is
-        # a little longer above.
+        # The interval lies between that of the normal distribution and Student's; positive parameters have one of the
+        # logarithm, which is slightly longer above.
         student = t.ppf(0.975, estimate.degrees_of_freedom)
         assert 0.99 * 1.959964 < 0.5 * width / estimate.std < 1.01 * student < 3.0
     assert estimates["mu"].unit == "1/s"
@@ -155,7 +155,7 @@ def test_alpha_of_a_nearly_linear_log_is_not_identifiable():
         assert found[path].identifiable, path
 
 
-def test_nothing_free_is_nothing_estimated(clean: Experiment):
+def test_uncertainty_without_free_parameters_is_empty(clean: Experiment):
     result = reduced_fit(noisy(clean, white(0)))
     found = uncertainty(eqx.tree_at(lambda f: f.problem.free, result, free_parameters(result.model, (), {})))
     assert found.estimates == {}
