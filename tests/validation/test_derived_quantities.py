@@ -1,4 +1,4 @@
-"""Figures that follow from the parameters, and their standard errors, against draws from the parameters' law."""
+"""Derived quantities and their standard errors, compared with draws from the parameters' distribution."""
 
 import dataclasses
 
@@ -26,8 +26,8 @@ def account_of(model: Model, std: dict[str, float], correlation: np.ndarray) -> 
     return Account(model, found, (), (), (), Identifiability({}, (), (), {}))
 
 
-def test_drive_by_draws():
-    """First-order propagation, so that errors of a thousandth agree to their own size and to the draws' chance."""
+def test_derived_quantities_of_a_drive_equal_those_of_parameter_draws():
+    """Propagation is of first order, so that relative errors of 1e-3 agree to 1e-3 and to the scatter of draws."""
     std = {"K": 5.0, "alpha": 60.0, "B_sp": 4e-4}
     correlation = np.array([[1.0, -0.8, 0.3], [-0.8, 1.0, -0.1], [0.3, -0.1, 1.0]])
     found = derived(account_of(rig.drive_model(), std, correlation), lambda m: drive_figures(m, X_MAX))
@@ -54,7 +54,7 @@ def test_drive_by_draws():
         assert np.mean((values > low) & (values < high)) == pytest.approx(0.95, abs=0.005), name
 
 
-def test_reduced_drive_leaves_out_its_own_parameters():
+def test_derived_quantities_of_a_reduced_log_exclude_its_fitted_parameters():
     std = {"mu": 0.01, "omega_0": 0.1, "alpha": 0.02, "gain": 0.1}
     found = derived(account_of(rig.reduced_model(), std, np.eye(4)), lambda m: drive_figures(m, 0.5))
     assert list(found) == ["natural_frequency", "zeta", "nonlinear_share", "stiffness_at_full_twist"]
@@ -71,8 +71,8 @@ def with_freedom(account: Account, freedom: dict[str, float]) -> Account:
     return dataclasses.replace(account, uncertainty=dataclasses.replace(account.uncertainty, estimates=estimates))
 
 
-def test_intervals_know_how_well_the_errors_are_known():
-    """Student's t of a parameter that a quantity follows from; between those of several where they share the error."""
+def test_intervals_use_degrees_of_freedom_of_the_parameters():
+    """Intervals are Student's t of the only parameter of a quantity, or lie between those of several parameters."""
     std = {"mu": 0.01, "omega_0": 0.1, "alpha": 0.02, "gain": 0.1}
     freedom = {"mu": 4.0, "omega_0": 30.0, "alpha": 7.0, "gain": 2.0}
     account = with_freedom(account_of(rig.reduced_model(), std, np.eye(4)), freedom)
@@ -82,7 +82,7 @@ def test_intervals_know_how_well_the_errors_are_known():
         assert high - low == pytest.approx(2 * stats.t.ppf(0.975, freedom[path]) * found[name].std), name
     # The damping ratio's error is mostly that of mu.
     assert freedom["mu"] < found["zeta"].degrees_of_freedom < 1.1 * freedom["mu"]
-    # No more than Satterthwaite gives to independent errors, whose variances are known so well.
+    # At most the degrees of freedom of Satterthwaite for independent errors.
     shares = np.array([0.01 / rig.MU, 0.1 / rig.OMEGA_0]) ** 2
     satterthwaite = shares.sum() ** 2 / np.sum(shares**2 / [freedom["mu"], freedom["omega_0"]])
     assert found["zeta"].degrees_of_freedom <= satterthwaite

@@ -1,4 +1,4 @@
-"""Test data that take the drive farther than what was fitted."""
+"""Detection of test data with larger twist, speed or torque than the fitted data."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -29,13 +29,13 @@ def run(twist: float, speed: float, torque: float, output: str = "dynamic_error"
 
 
 def beyond(fitted: Sequence[FreeRun], test: Sequence[FreeRun], selection: Sequence[FreeRun] = ()) -> dict[str, Any]:
-    """Quantities that test data take farther, fitted and test."""
+    """Quantities in which test data exceed the fitted data, with both values."""
     account = SimpleNamespace(training=tuple(fitted), selection=tuple(selection), test=tuple(test))
     return {one.quantity: (one.fitted, one.test) for one in extrapolations(cast(Account, account))}
 
 
 @given(SIZE, SIZE, SIZE, st.floats(0.0, 1.0 + 0.99 * BEYOND), st.floats(1.0 + 1.01 * BEYOND, 100.0))
-def test_what_is_larger_by_more_than_the_margin_is_told(
+def test_quantities_beyond_the_margin_are_reported_as_extrapolated(
     twist: float, speed: float, torque: float, little: float, much: float
 ):
     fitted = run(twist, speed, torque)
@@ -47,13 +47,13 @@ def test_what_is_larger_by_more_than_the_margin_is_told(
     }
 
 
-def test_selection_data_were_fitted_in_the_end():
+def test_selection_data_count_as_fitted():
     small, large = run(1.0, 1.0, 1.0), run(2.0, 2.0, 2.0)
     assert beyond([small], [large], [large]) == {} and beyond([small], []) == {}
     assert set(beyond([small], [large])) == {"twist", "speed", "torque"}
 
 
-def test_a_twist_that_no_sensor_saw_is_not_compared():
+def test_unmeasured_twist_is_not_compared():
     fitted, test = (run(size, size, size, "motor_angle") for size in (1.0, 2.0))
     assert set(beyond([fitted], [test])) == {"speed", "torque"}
 
@@ -64,7 +64,7 @@ def stretch() -> Stretch:
     return whole([experiment_from_log(log, hold="zero-order", N=JOINT.N)])[0]
 
 
-def test_reach_is_that_of_the_motion(stretch: Stretch):
+def test_reach_equals_the_largest_values_of_the_motion(stretch: Stretch):
     torque = joints.torque_of(JOINT, count=3000)
     motion = joints.motion_of(JOINT, torque)
     found = reach(stretch, MODEL)
@@ -74,12 +74,12 @@ def test_reach_is_that_of_the_motion(stretch: Stretch):
     assert found["speed"] == pytest.approx(np.max(np.abs(motion[:, 2])), rel=0.05)
 
 
-def test_a_part_of_a_log_reaches_no_farther(stretch: Stretch):
+def test_reach_of_a_part_is_at_most_that_of_the_log(stretch: Stretch):
     whole_log, part = reach(stretch, MODEL), reach(Stretch(stretch.experiment, 0, 800), MODEL)
     assert all(part[quantity] <= whole_log[quantity] for quantity in whole_log)
 
 
-def test_of_a_reduced_log_the_rate_of_the_dynamic_error_counts():
+def test_reach_of_a_reduced_log_uses_the_rate_of_the_dynamic_error():
     time = 1e-3 * np.arange(2000)
     x = 3.0 * np.sin(10.0 * time)
     log = rig.reduced_log(x, np.cos(time), noise=0.0, step=1e-3)

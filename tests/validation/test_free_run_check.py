@@ -1,4 +1,4 @@
-"""Free runs of whole held-out stretches against what their bands promised."""
+"""Errors of free runs of whole held-out stretches, compared with their prediction bands."""
 
 from dataclasses import replace
 
@@ -23,19 +23,19 @@ PATHS = ("mu", "omega_0", "alpha", "gain")
 
 
 def run(times_noise: float, weight: np.ndarray | None = None, count: int = 50) -> FreeRun:
-    """One that is off by so much at every sample."""
+    """A free run with the same error at every sample."""
     return FreeRun("log", np.arange(count) * 1e-3, np.zeros(count), np.full(count, times_noise * NOISE), None, weight)
 
 
 def band(of: FreeRun, std_parameters: float = 0.0, std_state: float = 0.0) -> PredictionBand:
-    """In units of the noise."""
+    """A prediction band with standard deviations in units of the noise."""
     ones = np.ones(of.time.size) * NOISE
     return PredictionBand(of, std_parameters * ones, std_state * ones, NOISE)
 
 
 @pytest.fixture(scope="module")
 def fitted() -> tuple[Fit, Account]:
-    """A model and its account, whose free runs are put in by hand."""
+    """A fit and its account; tests replace its free runs."""
     training, selection = split((rig.reduced_experiment(600, noise=2e-3),))
     found = fit(rig.reduced_model(), training, PATHS, Segmentation(128, substeps=2, count=8))
     return found, account(found, training, selection, noise=found.covariance, halo=0)
@@ -49,22 +49,22 @@ def fitted() -> tuple[Fit, Account]:
         ([band(run(3.0))], 3.0),
         # Squares count, over all stretches.
         ([band(run(1.0)), band(run(7.0), std_parameters=7.0)], np.sqrt(50.0 / 51.0)),
-        # A chaotic motion promises nothing.
+        # The band of a chaotic motion is huge.
         ([band(run(100.0), std_state=1e4)], 0.01),
     ],
 )
-def test_what_a_free_run_promised(bands: list[PredictionBand], expected: float):
+def test_error_over_band_is_that_of_the_squares_over_all_stretches(bands: list[PredictionBand], expected: float):
     assert over_bands(bands) == pytest.approx(expected, rel=1e-3)
 
 
-def test_samples_that_are_not_believed_do_not_count():
+def test_invalid_samples_do_not_count_in_error_over_band():
     weight = np.repeat([1.0, 0.0], 25)
     odd = run(1.0, weight)
     odd = replace(odd, measured=np.where(weight > 0, odd.measured, 1.0))
     assert over_bands([band(odd)]) == pytest.approx(1.0)
 
 
-def test_a_band_that_left_the_numbers_promised_nothing():
+def test_error_over_band_is_none_for_an_infinite_band():
     assert over_bands([band(run(9.0), std_state=np.inf), band(run(9.0))]) is None
 
 
@@ -80,7 +80,7 @@ def test_a_band_that_left_the_numbers_promised_nothing():
         (10.0, np.inf, True),
     ],
 )
-def test_bands_are_asked_where_names_do_not_explain(
+def test_free_runs_are_checked_only_where_effects_leave_unexplained_error(
     fitted: tuple[Fit, Account], before: float, after: float, asked: bool
 ):
     found, _ = fitted
@@ -90,8 +90,8 @@ def test_bands_are_asked_where_names_do_not_explain(
     assert (share < RULES.free_run_explained) == asked
 
 
-def test_a_right_model_does_not_surprise(fitted: tuple[Fit, Account]):
-    """Its own free run, beside a base model that does no better: what is asked is the band."""
+def test_free_runs_of_the_true_model_agree_with_their_bands(fitted: tuple[Fit, Account]):
+    """Errors of the free runs are as large as their bands predict."""
     found, known = fitted
     _, selection = split((rig.reduced_experiment(600, noise=2e-3),))
     held_out = replace(found, stretches=tuple(selection))
@@ -99,8 +99,8 @@ def test_a_right_model_does_not_surprise(fitted: tuple[Fit, Account]):
     assert beyond == pytest.approx(1.0, abs=0.2)
 
 
-def test_nor_does_it_where_the_noise_has_a_memory():
-    """Pieces of half a period take the slow part of such noise for motion, and tell less than a free run is off by."""
+def test_free_runs_under_coloured_noise_agree_with_their_bands():
+    """Pieces of half a period count the slow part of such noise as motion, so that free runs have a larger error."""
     rng = np.random.default_rng(3)
     forcing = rig.reduced_forcing(4000, rms=10.0, seed=3)
     noise = 2e-3 * np.asarray(lfilter([np.sqrt(1.0 - 0.95**2)], [1.0, -0.95], rng.normal(size=4000)))

@@ -1,4 +1,4 @@
-"""The frequency response agrees with the closed form, and says what a log shows and what it does not."""
+"""The frequency response equals the closed form, and states which resonances a log excites."""
 
 import dataclasses
 
@@ -26,8 +26,10 @@ COUNT = 40_000
 
 
 def stepped(hold: Hold) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Exact update `y' = A y + b u + c u_next` of `x'' + mu x' + omega_0^2 x = gain u`, by one matrix exponential of
-    oscillator and input (Van Loan)."""
+    """Exact update `y' = A y + b u + c u_next` of `x'' + mu x' + omega_0^2 x = gain u`.
+
+    It follows from one matrix exponential of oscillator and input (Van Loan).
+    """
     matrix = np.zeros((4, 4))
     matrix[:2, :2] = [[0.0, 1.0], [-(OMEGA_0**2), -MU]]
     matrix[1, 2] = GAIN
@@ -37,14 +39,14 @@ def stepped(hold: Hold) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def exact_response(frequency: np.ndarray, hold: Hold) -> np.ndarray:
-    """From input samples to samples of x."""
+    """Exact response from samples of the input to samples of x."""
     A, b, c = stepped(hold)
     z = np.exp(2j * np.pi * frequency * STEP)
     return np.array([np.linalg.solve(k * np.eye(2) - A, b + k * c)[0] for k in z])
 
 
 def simulated(u: np.ndarray, *, alpha: float = 0.0, noise: float = 0.0) -> Experiment:
-    """A log of the linear oscillator, exact from sample to sample; or of the cubic one, by the rig's Runge-Kutta."""
+    """A log of the linear oscillator, exact from sample to sample, or of the cubic one by the rig's Runge-Kutta."""
     if alpha:
         x = rig.reduced_motion(u, mu=MU, omega_0=OMEGA_0, alpha=alpha, gain=GAIN, step=STEP, substeps=2)[:, 0]
     else:
@@ -56,7 +58,7 @@ def simulated(u: np.ndarray, *, alpha: float = 0.0, noise: float = 0.0) -> Exper
     return experiment_from_log(rig.reduced_log(x, u, noise=noise, step=STEP), hold="zero-order")
 
 
-def look(experiment: Experiment, *, alpha: float = 0.0, hold: Hold = "zero-order", noise: float = 0.0):
+def response_of(experiment: Experiment, *, alpha: float = 0.0, hold: Hold = "zero-order", noise: float = 0.0):
     model = rig.reduced_model(mu=MU, omega_0=OMEGA_0, alpha=alpha, gain=GAIN)
     return frequency_response(model, [experiment], hold=hold, noise=noise)
 
@@ -67,50 +69,50 @@ def white() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def linear(white: np.ndarray) -> FrequencyResponse:
-    found = look(simulated(white))
+def linear_response(white: np.ndarray) -> FrequencyResponse:
+    found = response_of(simulated(white))
     assert found is not None
     return found
 
 
 @pytest.mark.parametrize("hold", ["zero-order", "linear"])
-def test_model_is_the_closed_form(white: np.ndarray, hold: Hold):
-    found = look(simulated(white), hold=hold)
+def test_model_response_equals_the_closed_form(white: np.ndarray, hold: Hold):
+    found = response_of(simulated(white), hold=hold)
     assert found is not None
     # Far above the resonance the transfer function is a small difference of large terms.
     np.testing.assert_allclose(found.model, exact_response(found.frequency, hold), rtol=1e-9, atol=1e-13)
 
 
-def test_smooth_input_has_the_response_of_continuous_time(white: np.ndarray):
-    found = look(simulated(white), hold="band-limited")
+def test_band_limited_input_has_the_continuous_time_response(white: np.ndarray):
+    found = response_of(simulated(white), hold="band-limited")
     assert found is not None
     s = 2j * np.pi * found.frequency
     np.testing.assert_allclose(found.model, GAIN / (s**2 + MU * s + OMEGA_0**2), rtol=1e-12)
 
 
-def test_a_linear_log_shows_the_closed_form(linear: FrequencyResponse):
-    truth = exact_response(linear.frequency, "zero-order")
-    error = np.abs(linear.measured / truth - 1)
-    coherent = linear.coherence > 0.99
-    assert np.mean(coherent[linear.frequency < 3 * F_0]) > 0.9
+def test_measured_response_of_a_linear_log_equals_the_closed_form(linear_response: FrequencyResponse):
+    truth = exact_response(linear_response.frequency, "zero-order")
+    error = np.abs(linear_response.measured / truth - 1)
+    coherent = linear_response.coherence > 0.99
+    assert np.mean(coherent[linear_response.frequency < 3 * F_0]) > 0.9
     # Random error of a line: sqrt((1 - coherence) / (2 averages coherence)), below 1 % here; leakage adds at the peak.
     assert np.median(error[coherent]) < 0.01 and np.max(error[coherent]) < 0.1
-    assert linear.width == pytest.approx(MU / (2 * np.pi))
-    assert linear.averages >= 8
+    assert linear_response.width == pytest.approx(MU / (2 * np.pi))
+    assert linear_response.averages >= 8
 
 
-def test_a_linear_log_shows_its_resonance(linear: FrequencyResponse):
-    assert excites_resonance(linear)
-    assert resonance_seen(linear) == pytest.approx(F_0, abs=2 * linear.resolution)
-    band = coherent_band(linear)
+def test_resonance_of_a_linear_log_is_detected(linear_response: FrequencyResponse):
+    assert excites_resonance(linear_response)
+    assert resonance_seen(linear_response) == pytest.approx(F_0, abs=2 * linear_response.resolution)
+    band = coherent_band(linear_response)
     assert band is not None and band[0] < 2.0 < 3 * F_0 < band[1]
-    assert unexplained_band(linear) is None
+    assert unexplained_band(linear_response) is None
 
 
-def test_coherence_falls_as_noise_says(white: np.ndarray):
+def test_coherence_decreases_with_noise_as_predicted(white: np.ndarray):
     """With noise on the response only, coherence is 1 - noise power / response power."""
     noise = 2e-4
-    found = look(simulated(white, noise=noise), noise=noise)
+    found = response_of(simulated(white, noise=noise), noise=noise)
     assert found is not None
     # One-sided densities of white noise; input of unit variance.
     response = np.abs(exact_response(found.frequency, "zero-order")) ** 2 * 2 * STEP
@@ -121,24 +123,24 @@ def test_coherence_falls_as_noise_says(white: np.ndarray):
     for part in np.array_split(np.arange(truth.size), 8):
         assert np.mean(found.coherence[part]) == pytest.approx(np.mean(expected[part]), abs=0.02)
     assert np.mean(np.abs(found.noise_coherence - truth)[truth > 0.5]) < 0.05
-    # Noise is no missing physics.
+    # Noise is not reported as an unexplained band.
     assert unexplained_band(found) is None
 
 
-def test_a_log_below_the_resonance_does_not_excite_it():
+def test_resonance_above_the_excited_band_is_not_detected():
     u = rig.multisine(COUNT, STEP, rms=1.0, low=0.5, high=6.0, seed=1)
-    # From rest the log would ring at first.
+    # The first samples are cut off because they hold the transient from rest.
     noise = 1e-5
-    found = look(simulated(u, noise=noise), noise=noise)
+    found = response_of(simulated(u, noise=noise), noise=noise)
     assert found is not None
-    tail = look(_cut(simulated(u, noise=noise), 4000), noise=noise)
+    tail = response_of(_cut(simulated(u, noise=noise), 4000), noise=noise)
     assert tail is not None and not excites_resonance(tail) and resonance_seen(tail) is None
 
 
-def test_lines_beyond_the_excited_ones_hide_no_peak():
-    """Where neither torque nor twist has power their ratio is anything."""
+def test_lines_without_excitation_do_not_mask_the_resonance():
+    """The ratio of twist to torque is arbitrary where neither has power."""
     u = rig.multisine(COUNT, STEP, rms=1.0, low=1.0, high=1.3 * F_0, seed=6)
-    found = look(simulated(u, noise=1e-7), noise=1e-7)
+    found = response_of(simulated(u, noise=1e-7), noise=1e-7)
     assert found is not None
     assert resonance_seen(found) == pytest.approx(F_0, abs=2 * found.resolution)
 
@@ -150,10 +152,10 @@ def _cut(experiment: Experiment, start: int) -> Experiment:
     return experiment_from_log(part, hold="zero-order")
 
 
-def test_a_bent_stiffness_lowers_the_coherence():
+def test_nonlinear_stiffness_lowers_the_coherence():
     u = 4e3 * np.random.default_rng(2).normal(size=20_000)
     experiment = simulated(u, alpha=0.3)
-    found = look(experiment, alpha=0.3)
+    found = response_of(experiment, alpha=0.3)
     assert found is not None
     x = experiment.measured[:, -1]
     assert 3 * 0.3 * np.mean(x**2) > 0.5
@@ -162,14 +164,14 @@ def test_a_bent_stiffness_lowers_the_coherence():
     assert unexplained_band(found) is not None
 
 
-def test_irregular_stamps_are_interpolated(white: np.ndarray, linear: FrequencyResponse):
-    """Stamps that jitter by a fifth of the step make no difference to slow motion."""
+def test_jitter_of_time_stamps_does_not_change_the_response(white: np.ndarray, linear_response: FrequencyResponse):
+    """Jitter of time stamps by a fifth of the step does not change the response of slow motion."""
     smooth = rig.multisine(COUNT, STEP, rms=1.0, low=2.0, high=60.0, seed=3)
     even = simulated(smooth)
     time = even.time + STEP * np.random.default_rng(4).uniform(-0.2, 0.2, COUNT)
     x, u = (np.interp(time, even.time, v) for v in (even.measured[:, -1], smooth))
     log = dataclasses.replace(rig.reduced_log(x, u, step=STEP), time=time)
-    irregular, regular = look(experiment_from_log(log, hold="zero-order")), look(even)
+    irregular, regular = response_of(experiment_from_log(log, hold="zero-order")), response_of(even)
     assert irregular is not None and regular is not None
     # The median step is that of the grid to a few parts in ten thousand.
     lines = np.flatnonzero((regular.frequency > 3) & (regular.frequency < 50) & (regular.coherence > 0.99))
@@ -178,13 +180,13 @@ def test_irregular_stamps_are_interpolated(white: np.ndarray, linear: FrequencyR
 
 
 @pytest.mark.parametrize(("count", "amplitude"), [(300, 1.0), (4000, 0.0)])
-def test_nothing_to_see(count: int, amplitude: float):
-    """A log that is too short, or a torque that does not move."""
+def test_short_log_or_constant_torque_has_no_response(count: int, amplitude: float):
+    """Neither a log that is too short nor a constant torque gives a frequency response."""
     u = 1.0 + amplitude * np.random.default_rng(5).normal(size=count)
-    assert look(simulated(u)) is None
+    assert response_of(simulated(u)) is None
 
 
-def test_a_drive_is_excited_by_its_motor_torque():
+def test_response_of_a_drive_log_has_the_motor_torque_as_input():
     """The two-inertia drive's twist obeys the reduced equation, with gain 1 / (N J_m)."""
     experiment = rig.drive_experiment(8000, noise=0.0)
     model = rig.drive_model(alpha=0.0)
@@ -194,11 +196,11 @@ def test_a_drive_is_excited_by_its_motor_torque():
     assert found.resonance == pytest.approx(np.sqrt(c * rig.K) / (2 * np.pi))
     omega = 2 * np.pi * found.frequency[0]
     truth = 1 / (rig.N * rig.J_M) / (c * rig.K - omega**2)
-    # The hold and the damping matter by (omega step)^2 and by zeta^2.
+    # The errors by hold and damping are of the order of (omega step)^2 and zeta^2.
     assert abs(found.model[0]) == pytest.approx(truth, rel=1e-4)
 
 
-def motor_alone(torque: np.ndarray, *, B_sp: float = 0.4, noise: float = 1e-4) -> tuple[Experiment, TwoInertiaModel]:
+def motor_only_log(torque: np.ndarray, *, B_sp: float = 0.4, noise: float = 1e-4) -> tuple[Experiment, TwoInertiaModel]:
     """A log of the motor's angle of a linear drive, exact from sample to sample, and its model."""
     N, J_m, J_l, K = 50.0, 4e-5, 0.2, 300.0
     mesh = np.array([K / N, -K, B_sp / N, -B_sp])  # of the motor's and the load's angle, and of their rates
@@ -221,8 +223,8 @@ ANTIRESONANCE = np.sqrt(300.0 / 0.2) / (2 * np.pi)
 RESONANCE = ANTIRESONANCE * np.sqrt(1.0 + 0.2 / (50.0**2 * 4e-5))
 
 
-def test_the_motor_alone_shows_antiresonance_and_resonance():
-    experiment, model = motor_alone(rig.multisine(COUNT, STEP, rms=0.05, low=0.5, high=40.0, seed=1))
+def test_motor_only_log_has_antiresonance_and_resonance():
+    experiment, model = motor_only_log(rig.multisine(COUNT, STEP, rms=0.05, low=0.5, high=40.0, seed=1))
     found = frequency_response(model, [experiment], hold="zero-order", noise=1e-4)
     assert found is not None and found.output == "motor_angle"
     assert found.antiresonance == pytest.approx(ANTIRESONANCE) and found.resonance == pytest.approx(RESONANCE)
@@ -231,15 +233,15 @@ def test_the_motor_alone_shows_antiresonance_and_resonance():
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.5, 0.6 * ANTIRESONANCE), (1.3 * ANTIRESONANCE, 40.0)])
-def test_a_torque_on_one_side_of_the_antiresonance_does_not_show_it(low: float, high: float):
-    experiment, model = motor_alone(rig.multisine(COUNT, STEP, rms=0.05, low=low, high=high, seed=2), noise=1e-3)
+def test_antiresonance_outside_the_excited_band_is_not_detected(low: float, high: float):
+    experiment, model = motor_only_log(rig.multisine(COUNT, STEP, rms=0.05, low=low, high=high, seed=2), noise=1e-3)
     found = frequency_response(model, [experiment], hold="zero-order", noise=1e-3)
     assert found is not None and coherent_band(found) is not None
     assert not excites_antiresonance(found) and antiresonance_seen(found) is None
 
 
 @pytest.mark.parametrize("measured", ["load_velocity", "joint_torque", "dynamic_error"])
-def test_what_does_not_see_the_motor_has_no_antiresonance(measured: str):
+def test_outputs_other_than_the_motor_have_no_antiresonance(measured: str):
     experiment = rig.drive_experiment(8000, noise=0.0)
     outputs = ("motor_turn", "dynamic_error") if measured == "dynamic_error" else ("motor_angle", measured)
     model = dataclasses.replace(rig.drive_model(alpha=0.0), measured=outputs)
@@ -248,10 +250,10 @@ def test_what_does_not_see_the_motor_has_no_antiresonance(measured: str):
     assert found is not None and found.antiresonance is None and not excites_antiresonance(found)
 
 
-def test_dips_and_peaks_that_the_lines_do_not_resolve_are_nothing_unexplained():
-    """A short log of little damping: leakage of the window lowers the coherence there."""
+def test_low_coherence_at_unresolved_peaks_is_not_unexplained():
+    """In a short log with little damping, leakage of the window lowers the coherence at peaks and dips."""
     torque = rig.multisine(8000, STEP, rms=0.05, low=0.5, high=30.0, seed=3)
-    experiment, model = motor_alone(torque, B_sp=0.02)
+    experiment, model = motor_only_log(torque, B_sp=0.02)
     found = frequency_response(model, [experiment], hold="zero-order", noise=1e-4)
     assert found is not None and found.width < found.resolution
     beside = np.abs(found.frequency - RESONANCE) < 2 * found.resolution

@@ -1,4 +1,4 @@
-"""Each figure of merit by an independent route."""
+"""Figures of merit, compared with independent computations."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ NOISE = np.array([[4e-10, 1e-10], [1e-10, 9e-10]])
 def fitted() -> Fit:
     torque = rig.drive_torque(3000)
     log = rig.drive_log(rig.drive_motion(torque), torque, noise=1.0)
-    # So small that the motion does not show it.
+    # So small that it does not change the motion.
     log = dataclasses.replace(log, load_torque=1e-9 * np.random.default_rng(0).normal(size=3000))
     training, _ = split([experiment_from_log(log, hold="zero-order", N=rig.N)])
     model = rig.drive_model()
@@ -49,12 +49,12 @@ def error(fitted: Fit) -> np.ndarray:
     return np.asarray(fitted.error).reshape(-1, 2)[:2400]
 
 
-def test_counts(found: Goodness):
+def test_counts_of_data_parameters_and_states(found: Goodness):
     assert (found.data, found.parameters, found.states) == (2 * 2400, 3, 10 * 4)
 
 
-def test_likelihood_and_criteria(found: Goodness, error: np.ndarray):
-    """The density of scipy, at the covariance that maximises it."""
+def test_likelihood_and_information_criteria_equal_those_by_scipy(found: Goodness, error: np.ndarray):
+    """The reference is scipy's density at the covariance that maximises it."""
     covariance = error.T @ error / 2400
     expected = np.sum(stats.multivariate_normal([0, 0], covariance).logpdf(error))
     assert found.log_likelihood == pytest.approx(expected)
@@ -64,24 +64,24 @@ def test_likelihood_and_criteria(found: Goodness, error: np.ndarray):
     assert found.bic == pytest.approx(count * np.log(4800) - 2 * expected)
 
 
-def test_reduced_chi_square(found: Goodness, error: np.ndarray):
+def test_reduced_chi_square_equals_its_definition(found: Goodness, error: np.ndarray):
     white = np.linalg.solve(np.linalg.cholesky(NOISE), error.T)
     assert found.reduced_chi_square == pytest.approx(np.sum(white**2) / (4800 - 43))
 
 
-def test_error_over_noise(found: Goodness, error: np.ndarray):
+def test_error_over_noise_is_given_by_output(found: Goodness, error: np.ndarray):
     rms = np.sqrt(np.mean(error**2, axis=0))
     assert list(found.error_over_noise) == ["motor angle", "dynamic error"]
-    # The fit's covariance has a floor, a billionth of the swing.
+    # The covariance of the fit has a floor of a billionth of the range.
     assert list(found.error_over_noise.values()) == pytest.approx(list(rms / np.sqrt(np.diag(NOISE))), rel=1e-5)
 
 
-def test_every_input_is_tested(fitted: Fit):
+def test_residual_is_tested_for_independence_of_each_input(fitted: Fit):
     found = residual_tests(fitted, diagnose(fitted))
     assert [c.name for c in found.inputs] == ["motor torque", "load torque"]
     assert {t.verdict for t in found.tests} == {"passed"}
     (load,) = [t for t in found.tests if t.name == "independence of load torque"]
-    # White, so that each lag counts.
+    # The input is white, so that each lag is a degree of freedom.
     assert load.degrees == 26
 
 
@@ -89,7 +89,7 @@ def run(measured: np.ndarray, predicted: np.ndarray) -> FreeRun:
     return FreeRun("log", np.arange(measured.size) * 1.0, predicted, measured, None)
 
 
-def test_fit_percent_by_its_definition():
+def test_fit_percent_equals_its_definition():
     random = np.random.default_rng(0)
     y = 3.0 + random.normal(size=400)
     yhat = y + 0.1 * random.normal(size=400)
@@ -100,8 +100,8 @@ def test_fit_percent_by_its_definition():
     assert fit_percent([run(y, np.full(400, np.inf))]) == -np.inf
 
 
-def test_each_run_has_its_own_mean():
-    """Two logs that differ by a constant fit as well together as each."""
+def test_fit_percent_subtracts_the_mean_of_each_run():
+    """Two logs that differ by a constant have together the fit percent of each."""
     random = np.random.default_rng(1)
     y, error = random.normal(size=100), 0.1 * random.normal(size=100)
     assert fit_percent([run(y, y + error), run(y + 50, y + 50 + error)]) == pytest.approx(

@@ -1,4 +1,4 @@
-"""The residual tests keep their level on noise, whatever its colour, and find what they are for."""
+"""The residual tests keep their level on noise of any colour and detect model errors."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ SAMPLES = 2000
 
 
 def direct_autocorrelation(values: np.ndarray, lags: int) -> np.ndarray:
-    """By its definition."""
+    """Autocorrelation by its definition."""
     v = values - values.mean()
     return np.array([np.sum(v[: v.size - k] * v[k:]) for k in range(lags + 1)]) / np.sum(v**2)
 
@@ -30,22 +30,22 @@ def coloured(random: np.random.Generator, memory: float) -> np.ndarray:
 
 
 def assert_uniform(p_values: list[float]) -> None:
-    """p-values are uniform if all is well (Kolmogorov-Smirnov at one in ten thousand, as a fixed seed is drawn)."""
+    """Check that p-values are uniform (Kolmogorov-Smirnov test at 1e-4, with a fixed seed)."""
     assert stats.kstest(p_values, "uniform").pvalue > 1e-4
 
 
-def test_the_uniformity_check_can_fail():
+def test_uniformity_check_detects_nonuniform_p_values():
     with pytest.raises(AssertionError):
         assert_uniform(list(np.random.default_rng(0).uniform(size=REPETITIONS) ** 2))
 
 
-def test_autocovariance_by_definition():
+def test_autocovariance_equals_its_definition():
     values = np.random.default_rng(0).normal(size=300)
     found = autocovariance(values, 40)
     np.testing.assert_allclose(found, [np.sum(values[: 300 - k] * values[k:]) for k in range(41)], atol=1e-10)
 
 
-def test_whiteness_is_that_of_ljung_and_box():
+def test_whiteness_statistic_equals_that_of_ljung_and_box():
     values = coloured(np.random.default_rng(1), 0.1)
     r = direct_autocorrelation(values, LAGS)
     test = whiteness(r, SAMPLES)
@@ -54,7 +54,7 @@ def test_whiteness_is_that_of_ljung_and_box():
     assert test.p_value == pytest.approx(1 - stats.chi2.cdf(Q, LAGS), abs=1e-12)
 
 
-def test_levels_on_white_noise():
+def test_residual_tests_keep_their_level_on_white_noise():
     random = np.random.default_rng(2)
     p_values = {"mean": [], "white": [], "normal": []}
     for _ in range(REPETITIONS):
@@ -63,14 +63,14 @@ def test_levels_on_white_noise():
         p_values["mean"].append(zero_mean(noise, r).p_value)
         p_values["white"].append(whiteness(r, SAMPLES).p_value)
         p_values["normal"].append(normality(noise - noise.mean(), r).p_value)
-    # The allowance for a memory sees chance correlations in white noise, so that the mean's test is a little shy.
+    # The allowance for correlation responds to chance in white noise, so that the test of the mean is conservative.
     assert np.mean(np.array(p_values["mean"]) < 0.05) < 0.08
     assert_uniform(p_values["white"])
     assert_uniform(p_values["normal"])
 
 
 @pytest.mark.parametrize(("memory", "input_memory"), [(0.0, 0.0), (0.0, 0.95), (0.9, 0.0), (0.9, 0.95)])
-def test_level_of_independence_under_colour(memory: float, input_memory: float):
+def test_independence_test_keeps_its_level_on_coloured_noise(memory: float, input_memory: float):
     random = np.random.default_rng(3)
     p_values, outside = [], []
     for _ in range(REPETITIONS):
@@ -78,13 +78,13 @@ def test_level_of_independence_under_colour(memory: float, input_memory: float):
         found, test = independence(residual - residual.mean(), signal - signal.mean(), name="torque", step=1e-3)
         p_values.append(test.p_value)
         outside.append(np.mean(np.abs(found.correlation) > found.limit))
-    # One in a hundred, whatever the colours; three sigma of 300 draws.
+    # A level of 1 % for all colours, within three standard deviations of 300 draws.
     assert np.mean(np.array(p_values) < 0.01) < 0.01 + 3 * np.sqrt(0.01 * 0.99 / REPETITIONS)
     assert np.mean(outside) == pytest.approx(0.05, abs=0.025)
     assert np.median(p_values) == pytest.approx(0.5, abs=0.15)
 
 
-def test_correlation_is_that_of_numpy():
+def test_cross_correlation_equals_its_definition():
     random = np.random.default_rng(4)
     residual, signal = random.normal(size=500), random.normal(size=500)
     residual, signal = residual - residual.mean(), signal - signal.mean()
@@ -95,8 +95,8 @@ def test_correlation_is_that_of_numpy():
         assert found.correlation[found.lag == lag][0] == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_missing_delay_is_found():
-    """What is left over holds the input of four samples ago, for a hundredth of its power."""
+def test_independence_test_detects_a_missing_delay():
+    """The residual contains the input of four samples earlier, with 4 % of the noise power."""
     random = np.random.default_rng(5)
     signal = coloured(random, 0.5)
     residual = random.normal(size=SAMPLES) + 0.2 * np.roll(signal, 4) / np.std(signal)
@@ -105,8 +105,8 @@ def test_a_missing_delay_is_found():
     assert found.lag[np.argmax(np.abs(found.correlation))] == 4
 
 
-def test_verdicts_weigh_the_size():
-    """With a million samples a correlation of 0.02 is certain, and of no matter."""
+def test_verdict_depends_on_the_size_of_the_correlation():
+    """With a million samples, a correlation of 0.02 is significant but too small to matter."""
     r = np.zeros(50)
     r[0], r[1] = 1.0, 0.02
     assert whiteness(r, 100).verdict == "passed"
@@ -115,7 +115,7 @@ def test_verdicts_weigh_the_size():
     assert whiteness(r, 1_000_000).verdict == "failed"
 
 
-def test_tails_and_lopsidedness_are_told():
+def test_normality_test_detects_heavy_tails_and_skewness():
     random = np.random.default_rng(6)
     white = np.eye(1, 50)[0]
     outliers = random.normal(size=SAMPLES)
@@ -128,36 +128,36 @@ def test_tails_and_lopsidedness_are_told():
     assert normality(outliers - outliers.mean(), white).statistic == pytest.approx(expected)
 
 
-def test_an_offset_is_told():
+def test_zero_mean_test_detects_an_offset():
     noise = 0.5 + np.random.default_rng(7).normal(size=SAMPLES)
     test = zero_mean(noise, np.eye(1, 50)[0])
     assert test.verdict == "failed" and "offset" in test.says
     share = noise.mean() / np.sqrt(np.mean(noise**2))
     assert f"{100 * share:+.2g} %" in test.says
-    # A slow drift has a mean too, by chance.
+    # A slow drift has a nonzero mean by chance.
     drift = lfilter([1.0], [1.0, -0.98], np.random.default_rng(8).normal(size=SAMPLES))
     assert zero_mean(drift, direct_autocorrelation(drift, 400)).p_value > 0.01
 
 
 def short_fit(seed: int, **physics) -> Fit:
-    """A fit whose simulations start anew every 32 samples."""
+    """A fit with segments of 32 samples."""
     experiment = rig.reduced_experiment(1600, noise=1e-3, seed=seed, **physics)
     model = rig.reduced_model()
     return fit(model, [Stretch(experiment, 0, 1600)], base_paths(model), Segmentation(32))
 
 
-def test_fitted_initial_states_leave_no_memory_behind():
-    """Two states for 32 samples colour white noise visibly; the autocorrelation knows what they took."""
+def test_autocorrelation_allows_for_fitted_initial_states():
+    """Two initial states for 32 samples colour white noise; the autocorrelation is corrected for them."""
     fits = [short_fit(seed) for seed in range(12)]
     root = np.sqrt(len(fits) * 1600)
     plain = root * np.mean([direct_autocorrelation(left_over(f), 10)[1:] for f in fits], axis=0)
     freed = root * np.mean([autocorrelation(f, 10)[1:] for f in fits], axis=0)
-    # Standard normal but for the small share that the parameters take.
+    # Standard normal except for the small share that the parameters take.
     assert np.max(np.abs(plain)) > 6.0
     assert np.max(np.abs(freed)) < 4.0
 
 
-def test_a_good_model_passes_and_a_poor_one_fails():
+def test_true_model_passes_the_residual_tests_and_a_wrong_one_fails():
     good = short_fit(0)
     verdicts = {t.name: t.verdict for t in residual_tests(good, diagnose(good)).tests}
     assert verdicts == dict.fromkeys(("zero mean", "whiteness", "independence of forcing", "normality"), "passed")

@@ -1,4 +1,4 @@
-"""Spectral densities against scipy's."""
+"""Spectral densities, compared with those of scipy."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ STEP = 0.004
 
 
 @pytest.mark.parametrize("window", [128, 129, 1000])
-def test_densities_are_those_of_scipy(window: int):
+def test_spectral_densities_equal_those_of_scipy(window: int):
     random = np.random.default_rng(0)
     one = 3.0 + random.normal(size=1000)
     other = np.convolve(one, [0.2, 0.5, -0.3], mode="same") + random.normal(size=1000)
