@@ -1,4 +1,4 @@
-"""Models on trial: how finely they are simulated, and what they must reach."""
+"""Fits of candidates: their solver steps, and the objective that they must reach."""
 
 import pytest
 
@@ -12,12 +12,12 @@ from hdjax.effects.friction import CoulombFriction
 
 HOLD: Hold = "zero-order"
 SHARP = 100.0, 0.05
-"""Friction and the rate over which its sign turns: sharper than the steps that suit the oscillator resolve."""
+"""Friction and the rate over which its sign changes, too sharp for the solver steps of the base model."""
 
 
 @pytest.fixture(scope="module")
-def begun():
-    """A base model of a drive that sticks, and what its trials share."""
+def base_trial_and_study():
+    """The base model's trial on a log of a drive with friction, and the study that trials share."""
     experiment = rig.reduced_experiment(3000, noise=2e-4, rms=30.0, friction=SHARP, substeps=60)
     data: Data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
@@ -31,9 +31,9 @@ def with_friction(model, T_c: float, v_0: float):
 
 
 @pytest.mark.slow
-def test_a_sharp_corner_takes_finer_steps(begun):
-    """The base model has no corner and keeps its steps; with friction in it the trial finds out what it needs."""
-    before, study = begun
+def test_candidate_with_sharp_friction_gets_finer_solver_steps(base_trial_and_study):
+    """The smooth base model keeps its solver steps; a trial with friction determines the steps that it needs."""
+    before, study = base_trial_and_study
     assert study.fine_enough(before.training) is study
     found = challenge([with_friction(before.model, 50.0, 0.3)], study, HOLD, champion=before)
     assert found is not None
@@ -41,8 +41,8 @@ def test_a_sharp_corner_takes_finer_steps(begun):
     assert float(found.model.effects[0].T_c) == pytest.approx(SHARP[0], rel=0.02)
 
 
-def test_a_champion_stays_where_nothing_explains_more(begun):
-    before, study = begun
+def test_candidate_that_explains_less_than_the_limit_is_rejected(base_trial_and_study):
+    before, study = base_trial_and_study
     limit = before.training.objective - 20.0
     start = with_friction(before.model, 50.0, 0.3)
     assert challenge([start], study, HOLD, champion=before, give_up_above=limit) is None

@@ -44,31 +44,31 @@ CASE = CaseEvidence((RoundEvidence((SEEN,), {"friction": (0.0,) * 9}, ()),), CHA
         ({"at_bounds": 1}, "at_bounds"),
     ],
 )
-def test_what_supports_an_effect(change: dict, failed: str | None):
+def test_each_rule_of_support_can_reject_an_effect(change: dict, failed: str | None):
     checks = support(replace(SEEN, **change))
     assert [c.rule for c in checks if not c.holds] == ([failed] if failed else [])
 
 
-def test_a_tie_is_what_scatter_over_blocks_explains():
+def test_candidates_tie_if_scatter_over_blocks_explains_their_difference():
     random = np.random.default_rng(0)
     scatter = random.normal(size=30)
     assert tie("a", scatter - scatter.mean()).holds
     assert not tie("a", scatter + 2.0).holds
-    # Worse in every block, by little: told apart all the same.
+    # Slightly worse in every block is no tie.
     assert not tie("a", 0.1 + 0.01 * scatter).holds
-    # Always worse by the same is told apart, one block is not.
+    # Worse by the same in each block is no tie, but a single block is one.
     assert not tie("a", np.full(4, 9.0)).holds
     assert tie("a", np.full(1, 9.0)).holds
 
 
-def test_false_alarms_of_a_tie_are_as_many_as_the_level():
+def test_tie_test_keeps_its_level():
     random = np.random.default_rng(1)
     draws = random.normal(size=(4000, 12))
     told = np.mean([not tie("a", draw).holds for draw in draws])
     assert told == pytest.approx(RULES.tie_level, abs=0.012)
 
 
-def test_of_equals_the_simplest_leads():
+def test_simplest_plausible_candidate_leads_among_equal_gains():
     one = Rival("one", 1.0, 2.0, True, 5, 2, True, False)
     other = replace(one, name="other", long_gain=2.01, parameters=7)
     assert leader([other, one])[0].name == "one"
@@ -90,11 +90,11 @@ def test_of_equals_the_simplest_leads():
         ({"names": (), "excess": (1.0, 2.0), "noise_explains": True}, "model_sufficient"),
     ],
 )
-def test_conclusion(change: dict, outcome: str):
+def test_conclusion_follows_from_names_excess_and_free_runs(change: dict, outcome: str):
     assert conclude(replace(FINAL, excess_at_first=(1.0, 9.0), **change))[0] == outcome
 
 
-def test_stored_evidence_is_decided_anew():
+def test_stored_evidence_gives_the_same_decision():
     stored = json.loads(json.dumps(finite(asdict(CASE))))
     again = case_evidence(stored)
     assert decide(again) == decide(CASE)
@@ -108,16 +108,16 @@ def test_every_rule_has_a_unit_a_meaning_and_a_source():
         assert all(rule.metadata[key] for key in ("unit", "meaning", "source")), rule.name
 
 
-def test_the_page_of_rules_is_the_code_s():
+def test_page_of_rules_is_up_to_date():
     page = Path(fitting.__file__).parents[1] / "docs" / "rules.md"
     assert page.read_text(encoding="utf-8") == rules_page()
 
 
-# Numbers that are no thresholds of a decision: neutral elements, halves, and sizes of work.
+# Numbers that are not thresholds of a decision: neutral elements, halves, and amounts of work.
 _PLAIN = {0, 1, 2, -1, 0.5, 1e-12, 1e-300, 1e-6}
 
 
-def test_no_other_number_decides():
+def test_deciding_modules_compare_with_rules_only():
     """Literals of the modules that decide: each comparison takes its threshold from the rules."""
     room = Path(fitting.__file__).parent
     deciding = ["discrepancy/challenge.py", "conclusion.py", "attribution/effect_search.py"]
@@ -131,7 +131,7 @@ def test_no_other_number_decides():
                 assert set(numbers) <= _PLAIN, (name, node.lineno, numbers)
 
 
-def test_what_a_replay_switches_off_is_a_rule():
+def test_replay_switches_off_existing_rules_and_reports_differences():
     assert set(OFF) <= {rule.name for rule in fields(RULES)}
     cases = {"one": CASE}
     assert differing(cases, RULES) == {}

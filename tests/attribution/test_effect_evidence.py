@@ -1,4 +1,4 @@
-"""What the data are said to call for is the law that was hidden, also where the fitted one is wrong."""
+"""The law that the data require is the true one, also where the fitted law is wrong."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def law(found: Evidence) -> np.ndarray:
     return T_C * np.tanh(found.places / V_0)
 
 
-def test_the_data_lie_on_the_right_law():
+def test_evidence_agrees_with_the_true_law():
     (found,) = evidence(fitted(CoulombFriction(T_c=100.0, v_0=V_0)))
     assert (found.variable, found.quantity) == ("v", "torque")
     assert np.all(np.diff(found.places) > 0)
@@ -40,20 +40,20 @@ def test_the_data_lie_on_the_right_law():
     np.testing.assert_array_less(np.abs(found.told - law(found)), 4.5 * found.std)
 
 
-def test_the_data_contradict_a_law_of_the_wrong_size():
+def test_evidence_contradicts_a_law_of_the_wrong_size():
     (found,) = evidence(fitted(CoulombFriction(T_c=0.8 * T_C, v_0=V_0), hold_parameters=True))
     far = np.abs(found.places) > 3 * V_0
     wrong = 0.8 * T_C * np.tanh(found.places / V_0)
-    # A fifth of the torque is much for a first-order look, which still takes the data's side.
+    # An error of a fifth is large for a first-order estimate, which is still much closer to the true law.
     assert np.all(np.abs(found.told - law(found))[far] < 0.3 * np.abs(wrong - law(found))[far])
 
 
-def test_no_picture_of_what_no_quantity_shows():
+def test_effect_without_a_variable_has_no_evidence():
     assert evidence(fitted(TorqueBias(bias=0.1))) == ()
 
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
-def test_hats_add_up_to_one_and_straight_lines_to_themselves(direction: float):
+def test_hat_functions_reproduce_constants_and_straight_lines(direction: float):
     from fitting.attribution.effect_evidence import _hats
 
     nodes = np.array([-1.0, -0.2, 0.5, 2.0, np.nan])

@@ -1,4 +1,4 @@
-"""Logs that a disturbance of its own frequency runs through: their clocks are set so that it is in phase."""
+"""Logs with a spectral line of unknown origin: their clocks are shifted until the line is in phase."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +21,7 @@ from hdjax.effects.learned import LEARNED_TORQUES, LearnedLoadTorque, LearnedMes
 HOLDS: tuple[Hold, ...] = ("zero-order", "linear")
 COUNT, NOISE = 3000, 1e-3
 OMEGA, LINE = 41.3, 400.0
-"""Of the disturbance: its frequency, not one of the forcing's own, and its acceleration."""
+"""Frequency of the disturbance, not one of the forcing, and its acceleration."""
 
 
 def experiment(seed: int, hold: Hold, phase: float | None) -> Experiment:
@@ -32,19 +32,19 @@ def experiment(seed: int, hold: Hold, phase: float | None) -> Experiment:
         # Constant over a sample, as the rig holds it: half a sample late, which is the same in all logs.
         acting = forcing + LINE / rig.GAIN * np.sin(OMEGA * np.arange(COUNT) * rig.REDUCED_STEP + phase)
     log = rig.reduced_log(rig.reduced_motion(acting)[:, 0], forcing, noise=NOISE, seed=seed)
-    # Stamps that begin anywhere: no clock but the log's own start counts.
+    # Time stamps have arbitrary origins; only the start of each log counts.
     return experiment_from_log(replace(log, name=f"log {seed}", time=log.time + 7.0 * seed), hold=hold)
 
 
-Begun = tuple[Trial, Study]
+TrialAndStudy = tuple[Trial, Study]
 
 
 @pytest.fixture(scope="module")
-def begun() -> Callable[..., Begun]:
-    """The base model fitted to logs whose line begins in given phases."""
+def fitted_to_phases() -> Callable[..., TrialAndStudy]:
+    """A function that fits the base model to logs whose lines have given initial phases."""
 
     @cache
-    def fitted(*phases: float | None) -> Begun:
+    def fitted(*phases: float | None) -> TrialAndStudy:
         data: Data = {h: split([experiment(i, h, phase) for i, phase in enumerate(phases)]) for h in HOLDS}
         training = data[HOLDS[0]][0]
         found = base_fit(rig.reduced_model(), training, halo=halo_for(training))
@@ -54,11 +54,13 @@ def begun() -> Callable[..., Begun]:
     return fitted
 
 
-def test_logs_that_begin_in_other_phases(begun):
-    """The second log's clock is put back by what its line comes later than the first one's; parameters stay, and one
-    torque then explains both logs to the noise."""
+def test_clock_of_the_second_log_is_shifted_into_phase(fitted_to_phases):
+    """The second log's clock is shifted by the delay of its line after that of the first log.
+
+    Parameters stay, and one torque then explains both logs down to the noise.
+    """
     first, second = 0.4, 2.3
-    base, study = begun(first, second)
+    base, study = fitted_to_phases(first, second)
     told = []
     after, clocked = with_clocks_set(base, replace(study, progress=told.append))
     for hold in HOLDS:
@@ -78,9 +80,9 @@ def test_logs_that_begin_in_other_phases(begun):
 
 
 @pytest.mark.parametrize(("phases", "logs"), [((0.4, 0.4), 2), ((None, None), 2), ((None, 0.4), 2), ((0.4, 2.3), 1)])
-def test_clocks_that_are_right_stay(begun, phases: tuple[float | None, ...], logs: int):
-    """In phase already, without a line, with one in a single log, and a log by itself."""
-    base, study = begun(*phases)
+def test_clocks_stay_without_a_line_out_of_phase(fitted_to_phases, phases: tuple[float | None, ...], logs: int):
+    """Cases: lines in phase, no line, a line in one log only, and a single log."""
+    base, study = fitted_to_phases(*phases)
     data = {hold: (training[:logs], selection[:logs]) for hold, (training, selection) in study.data.items()}
     after, clocked = with_clocks_set(base, replace(study, data=data))
     assert after is base and clocked.data is data
@@ -90,30 +92,30 @@ def line(*torque: complex) -> Phasors:
     return Phasors(LearnedLoadTorque, 10.0, np.array(torque), np.full(len(torque), 100.0), 1000.0)
 
 
-def test_how_late_a_line_comes():
-    """Against the first log that has it, within half a period; a log that lacks it keeps its clock."""
+def test_time_offsets_refer_to_the_first_log_with_the_line():
+    """Offsets are within half a period; a log without the line keeps its clock."""
     seen = line(0.001, 1.0, np.exp(0.5j), np.exp(-3.0j), 0.3j)
     np.testing.assert_allclose(seen.late, [0.0, 0.0, 0.05, -0.3, 0.0], atol=1e-15)
     np.testing.assert_allclose(seen.in_phase.torque, [0.001, 1.0, 1.0, 1.0, 0.3j], atol=1e-15)
     assert abs(seen.in_phase.mean) > abs(seen.mean)
 
 
-def test_the_share_that_a_line_explains():
-    """Ten standard errors in each of ten logs of a hundred values each: as much as the noise."""
+def test_share_explained_by_a_line_follows_from_its_standard_errors():
+    """Ten standard errors in each of ten logs of a hundred values have the power of the noise."""
     assert line(*np.exp(1j * np.arange(10.0))).share == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("place", LEARNED_TORQUES)
-def test_a_line_as_a_torque(place):
-    """`C cos + S sin`, at its place."""
+def test_line_becomes_a_sinusoidal_learned_torque_at_its_place(place):
+    """The torque is `C cos + S sin`."""
     effect = replace(line(3.0 + 4.0j), place=place).effect
     assert isinstance(effect, place)
     assert [float(c) for c in effect.c] == [3.0, 4.0]
 
 
-def test_a_segment_that_runs_away_tells_nothing(begun):
-    """A look along the motion leaves it out, whole, and the line is seen in the others."""
-    base, _ = begun(0.4, 2.3)
+def test_diverged_segment_is_excluded_from_the_line_estimate(fitted_to_phases):
+    """The linearisation gives the whole diverged segment weight zero and keeps the others."""
+    base, _ = fitted_to_phases(0.4, 2.3)
     fit = base.training
     states = np.array(fit.unknowns.states)
     states[2] = np.nan

@@ -1,4 +1,4 @@
-"""The first look: silent on noise, and on the right track where an effect hides."""
+"""Screening reports nothing on noise alone, and ranks a missing effect first."""
 
 import dataclasses
 
@@ -28,12 +28,12 @@ from hdjax.effects.kinematic import KinematicError
 from hdjax.effects.stiffness import QuadraticStiffness
 
 COUNT, HORIZON, NOISE = 1200, 128, 1e-3
-# Those that compile quickly; all of them in the slow tier.
-FORMS = (CoulombFriction, TorqueBias, QuadraticStiffness, QuadraticDamping, Backlash)
+# Forms that compile quickly; slow tests screen all forms.
+SOME_FORMS = (CoulombFriction, TorqueBias, QuadraticStiffness, QuadraticDamping, Backlash)
 
 
 def fits(seed: int = 0, model=None, **physics) -> tuple[Fit, Fit]:
-    """The base model on the training part, and with its parameters held on the rest."""
+    """Fit the base model to the training part, and with its parameters held to the rest."""
     experiment = rig.reduced_experiment(COUNT, noise=NOISE, seed=seed, **physics)
     training, held_out = split([experiment])
     segmentation = Segmentation(HORIZON, halo=4, substeps=2, count=8)
@@ -50,80 +50,82 @@ def fits(seed: int = 0, model=None, **physics) -> tuple[Fit, Fit]:
 
 
 @pytest.fixture(scope="module")
-def biased() -> Screen:
-    return screen(*fits(bias=0.3), catalogue=FORMS)
+def screen_with_bias() -> Screen:
+    return screen(*fits(bias=0.3), catalogue=SOME_FORMS)
 
 
 @pytest.fixture(scope="module")
-def rubbing() -> Screen:
-    return screen(*fits(friction=(10.0, 0.27)), catalogue=FORMS)
+def screen_with_friction() -> Screen:
+    return screen(*fits(friction=(10.0, 0.27)), catalogue=SOME_FORMS)
 
 
-@pytest.mark.parametrize("catalogue", [FORMS, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["some", "all"])
-def test_noise_alone_leads_nowhere(catalogue: tuple[type[Effect], ...]):
+@pytest.mark.parametrize(
+    "catalogue", [SOME_FORMS, pytest.param(CATALOGUE, marks=pytest.mark.slow)], ids=["some", "all"]
+)
+def test_p_values_are_not_small_on_noise_alone(catalogue: tuple[type[Effect], ...]):
     p_values = []
     for seed in range(6):
         found = screen(*fits(seed), seed=seed, catalogue=catalogue)
         p_values.append(found.p_value(found.leads[0].gain))
-    # Uniform where all is well, and never below 1/1001: the smallest of six is below 0.01 in 6 % of such sets.
+    # p-values are uniform and at least 1/1001: the smallest of six is below 0.01 in 6 % of such sets.
     assert min(p_values) >= 0.01, p_values
     assert max(p_values) > 0.3, p_values
 
 
-def test_a_torque_bias_leads(biased: Screen):
-    lead = biased.leads[0]
+def test_torque_bias_is_ranked_first_with_its_true_strength(screen_with_bias: Screen):
+    lead = screen_with_bias.leads[0]
     assert isinstance(lead.effect, TorqueBias)
-    # A bias acts linearly, but for the hardening.
+    # A bias acts linearly, except for the hardening spring.
     assert float(lead.effect.bias) == pytest.approx(0.3, rel=0.05)
 
 
-def test_a_torque_bias_is_not_chance(biased: Screen):
-    assert biased.p_value(biased.leads[0].gain) == 1 / (DRAWS * PARTNERS + 1)
+def test_torque_bias_has_the_smallest_possible_p_value(screen_with_bias: Screen):
+    assert screen_with_bias.p_value(screen_with_bias.leads[0].gain) == 1 / (DRAWS * PARTNERS + 1)
 
 
-def test_friction_leads(rubbing: Screen):
-    lead = rubbing.leads[0]
+def test_friction_is_ranked_first_and_corrects_the_damping(screen_with_friction: Screen):
+    lead = screen_with_friction.leads[0]
     assert isinstance(lead.effect, CoulombFriction)
-    assert rubbing.p_value(lead.gain) == 1 / (DRAWS * PARTNERS + 1)
+    assert screen_with_friction.p_value(lead.gain) == 1 / (DRAWS * PARTNERS + 1)
     # The proposal's sharpness is near the truth, and friction changes the motion by a percent or so.
     assert float(lead.effect.T_c) == pytest.approx(10.0, rel=0.15)
-    # What the base fit took for damping is given back.
+    # The base fit explains friction by damping, so that the estimated damping decreases.
     assert lead.drive_changes["mu"] < 0
 
 
-def test_every_form_that_suits_is_looked_at_once(biased: Screen):
-    names = [lead.effect.name for lead in biased.leads]
-    assert sorted(names) == sorted(f.name for f in FORMS)
-    gains = [lead.gain for lead in biased.leads]
+def test_each_applicable_form_is_screened_once_in_order_of_gain(screen_with_bias: Screen):
+    names = [lead.effect.name for lead in screen_with_bias.leads]
+    assert sorted(names) == sorted(f.name for f in SOME_FORMS)
+    gains = [lead.gain for lead in screen_with_bias.leads]
     assert gains == sorted(gains, reverse=True)
-    assert biased.null_gains.shape == (DRAWS * PARTNERS,)
-    assert np.isfinite(biased.null_gains).all()
-    assert set(biased.leads[0].drive_changes) == set(base_paths(rig.reduced_model()))
+    assert screen_with_bias.null_gains.shape == (DRAWS * PARTNERS,)
+    assert np.isfinite(screen_with_bias.null_gains).all()
+    assert set(screen_with_bias.leads[0].drive_changes) == set(base_paths(rig.reduced_model()))
 
 
-def test_positive_strengths_are_not_negative(biased: Screen, rubbing: Screen):
-    for lead in (*biased.leads, *rubbing.leads):
+def test_estimates_of_positive_strengths_are_not_negative(screen_with_bias: Screen, screen_with_friction: Screen):
+    for lead in (*screen_with_bias.leads, *screen_with_friction.leads):
         if isinstance(lead.effect, CoulombFriction):
             assert float(lead.effect.T_c) >= 0.0
         if isinstance(lead.effect, Backlash):
             assert float(lead.effect.b) >= 0.0
 
 
-def test_forms_that_need_the_motor_are_left_out_of_a_reduced_log():
-    found = screen(*fits(), catalogue=(MotorFriction, *FORMS))
-    assert len(found.leads) == len(FORMS)
+def test_motor_forms_are_not_screened_on_a_reduced_log():
+    found = screen(*fits(), catalogue=(MotorFriction, *SOME_FORMS))
+    assert len(found.leads) == len(SOME_FORMS)
 
 
-def test_the_seed_decides_the_surrogates_only():
+def test_seed_changes_only_the_surrogates():
     pair = fits(bias=0.3)
-    first, again, other = (screen(*pair, catalogue=FORMS, seed=s) for s in (0, 0, 7))
+    first, again, other = (screen(*pair, catalogue=SOME_FORMS, seed=s) for s in (0, 0, 7))
     np.testing.assert_array_equal(first.null_gains, again.null_gains)
     assert np.any(first.null_gains != other.null_gains)
     assert first.leads[0].gain == pytest.approx(other.leads[0].gain, rel=1e-12)
 
 
-def test_surrogates_have_the_noise_and_not_the_line():
-    """What a line leaves is no colour of noise: it would pass for chance in every surrogate."""
+def test_surrogates_exclude_spectral_lines_of_the_residual():
+    """A line is not coloured noise; surrogates with the line would have too large gains."""
     fitted, _ = fits()
     noise = np.random.default_rng(3).normal(size=np.asarray(fitted.error).shape)
     time = np.arange(noise[..., 0].size).reshape(noise.shape[:2])
@@ -136,12 +138,12 @@ def test_surrogates_have_the_noise_and_not_the_line():
         series = surrogates(given, 0).reshape(DRAWS, *noise.shape)[:, kept]
         drawn[name] = float(np.std(series))
     assert drawn["noise"] == pytest.approx(1.0, abs=0.03)
-    # Its skirts stay; with all of the line it would be 2.3.
+    # The skirts of the line remain; with the whole line it would be 2.3.
     assert drawn["both"] == pytest.approx(1.0, abs=0.15)
 
 
-def test_first_order_gains_are_those_of_a_refit_with_two_outputs():
-    """P-values compare the one with the other."""
+def test_first_order_gain_with_two_outputs_equals_that_of_a_refit():
+    """p-values compare first-order gains with gains of refits."""
     parts = split([rig.drive_experiment(COUNT)])
     segmentation = Segmentation(HORIZON, halo=4, substeps=1, count=10)
 
@@ -155,11 +157,11 @@ def test_first_order_gains_are_those_of_a_refit_with_two_outputs():
     before = fitted(rig.drive_model())
     after = fitted(before[0].model.with_effects(TorqueBias(bias=jnp.asarray(1e-6))))
     (lead,) = screen(*before, catalogue=(TorqueBias,)).leads
-    # Outputs are weighed anew by what is left over, which changes little.
+    # Outputs are weighted again by their residual, which changes little.
     assert lead.gain == pytest.approx(before[1].objective - after[1].objective, rel=0.1)
 
 
-def test_chance_is_uniform_for_what_was_learned_elsewhere():
+def test_p_value_of_a_term_learned_on_other_data_is_uniform():
     _, unseen = fits()
     random = np.random.default_rng(0)
     weight = np.asarray(unseen.problem.segments.weight)[..., None]
@@ -174,17 +176,17 @@ def test_chance_is_uniform_for_what_was_learned_elsewhere():
 
         learned = 10.0 ** random.uniform(-1.5, -0.5) * changed
         chances.append(chance_of_gain(leaving(noise), leaving(noise - learned), seed))
-    # Of eighty, 2e-3 of all sets are farther from uniform (Kolmogorov and Smirnov).
+    # The probability of a smaller p-value of the Kolmogorov-Smirnov test is 2e-3.
     assert kstest(chances, "uniform").pvalue > 2e-3
 
 
-def test_p_values_count_the_draws():
+def test_p_value_is_the_share_of_null_draws_with_a_larger_gain():
     found = Screen((), np.array([0.1, 0.2, 0.3]))
     assert [found.p_value(g) for g in (0.0, 0.1, 0.25, 0.4)] == [1.0, 1.0, 0.5, 0.25]
 
 
-def test_a_parameter_that_has_gone_to_infinity_explains_nothing():
-    """Its column is a hundred orders below what a number squared can hold, and something else on other data."""
+def test_parameter_with_a_negligible_column_gets_a_zero_step():
+    """Its column is negligible beside the others, and would differ on other data."""
     columns = np.random.default_rng(0).normal(size=(50, 3)) * [1.0, 1e-125, 3.0]
     residual = np.random.default_rng(1).normal(size=50)
     with np.errstate(under="ignore"):
@@ -194,8 +196,11 @@ def test_a_parameter_that_has_gone_to_infinity_explains_nothing():
     np.testing.assert_allclose(step[[0, 2]], kept)
 
 
-def test_only_a_positive_parameter_that_is_not_told_to_a_factor_e_is_left_out():
-    """Of two positive and one signed parameter, the latter two with information below one."""
+def test_only_undetermined_positive_parameters_lose_their_columns():
+    """Two positive parameters and one signed one, of which the last two have information below one.
+
+    Information of one means a positive parameter known to a factor of e.
+    """
     size = np.array([30.0, 0.5, 0.5])
     by_parameter = jnp.asarray(np.ones((2, 8, 3)) * size / 4.0)
     before = jnp.ones((2, 4, 3))
@@ -207,7 +212,7 @@ def test_only_a_positive_parameter_that_is_not_told_to_a_factor_e_is_left_out():
     np.testing.assert_array_equal(found.before_by_parameter[..., [0, 2]], 1.0)
 
 
-def test_a_kinematic_error_leads_although_the_encoders_read_it_as_a_twist():
+def test_kinematic_error_is_ranked_first_when_the_motion_strays():
     physics = {"rms": 0.05, "kinematic": (1e-4, 2e-4), "state": (0.0, 0.0, 15.0, 0.3)}
     training, held_out = split([rig.drive_experiment(2400, **physics)])
     segmentation = Segmentation(HORIZON, halo=4, substeps=2)

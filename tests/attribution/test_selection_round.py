@@ -1,4 +1,4 @@
-"""Competitors of one round: what a gain is worth."""
+"""Candidates of one selection round: how their gains count and who leads."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ STUDY = Study({}, Setting(Segmentation(32, halo=4, substeps=2, count=8)))
 
 @pytest.fixture(scope="module")
 def verdicts():
-    """Two competitors on data with an offset and a lopsided spring, neither of which is all that is missing."""
+    """Two candidates on data with a bias and a quadratic spring, neither of which explains both."""
     experiment = rig.reduced_experiment(2400, noise=1e-3, bias=0.5, quadratic=0.3)
     data = {HOLD: split((experiment,))}
     training = data[HOLD][0]
@@ -51,14 +51,14 @@ def short_gain(before: Trial, trial: Trial) -> float:
     return before.held_out.objective - trial.held_out.objective
 
 
-def test_without_memory_all_of_a_gain_counts(verdicts):
+def test_gain_of_a_form_without_memory_counts_fully(verdicts):
     before, found = verdicts
     bias = found["torque_bias"]
     assert bias.gain == pytest.approx(short_gain(before, bias.trial))
 
 
-def test_memory_that_stands_for_something_else_does_not_last(verdicts):
-    """Over short segments hidden states that are fitted pass for an offset; over the whole log they relax."""
+def test_gain_of_a_wrong_form_with_memory_shrinks_over_whole_stretches(verdicts):
+    """Over short segments, fitted hidden states can imitate a bias; over the whole log they relax."""
     before, found = verdicts
     creep = found["creep"]
     assert 0.0 <= creep.gain < 0.7 * short_gain(before, creep.trial)
@@ -69,13 +69,13 @@ def test_memory_that_stands_for_something_else_does_not_last(verdicts):
     [
         (-2.0, -2.6, 0.6),
         (-2.0, -9.0, 1.0),
-        (-2.0, -1.0, 0.0),  # as of a resonance that stood for a torque that is off: it moved the motor alone
+        (-2.0, -1.0, 0.0),  # like a resonance that imitates a wrong torque: it moves the motor alone
         (-2.0, 3.0, 0.0),
         (3.0, -2.0, 1.0),
-        (3.0, 3.0, 1.0),  # neither follows the drive: nothing is told
+        (3.0, 3.0, 1.0),  # neither follows the drive, so that whole stretches decide nothing
     ],
 )
-def test_what_lasts_is_what_whole_stretches_gain(
+def test_lasting_share_is_that_of_the_gain_over_whole_stretches(
     verdicts, long_before: float, long_after: float, share: float, monkeypatch: pytest.MonkeyPatch
 ):
     trial, _ = verdicts
@@ -95,14 +95,14 @@ def test_what_lasts_is_what_whole_stretches_gain(
 @pytest.mark.parametrize(
     ("bias_long", "creep_long", "leader"),
     [
-        (2.00, 2.01, "torque_bias"),  # the same: the simpler one
+        (2.00, 2.01, "torque_bias"),  # equal: the simpler one
         (1.00, 2.00, "creep"),
         (2.00, 1.00, "torque_bias"),
-        (None, 2.00, "creep"),  # free runs tell nothing: what short segments tell
+        (None, 2.00, "creep"),  # free runs are not available: short segments decide
         (-np.inf, -np.inf, "torque_bias"),
     ],
 )
-def test_free_runs_tell_apart_what_short_segments_cannot(
+def test_free_runs_decide_between_tied_candidates(
     verdicts, bias_long: float | None, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
 ):
     before, found = verdicts
@@ -124,11 +124,10 @@ def test_free_runs_tell_apart_what_short_segments_cannot(
     ("creep_long", "leader"),
     [(1.0, "torque_bias"), (3.0, "creep")],
 )
-def test_whole_stretches_judge_what_remembers(
+def test_form_with_memory_leads_only_with_a_gain_over_whole_stretches(
     verdicts, creep_long: float, leader: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """A form with memory leads another one that gains only where it does so over whole stretches; these then tell the
-    two apart."""
+    """A form with memory leads another form only if it gains more over whole stretches, which then separate the two."""
     before, found = verdicts
     bias, creep = found["torque_bias"], found["creep"]
     ordered = [
@@ -142,7 +141,7 @@ def test_whole_stretches_judge_what_remembers(
     assert (first.name, first.separable, second.separable) == (leader, False, True)
 
 
-def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monkeypatch: pytest.MonkeyPatch):
+def test_form_without_memory_is_preferred_at_equal_parameter_count(verdicts, monkeypatch: pytest.MonkeyPatch):
     _, found = verdicts
     monkeypatch.setattr(attribution, "long_gains", lambda before, trials, study: [1.0] * len(trials))
 
@@ -157,8 +156,8 @@ def test_of_as_many_parameters_the_one_without_memory_is_simpler(verdicts, monke
     assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 
-def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
-    """Errors of 1000 and 1 in units of the noise: the last unit is a thousandth of what was removed before."""
+def test_removed_share_is_relative_to_earlier_effects(verdicts):
+    """With errors of 1000 and 1 in units of the noise, the last unit is 1e-3 of what was removed before."""
     trial, _ = verdicts
 
     def with_error(rms: float) -> Trial:
@@ -172,15 +171,15 @@ def test_what_the_effects_before_may_get_wrong_is_no_further_effect(verdicts):
 @pytest.mark.parametrize(
     ("effect", "left", "noise", "is_all", "asked"),
     [
-        (TorqueBias(), 2.0, 1.0, True, True),  # 1.7 units beyond the noise, of 1000 that were removed
+        (TorqueBias(), 2.0, 1.0, True, True),  # 1.7 units beyond the noise, of 1000 that were removed earlier
         (TorqueBias(), 5.0, 1.0, False, True),
-        (MotorFriction(T_c=0.1, transition=0.1), 5.0, 1.0, True, True),  # nobody knows how a sign turns near rest
-        (MotorFriction(T_c=0.1, transition=0.1), 20.0, 1.0, False, False),  # even the base model tells
+        (MotorFriction(T_c=0.1, transition=0.1), 5.0, 1.0, True, True),  # the law of friction near rest is uncertain
+        (MotorFriction(T_c=0.1, transition=0.1), 20.0, 1.0, False, False),  # the base model's noise suffices to decide
         (TorqueBias(), 5.0, 4.9, True, True),
         (None, 0.0, 1.0, False, False),
     ],
 )
-def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
+def test_search_ends_when_only_imperfection_of_effects_is_left(
     verdicts,
     effect: Effect | None,
     left: float,
@@ -206,8 +205,8 @@ def test_where_only_what_laws_get_wrong_is_left_no_further_effect_is_looked_for(
     assert (seen is not by_base) == asked
 
 
-def nonzero_effects(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether a strength counts as determined beside a parameter of the drive, by a fit with this covariance."""
+def has_nonzero_strength(verdicts, effect, covariance: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether a strength counts as nonzero beside a parameter of the drive, in a fit with this covariance."""
     drive, own = (rig.drive_model(), "B_sp") if effect.needs_motor else (rig.reduced_model(), "mu")
     model = drive.with_effects(effect)
     paths = (own, *effect_paths(effect))
@@ -223,20 +222,20 @@ def nonzero_effects(verdicts, effect, covariance: np.ndarray, monkeypatch: pytes
     return support.nonzero_effects(eqx.tree_at(lambda f: f.model, before.training, model), {effect.name}) != set()
 
 
-def test_a_strength_in_a_valley_of_shapes_is_determined(verdicts, monkeypatch: pytest.MonkeyPatch):
-    """A creep's stiffness over its time is known, neither of them is; at the fitted time the stiffness is known."""
+def test_strength_counts_as_nonzero_at_the_fitted_shape(verdicts, monkeypatch: pytest.MonkeyPatch):
+    """Only the ratio of creep stiffness and creep time is determined, but at the fitted time the stiffness is known."""
     creep = Creep(k=400.0, tau=0.5, span=1e-3)
     along_valley = np.diag([1.0, 0.0, 0.0])
     along_valley[1:, 1:] = np.outer([400.0, 1.0], [400.0, 1.0])
-    assert nonzero_effects(verdicts, creep, along_valley + np.diag([0.0, 50.0**2, 0.0]), monkeypatch)
-    assert not nonzero_effects(verdicts, creep, along_valley + np.diag([0.0, 400.0**2, 0.0]), monkeypatch)
-    assert not nonzero_effects(verdicts, creep, np.diag([1.0, 400.0**2, 1.0]), monkeypatch)
+    assert has_nonzero_strength(verdicts, creep, along_valley + np.diag([0.0, 50.0**2, 0.0]), monkeypatch)
+    assert not has_nonzero_strength(verdicts, creep, along_valley + np.diag([0.0, 400.0**2, 0.0]), monkeypatch)
+    assert not has_nonzero_strength(verdicts, creep, np.diag([1.0, 400.0**2, 1.0]), monkeypatch)
 
 
-def test_what_an_effect_is_named_for_must_be_there(verdicts, monkeypatch: pytest.MonkeyPatch):
-    """Rippling friction whose ripple may be zero is friction, however well that is known."""
+def test_defining_strength_of_an_effect_must_be_nonzero(verdicts, monkeypatch: pytest.MonkeyPatch):
+    """Position-dependent friction needs a nonzero ripple, however well its mean is known."""
     rippling = PositionDependentMotorFriction(T_c=0.1, cosine=2e-3, sine=0.0, n=2.0, transition=0.1)
     std = dict.fromkeys(effect_paths(rippling), 1e-4)
-    assert nonzero_effects(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
+    assert has_nonzero_strength(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
     std |= {f"{rippling.name}.{n}": 1e-3 for n in ("cosine", "sine")}
-    assert not nonzero_effects(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)
+    assert not has_nonzero_strength(verdicts, rippling, np.diag([1.0, *(s**2 for s in std.values())]), monkeypatch)

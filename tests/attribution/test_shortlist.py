@@ -1,4 +1,4 @@
-"""Which forms are refitted, from the first look alone."""
+"""Choice of the forms that are refitted, from screening alone."""
 
 import numpy as np
 
@@ -17,34 +17,34 @@ UNDAMPED, GAP = Lead(UndampedBacklash(b=0.0), {}, 0.002), Lead(Backlash(b=0.0), 
 SCREEN = Screen((CREEP, QUADRATIC, BIAS, UNDAMPED, GAP), np.zeros(199))
 
 
-def test_what_explains_too_little_is_not_worth_a_refit():
+def test_form_with_too_small_gain_is_not_refitted():
     assert worth_a_refit(SCREEN, least=1e-4) == [CREEP, QUADRATIC]
 
 
-def test_what_chance_does_as_well_is_not_either():
+def test_form_with_gain_explained_by_chance_is_not_refitted():
     assert worth_a_refit(Screen(SCREEN.leads, np.full(199, 2.0)), least=1e-4) == []
 
 
-def test_a_suspect_is_there_however_little_it_explains():
-    """One form of its family; the others compete where that one is the best."""
+def test_suspect_family_is_refitted_in_any_case():
+    """First one form of the family is refitted; its other forms follow if that one is the best."""
     assert first_of_each_family([CREEP, QUADRATIC]) == [CREEP, QUADRATIC]
     assert first_of_each_family([CREEP, QUADRATIC], [UNDAMPED, GAP]) == [CREEP, QUADRATIC, UNDAMPED]
     assert further_forms([CREEP, UNDAMPED, GAP], ["backlash"], [CREEP, UNDAMPED]) == [GAP]
 
 
-def test_a_suspect_that_is_a_lead_already_is_not_there_twice():
+def test_suspect_family_is_refitted_once():
     assert first_of_each_family([CREEP, GAP], [UNDAMPED]) == [CREEP, GAP]
 
 
-def test_of_what_is_the_same_to_first_order_the_catalogues_first_form_goes_first():
-    """A gap without damping shows nothing of it to first order, and rounding decides which form leads."""
+def test_catalogue_order_decides_between_equal_first_order_gains():
+    """To first order, backlash with and without damping is the same, so that rounding would decide."""
     same = [Lead(UndampedBacklash(b=0.0), {}, 0.002 * (1.0 + 1e-13)), Lead(Backlash(b=0.0), {}, 0.002)]
     assert first_of_each_family(same) == same[1:]
     more = [Lead(UndampedBacklash(b=0.0), {}, 0.002), Lead(Backlash(b=0.0), {}, 0.002 * (1.0 - 1e-3))]
     assert first_of_each_family(more) == more[:1]
 
 
-def test_a_form_of_several_states_goes_first_only_where_it_explains_far_more():
+def test_form_with_several_states_needs_a_far_larger_gain_to_go_first():
     slip = Lead(MaxwellSlip(yield_twist=1.0, settling=1.0), {}, 1.0)
     near, far = (Lead(BoucWen(memory_twist=1.0), {}, gain) for gain in (0.3, 0.2))
     assert first_of_each_family([slip, near]) == [near]

@@ -1,4 +1,4 @@
-"""Friction that is most of the motor's torque is named, and K is right beside it."""
+"""Friction that takes most of the motor torque is identified, and K is correct beside it."""
 
 from collections.abc import Sequence
 
@@ -13,11 +13,11 @@ from hdjax.effects.actuation import TorqueGain
 from hdjax.effects.friction import CoulombFriction, LoadFriction, MotorFriction, StribeckMotorFriction
 from hdjax.effects.kinematic import KinematicError
 
-# With the forms that come nearest to it.
-FEW = (MotorFriction, StribeckMotorFriction, LoadFriction, CoulombFriction, KinematicError, TorqueGain)
+# Motor friction and the forms that are most similar to it.
+SOME_FORMS = (MotorFriction, StribeckMotorFriction, LoadFriction, CoulombFriction, KinematicError, TorqueGain)
 
 
-def check(seed: int, catalogue: Sequence[type[Effect]]) -> None:
+def assert_motor_friction_is_found(seed: int, catalogue: Sequence[type[Effect]]) -> None:
     joint = joints.drawn(seed)
     experiment = experiment_from_log(joints.log_of(joint, seed=seed), hold="zero-order", N=joint.N)
     model = TwoInertiaModel(Drive(N=joint.N, J_m=joint.J_m, J_l=joint.J_l, K=1.0))
@@ -29,12 +29,12 @@ def check(seed: int, catalogue: Sequence[type[Effect]]) -> None:
     assert float(found.get(f"{loop.findings[0].name}.b")) == pytest.approx(joint.viscous, rel=0.05)
 
 
-def test_strong_motor_friction_is_named_among_few_forms():
+def test_strong_motor_friction_is_found_among_few_forms():
     # Coulomb 57 %, viscous 35 % of the rms torque.
-    check(13, FEW)
+    assert_motor_friction_is_found(13, SOME_FORMS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
-def test_strong_motor_friction_is_named_among_all_forms(seed: int):
-    check(seed, CATALOGUE)
+def test_strong_motor_friction_is_found_among_all_forms(seed: int):
+    assert_motor_friction_is_found(seed, CATALOGUE)

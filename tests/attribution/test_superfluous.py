@@ -1,4 +1,4 @@
-"""What a search has accepted and later effects make superfluous: simpler forms, and holds of the torque."""
+"""Simpler forms and torque holds that a search has accepted, and that later effects make superfluous."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ COUNT, B = 3000, 2e-5
 WIDER = [form for form in CATALOGUE if form.contains]
 
 
-def test_a_contained_form_has_no_other_parameters():
+def test_parameters_of_a_contained_form_belong_to_the_wider_form():
     assert len(WIDER) == 7
     for form in WIDER:
         for name in form.contains:
@@ -28,7 +28,7 @@ def test_a_contained_form_has_no_other_parameters():
             assert {f.name for f in dataclasses.fields(narrow)} <= {f.name for f in dataclasses.fields(form)}
 
 
-def test_the_wider_form_takes_over_what_it_replaces():
+def test_wider_form_adds_the_value_of_the_form_that_it_replaces():
     beside = ViscousLoadFriction(b=jnp.asarray(0.3))
     model = rig.drive_model().with_effects(ViscousMotorFriction(b=jnp.asarray(0.2)), beside)
     found = _with_form(model, MotorFriction(T_c=jnp.asarray(0.1), b=jnp.asarray(0.05), transition=jnp.asarray(1.0)))
@@ -40,7 +40,7 @@ def test_the_wider_form_takes_over_what_it_replaces():
 @pytest.mark.parametrize(
     "friction, form", [((B * 1e5, 1e5), ViscousMotorFriction), ((2e-3, 0.1), MotorFriction)], ids=["viscous", "dry"]
 )
-def test_the_simplest_sufficient_form_is_found(friction: tuple[float, float], form: type[Effect]):
+def test_loop_finds_the_simplest_sufficient_form(friction: tuple[float, float], form: type[Effect]):
     experiment = rig.drive_experiment(COUNT, motor_friction=friction)
     catalogue = (MotorFriction, ViscousMotorFriction)
     loop = close_loop(rig.drive_model(), {"zero-order": (experiment,)}, hold="zero-order", catalogue=catalogue)
@@ -50,7 +50,7 @@ def test_the_simplest_sufficient_form_is_found(friction: tuple[float, float], fo
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_a_hold_that_later_effects_make_superfluous_is_dropped(monkeypatch: pytest.MonkeyPatch, better: bool):
+def test_hold_made_superfluous_by_later_effects_is_dropped(monkeypatch: pytest.MonkeyPatch, better: bool):
     """A base model without friction may follow a log better under a wrong hold."""
 
     def trial(objective: float) -> Any:
