@@ -1,4 +1,4 @@
-"""Simulations that stay with the log show the motion as it was, where those of the model lead elsewhere."""
+"""Simulations that follow the log closely give the true motion where those of the model diverge from it."""
 
 import numpy as np
 
@@ -16,12 +16,12 @@ JOINT = joints.with_friction(joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_
 COUNT = 1500
 
 
-def test_motor_speed_under_friction_that_the_model_lacks():
+def test_closely_followed_motor_speed_is_accurate_under_missing_friction():
     torque = joints.torque_of(JOINT, count=COUNT)
     truth = joints.motion_of(JOINT, torque)[:, 2]
     experiment = experiment_from_log(joints.log_of(JOINT, count=COUNT), hold="zero-order", N=JOINT.N)
     model = TwoInertiaModel(Drive(N=JOINT.N, J_m=JOINT.J_m, J_l=JOINT.J_l, K=JOINT.K, B_sp=JOINT.B_sp))
-    # 1024 samples in segments of 256, the last of which the data do not fill.
+    # Horizons of 1024 samples in segments of 256; the data fill the last segment only in part.
     found = fit(
         model,
         whole([experiment]),

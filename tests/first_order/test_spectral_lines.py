@@ -1,4 +1,4 @@
-"""Lines are found where they are, and none in noise."""
+"""Spectral lines of the residual are detected at their frequencies, and none in noise."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from fitting.estimation.problem import Segmentation
 from fitting.first_order.spectral_lines import spectral_lines
 
 
-def found(forcing: np.ndarray, hidden: np.ndarray) -> Fit:
-    """The base model's fit of a reduced log under a forcing that is not all logged."""
+def fit_with_unlogged_forcing(forcing: np.ndarray, hidden: np.ndarray) -> Fit:
+    """Fit the base model to a reduced log under a forcing with an unlogged part."""
     motion = rig.reduced_motion(forcing + hidden)
     experiment = experiment_from_log(rig.reduced_log(motion[:, 0], forcing, noise=1e-3), hold="zero-order")
     model = rig.reduced_model()
@@ -20,13 +20,13 @@ def found(forcing: np.ndarray, hidden: np.ndarray) -> Fit:
 
 
 @pytest.mark.parametrize("omega", [7.0, 62.0, 141.0])
-def test_a_hidden_line_is_found(omega: float):
+def test_unlogged_spectral_line_is_detected(omega: float):
     time = np.arange(2000) * rig.REDUCED_STEP
-    lines = spectral_lines(found(rig.reduced_forcing(2000), 1.5 * np.sin(omega * time)))
+    lines = spectral_lines(fit_with_unlogged_forcing(rig.reduced_forcing(2000), 1.5 * np.sin(omega * time)))
     resolution = 2 * np.pi / (1600 * rig.REDUCED_STEP)
     assert lines[0] == pytest.approx(omega, abs=0.1 * resolution)
 
 
-def test_noise_has_no_lines():
+def test_no_line_is_detected_in_noise():
     forcing = rig.reduced_forcing(2000)
-    assert spectral_lines(found(forcing, np.zeros(2000))) == ()
+    assert spectral_lines(fit_with_unlogged_forcing(forcing, np.zeros(2000))) == ()
