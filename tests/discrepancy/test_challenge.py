@@ -1,4 +1,4 @@
-"""When a name stands, and when it falls."""
+"""When named effects stand against a learned term, and when they are withdrawn."""
 
 from dataclasses import replace
 
@@ -37,8 +37,8 @@ def model(
     return ModelEvidence(selection if training is None else training, selection, parameters, (10.0,), white)
 
 
-def challenge(better_by: float, *, beside: bool, enough: bool, fewer: int, **answers) -> ChallengeEvidence:
-    """Names that gain 9 or more, with a learned term in their place that gains 10."""
+def challenge_evidence(better_by: float, *, beside: bool, enough: bool, fewer: int, **answers) -> ChallengeEvidence:
+    """Evidence of names that gain 5 or more, with a learned term in their place that gains 10."""
     instead = model(-10.0, parameters=5 - fewer)
     rival = model(-10.0 + better_by)
     named = model(-5.0, white=enough) if beside else replace(rival, white=enough)
@@ -58,33 +58,33 @@ def challenge(better_by: float, *, beside: bool, enough: bool, fewer: int, **ans
 @pytest.mark.parametrize(
     ("better_by", "beside", "enough", "come_out", "fewer", "one_shape", "stands"),
     [
-        (-0.5, True, False, False, 1, True, True),  # what stands in their place is poorer
-        (0.0, True, False, False, 0, False, False),  # as good as with what is learned beside them, and something else
-        (0.0, True, False, True, 1, False, True),  # as good, and what they name
-        (0.0, True, False, True, 0, True, False),  # what they name has another shape
-        (0.0, True, False, True, -1, True, True),  # another shape, for more parameters
+        (-0.5, True, False, False, 1, True, True),  # the learned term in their place is worse
+        (0.0, True, False, False, 0, False, False),  # as good as with a term beside them, and different
+        (0.0, True, False, True, 1, False, True),  # as good, and equal to the names
+        (0.0, True, False, True, 0, True, False),  # the learned law has another shape
+        (0.0, True, False, True, -1, True, True),  # another shape, with more parameters
         (0.9, True, False, True, 0, False, True),
         (0.9, True, False, True, 1, False, False),  # better by far and simpler
-        (0.0, False, False, False, 1, False, True),  # as good as they are alone
+        (0.0, False, False, False, 1, False, True),  # as good as the names alone
         (0.9, False, False, False, 0, False, False),
         (0.9, False, False, True, 1, False, False),
-        (0.0, False, True, False, 1, False, False),  # they leave but noise, and one function with fewer parameters does
+        (0.0, False, True, False, 1, False, False),  # names leave only noise, a simpler function does too
         (0.0, False, True, False, 0, False, True),
-        (0.0, False, True, True, 1, False, True),  # it has come out as what they name
+        (0.0, False, True, True, 1, False, True),  # the learned term equals the names
         (-0.5, False, True, False, 3, False, True),
     ],
 )
-def test_when_names_stand(
+def test_names_stand_unless_a_learned_term_is_better_or_simpler(
     better_by: float, beside: bool, enough: bool, come_out: bool, fewer: int, one_shape: bool, stands: bool
 ):
     answers = {"come_out": 0.9 if come_out else 0.5, "one_shape": one_shape}
-    seen = challenge(better_by, beside=beside, enough=enough, fewer=fewer, **answers)
+    seen = challenge_evidence(better_by, beside=beside, enough=enough, fewer=fewer, **answers)
     assert any(check.holds for check in names_stand(seen)) == stands
 
 
 @pytest.mark.parametrize(("longer_worse", "stand"), [(0.0, False), (0.05, False), (3.6, True)])
-def test_names_stand_where_what_is_in_their_place_does_not_last(longer_worse: float, stand: bool):
-    seen = challenge(0.9, beside=False, enough=False, fewer=0, come_out=0.72, longer_worse=longer_worse)
+def test_names_stand_if_the_learned_term_is_worse_in_free_runs(longer_worse: float, stand: bool):
+    seen = challenge_evidence(0.9, beside=False, enough=False, fewer=0, come_out=0.72, longer_worse=longer_worse)
     assert any(check.holds for check in names_stand(seen)) == stand
 
 
@@ -94,14 +94,14 @@ def test_names_stand_where_what_is_in_their_place_does_not_last(longer_worse: fl
         (2, True, False, []),
         (2, False, False, ["instead", "beside"]),
         (2, False, True, []),
-        (3, True, False, ["instead"]),  # many names that leave but noise
+        (3, True, False, ["instead"]),  # many names that leave only noise
         (3, False, True, ["instead"]),
         (3, False, False, ["instead", "beside"]),
         (0, False, False, ["beside"]),
         (0, True, False, []),
     ],
 )
-def test_what_is_learned_to_challenge_names(names: int, white: bool, imperfect: bool, asks_for: list[str]):
+def test_learned_terms_to_fit_depend_on_names_and_noise(names: int, white: bool, imperfect: bool, asks_for: list[str]):
     seen = ChallengeEvidence(model(0.0), model(-2.0, white=white), names, NOISE_OBJECTIVE, imperfect)
     asked = []
     while (question := next_question(seen)) is not None:
@@ -112,10 +112,8 @@ def test_what_is_learned_to_challenge_names(names: int, white: bool, imperfect: 
 
 
 @pytest.mark.parametrize(("come_out", "asks_for"), [(0.5, ["instead"]), (0.9, ["instead", "beside"])])
-def test_where_what_stands_in_their_place_leaves_noise_nothing_is_learned_beside_names(
-    come_out: float, asks_for: list[str]
-):
-    """Unless it has come out as what they name."""
+def test_no_term_is_learned_beside_names_if_one_in_their_place_leaves_noise(come_out: float, asks_for: list[str]):
+    """The exception is a learned term that equals the names."""
     seen = ChallengeEvidence(model(0.0), model(-2.0), 1, NOISE_OBJECTIVE, False)
     asked = []
     while (question := next_question(seen)) is not None:
@@ -134,7 +132,7 @@ def test_where_what_stands_in_their_place_leaves_noise_nothing_is_learned_beside
         (1.3, ["instead", "beside"]),
     ],
 )
-def test_names_that_noise_itself_would_hardly_better_are_in_no_doubt(left: float, asks_for: list[str]):
+def test_names_near_the_noise_are_not_challenged_by_a_term_in_their_place(left: float, asks_for: list[str]):
     base, named = (model(float(np.log(ratio * NOISE))) for ratio in (100.0, left))
     seen = ChallengeEvidence(base, named, 1, NOISE_OBJECTIVE, False)
     asked = []
@@ -148,11 +146,11 @@ def test_names_that_noise_itself_would_hardly_better_are_in_no_doubt(left: float
     ("training", "selection", "little"),
     [
         (0.01, 0.01, True),
-        (0.3, 0.01, False),  # the selection data don't show the motion where the names fail
+        (0.3, 0.01, False),  # the selection data lack the motion where the names fail
         (0.01, 0.3, False),
     ],
 )
-def test_what_little_a_learned_term_adds(training: float, selection: float, little: bool):
+def test_names_stand_if_a_learned_term_beside_them_adds_little(training: float, selection: float, little: bool):
     """Names that gain 2 on training data and 1 on selection data."""
     base, named = model(0.0), model(-1.0, training=-2.0)
     beside = model(-1.0 - selection, training=-2.0 - training)
@@ -171,14 +169,14 @@ def base() -> Trial:
     ("told", "missed_by", "left"),
     [
         (set(), 0.0, set()),
-        (set(), 0.09, set()),  # hardly missed, of a gain of two
+        (set(), 0.09, set()),  # a small loss, compared with a gain of two
         (set(), 0.2, {"creep", "torque_bias"}),
         ({"torque_bias"}, 0.0, {"torque_bias"}),
         ({"creep"}, 0.0, {"creep"}),
         ({"creep", "torque_bias"}, 0.0, {"creep", "torque_bias"}),
     ],
 )
-def test_names_that_what_is_learned_leaves_nothing_fall(
+def test_names_without_strength_beside_a_learned_term_are_dropped(
     base: Trial, told: set[str], missed_by: float, left: set[str], monkeypatch: pytest.MonkeyPatch
 ):
     def with_effects(*effects, objective: float) -> Trial:
@@ -202,6 +200,6 @@ def test_names_that_what_is_learned_leaves_nothing_fall(
     assert {e.name for e in bare.model.effects} == left
     assert (bare is base) == (left == set()) and beside.before is bare
     assert {e.name for e in beside.trial.model.effects} == left | {LEARNED.name}
-    # The states of what fell are gone with it; creep has one.
+    # The states of dropped effects are removed with them; creep has one.
     assert beside.states.shape == beside.push.shape == (2, 3 if "creep" in left else 2)
     assert beside.gain == pytest.approx(bare.held_out.objective - beside.trial.held_out.objective)

@@ -1,4 +1,4 @@
-"""The learned torques with memory: which known laws they are, and that they are found where no function will do."""
+"""Learned torques with memory equal known laws as special cases, and are found where no function suffices."""
 
 import json
 from dataclasses import replace
@@ -60,7 +60,7 @@ def rates(effect: Effect, own: list[float]) -> np.ndarray:
 
 
 @every_form
-def test_without_strength_it_is_gone_and_its_states_stay_finite(form: type[LearnedMemory]):
+def test_learned_law_of_zero_strength_does_not_act_and_has_finite_rates(form: type[LearnedMemory]):
     assert form.family == FAMILY
     for effect in form.proposals(SCALES):
         own = np.asarray(effect.initial_state(BASE.motion(STATE)))
@@ -70,7 +70,7 @@ def test_without_strength_it_is_gone_and_its_states_stay_finite(form: type[Learn
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_a_load_that_lags_is_a_third_inertia(beside: bool):
+def test_lagging_load_torque_equals_a_third_inertia(beside: bool):
     share, omega, zeta = 0.3, 250.0, 0.04
     form = ResonanceBesideLoad if beside else ExtraResonance
     known = form(mass_ratio=share, omega_3=omega, zeta=zeta, twist_span=1.0, rate_span=1.0)
@@ -81,8 +81,8 @@ def test_a_load_that_lags_is_a_third_inertia(beside: bool):
     np.testing.assert_array_equal(same.initial_state(BASE.motion(STATE)), known.initial_state(BASE.motion(STATE)))
 
 
-def test_a_share_of_the_motor_may_lag_with_it():
-    """With all that lags tied to the motor for good, the motor is what it was."""
+def test_lagging_motor_torque_takes_its_share_of_the_motor_inertia():
+    """A share of the motor inertia lags; the rest is accelerated by the same torque."""
     J_m, share, omega = float(BASE.drive.J_m), 0.4, 300.0
     k, b = share * J_m * omega**2, 0.2 * omega * share * J_m
     taken = LaggingMotorTorque(k=k, b=b, omega=omega, zeta=0.1, share=share, **SPANS)
@@ -91,13 +91,13 @@ def test_a_share_of_the_motor_may_lag_with_it():
     bare = np.asarray(BASE.rates(STATE, jnp.asarray(0.3), jnp.zeros(())))
     assert found[2] == pytest.approx(bare[2] / (1.0 - share), rel=1e-12)
     assert np.asarray(taken.state_rates(motion, jnp.asarray([0.0, STATE[2]])))[1] == 0.0
-    # Slowly enough nothing lags: the share moves along, and the whole inertia is felt.
+    # In slow motion nothing lags: the share moves with the motor, and the whole inertia acts.
     slow = taken.stiffness(jnp.asarray(1e-3 * omega), BASE.drive)
     assert abs(complex(slow)) < 1e-5 * share * J_m * (1e-3 * omega) ** 2
 
 
 @pytest.mark.parametrize("omega", [20.0, 200.0, 900.0])
-def test_the_stiffness_of_what_lags_is_that_of_its_equations(omega: float):
+def test_dynamic_stiffness_of_a_lag_equals_that_of_its_equations(omega: float):
     effect = LaggingMeshTorque(k=500.0, b=0.7, omega=210.0, zeta=0.3, **SPANS)
     zero = jnp.zeros(())
 
@@ -129,7 +129,7 @@ KNOWN = {
 @pytest.mark.parametrize("known", KNOWN)
 @given(share=st.floats(-1.0, 1.0), backwards=st.booleans())
 @settings(max_examples=20, deadline=None)
-def test_what_yields_is_a_known_hysteresis(known: str, share: float, backwards: bool):
+def test_yielding_torque_equals_known_hysteresis_laws(known: str, share: float, backwards: bool):
     effect, shape = KNOWN[known]
     same = YieldingMeshTorque(k=900.0, **{"back": 0.0, "back_bow": 0.0} | shape)
     motion = Motion(x=jnp.zeros(()), v=jnp.asarray(-0.2 if backwards else 0.2))
@@ -141,7 +141,7 @@ def test_what_yields_is_a_known_hysteresis(known: str, share: float, backwards: 
 
 @given(bow=st.floats(0.0, 1.0), back=st.floats(0.0, 2.0), swing=st.floats(0.1, 30.0))
 @settings(max_examples=15, deadline=None)
-def test_what_yields_saturates_and_takes_energy(bow: float, back: float, swing: float):
+def test_yielding_torque_saturates_and_dissipates_energy(bow: float, back: float, swing: float):
     reach, steps = 1e-3, 4000
     effect = YieldingMotorTorque(k=5.0, reach=reach, bow=bow, back=back)
     phase = np.linspace(0.0, 4 * np.pi, steps)
@@ -155,12 +155,12 @@ def test_what_yields_saturates_and_takes_energy(bow: float, back: float, swing: 
 
     z, power = jax.lax.scan(step, jnp.zeros(1), moves)
     assert abs(float(z[0])) < 1.01 * reach
-    # Of the second round, whose start and end are the same.
+    # Power over the second period, whose start and end are the same.
     assert float(jnp.sum(power[steps // 2 :])) < 0.0
 
 
 @every_form
-def test_it_is_read_as_it_was_written(form: type[LearnedMemory], tmp_path: Path):
+def test_learned_law_is_read_from_its_file_unchanged(form: type[LearnedMemory], tmp_path: Path):
     effect = form.proposals(SCALES)[0]
     stored = StoredModel(
         BASE.with_effects(effect).replace({f"{form.name}.k": 1 / 7}), "linear", 2, 4, 1e-12 * jnp.eye(2)
@@ -171,7 +171,7 @@ def test_it_is_read_as_it_was_written(form: type[LearnedMemory], tmp_path: Path)
     assert type(read) is form and float(read.k) == 1 / 7
 
 
-def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: pytest.MonkeyPatch):
+def test_no_second_law_with_memory_is_screened_at_the_same_place(monkeypatch: pytest.MonkeyPatch):
     asked = []
 
     def screen(training, held_out, *, catalogue, seed):
@@ -187,8 +187,8 @@ def test_no_second_memory_is_looked_for_where_an_effect_remembers(monkeypatch: p
     assert set(asked) == {form for form in LEARNED_WITH_MEMORY if place_of(form) is not LearnedMeshTorque}
 
 
-def yielding_log() -> Loop:
-    """A loop over logs of a spring that yields (Bouc-Wen, written down again), with no names looked for."""
+def loop_with_yielding_spring() -> Loop:
+    """A loop on a log of a yielding spring (Bouc-Wen, implemented here), without a search for named effects."""
     forcing = rig.reduced_forcing(COUNT, rms=14.0)
     k, beta, gamma = 0.35 * rig.OMEGA_0**2, 2.0, 0.8
 
@@ -205,37 +205,37 @@ def yielding_log() -> Loop:
 
 
 @pytest.fixture(scope="module")
-def yielded() -> Loop:
-    return yielding_log()
+def yielding_loop() -> Loop:
+    return loop_with_yielding_spring()
 
 
-def test_hysteresis_without_a_name_is_learned_with_its_memory(yielded: Loop):
-    assert yielded.decision == "unexplained" and yielded.unknown is not None
-    assert [f.name for f in yielded.findings] == [YieldingMeshTorque.name]
-    assert yielded.after.rmse["selection"] < 1.2 * NOISE < 0.2 * yielded.before.rmse["selection"]
-    assert yielded.findings[0].p_value <= 0.01
-    assert float(yielded.after.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=5e-3)
+def test_hysteresis_missing_from_the_catalogue_is_learned_with_memory(yielding_loop: Loop):
+    assert yielding_loop.decision == "unexplained" and yielding_loop.unknown is not None
+    assert [f.name for f in yielding_loop.findings] == [YieldingMeshTorque.name]
+    assert yielding_loop.after.rmse["selection"] < 1.2 * NOISE < 0.2 * yielding_loop.before.rmse["selection"]
+    assert yielding_loop.findings[0].p_value <= 0.01
+    assert float(yielding_loop.after.model.get("omega_0")) == pytest.approx(rig.OMEGA_0, rel=5e-3)
 
 
-def test_what_was_learned_comes_out_as_the_hysteresis_that_it_is(yielded: Loop):
-    """Where a name stands, memory and all, what is learned in its place confirms it."""
-    found = yielded.unknown
+def test_learned_hysteresis_agrees_with_the_equivalent_named_effect(yielding_loop: Loop):
+    """A learned term with memory confirms a named effect of the same law."""
+    found = yielding_loop.unknown
     assert found is not None
     training = found.trial.training
     effect = training.model.effects[0]
     assert isinstance(effect, Yielding)
-    # The same torque under its other name, along the same states.
+    # The same torque as a named effect, with the same states.
     named = BoucWen(k=effect.k, memory_twist=effect.reach, ratio=0.0)
     model = found.before.model.with_effects(named)
     names = {"yielding_mesh_torque.z": "bouc_wen.z"}
     assert model.state_names[2:] == tuple(names.values())
     assert share_of(training.model, found, training) > 0.99
-    assert share_of(model, found) < 0.1  # at rest it does nothing
+    assert share_of(model, found) < 0.1  # without motion it has no torque
 
 
-def test_the_report_tells_what_yields(yielded: Loop, tmp_path: Path):
+def test_report_states_the_learned_yielding_torque(yielding_loop: Loop, tmp_path: Path):
     units = {"dynamic_error": "V", "forcing": "V"}
-    paths = Report.of(yielded, units=units).write(tmp_path)
+    paths = Report.of(yielding_loop, units=units).write(tmp_path)
     report = json.loads(paths["report.json"].read_text())
     told = report["unknown"]
     assert (told["place"], told["variables"], told["memory"]) == ("mesh", ["x"], "yields")
@@ -246,7 +246,7 @@ def test_the_report_tells_what_yields(yielded: Loop, tmp_path: Path):
     assert read_model(paths["model.json"]).model.effects[0].name == YieldingMeshTorque.name
 
 
-def test_the_response_of_what_lags_is_drawn_with_its_band():
+def test_dynamic_stiffness_of_a_learned_lag_is_plotted_with_its_band():
     effect = LaggingLoadTorque(k=900.0, b=0.5, omega=250.0, zeta=0.1, **SPANS)
     model = BASE.with_effects(effect)
     paths = ["K", *(f"{effect.name}.{n}" for n in ("k", "b", "omega", "zeta", "share"))]
@@ -258,7 +258,7 @@ def test_the_response_of_what_lags_is_drawn_with_its_band():
     assert (found.place, found.angle) == ("load", "theta_l")
     wanted = np.abs(np.asarray(effect.stiffness(jnp.asarray(2 * np.pi * found.frequency), BASE.drive)))
     np.testing.assert_allclose(found.stiffness, wanted, rtol=1e-9)
-    # Where the spring alone counts, a hundredth of k is a hundredth of the whole.
+    # At low frequency only the spring acts, so that 1 % of k is 1 % of the whole.
     assert found.std[0] == pytest.approx(0.01, rel=1e-2)
     assert isinstance(effect, Lagging)
     drawn = response_plot(found, unit="N m/rad")
