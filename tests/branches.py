@@ -1,4 +1,4 @@
-"""What a branch of steady motions looks like: its motions, its turns, and what its equations leave over."""
+"""Properties of a branch of steady motions: its motions, its folds, and the residual of its equations."""
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ def row(branch: Branch, i: int) -> FourierSeries:
 
 
 def path(branch: Branch) -> np.ndarray:
-    """Unknowns and scaled parameter by row: the space in which the branch is followed."""
+    """Unknowns and scaled parameter by row: the space of the continuation."""
     return np.concatenate([branch.unknowns, np.asarray(branch.value / branch.scale)[:, None]], axis=1)
 
 
@@ -36,10 +36,10 @@ def _residuals(branch: Branch) -> jax.Array:
 
 
 def assert_whole(branch: Branch, start: float, end: float):
-    """Ends where it should, is solved everywhere, and never jumps: chords are even."""
+    """Assert that a branch has the given ends, is solved everywhere and has even chords, hence no jumps."""
     assert bool(branch.complete) and np.asarray(branch.valid).all()
     value = np.asarray(branch.value)
-    # The last step's end is interpolated: good to a fraction of a step of 0.3 % of the range.
+    # The end is interpolated within the last step: the error is a fraction of a step of 0.3 % of the range.
     assert abs(value[0] - start) < 1e-9 * start and abs(value[-1] - end) < 1e-4 * end
     if len(turns(branch)) == 0:
         assert value.min() >= min(start, end) * (1 - 1e-9) and value.max() <= max(start, end) * (1 + 1e-4)

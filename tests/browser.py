@@ -1,4 +1,4 @@
-"""A page as a real browser shows it, without a network."""
+"""An HTML page as a browser renders it, without a network."""
 
 import re
 import shutil
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# Offline, with time that passes as fast as the scripts allow.
+# Offline, with virtual time that advances as fast as the scripts run.
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -22,7 +22,7 @@ _FLAGS = (
 
 
 def shown(page: Path) -> tuple[str, list[str]]:
-    """A page's document after its scripts have run, and what they wrote on the console; skips without a browser."""
+    """A page's document and console output after its scripts have run; skips without a browser."""
     browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         pytest.skip("needs a Chromium or Chrome, which is absent here")

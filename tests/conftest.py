@@ -1,4 +1,4 @@
-"""Settings for every test (stricter than a user's), and the data beside the repository."""
+"""Settings for every test, which are stricter than a user's, and fixtures that many tests share."""
 
 import gc
 import os
@@ -11,8 +11,8 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from jaxtyping import install_import_hook
 
-# Tests compile more than they compute, and XLA reads this when the first program is compiled; so do the processes begun
-# by tests. What a user's command compiles is made well, as `jit_small` says.
+# Tests spend more time on compilation than on computation. XLA reads this when the first program is compiled, also in
+# processes that tests start. A user's command compiles with more optimisation, see `jit_small`.
 _QUICK = (
     "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
@@ -25,8 +25,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# The first example of a property compiles, so time limits say nothing. The same
-# examples every time: the gate passes or fails by the code alone.
+# The first example of a property compiles, so that time limits have no meaning. Examples are the same in every run:
+# the result of the gate depends on the code alone.
 hypothesis.settings.register_profile(
     "gate", deadline=None, derandomize=True, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
@@ -35,8 +35,8 @@ hypothesis.settings.load_profile("gate")
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
 
-# The modules that annotate shapes are checked at run time. A check takes longer than most functions of the others do,
-# and their types are checked statically.
+# Modules that annotate shapes are checked at run time. The others are checked statically, since a check at run time
+# takes longer than most of their functions.
 _SHAPED = [
     f for package in ("hdjax", "fitting") for f in (ROOT / package).rglob("*.py") if "jaxtyping" in f.read_text()
 ]
@@ -53,11 +53,11 @@ def shared() -> Path:
 
 @pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """For a test of the command line: compiled programs go to the test's folder, and JAX's settings are put back."""
+    """For a test of the command line: compiled programs go to the test's folder, and JAX's settings are restored."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
     before = {name: getattr(jax.config, name) for name in names}
-    # JAX decides once in a process whether it keeps programs, and where: the tests behind this one would go on with it.
+    # JAX decides once in a process whether and where it stores programs: later tests would use the same folder.
     compilation_cache.reset_cache()
     yield
     for name, value in before.items():
@@ -67,8 +67,8 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 @pytest.fixture(autouse=True, scope="module")
 def few_programs() -> Iterator[None]:
-    """A process may hold so many compiled programs that the system gives it no further memory mappings (65,530 on
-    Linux), and the next compilation crashes it."""
+    """Clear compiled programs before their memory mappings reach the limit of the system (65,530 on Linux), at which a
+    compilation crashes."""
     yield
     mappings = Path("/proc/self/maps")
     if mappings.exists() and mappings.read_text().count("\n") > 20_000:

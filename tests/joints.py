@@ -1,7 +1,6 @@
-"""Joints as they are built: two inertias on a mesh, with friction on the motor, drawn at random.
+"""Random joints of realistic parameters: two inertias on a mesh, with friction on the motor.
 
-The equations once more in plain numpy (DESIGN 2.1), all joints of a draw side by side. Nothing here comes from hdjax'
-simulator.
+The equations of motion are written independently in numpy (DESIGN 2.1), without hdjax' simulator.
 """
 
 from collections.abc import Sequence
@@ -49,7 +48,7 @@ class Joint:
 
 
 def torque_of(joint: Joint, *, count: int = COUNT, step: float = STEP, seed: int = 0) -> np.ndarray:
-    """A multisine from a tenth of the natural frequency to one and a half of it."""
+    """A multisine from 5 % to 150 % of the natural frequency."""
     natural = joint.omega_0 / (2 * np.pi)
     low, high = max(2.0 / (count * step), 0.05 * natural), min(1.5 * natural, 0.2 / step)
     return rig.multisine(count, step, rms=joint.rms, low=low, high=high, seed=seed)
@@ -70,7 +69,7 @@ def motion_of(joint: Joint, torque: np.ndarray, *, step: float = STEP, substeps:
 
 
 def with_friction(joint: Joint, coulomb: float, viscous: float, *, seed: int = 0) -> Joint:
-    """The joint with friction of so large a share of the rms torque, each kind, as it moves then."""
+    """The joint with Coulomb and viscous friction as shares of the rms torque in its motion."""
     torque = torque_of(joint, seed=seed)
     joint = replace(joint, coulomb=coulomb * joint.rms)
     for _ in range(4):
@@ -95,7 +94,7 @@ def drawn(seed: int) -> Joint:
 
 
 def log_of(joint: Joint, *, seed: int = 0, count: int = COUNT, name: str = "joint") -> Log:
-    """Its log; the encoders' noise is a thousandth of the twist's rms, at the output."""
+    """The joint's log; the encoders' noise at the output is a thousandth of the twist's rms."""
     random = np.random.default_rng(10_000 + seed)
     torque = torque_of(joint, count=count, seed=seed)
     motion = motion_of(joint, torque)
@@ -108,7 +107,7 @@ def log_of(joint: Joint, *, seed: int = 0, count: int = COUNT, name: str = "join
 def log_of_sensors(
     joint: Joint, sensors: Sequence[str], *, seed: int = 0, count: int = COUNT, noise: float = 1e-3, name: str = "joint"
 ) -> Log:
-    """Its log by some sensors, each with white noise of so large a share of what the twist does to it."""
+    """The joint's log of some sensors, with white noise as a share of the signal that the twist causes in each."""
     random = np.random.default_rng(20_000 + seed)
     torque = torque_of(joint, count=count, seed=seed)
     theta_m, theta_l, omega_m, omega_l = motion_of(joint, torque).T

@@ -1,4 +1,4 @@
-"""Tables written as files of every format, each spoilt in ways of its own, and then byte by byte."""
+"""Tables written as files of every format with random faults of that format, and damage of random bytes."""
 
 import gzip
 import json
@@ -83,7 +83,7 @@ def _hdf5(random: Random, table: Table, path: Path) -> None:
 
 
 def _lvm(random: Random, table: Table) -> bytes:
-    """A LabVIEW measurement file, with whatever lines of its header left out."""
+    """A LabVIEW measurement file, with random lines of its header left out."""
     decimal = str(random.choice([".", ","]))
     head = ["LabVIEW Measurement", "Separator\tTab", f"Decimal_Separator\t{decimal}"]
     head += [f"X_Columns\t{random.choice(['One', 'Multi', 'No'])}", "***End_of_Header***", ""]
@@ -133,7 +133,7 @@ def _mcap(random: Random, table: Table, path: Path) -> None:
 
 
 WRITERS = {"mat": _mat, "h5": _hdf5, "npz": _numpy}
-"""What writes formats that are no text."""
+"""Writers of binary formats."""
 if find_spec("fastexcel"):
     WRITERS["xlsx"] = _sheet
 if find_spec("mcap") and find_spec("rosbags"):
@@ -141,7 +141,7 @@ if find_spec("mcap") and find_spec("rosbags"):
 
 
 def write(random: Random, table: Table, folder: Path) -> Path:
-    """A log file of any format."""
+    """Write a log file of a random format."""
     kind = str(random.choice(["csv", "csv", "csv", "tsv", "txt", "lvm", "csv.gz", "parquet", *WRITERS]))
     path = folder / f"log.{kind}"
     if kind in WRITERS:
@@ -159,7 +159,7 @@ def write(random: Random, table: Table, folder: Path) -> Path:
 
 
 def damage(random: Random, path: Path) -> Path:
-    """Bytes flipped, cut, put in, or the suffix changed."""
+    """Change, remove or insert bytes of a file, or change its suffix."""
     raw = bytearray(path.read_bytes())
     how = int(random.integers(6))
     if how == 0 and raw:

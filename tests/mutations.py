@@ -1,4 +1,4 @@
-"""Logs and drive files spoilt in every way that a seed picks: bytes, columns, units, types, sizes, shapes."""
+"""Logs and drive files with random faults: bytes, columns, units, types, sizes and shapes."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,7 +18,7 @@ DRIVE = {
 
 
 def healthy(seed: int) -> Table:
-    """Columns of a drive log or, now and then, a reduced one."""
+    """Columns of a valid drive log or, for every fifth seed, of a reduced log."""
     if seed % 5 == 4:
         forcing = rig.reduced_forcing(ROWS, seed=seed)
         log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0], forcing, noise=1e-3, seed=seed)
@@ -91,7 +91,7 @@ def _clip(random: Random, table: Table) -> None:
 
 
 def _rows(random: Random, table: Table) -> None:
-    """Rows lost, doubled, shuffled, reversed, or nearly all of them gone."""
+    """Remove, repeat, shuffle or reverse rows, or remove nearly all."""
     count = len(next(iter(table.values()), np.zeros(0)))
     order = np.arange(count)
     how = int(random.integers(7))
@@ -141,7 +141,7 @@ def _coarse(random: Random, table: Table) -> None:
 
 
 def _split(random: Random, table: Table) -> None:
-    """Stamps in two columns, or half of them alone."""
+    """Time stamps in two columns, or their fractions alone."""
     if "time" in table:
         whole = np.floor(table["time"])
         table["time_ns"] = np.rint((table.pop("time") - whole) * 1e9)
@@ -177,7 +177,7 @@ COLUMNS: tuple[Callable[[Random, Table], None], ...] = (
 
 
 def drive_text(random: Random, spoilt: bool, columns: Mapping[str, str] = {}) -> bytes:
-    """A drive file, with whatever nonsense in it."""
+    """A drive file, with random faults where `spoilt`."""
     content = {table: dict(keys) for table, keys in (DRIVE | {"columns": dict(columns)}).items()}
     odd = [
         "1e400",
@@ -231,7 +231,7 @@ def drive_text(random: Random, spoilt: bool, columns: Mapping[str, str] = {}) ->
 
 
 def spoilt_case(seed: int, folder: Path) -> tuple[Path, Path]:
-    """A log and a drive file, at least one of them spoilt."""
+    """Write a log and a drive file with random faults."""
     random = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
     table = healthy(int(random.integers(20)))
@@ -244,7 +244,7 @@ def spoilt_case(seed: int, folder: Path) -> tuple[Path, Path]:
     if random.random() < 0.2:
         log = damage(random, log)
     drive = folder / "drive.toml"
-    # A field of a topic is named in full.
+    # A field of a topic has its full name.
     named = {name: f'"/{name}/data"' for name in table if name in SIGNALS[1:]} if log.suffix == ".mcap" else {}
     named |= {"time": '"time_ns"'} if "time_ns" in table else {}
     drive.write_bytes(drive_text(random, random.random() < 0.25, named))

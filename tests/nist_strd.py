@@ -1,6 +1,6 @@
-"""Nonlinear regression problems with certified answers (NIST StRD), as the core of the fit takes them.
+"""Nonlinear regression problems with certified answers (NIST StRD), as input of the least-squares solver.
 
-All problems are padded to one shape and share one program, which chooses the model by its number.
+All problems are padded to one shape and share one compiled program, which selects the model by its number.
 """
 
 import tomllib
@@ -18,7 +18,7 @@ from fitting.estimation.levenberg_marquardt import ArrowLevenbergMarquardt, norm
 from fitting.estimation.residual import Blocks, LinearisedResidual, Products, Unknowns
 
 SAMPLES, PARAMETERS = 250, 9
-# Where a model leaves the numbers, as in `fitting.estimation.residual`: a rejected step.
+# Residual of a model that is not finite, as in `fitting.estimation.residual`: the step is rejected.
 LOST = 1e8
 
 
@@ -86,17 +86,17 @@ MODELS: dict[str, Callable[[Array, Array, Array], Array]] = {
     "Bennett5": lambda b, x, _: b[0] * _power(b[1] + x, -1 / b[2]),
 }
 
-# Some problems share a model; the program holds each one once.
+# Some problems share a model, which the program contains once.
 _FORMS = list(dict.fromkeys(MODELS.values()))
 TABLE = tomllib.loads((Path(__file__).parent / "nist_strd.toml").read_text(encoding="utf-8"))
 
 
-# Fitted by their logarithm, as `fitting.estimation.free_parameters` fits what must be positive.
+# Parameters fitted by their logarithm, as `fitting.estimation.free_parameters` does for positive ones.
 POSITIVE = {"MGH10": (0, 1, 2)}
 
 
 class Regression(eqx.Module):
-    """One problem's data, padded: `weight` is zero where there are none."""
+    """Padded data of one problem: `weight` is zero in the padding."""
 
     number: Int[Array, ""]
     x_1: Float[Array, " samples"]
@@ -107,7 +107,7 @@ class Regression(eqx.Module):
 
 
 class Answer(eqx.Module):
-    """What the fit found."""
+    """Result of a fit."""
 
     parameters: Float[Array, " parameters"]
     sum_of_squares: Array
@@ -122,7 +122,7 @@ def regression(name: str) -> Regression:
     x_1 = np.asarray(entry["x_1"] if name == "Nelson" else entry["x"])
     x_2 = np.asarray(entry["x_2"]) if name == "Nelson" else x_1
     rest = SAMPLES - y.size
-    # Padding repeats the last sample, where the model is as good as in the data.
+    # Padding repeats the last sample, where the model is finite.
     x_1, x_2, y = (jnp.asarray(np.pad(a, (0, rest), mode="edge")) for a in (x_1, x_2, y))
     weight = jnp.asarray(np.pad(np.ones(SAMPLES - rest), (0, rest)))
     logarithmic = np.isin(np.arange(PARAMETERS), POSITIVE.get(name, ()))
@@ -130,17 +130,17 @@ def regression(name: str) -> Regression:
 
 
 def padded(values: list[float]) -> Float[Array, " parameters"]:
-    """A problem's parameters with ones in place of those that it lacks."""
+    """A problem's parameters, padded by ones."""
     return jnp.asarray(np.pad(np.asarray(values), (0, PARAMETERS - len(values)), constant_values=1.0))
 
 
 def physical(vector: Array, data: Regression) -> Array:
-    """The parameters that the fitted vector stands for."""
+    """The physical parameters of a fitted vector."""
     return jnp.where(data.logarithmic, jnp.exp(jnp.where(data.logarithmic, vector, 0.0)), vector)
 
 
 def residual(unknowns: Unknowns, data: Regression) -> tuple[LinearisedResidual, Products]:
-    """The residual of one segment, whose single state moves nothing; and what the core needs of it."""
+    """Residual and products of one segment, whose single state has no influence."""
 
     def error(parameters: Array) -> Array:
         values = jax.lax.switch(data.number, _FORMS, physical(parameters, data), data.x_1, data.x_2)
@@ -155,11 +155,11 @@ def residual(unknowns: Unknowns, data: Regression) -> tuple[LinearisedResidual, 
 
 @eqx.filter_jit
 def solve(data: Regression, start: Float[Array, " parameters"]) -> Answer:
-    """Fit a problem from a start, by the core of every fit; the information is J^T J of the physical parameters."""
+    """Fit a problem by the least-squares solver of every fit; the information is J^T J of the physical parameters."""
     vector = jnp.where(data.logarithmic, jnp.log(jnp.where(data.logarithmic, start, 1.0)), start)
     state = jnp.zeros((1, 1))
     alone = jnp.zeros(1, dtype=bool)
-    # The starts are anywhere, so the first steps are short ones.
+    # Starting values are far from the solution, so that the first steps are short.
     rows = jnp.asarray(float(data.y.size))
     solver = ArrowLevenbergMarquardt(alone, jnp.ones(1), jnp.asarray(30.0), jnp.asarray(2000), rows, rtol=1e-14)
     start = Unknowns(vector, state)

@@ -1,4 +1,4 @@
-"""Motions against scipy's integration: how far a series is from a solution, and the monodromy along one."""
+"""Periodic motions against scipy's integration: error of a Fourier series, and Floquet multipliers."""
 
 from collections.abc import Callable
 from math import cos
@@ -19,7 +19,7 @@ def duffing(mu: float, alpha: float, omega_0: float = 1.0) -> ReducedModel:
 
 
 def duffing_rates(mu: float, alpha: float, level: float, omega: float, omega_0: float = 1.0) -> Rates:
-    """The same under `level cos(omega t)`, in plain floats for scipy."""
+    """Rates of the same equation under `level cos(omega t)`, in floats for scipy."""
 
     def rates(t, y):
         return y[1], level * cos(omega * t) - mu * y[1] - omega_0**2 * y[0] * (1 + alpha * y[0] * y[0])
@@ -38,10 +38,10 @@ def columns(x: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def period_error(rates: Rates, motion: FourierSeries, state: Callable = columns) -> float:
-    """Largest relative distance of a series from scipy's integration over one period from its own start.
+    """Largest relative distance of a series from scipy's integration over one period from the same initial state.
 
-    `state` turns (coordinates, their rates, times) into what `rates` integrates. Quarter by quarter, since an
-    integrator's interpolation is worse than its steps.
+    `state` turns (coordinates, their rates, times) into what `rates` integrates. It integrates quarter by quarter,
+    since the interpolation of an integrator is less accurate than its steps.
     """
     t = np.linspace(0.0, 2 * np.pi / float(motion.omega), 5)
     rows = state(np.asarray(motion(jnp.asarray(t))), np.asarray(motion.derivative()(jnp.asarray(t))), t)
@@ -54,7 +54,7 @@ def period_error(rates: Rates, motion: FourierSeries, state: Callable = columns)
 
 
 def multipliers(rates: Rates, slope: Callable[[np.ndarray], np.ndarray], motion: FourierSeries) -> np.ndarray:
-    """Floquet multipliers: the variational equations along a motion of a reduced drive, beside the motion itself.
+    """Floquet multipliers from the variational equations along a motion of a reduced drive.
 
     `slope` is the derivative of the rates by the state.
     """

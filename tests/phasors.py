@@ -1,4 +1,4 @@
-"""Complex amplitudes of steady motions, and a harmonic balance in numpy that finds them."""
+"""Complex amplitudes of steady motions, and their computation by harmonic balance in numpy."""
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def balanced(drive: ReducedDrive, omega: float, forces: dict[int, complex], star
 
 
 def phasors(series: FourierSeries, harmonics: int = 15) -> np.ndarray:
-    """Of the harmonics 1, 2, ... of a series, zero where it has none."""
+    """Phasors of the harmonics 1, 2, ... of a series, zero where it has none."""
     X = np.zeros(harmonics, complex)
     X[: series.harmonics] = np.asarray(series.cosine) - 1j * np.asarray(series.sine)
     return X

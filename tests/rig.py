@@ -1,6 +1,6 @@
-"""A simulated test rig of its own: the equations of motion once more, in plain Python, with a classical Runge-Kutta.
+"""An independent simulated test rig: the equations of motion in plain Python, with the classical Runge-Kutta method.
 
-Nothing here comes from hdjax, so that an error there can't hide. The torque is held between samples.
+It uses no equations of hdjax, so that an error there is detected. The torque is held between samples.
 """
 
 import math
@@ -48,7 +48,7 @@ def multisine(count: int, step: float, *, rms: float, low: float, high: float, s
 
 
 def drive_torque(count: int, *, rms: float = 0.3, seed: int = 0) -> np.ndarray:
-    """Motor torque [N m] that swings the drive slowly and shakes it through its resonance."""
+    """Motor torque [N m]: a slow sine and a multisine across the resonance."""
     slow = 0.15 * np.sin(4 * np.pi * np.arange(count) / count)
     return multisine(count, STEP, rms=rms, low=2.0, high=110.0, seed=seed) + slow
 
@@ -78,9 +78,9 @@ def drive_motion(
         alpha: cubic coefficient.
         damping: B_sp.
         state: at the first sample.
-        mesh_friction: torque [N m] and the twist rate over which its sign turns [rad/s].
+        mesh_friction: torque [N m] and the twist rate over which its sign changes [rad/s].
         motor_friction: likewise on the motor.
-        torque_bias: what acts beyond the logged torque [N m].
+        torque_bias: acting torque less the logged torque [N m].
         kinematic: cosine and sine part of a second-order kinematic error [rad].
         gravity: m g r of the load [N m].
         tether: stiffness of a spring from the load to the ground [N m/rad].
@@ -107,7 +107,7 @@ def drive_motion(
 def drive_log(
     motion: np.ndarray, torque: np.ndarray, *, noise: float = 1.0, seed: int = 0, step: float = STEP, name: str = "log"
 ) -> Log:
-    """The rig's log of a motion; `noise` multiplies the encoders' usual one."""
+    """The rig's log of a motion; `noise` multiplies the encoders' nominal noise."""
     random = np.random.default_rng(1000 + seed)
     count = torque.size
     motor = motion[:, 0] + noise * MOTOR_NOISE * random.normal(size=count)
@@ -118,7 +118,7 @@ def drive_log(
 def log_of_angles(
     motor: np.ndarray, load: np.ndarray, torque: np.ndarray, *, ratio: float, step: float, name: str
 ) -> Log:
-    """A drive log of what was read."""
+    """A drive log of encoder readings."""
     return Log(
         name=name,
         path=Path(f"{name}.csv"),
@@ -146,7 +146,7 @@ def drive_experiment(
 def drive_parts(
     *counts: int, noise: float = 1.0, seed: int = 0, rms: float = 0.3, name: str = "log", **physics
 ) -> tuple[Experiment, ...]:
-    """The rig's experiment in parts of so many samples, one after the other."""
+    """Consecutive parts of the rig's experiment with the given numbers of samples."""
     torque = drive_torque(sum(counts), rms=rms, seed=seed)
     log = drive_log(drive_motion(torque, **physics), torque, noise=noise, seed=seed, name=name)
     ends = np.cumsum(counts)
@@ -160,7 +160,7 @@ def drive_model(*, K: float = K, alpha: float = ALPHA, B_sp: float = B_SP) -> Tw
 
 
 def reduced_forcing(count: int, *, rms: float = 10.0, seed: int = 0) -> np.ndarray:
-    """Forcing through the reduced oscillator's resonance."""
+    """Multisine forcing across the reduced oscillator's resonance."""
     return multisine(count, REDUCED_STEP, rms=rms, low=0.3, high=30.0, seed=seed)
 
 

@@ -1,4 +1,4 @@
-"""Simulated logs of slow joints whose truth is known, by equations of their own: twist from torque, row by row."""
+"""Simulated quasi-static logs with known effects, by independent equations: twist from torque, row by row."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,15 +15,15 @@ K = 4e4
 RATIO = 100.0
 STEP = 0.004
 
-Effect = Callable[["Motion_"], np.ndarray]
+Effect = Callable[["JointMotion"], np.ndarray]
 
 
-class Motion_:
-    """What a simulated joint does.
+class JointMotion:
+    """Motion and torque of a simulated joint.
 
     Attributes:
         time: [s].
-        torque: That truly passes through the gear [N m].
+        torque: True torque through the gear [N m].
         motor: theta_m [rad].
         speed: Of the joint [rad/s].
     """
@@ -35,14 +35,14 @@ class Motion_:
         if moves == "held":
             self.speed = np.zeros(rows)
         elif moves == "one way":
-            # Steadily for two thirds, then a rest.
+            # Constant speed for two thirds, then a rest.
             self.speed = 0.2 * np.clip((rows - 1.5 * np.arange(rows)) / (0.05 * rows), 0.0, 1.0)
         else:
             self.speed = 0.2 * np.sign(np.sin(2 * np.pi * 2 * np.arange(rows) / rows + 0.3))
         path = np.zeros(rows)
         path[1:] = STEP * np.cumsum(self.speed[:-1])
         self.motor = 3.0 + RATIO * path
-        # A weight's torque hangs on the angle, and stays where the joint rests.
+        # A weight's torque depends on the angle, and is constant while the joint rests.
         if kind == "weight":
             wave = np.sin(2 * np.pi * cycles * path / path[-1])
         self.torque = largest * wave
@@ -63,24 +63,24 @@ def slow_joint(
     seed: int = 0,
     name: str = "log",
 ) -> tuple[Log, Motion]:
-    """A log, and how its joint moved.
+    """A log, and the kind of motion of its joint.
 
     Args:
-        effects: What each adds to the twist [rad].
+        effects: Contributions to the twist [rad].
         moves: "held", "one way" or "both ways".
         cycles: Of the torque.
         rows: 4 ms apart.
         largest: Amplitude of the torque [N m].
-        kind: Course of the torque, "sine", "triangle", or a "weight" that the joint carries round.
+        kind: Course of the torque, "sine", "triangle", or that of a "weight" on the joint.
         twist_noise: [rad].
         torque_noise: [N m].
         colour: Correlation of neighbouring noises of the twist.
-        friction: What the torque is read too large by [N m].
+        friction: Error of the measured torque [N m].
         seed: Of the noise.
         name: Of the log.
     """
     random = np.random.default_rng(seed)
-    motion = Motion_(moves=moves, cycles=cycles, rows=rows, largest=largest, kind=kind)
+    motion = JointMotion(moves=moves, cycles=cycles, rows=rows, largest=largest, kind=kind)
     noises = lfilter([np.sqrt(1 - colour**2)], [1.0, -colour], random.normal(size=rows + 500))[500:]
     twist = 0.3 + motion.torque / K + sum((effect(motion) for effect in effects), np.zeros(rows))
     read = motion.torque + (0.0 if friction is None else friction(motion))
@@ -103,19 +103,19 @@ def slow_joint(
 
 
 def closed(*logs: tuple[Log, Motion], **options) -> QuasiStaticLoop:
-    """The loop on simulated logs."""
+    """Close the loop on simulated logs."""
     return close_loop(points_of([log for log, _ in logs], [how for _, how in logs], RATIO), **options)
 
 
 def ripple(amplitude: float, order: int, phase: float = 0.7) -> Effect:
-    """Kinematic error: the spring sees it, the encoders don't."""
+    """Kinematic error: it acts on the spring, and encoders do not measure it."""
     return lambda motion: -amplitude * np.cos(order * motion.motor + phase)
 
 
 def sliders(width: float, yields: Sequence[float] = (4.0, 10.0)) -> Effect:
-    """Loop of the twist from friction elements between the gear's sides (Maxwell slip along the torque)."""
+    """Hysteresis of the twist by friction elements between the gear's sides (Maxwell slip along the torque)."""
 
-    def effect(motion: Motion_) -> np.ndarray:
+    def effect(motion: JointMotion) -> np.ndarray:
         total = np.zeros_like(motion.torque)
         for most in yields:
             borne, path = 0.0, []
@@ -131,7 +131,7 @@ def sliders(width: float, yields: Sequence[float] = (4.0, 10.0)) -> Effect:
 def relaxation(share: float, constant: float) -> Effect:
     """Standard linear solid, by small Euler steps."""
 
-    def effect(motion: Motion_) -> np.ndarray:
+    def effect(motion: JointMotion) -> np.ndarray:
         z, path = 0.0, []
         for torque in motion.torque.tolist():
             path.append(z)
@@ -142,9 +142,9 @@ def relaxation(share: float, constant: float) -> Effect:
 
 
 def relaxing_rests(amplitude: float, constant: float) -> Effect:
-    """Each stop leaves the twist off its end by an amplitude, which it loses step by step while the joint rests."""
+    """The twist at a stop differs by an amplitude from its final value, to which it relaxes while the joint rests."""
 
-    def effect(motion: Motion_) -> np.ndarray:
+    def effect(motion: JointMotion) -> np.ndarray:
         off, path, rested = 0.0, [], motion.speed[0] == 0
         for rests in (motion.speed == 0).tolist():
             off = (amplitude if not rested else off) * (1.0 - STEP / constant) if rests else 0.0
@@ -156,9 +156,9 @@ def relaxing_rests(amplitude: float, constant: float) -> Effect:
 
 
 def hardening(alpha: float) -> Effect:
-    """The cubic spring tau = K (x + alpha x^3), by Newton's steps, less its straight line."""
+    """Twist of the cubic spring tau = K (x + alpha x^3), by Newton's method, less that of the linear spring."""
 
-    def effect(motion: Motion_) -> np.ndarray:
+    def effect(motion: JointMotion) -> np.ndarray:
         line = motion.torque / K
         x = line.copy()
         for _ in range(30):
@@ -181,9 +181,9 @@ def play(half_width: float) -> Effect:
 
 
 def coulomb(torque: float) -> Effect:
-    """Friction on the motor's side while the joint moves; at rest half of what it was."""
+    """Friction on the motor's side while the joint moves; half of it at rest."""
 
-    def friction(motion: Motion_) -> np.ndarray:
+    def friction(motion: JointMotion) -> np.ndarray:
         rest = np.where(motion.speed == 0, 0.5, 0.0)
         return torque * (np.sign(motion.speed) + rest)
 
@@ -191,5 +191,5 @@ def coulomb(torque: float) -> Effect:
 
 
 def late(delay: float) -> Effect:
-    """The torque channel leads by a delay: the twist answers later."""
+    """Delay of the twist behind the logged torque."""
     return lambda motion: (np.interp(motion.time - delay, motion.time, motion.torque) - motion.torque) / K

@@ -1,4 +1,4 @@
-"""Many logs in one table: a bad one stops nobody, and what is finished is not done twice."""
+"""Fits of all logs of a folder: one table, refusals of single logs, and resumption of interrupted runs."""
 
 from pathlib import Path
 
@@ -36,8 +36,8 @@ def drive(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The logs that were read for a fit, each of which then can't be fitted."""
+def attempted_logs(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The logs for which a fit was attempted; each attempt is refused."""
     seen: list[Path] = []
 
     def refuse(logs: list[Path], drive: Path, **how: bool):
@@ -48,7 +48,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return seen
 
 
-def test_each_log_is_fitted_on_its_own(tmp_path: Path, drive: Path):
+def test_each_log_of_a_folder_is_fitted_separately(tmp_path: Path, drive: Path):
     frequencies = {"a.csv": 80.0, "deeper/b.csv": 100.0}
     for seed, (name, omega_0) in enumerate(frequencies.items()):
         write_log(tmp_path / "logs" / name, seed=seed, omega_0=omega_0)
@@ -71,23 +71,23 @@ def test_each_log_is_fitted_on_its_own(tmp_path: Path, drive: Path):
     assert "3 logs: 2 fitted, 1 refused" in fleet_text(table)
 
 
-def test_finished_logs_are_not_fitted_again(tmp_path: Path, drive: Path, counted: list[Path]):
+def test_finished_logs_are_not_fitted_again(tmp_path: Path, drive: Path, attempted_logs: list[Path]):
     logs = [write_log(tmp_path / "logs" / f"{i}.csv", seed=i) for i in range(3)]
     first = fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
-    assert sorted(counted) == logs
-    counted.clear()
+    assert sorted(attempted_logs) == logs
+    attempted_logs.clear()
     assert fit_fleet(tmp_path / "logs", drive, tmp_path / "out").equals(first)
-    assert not counted
+    assert not attempted_logs
     write_log(logs[1], seed=7)
     fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
-    assert counted == [logs[1]]
-    counted.clear()
+    assert attempted_logs == [logs[1]]
+    attempted_logs.clear()
     drive.write_text(DRIVE + "# another file\n", encoding="utf-8")
     fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
-    assert sorted(counted) == logs
+    assert sorted(attempted_logs) == logs
 
 
-def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+def test_interrupted_run_is_resumed(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
     logs = [write_log(tmp_path / "logs" / f"{i}.csv", seed=i) for i in range(4)]
     seen: list[Path] = []
     limit = 2
@@ -99,7 +99,7 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch
         raise DataError(f"{paths[0]}: no")
 
     monkeypatch.setattr(fitting.batch_fit, "read_rig", read)
-    # One after the other.
+    # One log at a time.
     monkeypatch.setattr(fitting.batch_fit.os, "cpu_count", lambda: 1)
     with pytest.raises(KeyboardInterrupt):
         fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
@@ -110,7 +110,7 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path: Path, drive: Path, monkeypatch
     assert len(table) == 4
 
 
-def test_a_bug_in_one_fit_stops_nobody(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+def test_exception_in_one_fit_does_not_stop_the_others(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
     for i in range(2):
         write_log(tmp_path / "logs" / f"{i}.csv", seed=i)
 
@@ -125,7 +125,7 @@ def test_a_bug_in_one_fit_stops_nobody(tmp_path: Path, drive: Path, monkeypatch:
     assert "ZeroDivisionError: oops" in table["message"][0]
 
 
-def test_a_drive_file_beside_a_log_goes_first(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
+def test_drive_file_beside_a_log_takes_precedence(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch):
     write_log(tmp_path / "logs" / "one" / "log.csv")
     own = tmp_path / "logs" / "one" / "drive.toml"
     own.write_text(DRIVE, encoding="utf-8")
@@ -141,17 +141,17 @@ def test_a_drive_file_beside_a_log_goes_first(tmp_path: Path, drive: Path, monke
     assert used == {"one": own, "two": drive}
 
 
-def test_a_spoilt_record_is_made_again(tmp_path: Path, drive: Path, counted: list[Path]):
+def test_corrupted_record_is_recomputed(tmp_path: Path, drive: Path, attempted_logs: list[Path]):
     write_log(tmp_path / "logs" / "0.csv")
     fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
     (record,) = (tmp_path / "out" / "finished").iterdir()
     record.write_text("{", encoding="utf-8")
-    counted.clear()
+    attempted_logs.clear()
     fit_fleet(tmp_path / "logs", drive, tmp_path / "out")
-    assert len(counted) == 1
+    assert len(attempted_logs) == 1
 
 
-def test_which_files_are_logs(tmp_path: Path):
+def test_log_files_of_a_folder_are_found(tmp_path: Path):
     for name in ("b.CSV", "a.parquet", "notes.md", ".hidden.csv", ".cache/c.csv", "out/old.csv"):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
@@ -162,8 +162,8 @@ def test_which_files_are_logs(tmp_path: Path):
         find_logs(tmp_path / "empty")
 
 
-def test_why_a_parameter_is_not_told():
-    """The reason stands beside the flag, in the log's units."""
+def test_unidentifiable_parameter_has_its_reason_in_the_table():
+    """The reason is beside the flag, in the units of the log."""
     estimates = {
         "alpha": Estimate("alpha", 1.0, 2.0, 2.0, (-3.0, 5.0), "1/[x]^2", False),
         "mu": Estimate("mu", 1.0, 0.1, 0.1, (0.8, 1.2), "1/s", True),
@@ -177,7 +177,7 @@ def test_why_a_parameter_is_not_told():
 
 
 @pytest.mark.slow
-def test_a_cluster_makes_the_same_table(tmp_path: Path, drive: Path):
+def test_dask_workers_give_the_same_table(tmp_path: Path, drive: Path):
     pytest.importorskip("distributed", reason="needs the extra `sweep`, which is not installed")
     for i in range(3):
         log = tmp_path / "logs" / f"{i}.csv"
@@ -191,7 +191,7 @@ def test_a_cluster_makes_the_same_table(tmp_path: Path, drive: Path):
     assert there.drop("seconds").equals(here.drop("seconds"))
 
 
-def test_an_absent_scheduler_is_told(tmp_path: Path, drive: Path):
+def test_unreachable_scheduler_is_reported(tmp_path: Path, drive: Path):
     pytest.importorskip("distributed", reason="needs the extra `sweep`, which is not installed")
     import dask
 

@@ -1,4 +1,4 @@
-"""The whole loop on a small scale: it names the effect that was hidden, and nothing where nothing was."""
+"""The whole loop with few candidates: the missing effect is identified, and none is found where none is missing."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,8 +35,8 @@ REDUCED_NOISE = 1e-3
 
 
 def reduced_loop(experiment: Experiment, *, catalogue: Sequence[type[Effect]] = REDUCED_CATALOGUE, **options) -> Loop:
-    """With placeholders that are wrong by a factor of about a hundred, and one effect at most: further rounds compile
-    as much again."""
+    """Close the loop from placeholders that are wrong by a factor of a hundred, with one effect at most: each further
+    round has to compile again."""
     placeholder = rig.reduced_model(mu=1.0, omega_0=1.0, alpha=0.0, gain=1.0)
     return close_loop(
         placeholder, {"zero-order": (experiment,)}, catalogue=catalogue, search=SearchOptions(1), **options
@@ -51,14 +51,14 @@ def drive_loop(experiment: Experiment, **options) -> Loop:
 
 
 @pytest.fixture(scope="module")
-def rubbing() -> tuple[Loop, list[str]]:
+def friction_loop() -> tuple[Loop, list[str]]:
     told: list[str] = []
     experiment = rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION)
     return reduced_loop(experiment, progress=told.append), told
 
 
-def test_friction_is_found(rubbing):
-    found, told = rubbing
+def test_coulomb_friction_is_identified(friction_loop):
+    found, told = friction_loop
     assert found.decision == "effect_found"
     (finding,) = found.findings
     assert (finding.family, finding.name) == ("coulomb_friction", "coulomb_friction")
@@ -69,8 +69,8 @@ def test_friction_is_found(rubbing):
     assert any("found coulomb_friction" in message for message in told)
 
 
-def test_the_drive_is_right_once_the_effect_is_inside(rubbing):
-    after = rubbing[0].after
+def test_parameters_are_unbiased_once_the_effect_is_added(friction_loop):
+    after = friction_loop[0].after
     truth = {
         "omega_0": rig.OMEGA_0,
         "alpha": rig.REDUCED_ALPHA,
@@ -82,13 +82,13 @@ def test_the_drive_is_right_once_the_effect_is_inside(rubbing):
     for path, value in truth.items():
         estimate = after.uncertainty.estimates[path]
         assert abs(estimate.value - value) < 4 * estimate.std, (path, estimate)
-    # Without friction its dissipation had passed for damping, by many standard errors.
-    before = rubbing[0].before.uncertainty.estimates["mu"]
+    # Without friction in the model, its dissipation biases the damping by many standard errors.
+    before = friction_loop[0].before.uncertainty.estimates["mu"]
     assert before.value - rig.MU > 5 * before.std
 
 
-def test_selection_data_say_so(rubbing):
-    found, _ = rubbing
+def test_error_on_selection_data_falls_to_the_noise(friction_loop):
+    found, _ = friction_loop
     assert found.after.rmse["selection"] < found.before.rmse["selection"]
     assert found.after.rmse["selection"] < 1.3 * REDUCED_NOISE
     assert np.sqrt(float(found.noise[0, 0])) == pytest.approx(REDUCED_NOISE, rel=0.1)
@@ -98,7 +98,7 @@ def test_selection_data_say_so(rubbing):
     assert not np.any(np.isin(found.after.selection[0].time, found.after.training[0].time))
 
 
-def test_nothing_is_found_where_nothing_is():
+def test_no_effect_is_found_where_none_is_missing():
     clean = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE))
     assert clean.decision == "model_sufficient"
     assert clean.findings == ()
@@ -109,7 +109,7 @@ def test_nothing_is_found_where_nothing_is():
 
 
 @pytest.mark.slow
-def test_a_torque_bias_of_a_drive_is_found():
+def test_torque_bias_of_a_drive_is_identified():
     found = drive_loop(rig.drive_experiment(COUNT, torque_bias=BIAS))
     assert found.decision == "effect_found"
     (finding,) = found.findings
@@ -117,14 +117,14 @@ def test_a_torque_bias_of_a_drive_is_found():
     assert finding.p_value <= 0.01
     assert finding.gain > 0.3
     assert float(finding.effect.bias) == pytest.approx(BIAS, rel=0.05)
-    # The placeholder was wrong by a factor of thousands.
+    # The placeholder is wrong by a factor of thousands.
     assert float(found.after.model.get("K")) == pytest.approx(rig.K, rel=2e-3)
     assert float(found.after.model.get("alpha")) == pytest.approx(rig.ALPHA, rel=0.1)
     assert found.after.rmse["selection"] < 2 * X_NOISE
 
 
 @pytest.mark.slow
-def test_a_drive_without_effects_suffices():
+def test_base_model_suffices_for_a_drive_without_effects():
     clean = drive_loop(rig.drive_experiment(COUNT))
     assert clean.decision == "model_sufficient"
     assert clean.findings == ()
@@ -132,8 +132,8 @@ def test_a_drive_without_effects_suffices():
 
 
 @pytest.mark.slow
-def test_a_weight_that_outweighs_the_motor_is_found():
-    """No minimum of the base model is near the drive; from where it is held, the weight is found."""
+def test_gravity_load_larger_than_the_motor_torque_is_identified():
+    """No minimum of the base model is near the true parameters; gravity is found with the base parameters fixed."""
     torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
     log = rig.drive_log(rig.drive_motion(torque, gravity=20.0), torque, noise=0.1)
     found = drive_loop(experiment_from_log(log, hold="zero-order", N=rig.N))
@@ -148,8 +148,8 @@ def test_a_weight_that_outweighs_the_motor_is_found():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [2.0, 10.0])
-def test_a_spring_to_the_ground_is_no_weight(stiffness: float):
-    """The catalogue lacks it: a weight and what stands beside it come near, and one simple function nearer."""
+def test_ground_spring_is_learned_and_not_identified_as_gravity(stiffness: float):
+    """The catalogue lacks a ground spring: a learned function of one variable explains more than gravity."""
     torque = np.repeat(0.1 * np.random.default_rng(0).normal(size=20), 300)
     log = rig.drive_log(rig.drive_motion(torque, tether=stiffness), torque, noise=0.1)
     found = drive_loop(experiment_from_log(log, hold="zero-order", N=rig.N))
@@ -165,13 +165,13 @@ def test_a_spring_to_the_ground_is_no_weight(stiffness: float):
     [
         ([], []),
         (["linear"], []),
-        (["linear", "zero-order"], ["linear hold", "zero-order hold"]),  # the first one again: nothing was found
+        (["linear", "zero-order"], ["linear hold", "zero-order hold"]),  # the first hold again: no finding
         (["linear", "cubic"], ["linear hold"]),
     ],
 )
-def test_a_hold_that_was_taken_back_is_no_finding(rubbing, tried: list[Hold], given_up: list[str]):
+def test_withdrawn_hold_is_not_a_finding(friction_loop, tried: list[Hold], given_up: list[str]):
     first: Hold = "zero-order"
-    (this, *_) = rubbing[0].rounds
+    (this, *_) = friction_loop[0].rounds
     rounds, now = [this], first
     for hold in tried:
         before, after = replace(this.before, hold=now), replace(this.before, hold=hold)
@@ -192,8 +192,8 @@ def test_single_precision_is_refused():
         jax.config.update("jax_enable_x64", True)
 
 
-def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatch: pytest.MonkeyPatch):
-    """What is found over short segments is named all the same where nothing else can be learned; more is missing."""
+def test_effect_that_does_not_explain_free_runs_is_unexplained(monkeypatch: pytest.MonkeyPatch):
+    """An effect found over short segments is reported where no term can be learned; the decision is `unexplained`."""
     module = import_module("fitting.conclusion")
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
     monkeypatch.setattr(module, "learn_supported", lambda *args, **options: None)
@@ -203,9 +203,8 @@ def test_names_that_do_not_explain_whole_stretches_are_no_explanation(monkeypatc
 
 
 @pytest.mark.slow
-def test_what_explains_whole_stretches_is_learned_in_place_of_names_that_do_not(monkeypatch: pytest.MonkeyPatch):
-    """Damping by the rate's square, made to pass for an explanation, stands for dry friction; a learned jump explains
-    more."""
+def test_learned_term_replaces_an_effect_that_does_not_explain_free_runs(monkeypatch: pytest.MonkeyPatch):
+    """Quadratic damping is accepted in place of dry friction, by substituted evidence; a learned jump explains more."""
     module, loop_module = import_module("fitting.conclusion"), import_module("fitting.loop")
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
     explains = {"excess": (1.0,), "excess_at_first": (9.0,), "learned": False}

@@ -1,4 +1,4 @@
-"""Logs of one drive, each under a name of its own."""
+"""Logs of one drive: unique names, and one kind."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def drive(tmp_path: Path) -> Path:
     return path
 
 
-def test_logs_of_one_name_are_told_apart(tmp_path: Path, drive: Path):
+def test_logs_of_equal_name_get_distinct_names(tmp_path: Path, drive: Path):
     paths = [
         write(tmp_path / "a", "run.csv", 0),
         write(tmp_path / "b", "run.csv", 1),
@@ -37,6 +37,6 @@ def test_logs_of_one_name_are_told_apart(tmp_path: Path, drive: Path):
     assert [e.name for e in found.experiments["linear"]] == names
 
 
-def test_logs_of_two_kinds_do_not_mix(tmp_path: Path, drive: Path):
+def test_logs_of_two_kinds_are_refused(tmp_path: Path, drive: Path):
     with pytest.raises(InputError, match="can't be fitted together"):
         read_rig([write(tmp_path, "a.csv", 0), write(tmp_path, "b.csv", 4)], drive)

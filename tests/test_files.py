@@ -1,4 +1,4 @@
-"""Files are written whole or not at all."""
+"""Files are written completely or not at all."""
 
 import os
 import stat
@@ -14,7 +14,7 @@ def contents(folder: Path) -> dict[str, str]:
     return {p.name: p.read_text(encoding="utf-8") for p in folder.iterdir()}
 
 
-def test_several_files_in_folders_that_are_made(tmp_path: Path):
+def test_several_files_are_written_into_new_folders(tmp_path: Path):
     first, second = tmp_path / "a" / "b" / "one.txt", tmp_path / "c" / "two.txt"
     write_whole({first: "eins\n", second: "zwölf"})
     assert contents(first.parent) == {"one.txt": "eins\n"}
@@ -22,7 +22,7 @@ def test_several_files_in_folders_that_are_made(tmp_path: Path):
     assert stat.S_IMODE(first.stat().st_mode) == 0o644
 
 
-def test_an_old_file_is_replaced(tmp_path: Path):
+def test_existing_file_is_replaced(tmp_path: Path):
     path = tmp_path / "report.json"
     path.write_text("old and longer", encoding="utf-8")
     write_whole({path: "new"})
@@ -30,13 +30,13 @@ def test_an_old_file_is_replaced(tmp_path: Path):
 
 
 @pytest.mark.parametrize("failing", [1, 2])
-def test_nothing_is_touched_when_writing_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int):
+def test_failed_write_changes_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int):
     (tmp_path / "one.txt").write_text("old", encoding="utf-8")
     opened = []
     fdopen = os.fdopen
 
     class FullDisk:
-        """A file whose disk is full after the first characters."""
+        """A file on a disk that is full after two characters."""
 
         def __init__(self, file):
             self.file = file
@@ -62,7 +62,7 @@ def test_nothing_is_touched_when_writing_fails(tmp_path: Path, monkeypatch: pyte
     assert contents(tmp_path) == {"one.txt": "old"}
 
 
-def test_nothing_is_touched_when_the_first_renaming_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_failed_first_renaming_changes_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "one.txt").write_text("old", encoding="utf-8")
 
     def refuse(source, destination):
@@ -74,7 +74,7 @@ def test_nothing_is_touched_when_the_first_renaming_fails(tmp_path: Path, monkey
     assert contents(tmp_path) == {"one.txt": "old"}
 
 
-def test_a_renaming_that_fails_late_leaves_whole_files_and_no_litter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_failed_later_renaming_leaves_only_whole_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "two.txt").write_text("old", encoding="utf-8")
     replace = os.replace
 
@@ -86,11 +86,11 @@ def test_a_renaming_that_fails_late_leaves_whole_files_and_no_litter(tmp_path: P
     monkeypatch.setattr(files.os, "replace", refuse_two)
     with pytest.raises(PermissionError):
         write_whole({tmp_path / "one.txt": "new", tmp_path / "two.txt": "more"})
-    # Whole files only: either the old or the new text, and no temporary ones.
+    # Complete files only, with the old or the new text, and no temporary ones.
     assert contents(tmp_path) in ({"one.txt": "new", "two.txt": "old"}, {"two.txt": "old"})
 
 
-def test_a_folder_that_is_a_file(tmp_path: Path):
+def test_folder_that_is_a_file_is_refused(tmp_path: Path):
     (tmp_path / "taken").write_text("", encoding="utf-8")
     with pytest.raises(OSError):
         write_whole({tmp_path / "taken" / "one.txt": "new"})

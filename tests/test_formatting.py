@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them."""
+"""Formatting of numbers: significant digits, powers of ten and relative changes."""
 
 import pytest
 from hypothesis import given
@@ -20,12 +20,12 @@ from fitting import formatting
         (0.123456, "0.123"),
     ],
 )
-def test_a_number_has_its_significant_digits(value, text):
+def test_number_has_three_significant_digits(value, text):
     assert formatting.number(value) == text
 
 
 @given(st.floats(1e-12, 1e12))
-def test_a_number_reads_back_to_within_its_digits(value: float):
+def test_formatted_number_reads_back_within_its_digits(value: float):
     text = formatting.number(value).replace("\u202f", "")
     mantissa, _, power = text.partition(" × 10")
     exponent = int(power.translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")) or 0)
@@ -37,5 +37,5 @@ def test_a_number_reads_back_to_within_its_digits(value: float):
     ("share", "text"),
     [(0.5, "50 % smaller"), (-1.55, "155 % larger"), (0.0, "0 % smaller"), (None, "— smaller")],
 )
-def test_an_error_that_rises_is_not_called_smaller(share, text):
+def test_risen_error_is_called_larger(share, text):
     assert formatting.smaller(share) == text

@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom, in this process: a kernel of its own would load JAX anew."""
+"""Every notebook runs from top to bottom, in this process: a separate kernel would load JAX again."""
 
 import sys
 from pathlib import Path
@@ -16,11 +16,11 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
-    # The shell's namespace takes its place.
+    # The shell replaces the module `__main__`.
     monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])
     plt.switch_backend("agg")
     shell = InteractiveShell(config=Config(HistoryManager={"enabled": False}))
-    # Results show themselves, figures as pictures.
+    # Figures are shown as PNG.
     select_figure_formats(shell, {"png"})
     for cell in jupytext.read(path).cells:
         if cell.cell_type == "code":
@@ -28,5 +28,5 @@ def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     plt.close("all")
 
 
-def test_there_is_a_notebook():
+def test_notebooks_exist():
     assert NOTEBOOKS

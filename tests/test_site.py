@@ -1,4 +1,4 @@
-"""The documentation: pages made from the code are up to date, every link leads somewhere, and the site builds."""
+"""The documentation: generated pages are up to date, links resolve, and the site builds."""
 
 import importlib
 import re
@@ -23,7 +23,7 @@ CONFIG = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))["pr
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, built strictly: a warning ends the build."""
+    """The site, built in strict mode: a warning ends the build."""
     pytest.importorskip("zensical", reason="needs the extra `docs`")
     room = tmp_path_factory.mktemp("site")
     for name in ("CHANGELOG.md", "zensical.toml"):
@@ -43,14 +43,14 @@ def pages_of(nav: list) -> Iterator[str]:
 
 
 def heading_anchors(page: str) -> set[str]:
-    """As the hosts of repositories make them: lower case, hyphens for blanks, no punctuation."""
+    """Anchors of headings as repository hosts make them: lower case, hyphens for blanks, no punctuation."""
     headings = re.findall(r"^#+ (.*)$", page, flags=re.MULTILINE)
     plain = (re.sub(r"[^\w\- ]", "", heading.replace("`", "")) for heading in headings)
     return {heading.strip().lower().replace(" ", "-") for heading in plain} | set(re.findall(r'<a id="([^"]+)"', page))
 
 
-def dangling(path: Path) -> list[str]:
-    """Links of a page of Markdown that lead to no file or no heading of the repository."""
+def broken_links(path: Path) -> list[str]:
+    """Links of a Markdown page whose file or heading does not exist in the repository."""
     text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
     missing = []
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -66,7 +66,7 @@ def dangling(path: Path) -> list[str]:
     return missing
 
 
-def test_pages_made_from_the_code_are_up_to_date(monkeypatch):
+def test_generated_pages_are_up_to_date(monkeypatch):
     monkeypatch.syspath_prepend(DOCS)
     for path, text in importlib.import_module("generate").generated().items():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is out of date: run `make docs`"
@@ -82,20 +82,20 @@ def test_glossary_has_every_parameter_of_a_drive_with_its_unit():
     assert known - {("alpha", "1/[x]^2")} <= told
 
 
-def test_navigation_holds_every_page():
+def test_navigation_lists_every_page():
     listed = list(pages_of(CONFIG["nav"]))
     assert sorted(listed) == sorted(str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md"))
 
 
 def test_links_between_pages_resolve():
     for path in (*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").rglob("*.md")):
-        assert dangling(path) == [], path
+        assert broken_links(path) == [], path
 
 
-def test_a_dangling_link_is_seen(tmp_path):
+def test_broken_links_are_detected(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# One\n\n[a](page.md#one) [b](page.md#two) [c](other.md) [d](#one)\n", encoding="utf-8")
-    assert dangling(page) == ["page.md#two", "other.md"]
+    assert broken_links(page) == ["page.md#two", "other.md"]
 
 
 def test_site_builds_and_its_links_resolve(site):
@@ -105,7 +105,7 @@ def test_site_builds_and_its_links_resolve(site):
     for path, text in pages.items():
         for link in re.findall(r'<a\s[^>]*?href="?([^"\s>]+)', text):
             parts = urlsplit(link)
-            # The page for what is not found has links from the root of a server.
+            # The page 404.html has links from the root of a server.
             if parts.scheme or path.name == "404.html":
                 continue
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path

@@ -1,4 +1,4 @@
-"""model.json gives back the model that was written, and refuses anything else in one sentence."""
+"""`model.json` restores the model that was written; any other file is refused in one sentence."""
 
 import json
 from pathlib import Path
@@ -52,25 +52,25 @@ def round_trip(wanted: StoredModel, folder: Path) -> StoredModel:
 
 
 @pytest.mark.parametrize("form", CATALOGUE, ids=lambda form: form.name)
-def test_round_trip_of_every_form(form: type[Effect], tmp_path: Path):
+def test_model_of_every_form_survives_the_round_trip(form: type[Effect], tmp_path: Path):
     bases = [rig.drive_model(K=1e4 / 3)] + ([] if form.needs_motor else [rig.reduced_model(mu=1 / 3)])
     for base in bases:
         whole = base.with_effects(form.proposals(SCALES)[0])
         own = [p for p in whole.parameters() if p.startswith(form.name)]
-        # Awkward numbers, all different.
+        # Irrational numbers, all different.
         filled = whole.replace({p: (i + 1) * np.pi * 1e-5 for i, p in enumerate(own)})
         wanted = stored(filled)
         assert_same(round_trip(wanted, tmp_path), wanted)
 
 
 @pytest.mark.parametrize("hold", HOLDS)
-def test_round_trip_without_and_with_several_effects(hold: str, tmp_path: Path):
+def test_model_without_and_with_effects_survives_the_round_trip(hold: str, tmp_path: Path):
     for effects in ((), (QuadraticStiffness(k2=3.0), BoucWen(k=10.0, memory_twist=1e-4, n=1.5))):
         wanted = stored(rig.drive_model().with_effects(*effects), hold)
         assert_same(round_trip(wanted, tmp_path), wanted)
 
 
-def broken(change) -> str:
+def changed_content(change) -> str:
     content = json.loads(to_json(stored(rig.drive_model().with_effects(QuadraticStiffness(k2=3.0)))))
     change(content)
     return json.dumps(content)
@@ -81,26 +81,26 @@ BROKEN = {
     "not JSON": "{",
     "a list": "[]",
     "null": "null",
-    "other schema": broken(lambda c: c.update(schema="hdjax-report/1")),
-    "no drive": broken(lambda c: c.pop("drive")),
-    "drive without K": broken(lambda c: c["drive"].pop("K")),
-    "drive with more": broken(lambda c: c["drive"].update(colour=3.0)),
-    "K is text": broken(lambda c: c["drive"].update(K="stiff")),
-    "unknown effect": broken(lambda c: c["effects"][0].update(name="magic")),
-    "effect without its name": broken(lambda c: c["effects"][0].pop("name")),
-    "effects are text": broken(lambda c: c.update(effects="none")),
-    "unknown hold": broken(lambda c: c.update(torque_hold="first-order")),
-    "noise too small": broken(lambda c: c.update(noise_covariance=[[1.0]])),
-    "noise not finite": broken(lambda c: c.update(noise_covariance=[[1.0, 0.0], [0.0, float("nan")]])),
-    "noise ragged": broken(lambda c: c.update(noise_covariance=[[1.0, 0.0], [0.0]])),
-    "no substeps": broken(lambda c: c.pop("substeps")),
-    "kind of another drive": broken(lambda c: c.update(kind="reduced")),
-    "unknown kind": broken(lambda c: c.update(kind="three-inertia")),
+    "other schema": changed_content(lambda c: c.update(schema="hdjax-report/1")),
+    "no drive": changed_content(lambda c: c.pop("drive")),
+    "drive without K": changed_content(lambda c: c["drive"].pop("K")),
+    "drive with more": changed_content(lambda c: c["drive"].update(colour=3.0)),
+    "K is text": changed_content(lambda c: c["drive"].update(K="stiff")),
+    "unknown effect": changed_content(lambda c: c["effects"][0].update(name="magic")),
+    "effect without its name": changed_content(lambda c: c["effects"][0].pop("name")),
+    "effects are text": changed_content(lambda c: c.update(effects="none")),
+    "unknown hold": changed_content(lambda c: c.update(torque_hold="first-order")),
+    "noise too small": changed_content(lambda c: c.update(noise_covariance=[[1.0]])),
+    "noise not finite": changed_content(lambda c: c.update(noise_covariance=[[1.0, 0.0], [0.0, float("nan")]])),
+    "noise ragged": changed_content(lambda c: c.update(noise_covariance=[[1.0, 0.0], [0.0]])),
+    "no substeps": changed_content(lambda c: c.pop("substeps")),
+    "kind of another drive": changed_content(lambda c: c.update(kind="reduced")),
+    "unknown kind": changed_content(lambda c: c.update(kind="three-inertia")),
 }
 
 
 @pytest.mark.parametrize("text", BROKEN.values(), ids=BROKEN.keys())
-def test_broken_files(text: str, tmp_path: Path):
+def test_invalid_model_file_is_refused_in_one_sentence(text: str, tmp_path: Path):
     path = tmp_path / "model.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
@@ -121,18 +121,18 @@ OUT_OF_RANGE = {
 
 
 @pytest.mark.parametrize("change", OUT_OF_RANGE.values(), ids=OUT_OF_RANGE.keys())
-def test_numbers_out_of_range(change, tmp_path: Path):
+def test_model_with_values_out_of_range_is_refused(change, tmp_path: Path):
     path = tmp_path / "model.json"
-    path.write_text(broken(change), encoding="utf-8")
+    path.write_text(changed_content(change), encoding="utf-8")
     with pytest.raises(InputError):
         read_model(path)
 
 
-def test_missing_file(tmp_path: Path):
+def test_missing_model_file_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="the model can't be read"):
         read_model(tmp_path / "absent.json")
 
 
-def test_numbers_that_left_their_domain_are_not_written():
+def test_model_with_invalid_numbers_is_not_written():
     with pytest.raises(ValueError):
         to_json(stored(rig.drive_model(K=float("nan"))))

@@ -1,4 +1,4 @@
-"""Simulated torque-twist logs whose truth is known: a nonlinear spring beside sliders or Bouc and Wen's law."""
+"""Simulated torque-twist logs with known parameters: a nonlinear spring beside sliders or Bouc and Wen's law."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +22,7 @@ def cubic(x: np.ndarray) -> np.ndarray:
 
 
 def three_slopes(x: np.ndarray) -> np.ndarray:
-    """The vendors' curve, torque from twist."""
+    """Torque of the vendors' three-slope curve."""
     knees = [0.0, T1 / K1, T1 / K1 + (T2 - T1) / K2, 1.0]
     torques = [0.0, T1, T2, T2 + K3 * (1.0 - knees[2])]
     return np.sign(x) * np.interp(np.abs(x), knees, torques)
@@ -69,7 +69,7 @@ def cycles(
 
     Args:
         spring: Torque from twist.
-        friction: Likewise, with memory.
+        friction: Torque from twist, with hysteresis.
         count: Number of cycles.
         rows: Number of rows, 10 ms apart.
         largest: Amplitude of the twist [rad].
@@ -89,7 +89,7 @@ def cycles(
 
 
 def quasi_static_log(time: np.ndarray, twist: np.ndarray, torque: np.ndarray) -> Log:
-    """A log as the reader would give it."""
+    """A quasi-static log as `read_log` returns it."""
     return Log(
         name="log",
         path=Path("log.csv"),

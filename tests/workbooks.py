@@ -1,4 +1,4 @@
-"""Workbooks as Office Open XML, written by hand: no library that writes them is needed."""
+"""Workbooks in Office Open XML, written without a library."""
 
 from pathlib import Path
 from zipfile import ZipFile
@@ -20,7 +20,7 @@ def _sheet(rows: dict[int, dict[str, object]]) -> str:
 
 
 def workbook(path: Path, *sheets: dict[int, dict[str, object]]) -> None:
-    """A workbook of some sheets, each a cell's number or text by row and letter."""
+    """Write a workbook of some sheets, each with numbers or text by row and column letter."""
     main = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
     office = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
     package = "http://schemas.openxmlformats.org/package/2006"

@@ -1,4 +1,4 @@
-"""`import fitting`, and what a notebook does with it: logs in from anywhere, results out."""
+"""The Python interface: `load`, `fit`, `close_loop`, `predict`, `compare`, and their results."""
 
 import json
 import subprocess
@@ -25,8 +25,8 @@ DRIVE = {
 }
 
 
-def arrays(*, seed: int = 0, count: int = COUNT, **physics) -> dict[str, np.ndarray]:
-    """A drive log by name."""
+def drive_columns(*, seed: int = 0, count: int = COUNT, **physics) -> dict[str, np.ndarray]:
+    """Columns of a simulated drive log by name."""
     torque = rig.drive_torque(count, seed=seed)
     log = rig.drive_log(rig.drive_motion(torque, **physics), torque, seed=seed)
     assert log.motor_angle is not None and log.load_angle is not None
@@ -39,23 +39,23 @@ def arrays(*, seed: int = 0, count: int = COUNT, **physics) -> dict[str, np.ndar
 
 
 @pytest.fixture(scope="module")
-def fitted() -> fitting.FitResult:
-    return fitting.fit(fitting.load(arrays(), drive=DRIVE))
+def fit_result() -> fitting.FitResult:
+    return fitting.fit(fitting.load(drive_columns(), drive=DRIVE))
 
 
 @pytest.fixture(scope="module")
-def closed() -> fitting.LoopResult:
-    data = fitting.load([arrays(seed=s, torque_bias=0.02) for s in (0, 1)], drive=DRIVE)
+def loop_result() -> fitting.LoopResult:
+    data = fitting.load([drive_columns(seed=s, torque_bias=0.02) for s in (0, 1)], drive=DRIVE)
     return fitting.close_loop(data, test="log 2")
 
 
-def same(one: fitting.Data, other: fitting.Data) -> bool:
-    pairs = [(a, b) for name in arrays(count=50) for a, b in [(getattr(d.logs[0], name) for d in (one, other))]]
+def same_signals(one: fitting.Data, other: fitting.Data) -> bool:
+    pairs = [(a, b) for name in drive_columns(count=50) for a, b in [(getattr(d.logs[0], name) for d in (one, other))]]
     return all(np.allclose(a, b, rtol=1e-12, atol=0) for a, b in pairs)
 
 
-def test_logs_come_from_anywhere(tmp_path: Path):
-    columns = arrays()
+def test_logs_are_loaded_from_arrays_frames_and_files(tmp_path: Path):
+    columns = drive_columns()
     by_name = fitting.load(columns, drive=DRIVE)
     assert by_name.kind == "drive" and by_name.table["rows"].to_list() == [COUNT]
     frame = pl.DataFrame(columns)
@@ -65,28 +65,28 @@ def test_logs_come_from_anywhere(tmp_path: Path):
         f'[drive]\nname = "rig"\nreduction_ratio = {rig.N}\nmotor_inertia = {rig.J_M}\nload_inertia = {rig.J_L}\n'
         '[signals]\ntorque_hold = "zero-order"\n'
     )
-    assert same(by_name, fitting.load(frame, drive=DRIVE))
-    assert same(by_name, fitting.load(path, drive=drive))
+    assert same_signals(by_name, fitting.load(frame, drive=DRIVE))
+    assert same_signals(by_name, fitting.load(path, drive=drive))
     several = fitting.load([frame, path], drive=drive)
     assert [log.name for log in several.logs] == ["log 1", "run"]
 
 
-def test_frames_of_pandas_and_datasets_of_xarray_are_logs():
+def test_pandas_frames_and_xarray_datasets_are_loaded():
     pandas, xarray = (pytest.importorskip(name, reason=f"{name} is not installed") for name in ("pandas", "xarray"))
-    columns = arrays()
+    columns = drive_columns()
     by_name = fitting.load(columns, drive=DRIVE)
-    assert same(by_name, fitting.load(pandas.DataFrame(columns), drive=DRIVE))
+    assert same_signals(by_name, fitting.load(pandas.DataFrame(columns), drive=DRIVE))
     degrees = xarray.Dataset({name: ("sample", values) for name, values in columns.items()})
     degrees["load_angle"] = np.rad2deg(degrees["load_angle"])
     degrees["load_angle"].attrs["units"] = "deg"
-    assert same(by_name, fitting.load(degrees, drive=DRIVE))
+    assert same_signals(by_name, fitting.load(degrees, drive=DRIVE))
 
 
-def test_units_stand_in_the_names_of_columns():
-    columns = arrays()
+def test_units_in_column_names_are_converted():
+    columns = drive_columns()
     named = {("load_angle [mrad]" if n == "load_angle" else n): v for n, v in columns.items()}
     named["load_angle [mrad]"] = 1e3 * named["load_angle [mrad]"]
-    assert same(fitting.load(columns, drive=DRIVE), fitting.load(named, drive=DRIVE))
+    assert same_signals(fitting.load(columns, drive=DRIVE), fitting.load(named, drive=DRIVE))
 
 
 @pytest.mark.parametrize(
@@ -98,75 +98,75 @@ def test_units_stand_in_the_names_of_columns():
     ],
     ids=["absent", "matrix", "mixed"],
 )
-def test_a_bad_table_is_refused_by_its_name(change: dict, says: str):
-    columns = {name: value for name, value in (arrays() | change).items() if value is not None}
+def test_invalid_table_is_refused_with_the_name_of_the_log(change: dict, says: str):
+    columns = {name: value for name, value in (drive_columns() | change).items() if value is not None}
     with pytest.raises((InputError, DataError), match=says) as told:
         fitting.load(columns, drive=DRIVE)
     assert "log 1" in str(told.value)
 
 
-def test_a_fit_is_a_table_a_text_and_a_picture(fitted: fitting.FitResult, tmp_path: Path):
-    table = fitted.parameters
+def test_fit_result_gives_table_text_plots_and_report(fit_result: fitting.FitResult, tmp_path: Path):
+    table = fit_result.parameters
     stiffness = table.row(by_predicate=pl.col("parameter") == "K", named=True)
     assert stiffness["low"] < rig.K < stiffness["high"] and stiffness["unit"] == "N m/rad"
-    assert "K" in fitted.summary() and str(fitted) == fitted.summary()
-    assert "<table" in fitted._repr_html_()
-    assert repr(fitted).startswith("FitResult(") and fitted.report["summary"] in repr(fitted)
-    for name in fitted.plots:
-        fitted.plot(name)
+    assert "K" in fit_result.summary() and str(fit_result) == fit_result.summary()
+    assert "<table" in fit_result._repr_html_()
+    assert repr(fit_result).startswith("FitResult(") and fit_result.report["summary"] in repr(fit_result)
+    for name in fit_result.plots:
+        fit_result.plot(name)
         matplotlib.pyplot.close("all")
     with pytest.raises(ValueError, match="prediction-0"):
-        fitted.plot("no such picture")
-    folder = fitted.save(tmp_path / "report")
+        fit_result.plot("no such picture")
+    folder = fit_result.save(tmp_path / "report")
     stored = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    assert stored["before"]["parameters"] == fitted.to_dict()["before"]["parameters"]
+    assert stored["before"]["parameters"] == fit_result.to_dict()["before"]["parameters"]
 
 
-def test_a_loop_tells_what_was_missing(closed: fitting.LoopResult):
-    assert closed.decision == "effect_found"
-    assert closed.effects["family"].to_list() == ["torque_sensor"]
-    assert set(closed.rmse) == {"training", "selection", "test"}
-    assert {"statistic", "threshold"} <= set(closed.rules.columns)
-    assert closed.effect_parameters.height > 0
-    axes = closed.plot("prediction")
+def test_loop_result_names_the_missing_effect(loop_result: fitting.LoopResult):
+    assert loop_result.decision == "effect_found"
+    assert loop_result.effects["family"].to_list() == ["torque_sensor"]
+    assert set(loop_result.rmse) == {"training", "selection", "test"}
+    assert {"statistic", "threshold"} <= set(loop_result.rules.columns)
+    assert loop_result.effect_parameters.height > 0
+    axes = loop_result.plot("prediction")
     assert [place.get_xlabel() for place in axes][-1] == "time [s]"
     matplotlib.pyplot.close("all")
 
 
-def test_predictions_use_the_first_samples_of_the_outputs_alone(closed: fitting.LoopResult, tmp_path: Path):
-    unseen = arrays(seed=5, torque_bias=0.02)
+def test_prediction_uses_only_the_first_samples_of_the_outputs(loop_result: fitting.LoopResult, tmp_path: Path):
+    unseen = drive_columns(seed=5, torque_bias=0.02)
     blank = unseen | {n: np.where(np.arange(COUNT) < 50, unseen[n], np.nan) for n in ("motor_angle", "load_angle")}
-    known = fitting.predict(closed, fitting.load(unseen, drive=DRIVE))
-    guessed = fitting.predict(closed, fitting.load(blank, drive=DRIVE, outputs_until=50))
+    known = fitting.predict(loop_result, fitting.load(unseen, drive=DRIVE))
+    guessed = fitting.predict(loop_result, fitting.load(blank, drive=DRIVE, outputs_until=50))
     assert np.allclose(known.run.predicted, guessed.run.predicted, rtol=1e-9, atol=1e-15)
     assert known.run.rmse < 5e-6
-    folder = closed.save(tmp_path / "report")
+    folder = loop_result.save(tmp_path / "report")
     again = fitting.predict(folder / "model.json", fitting.load(unseen, drive=DRIVE))
     assert np.allclose(again.run.predicted, known.run.predicted, rtol=1e-6, atol=1e-12)
     assert pl.read_csv(again.save(tmp_path / "prediction.csv")).height == COUNT
 
 
-def test_models_are_compared_side_by_side(fitted: fitting.FitResult, closed: fitting.LoopResult):
-    data = fitting.load(arrays(seed=6, torque_bias=0.02), drive=DRIVE)
-    table = fitting.compare({"without": fitted, "with": closed}, data).table
+def test_compare_tabulates_the_error_of_each_model(fit_result: fitting.FitResult, loop_result: fitting.LoopResult):
+    data = fitting.load(drive_columns(seed=6, torque_bias=0.02), drive=DRIVE)
+    table = fitting.compare({"without": fit_result, "with": loop_result}, data).table
     without, with_it = table["rmse"].to_list()
     assert with_it < 0.5 * without
 
 
-def test_a_model_is_simulated_under_any_torque(closed: fitting.LoopResult):
-    assert closed.model is not None
+def test_fitted_model_is_simulated_under_a_given_torque(loop_result: fitting.LoopResult):
+    assert loop_result.model is not None
     times = rig.STEP * np.arange(200)
-    motion = closed.model.simulate(np.full(200, 0.1), times)
+    motion = loop_result.model.simulate(np.full(200, 0.1), times)
     assert motion.dynamic_error.shape == (200,) and np.isfinite(motion.dynamic_error).all()
 
 
-def test_a_named_log_is_test_data_from_beginning_to_end(closed: fitting.LoopResult):
-    counted = {log["name"]: (log["training"] + log["selection"], log["test"]) for log in closed.report["logs"]}
+def test_named_test_log_is_test_data_throughout(loop_result: fitting.LoopResult):
+    counted = {log["name"]: (log["training"] + log["selection"], log["test"]) for log in loop_result.report["logs"]}
     assert counted == {"log 1": (COUNT, 0), "log 2": (0, COUNT)}
 
 
-def test_test_logs_are_named(closed: fitting.LoopResult):
-    data = fitting.load([arrays(), arrays(seed=1)], drive=DRIVE)
+def test_test_logs_are_selected_by_name(loop_result: fitting.LoopResult):
+    data = fitting.load([drive_columns(), drive_columns(seed=1)], drive=DRIVE)
     assert [log.name for log in data.with_test("log 2").test] == ["log 2"]
     with pytest.raises(InputError, match="no log 'log 9'"):
         fitting.close_loop(data, test="log 9")
@@ -174,7 +174,7 @@ def test_test_logs_are_named(closed: fitting.LoopResult):
         data.with_test(["log 1", "log 2"])
 
 
-def test_quasi_static_logs_go_through_the_same_verbs(tmp_path: Path):
+def test_quasi_static_logs_use_the_same_functions(tmp_path: Path):
     log = torque_cycles.cycles(torque_cycles.line, torque_cycles.no_friction)
     columns = {"time": log.time, "twist": log.dynamic_error, "joint_torque": log.joint_torque}
     data = fitting.load(columns, drive={"drive": {"name": "joint"}})
@@ -192,7 +192,7 @@ def test_quasi_static_logs_go_through_the_same_verbs(tmp_path: Path):
 
 
 def test_single_precision_is_refused_with_the_remedy():
-    data = fitting.load(arrays(), drive=DRIVE)
+    data = fitting.load(drive_columns(), drive=DRIVE)
     jax.config.update("jax_enable_x64", False)
     try:
         with pytest.raises(ValueError, match="jax_enable_x64"):
@@ -201,7 +201,7 @@ def test_single_precision_is_refused_with_the_remedy():
         jax.config.update("jax_enable_x64", True)
 
 
-def test_the_package_loads_without_jax():
+def test_package_import_does_not_load_jax():
     code = "import sys, fitting; print(fitting.__version__, 'jax' in sys.modules, sorted(dir(fitting))[:2])"
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     assert "False" in told

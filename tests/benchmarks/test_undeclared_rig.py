@@ -1,4 +1,4 @@
-"""The study's rig against scipy, closed forms and the balance of energy; and that each of its forms makes a log."""
+"""The simulated rig of the study against scipy, closed forms and the energy balance, and the logs of its cases."""
 
 import json
 from pathlib import Path
@@ -24,13 +24,13 @@ BASE = Mechanism(k3=2e7)
 START = np.array([0.3, 5.0, 0.3 / 50, -0.2])
 
 
-def shaking(count: int, *, rms: float = 0.3, seed: int = 0) -> np.ndarray:
+def random_torque(count: int, *, rms: float = 0.3, seed: int = 0) -> np.ndarray:
     return rms * np.random.default_rng(seed).normal(size=count)
 
 
 @pytest.mark.slow
-def test_smooth_effects_against_scipy():
-    """All that has a smooth right side, at once; its equations are written anew here."""
+def test_smooth_effects_agree_with_scipy():
+    """All effects with a smooth right-hand side at once, with equations written independently here."""
     p = BASE._replace(
         **table({2: (2e-4, 0.7), 1: (1e-4, -0.4)}),
         wobble=0.3,
@@ -76,7 +76,7 @@ def test_smooth_effects_against_scipy():
         third_stiffness=3000.0,
         third_damping=0.2,
     )
-    torque, heat = shaking(60), 12.0
+    torque, heat = random_torque(60), 12.0
 
     def acting(u):
         u = np.sign(u) * max(abs(u) - 0.05, 0.0)
@@ -112,13 +112,13 @@ def test_smooth_effects_against_scipy():
         y = solve_ivp(rates, (k * DT, (k + 1) * DT), y, args=(u,), method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
 
 
-def test_bouc_wen_and_bristles_against_scipy():
-    """Both have a kink where the rate turns: scipy's steps find it by their error control."""
+def test_bouc_wen_and_bristles_agree_with_scipy():
+    """Both have a kink where the rate reverses, which scipy's error control resolves."""
     p = BASE._replace(
         bouc_k=2000.0, bouc_yield=3e-4, bouc_power=1.5, bouc_share=0.7,
         c_lean=0.1, slide_m=0.03, hold_m=0.05, sink_m=2.0, bristle_m=5.0, bristle_drag_m=0.01,
     )  # fmt: skip
-    torque = shaking(40)
+    torque = random_torque(40)
 
     def rates(t, y, u):
         a, w, b, r, z, s = y
@@ -138,7 +138,7 @@ def test_bouc_wen_and_bristles_against_scipy():
 
 
 def energy(p: Mechanism, states: np.ndarray) -> np.ndarray:
-    """Of any spring, wobbling teeth, stiffness ripple, weight, tether, lobes, swinging load and third inertia [J]."""
+    """Energy [J] of the springs, gravity, the varying load inertia and the third inertia."""
     a, w, b, r, c, q = states[:, :6].T
     x = a / p.ratio + 2e-4 * np.cos(2 * a) * (1 + p.wobble * np.cos(b)) * np.any(p.teeth) - b
     bent = np.maximum(np.abs(x) - p.gap, 0.0)
@@ -169,12 +169,12 @@ CONSERVATIVE = {
 
 
 @pytest.mark.parametrize("name", CONSERVATIVE)
-def test_energy_is_kept(name: str):
+def test_conservative_effects_keep_the_energy(name: str):
     p = BASE._replace(c1=0.0, **CONSERVATIVE[name])
     states, _ = integrate(p, START, np.zeros(400), dt=DT, substeps=100)
     of = energy(p, states)
     assert np.ptp(states[:, 0] / 50 - states[:, 2]) > 5e-4
-    # Knees and gaps cost the integration two of its orders: 2e-7 where the gap is crossed, 1e-12 elsewhere.
+    # Knees and gaps reduce the order of the integration by two: 2e-7 where the gap is crossed, else 1e-12.
     assert np.ptp(of) < 1e-6 * np.max(np.abs(of))
 
 
@@ -184,8 +184,8 @@ LOSSES = (
 
 
 @pytest.mark.parametrize("form", [f for f in FORMS if f.family in LOSSES], ids=lambda f: f"{f.family}-{f.name}")
-def test_losses_lose(form: Form):
-    """In the end there is less energy than without the loss; on the way, memory stores some and returns it."""
+def test_dissipative_effects_lose_energy(form: Form):
+    """The final energy is less than without the loss; in between, hysteresis stores energy and returns it."""
     base = BASE._replace(c1=1e-6)
     lossy = base._replace(**form.changes(form.high, np.random.default_rng(0), BASE))
     kept, left = (energy(base, integrate(p, START, np.zeros(600), dt=DT, substeps=100)[0]) for p in (base, lossy))
@@ -193,9 +193,9 @@ def test_losses_lose(form: Form):
 
 
 @pytest.mark.parametrize("form", FORMS, ids=lambda f: f"{f.family}-{f.name}")
-def test_every_form_moves_the_log_and_nothing_does_at_zero(form: Form):
+def test_every_form_changes_the_log_except_at_zero_strength(form: Form):
     base = Mechanism()
-    torque, warm = shaking(200), np.full(200, 10.0)
+    torque, warm = random_torque(200), np.full(200, 10.0)
 
     def readings(strength: float) -> np.ndarray:
         p = base._replace(**form.changes(strength, np.random.default_rng(3), base))
@@ -209,21 +209,21 @@ def test_every_form_moves_the_log_and_nothing_does_at_zero(form: Form):
         assert readings(0.0) == pytest.approx(plain, rel=1e-13, abs=1e-13)
 
 
-def test_dry_friction_holds_slides_and_stops():
+def test_dry_friction_sticks_slides_and_stops():
     """A motor without spring, in closed form."""
     p = Mechanism(k1=1e-9, c1=0.0, hold_m=0.05, slide_m=0.04, sink_m=1e-9)
     still, _ = integrate(p, np.zeros(4), np.full(50, 0.0499), dt=DT, substeps=100)
     assert np.all(still[:, :2] == 0.0)
     loose, _ = integrate(p, np.zeros(4), np.full(50, 0.051), dt=DT, substeps=100)
     time = DT * np.arange(50)
-    # The very first stage, at rest, still meets the holding torque: a sixth of a step's worth.
+    # The first stage of the solver, at rest, has the static friction: an error of a sixth of a step.
     assert loose[:, 1] == pytest.approx((0.051 - 0.04) / 5e-4 * time, abs=2e-5)
     slowing, _ = integrate(p, np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(50), dt=DT, substeps=100)
     assert slowing[:, 1] == pytest.approx(np.maximum(1.0 - 0.04 / 5e-4 * time, 0.0), abs=1e-9)
 
 
-def test_dead_time_is_a_shift():
-    torque = np.concatenate([np.zeros(20), shaking(60)])
+def test_dead_time_shifts_the_response():
+    torque = np.concatenate([np.zeros(20), random_torque(60)])
     late, _ = integrate(BASE._replace(dead_time=3 * DT), np.zeros(4), torque, dt=DT, substeps=50)
     prompt, _ = integrate(BASE, np.zeros(4), torque, dt=DT, substeps=50)
     assert late[3:, :4] == pytest.approx(prompt[:-3, :4], rel=1e-12, abs=1e-15)
@@ -239,11 +239,11 @@ def test_dead_time_is_a_shift():
     ],
     ids=lambda f: f.family,
 )
-def test_steps_are_fine_enough_for_nonsmooth_effects(form: Form):
-    """Half the step changes the twist by far less than an encoder's noise, 1e-6 rad."""
+def test_solver_steps_are_fine_enough_for_nonsmooth_effects(form: Form):
+    """Halving the step changes the twist by much less than an encoder's noise of 1e-6 rad."""
     p = BASE._replace(**form.changes(0.3 * form.high, np.random.default_rng(0), BASE))
     runs = [
-        integrate(p, np.zeros(4), np.repeat(shaking(50), 12), dt=DT, substeps=n)[0]
+        integrate(p, np.zeros(4), np.repeat(random_torque(50), 12), dt=DT, substeps=n)[0]
         for n in (int(DT / drawing.FINEST), 2 * int(DT / drawing.FINEST))
     ]
     first, second = (states[:, 0] / 50 - states[:, 2] for states in runs)
@@ -251,30 +251,30 @@ def test_steps_are_fine_enough_for_nonsmooth_effects(form: Form):
     assert np.sqrt(np.mean((first - second) ** 2)) < 1e-7
 
 
-def seen(p: Mechanism, sigma: tuple[float, float] = (1e-5, 1e-6)) -> float:
-    torque = np.repeat(shaking(400), 5)
+def detectability_of(p: Mechanism, sigma: tuple[float, float] = (1e-5, 1e-6)) -> float:
+    torque = np.repeat(random_torque(400), 5)
     states, _ = integrate(p, np.zeros(4), torque, dt=DT, substeps=20)
     readings = np.column_stack(read_encoders(p, states))
     return detectability(BASE, [(states, readings, torque, np.zeros(2000))], sigma=sigma, dt=DT)
 
 
-def test_detectability_sees_what_a_refit_leaves():
-    one = seen(BASE._replace(bias=0.01))
+def test_detectability_measures_the_residual_after_a_refit():
+    one = detectability_of(BASE._replace(bias=0.01))
     assert one > 1.0
-    assert seen(BASE._replace(bias=0.02)) == pytest.approx(2 * one, rel=0.05)
-    assert seen(BASE._replace(bias=0.01), sigma=(2e-5, 2e-6)) == pytest.approx(one / 2, rel=1e-3)
-    # What another stiffness or damping can do is not there to be found.
-    assert seen(BASE) < 1e-2
-    assert seen(BASE._replace(k1=7007.0, c1=0.303)) < 0.05
-    # One sample of one encoder, off by so many sigma: a fifth of its square counts.
-    states, _ = integrate(BASE, np.zeros(4), shaking(400), dt=DT, substeps=20)
+    assert detectability_of(BASE._replace(bias=0.02)) == pytest.approx(2 * one, rel=0.05)
+    assert detectability_of(BASE._replace(bias=0.01), sigma=(2e-5, 2e-6)) == pytest.approx(one / 2, rel=1e-3)
+    # Changes of stiffness or damping alone are not detectable as an effect.
+    assert detectability_of(BASE) < 1e-2
+    assert detectability_of(BASE._replace(k1=7007.0, c1=0.303)) < 0.05
+    # One wrong sample of one encoder: a fifth of its squared error counts.
+    states, _ = integrate(BASE, np.zeros(4), random_torque(400), dt=DT, substeps=20)
     readings = np.column_stack(read_encoders(BASE, states))
     readings[100, 1] += 1e-4
-    found = detectability(BASE, [(states, readings, shaking(400), np.zeros(400))], sigma=(1e-5, 1e-6), dt=DT)
+    found = detectability(BASE, [(states, readings, random_torque(400), np.zeros(400))], sigma=(1e-5, 1e-6), dt=DT)
     assert found == pytest.approx(100 * np.sqrt(0.2) / LIMIT, rel=0.05)
 
 
-def test_noise_has_its_rms_and_colour():
+def test_encoder_noise_has_its_rms_and_colour():
     random = np.random.default_rng(0)
     for encoders in (Encoders((1e-5, 1e-6), (0.0, 0.0), 0.9), Encoders((1e-5, 1e-6), (2e-5, 2e-6), 0.0)):
         error = encoders.read(np.zeros((200000, 2)) + np.linspace(0, 1, 200000)[:, None], random)
@@ -284,7 +284,7 @@ def test_noise_has_its_rms_and_colour():
         assert neighbours == pytest.approx(2 / 3 * encoders.memory, abs=0.02)
 
 
-def test_a_case_becomes_a_log_folder_that_the_loop_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_recorded_case_is_readable_and_reproducible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(drawing, "_SIZES", ((1000.0, (1200, 1200, 800)),) * 3)
     (form,) = [f for f in FORMS if f.name == "stiffness" and f.family == "temperature"]
     case = drawing.Case("try-1", (form,), 5)
@@ -304,15 +304,15 @@ def test_a_case_becomes_a_log_folder_that_the_loop_reads(tmp_path: Path, monkeyp
     assert (tmp_path / "again" / "train_1.csv").read_bytes() == (tmp_path / "train_1.csv").read_bytes()
 
 
-def test_faint_cases_are_faint(monkeypatch: pytest.MonkeyPatch):
+def test_faint_cases_are_near_the_detection_limit(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(drawing, "_SIZES", ((1000.0, (1200, 1200, 800)),) * 3)
     drawn = drawing.draw(drawing.Case("try-2", (forms_of("torque_sensor")[0],), 6, faint=True))
     assert drawing.LEAST <= drawn.detectable[0] < 1.5 * drawing.FAINT
 
 
-def test_only_a_motion_that_forgets_its_start_leaves_the_true_equations_astray():
-    """A linear drive is off in proportion to the noise that its start is told by; a rattling one by orders more."""
-    torque = shaking(4000)
+def test_own_error_is_proportional_to_the_noise_except_for_chaotic_motion():
+    """The error of a linear drive is proportional to the noise of its initial state; with a gap it is far larger."""
+    torque = random_torque(4000)
     still = np.zeros(torque.size)
 
     def off(drive: Mechanism, noise: float) -> float:
@@ -325,11 +325,11 @@ def test_only_a_motion_that_forgets_its_start_leaves_the_true_equations_astray()
     assert off(linear, 1e-6) < 1e-6 < 20e-6 < off(linear._replace(gap=2e-4), 1e-6)
 
 
-def test_lists_of_cases():
+def test_case_lists_cover_all_families_and_pairs_do_not_overlap():
     cases = drawing.single_cases(3 * len(FAMILIES), 0, FAMILIES)
     assert len({c.name for c in cases}) == len(cases)
     assert {c.forms[0].family for c in cases} == set(FAMILIES)
-    # A longer study goes on with the cases of a shorter one.
+    # A longer study begins with the cases of a shorter one.
     assert cases[:10] == drawing.single_cases(10, 0, FAMILIES)
     for first, second in (case.forms for case in drawing.pair_cases(200, 0)):
         assert first.family != second.family
@@ -337,9 +337,9 @@ def test_lists_of_cases():
         assert not changed[0] & changed[1]
 
 
-def test_dry_friction_turns_within_a_step():
-    """Whether a step is long or short: what is lost where a rate turns is no more than the friction of a step."""
-    torque = shaking(400)
+def test_dry_friction_reversal_does_not_depend_on_the_step():
+    """The error where the rate reverses is at most the friction within one step, for long and short steps."""
+    torque = random_torque(400)
     p = BASE._replace(slide_m=1e-4, hold_m=1e-4)
     coarse, fine, without = (
         integrate(mechanism, START, torque, dt=DT, substeps=substeps)[0][:, 0]

@@ -1,4 +1,4 @@
-"""The study's verdicts and tables on results whose right count is known."""
+"""Verdicts, tables and reference methods of the study on cases with known answers."""
 
 import re
 from pathlib import Path
@@ -65,11 +65,11 @@ def result(truth: list[str], said: list[str], *, ties: tuple[str, ...] = (), dec
         (result(["creep"], [], leave_out=True), "missed"),
     ],
 )
-def test_verdicts(case: dict, expected: str):
+def test_verdict_compares_named_families_with_the_truth(case: dict, expected: str):
     assert verdict(case) == expected
 
 
-def test_tables_count():
+def test_tables_count_known_results():
     results = [
         result(["backlash"], ["backlash"]),
         result(["backlash"], ["creep"]),
@@ -100,14 +100,14 @@ def test_tables_count():
     assert all("|" in table.text(markdown=True) for table in told.values())
 
 
-def test_what_left_the_numbers_counts_as_infinite():
+def test_diverged_prediction_counts_as_infinite_error():
     cases = [result(["creep"], ["creep"], held_out={"before": 5e-6, "after": None}) for _ in range(3)]
     (errors,) = [t for t in tables(cases) if t.title.startswith("Held-out")]
     assert errors.rows[0][3:5] == ("inf", "inf")
 
 
-def test_an_error_is_measured_against_that_of_the_true_equations():
-    """Where their own start leaves them three quarters of it, and the noise the rest."""
+def test_held_out_error_is_relative_to_that_of_the_true_equations():
+    """The true equations err by 3 times the noise, because their initial state is estimated."""
     case = result(["backlash"], ["backlash"], case={"own_error": 3e-6}, held_out={"before": 9e-6, "after": 3.2e-6})
     (errors,) = [t for t in tables([case]) if t.title.startswith("Held-out")]
     assert errors.rows[0][5::2] == ("3.16", "1.01")
@@ -127,7 +127,7 @@ def linear_log(bias: float, seed: int) -> Log:
     torque = np.repeat(random.normal(size=count // 4), 4) * 0.2
     torque -= torque.mean()
     y = np.zeros((count, 5))
-    # It turns both ways; else a bias is a friction.
+    # The motor turns both ways; otherwise a bias is confounded with friction.
     y[0, :4] = 0.0, -60.0, 0.0, -60.0 / n
     for i in range(count - 1):
         y[i, 4] = torque[i] + bias
@@ -145,7 +145,7 @@ def linear_log(bias: float, seed: int) -> Log:
 OMEGA_0 = float(np.sqrt(7000 * (1 / (50**2 * 5e-4) + 1 / 5e-2)))
 
 
-def test_greedy_bic_names_a_bias():
+def test_greedy_bic_identifies_a_torque_bias():
     assert greedy_bic([linear_log(0.02, 0), linear_log(0.02, 1)], OMEGA_0)[0] == "torque_sensor"
 
 
@@ -154,8 +154,8 @@ def test_black_box_predicts_a_linear_drive():
     assert black_box_error(logs, OMEGA_0) < 0.1 * np.std(logs[2].x)
 
 
-def test_no_file_of_the_rig_knows_the_catalogue():
-    """The rig shares no code with what it judges: only what runs cases, or decides them anew, may import it."""
+def test_study_rig_does_not_import_the_tested_packages():
+    """The rig shares no code with the tested packages: only the files that run or re-evaluate cases import them."""
     folder = Path(__file__).parents[2] / "benchmarks" / "undeclared"
     allowed = {"trial.py", "run.py", "replay.py"}
     told = {f.name for f in folder.glob("*.py") if re.search(r"(from|import) (hdjax|fitting)\b", f.read_text())}

@@ -1,4 +1,4 @@
-"""`hdjax design` as a user meets it: a good file, bad ones, and the folder of a fit."""
+"""`hdjax design`: valid and invalid design files, and parameter draws from the report of a fit."""
 
 import json
 from pathlib import Path
@@ -46,7 +46,7 @@ points = 3
 """
 
 
-def written(folder: Path, text: str) -> Path:
+def write_design_file(folder: Path, text: str) -> Path:
     path = folder / "spec.toml"
     path.write_text(text, encoding="utf-8")
     return path
@@ -60,16 +60,16 @@ def run(*arguments: object) -> int:
     return 0
 
 
-def test_a_design_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert run("design", written(tmp_path, GOOD), "--out", tmp_path / "out") == 0
+def test_design_command_writes_the_confirmed_best_design(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run("design", write_design_file(tmp_path, GOOD), "--out", tmp_path / "out") == 0
     found = json.loads((tmp_path / "out" / "design.json").read_text())
     assert found["schema"] == "hdjax-design/1" and found["confirmed"] and found["feasible"]
     best = found["best"]
-    # The motor's speed holds the ratio at 90/1.5, nothing speaks against the stiffest gear.
+    # The motor's speed limits the ratio to 90/1.5; nothing limits the size of the gear.
     assert best["values"] == {"N": pytest.approx(60.0, rel=1e-6), "size": pytest.approx(65.0)}
     assert best["at_bound"] == {"size": "high"} and best["bound_multipliers"]["size"] > 0.0
     assert best["multipliers"]["motor_speed"] > 0.0
-    # The worst share of a torque that rises with the load's inertia; the rest is not drawn.
+    # The torque rises with the load's inertia, which alone is drawn.
     assert best["measures"]["effort"]["worst"] > best["measures"]["effort"]["expected"]
     assert found["draws"] == 16 and len(found["starts"]) == 2
     assert (tmp_path / "out" / "design.png").read_bytes().startswith(b"\x89PNG")
@@ -77,9 +77,9 @@ def test_a_design_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "Best design" in said and "Confirmed: none of 9 designs" in said and "at its high bound" in said
 
 
-def test_no_design_that_keeps_the_limits_is_said_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_infeasible_design_is_reported_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     text = GOOD.replace("at_most = 90.0", "at_most = 20.0")
-    assert run("design", written(tmp_path, text), "--out", tmp_path / "out", "--no-plot") == 1
+    assert run("design", write_design_file(tmp_path, text), "--out", tmp_path / "out", "--no-plot") == 1
     told = capsys.readouterr()
     assert "no design that was found meets all limits" in told.err and "MISSED by 125 %" in told.out
     assert not json.loads((tmp_path / "out" / "design.json").read_text())["feasible"]
@@ -124,9 +124,9 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_bad_file_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_invalid_design_file_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     text, message = BAD[name]
-    path = tmp_path / "spec.toml" if text is None else written(tmp_path, text)
+    path = tmp_path / "spec.toml" if text is None else write_design_file(tmp_path, text)
     assert run("design", path, "--out", tmp_path / "out") == 2
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1 and "Traceback" not in told
@@ -136,8 +136,8 @@ def test_a_bad_file_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys
 # -- the folder of a fit --
 
 
-def report(folder: Path, **changes: object) -> Path:
-    """What the reader needs of a report of `hdjax fit`."""
+def write_fit_report(folder: Path, **changes: object) -> Path:
+    """Write those parts of a report of `hdjax fit` that draws need."""
     model = TwoInertiaModel(hdc_40_050())
     stored = StoredModel(model, "zero-order", 1, 0, jnp.eye(2))
     (folder / "model.json").write_text(to_json(stored))
@@ -151,11 +151,11 @@ def report(folder: Path, **changes: object) -> Path:
     return folder
 
 
-def test_draws_have_the_reports_errors_and_correlations(tmp_path: Path):
-    draws = drawn_from_report(report(tmp_path), 400)
+def test_parameter_draws_have_the_reported_standard_errors_and_correlations(tmp_path: Path):
+    draws = drawn_from_report(write_fit_report(tmp_path), 400)
     assert draws.paths == ("K", "B_sp", "alpha")
     values = np.asarray(draws.values)
-    # A Latin hypercube knows means far better than 1/sqrt(400), spreads and correlations to a few percent.
+    # A Latin hypercube gives means far better than 1/sqrt(400), and spreads and correlations to a few percent.
     np.testing.assert_allclose(values.mean(axis=0), [7160.0, 0.017, 1e5], rtol=0.01)
     np.testing.assert_allclose(values.std(axis=0), [70.0, 0.002, 2e4], rtol=0.08)
     np.testing.assert_allclose(np.corrcoef(values.T)[0], [1.0, 0.0, -0.9], atol=0.06)
@@ -163,8 +163,8 @@ def test_draws_have_the_reports_errors_and_correlations(tmp_path: Path):
     assert drawn_from_report(tmp_path, 8, hold=["alpha"]).paths == ("K", "B_sp")
 
 
-def test_draws_of_the_sampler_go_before_the_normal_law(tmp_path: Path):
-    folder = report(tmp_path)
+def test_posterior_draws_take_precedence_over_the_normal_distribution(tmp_path: Path):
+    folder = write_fit_report(tmp_path)
     table = pl.DataFrame(
         {"chain": [0] * 9, "draw": range(9), "K": np.arange(9.0), "B_sp": [1.0] * 9, "alpha": [2.0] * 9}
     )
@@ -172,22 +172,22 @@ def test_draws_of_the_sampler_go_before_the_normal_law(tmp_path: Path):
     np.testing.assert_allclose(np.asarray(drawn_from_report(folder, 3).values)[:, 0], [0.0, 4.0, 8.0])
 
 
-def test_draws_of_something_else_are_refused(tmp_path: Path):
-    folder = report(tmp_path)
+def test_posterior_draws_of_other_parameters_are_refused(tmp_path: Path):
+    folder = write_fit_report(tmp_path)
     pl.DataFrame({"mu": [1.0]}).write_parquet(folder / "posterior.parquet")
     with pytest.raises(InputError, match="not the draws of K, B_sp, alpha"):
         drawn_from_report(folder, 3)
 
 
-def test_what_the_log_does_not_tell_is_not_drawn(tmp_path: Path):
+def test_unidentifiable_parameter_is_not_drawn(tmp_path: Path):
     with pytest.raises(DataError, match=r"does not determine alpha.*hold = \[\"alpha\"\]"):
-        drawn_from_report(report(tmp_path, identifiable=False, std=None), 8)
+        drawn_from_report(write_fit_report(tmp_path, identifiable=False, std=None), 8)
 
 
-def test_a_study_against_what_a_fit_leaves_open(tmp_path: Path):
+def test_design_study_draws_parameters_from_a_fit_report(tmp_path: Path):
     folder = tmp_path / "fit"
     folder.mkdir()
-    report(folder)
+    write_fit_report(folder)
     text = """
 [variables]
 N = { from = 30, to = 160 }
@@ -198,22 +198,22 @@ report = "fit"
 hold = ["B_sp"]
 draws = 4
 """
-    asked = read_design_file(written(tmp_path, text))
+    asked = read_design_file(write_design_file(tmp_path, text))
     assert float(asked.study.case.drive.K) == 7160.0
     assert asked.study.draws is not None and asked.study.draws.paths == ("K", "alpha")
     assert asked.study.criterion == "worst" and asked.search.starts == 8
 
 
-def test_a_spread_is_relative_and_of_the_value():
+def test_parameter_spread_is_relative_to_the_value():
     draws = np.asarray(spread_around({"K": 100.0, "alpha": -2.0}, {"K": 0.1, "alpha": 0.2}, 500).values)
     np.testing.assert_allclose(draws.mean(axis=0), [100.0, -2.0], rtol=0.01)
     np.testing.assert_allclose(draws.std(axis=0), [10.0, 0.4], rtol=0.05)
     assert (draws[:, 1] < 0.0).all()
 
 
-def test_the_example_of_the_documentation_is_understood(tmp_path: Path):
+def test_documented_design_file_is_read(tmp_path: Path):
     page = (Path(__file__).parents[2] / "docs" / "design.md").read_text(encoding="utf-8")
-    asked = read_design_file(written(tmp_path, page.split("```toml")[1].split("```")[0]))
+    asked = read_design_file(write_design_file(tmp_path, page.split("```toml")[1].split("```")[0]))
     assert [v.path for v in asked.study.variables] == ["size", "N"]
     assert [limit.label for limit in asked.study.limits] == ["motor_speed"] and asked.search.starts == 8
     for name in MEASURES:

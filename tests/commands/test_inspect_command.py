@@ -1,4 +1,4 @@
-"""`hdjax inspect` and `hdjax init` as a user calls them."""
+"""The commands `hdjax inspect` and `hdjax init`."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def run(*arguments: object) -> int:
 
 
 def write_slow_log(path: Path, *, twist: str = "deflection", rows: int = 2000) -> Path:
-    """Slow torque cycles on a spring with a little friction."""
+    """Write a log of slow torque cycles on a spring with little friction."""
     time = np.arange(rows) / 100.0
     angle = 2e-3 * np.sin(0.5 * time)
     torque = 2e4 * angle + 2.0 * np.sign(np.cos(0.5 * time))
@@ -30,7 +30,7 @@ def write_slow_log(path: Path, *, twist: str = "deflection", rows: int = 2000) -
     return path
 
 
-def test_a_log_that_nobody_described_is_fitted_in_two_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_log_without_drive_file_is_fitted_after_init(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     log, drive = write_slow_log(tmp_path / "run.csv"), tmp_path / "drive.toml"
     assert run("init", log, "--out", drive) == 0
     told = capsys.readouterr().out
@@ -40,7 +40,7 @@ def test_a_log_that_nobody_described_is_fitted_in_two_commands(tmp_path: Path, c
     assert (tmp_path / "report" / "report.json").exists()
 
 
-def test_a_drive_file_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_init_overwrites_a_drive_file_only_by_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     log, drive = write_slow_log(tmp_path / "run.csv"), tmp_path / "drive.toml"
     drive.write_text("mine", encoding="utf-8")
     assert run("init", log, "--out", drive) == 2
@@ -76,7 +76,7 @@ def test_logs_with_the_same_columns_are_inspected_together(tmp_path: Path, capsy
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
 )
-def test_bad_use_ends_with_one_sentence(
+def test_invalid_arguments_are_refused_in_one_sentence(
     arguments: tuple[str, ...],
     words: tuple[str, ...],
     tmp_path: Path,

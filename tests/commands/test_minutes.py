@@ -1,4 +1,4 @@
-"""What a pipe is told while a command works."""
+"""Progress lines on standard error where it is no terminal."""
 
 import sys
 import threading
@@ -15,8 +15,8 @@ from fitting.commands.spinner import counting, spinning
 INTERVAL = 0.02  # s
 
 
-class Leaving:
-    """A stream whose reader has left."""
+class ClosedPipe:
+    """A stream whose reader has closed the pipe."""
 
     def __init__(self):
         self.tried = 0
@@ -29,7 +29,7 @@ class Leaving:
 
 
 def last_line(capsys: pytest.CaptureFixture[str]) -> str:
-    """The next line that is told; it fails where none comes in a second, fifty times the interval."""
+    """The next progress line; fails if none is written within a second, fifty times the interval."""
     until = time.monotonic() + 50 * INTERVAL
     while time.monotonic() < until:
         if told := capsys.readouterr().err:
@@ -38,7 +38,7 @@ def last_line(capsys: pytest.CaptureFixture[str]) -> str:
     raise AssertionError("no line came")
 
 
-def test_a_stage_that_lasts_is_told_again_and_again_until_the_end(capsys: pytest.CaptureFixture[str]):
+def test_stage_is_reported_each_interval_until_its_end(capsys: pytest.CaptureFixture[str]):
     with line_a_minute("starting", interval=INTERVAL) as say:
         assert last_line(capsys) == "hdjax: 0:00:00 starting"
         assert last_line(capsys) == "hdjax: 0:00:00 starting"
@@ -50,7 +50,7 @@ def test_a_stage_that_lasts_is_told_again_and_again_until_the_end(capsys: pytest
     assert capsys.readouterr().err == ""
 
 
-def test_short_work_is_not_told_and_no_thread_stays(capsys: pytest.CaptureFixture[str]):
+def test_short_work_reports_nothing_and_leaves_no_thread(capsys: pytest.CaptureFixture[str]):
     threads = threading.active_count()
     with pytest.raises(ValueError, match="work"), line_a_minute("starting") as say:
         say("fitting the base model")
@@ -59,8 +59,8 @@ def test_short_work_is_not_told_and_no_thread_stays(capsys: pytest.CaptureFixtur
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_reader_that_leaves_does_not_end_the_work(monkeypatch: pytest.MonkeyPatch):
-    stream = Leaving()
+def test_closed_pipe_does_not_end_the_work(monkeypatch: pytest.MonkeyPatch):
+    stream = ClosedPipe()
     monkeypatch.setattr(sys, "stderr", stream)
     with line_a_minute("starting", interval=INTERVAL):
         time.sleep(5 * INTERVAL)
@@ -68,13 +68,13 @@ def test_a_reader_that_leaves_does_not_end_the_work(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A minute takes an instant."""
+def short_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the interval between progress lines from a minute to 20 ms."""
     monkeypatch.setattr(spinner, "line_a_minute", partial(line_a_minute, interval=INTERVAL))
 
 
-@pytest.mark.usefixtures("quick")
-def test_what_is_counted_is_told(capsys: pytest.CaptureFixture[str]):
+@pytest.mark.usefixtures("short_interval")
+def test_counted_progress_is_reported(capsys: pytest.CaptureFixture[str]):
     with counting("logs", first="choosing the route") as progress:
         assert last_line(capsys).endswith(" choosing the route")
         progress(3, 20)
@@ -82,8 +82,8 @@ def test_what_is_counted_is_told(capsys: pytest.CaptureFixture[str]):
         assert last_line(capsys).endswith(" 3 of 20 logs")
 
 
-@pytest.mark.usefixtures("quick")
-def test_a_terminal_is_told_by_a_spinner_alone(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.usefixtures("short_interval")
+def test_terminal_shows_only_the_spinner(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     with spinning() as say:
@@ -92,8 +92,10 @@ def test_a_terminal_is_told_by_a_spinner_alone(monkeypatch: pytest.MonkeyPatch, 
     assert "hdjax: " not in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("quick")
-def test_a_loop_in_a_pipe_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+@pytest.mark.usefixtures("short_interval")
+def test_progress_of_the_loop_is_reported_on_a_pipe(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
     lines: list[str] = []
 
     class Found:

@@ -1,4 +1,4 @@
-"""Sweep files: what they mean, and one sentence for each that means nothing."""
+"""Sweep files: model, forcing and points that they define, and one sentence for each mistake."""
 
 import numpy as np
 import pytest
@@ -30,14 +30,14 @@ tolerance = 1e-5
 """
 
 
-def written(tmp_path, text):
+def write_sweep_file(tmp_path, text):
     path = tmp_path / "sweep.toml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_a_sweep_file_is_a_model_a_forcing_and_points(tmp_path):
-    found = read_sweep_file(written(tmp_path, GOOD))
+def test_sweep_file_defines_model_forcing_and_points(tmp_path):
+    found = read_sweep_file(write_sweep_file(tmp_path, GOOD))
     assert float(found.model.drive.alpha) == 50.0 and float(found.model.get("quadratic_stiffness.k2")) == 0.5
     assert float(found.forcing.amplitude) == 2.0 and found.request.tolerance == 1e-5
     assert found.request.points.shape == {"K": 4, "forcing.omega": 2, "sample": 5}
@@ -67,28 +67,28 @@ def test_a_sweep_file_is_a_model_a_forcing_and_points(tmp_path):
         ("[drive]", "[drive", "not a TOML file"),
     ],
 )
-def test_a_bad_sweep_file_is_refused_in_one_sentence(tmp_path, old, new, words):
-    path = written(tmp_path, GOOD.replace(old, new, 1))
+def test_invalid_sweep_file_is_refused_in_one_sentence(tmp_path, old, new, words):
+    path = write_sweep_file(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(InputError, match=words) as refusal:
         read_sweep_file(path)
     assert str(refusal.value).startswith(str(path)) and "\n" not in str(refusal.value)
 
 
-def test_a_missing_sweep_file_is_refused(tmp_path):
+def test_missing_sweep_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="can't be read"):
         read_sweep_file(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize("rule", ["latin-hypercube", "sobol", "random"])
-def test_a_drawn_sample_fills_its_ranges(rule):
+def test_drawn_sample_covers_its_ranges(rule):
     found = drawn({"K": (1.0, 100.0, "log"), "alpha": (-1.0, 3.0, "linear")}, 256, rule=rule)
     assert found["K"].shape == (256,) and found["K"].min() >= 1.0 and found["K"].max() <= 100.0
-    # Half of the values below the geometric and the arithmetic mean; three standard deviations of chance.
+    # Half of the values are below the geometric and the arithmetic mean, within three standard deviations.
     for below in (found["K"] < 10.0, found["alpha"] < 1.0):
         assert abs(below.mean() - 0.5) < (0.1 if rule == "random" else 0.01)
 
 
-def test_points_count_with_the_last_dimension_fastest():
+def test_points_are_numbered_with_the_last_dimension_fastest():
     points = Points({"K": np.array([1.0, 2.0]), "J_l": np.array([3.0, 4.0, 5.0])}, {"alpha": np.array([6.0, 7.0])})
     found = points.values(np.arange(points.size))
     grid = np.meshgrid([1.0, 2.0], [3.0, 4.0, 5.0], [6.0, 7.0], indexing="ij")

@@ -1,4 +1,4 @@
-"""Drive files from guesses: they are read as they are, and fitted once the lines to fill in are filled in."""
+"""Drive files proposed by `inspect`: readable as written, and sufficient for a fit once open lines are filled in."""
 
 import re
 import tomllib
@@ -8,7 +8,8 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from joint_logs import SHAPES, Motion, simulated
+from joint_logs import SHAPES
+from simulated_joint import Motion, simulated
 
 import fitting
 from fitting.logs.drive_file import read_drive_file
@@ -22,14 +23,14 @@ def motion() -> Motion:
 
 
 def fill_in(text: str) -> str:
-    """The same with the numbers that are known of the drive."""
+    """Replace the open lines of a drive file by the drive's values."""
     for key, number in FILLED.items():
         text = re.sub(rf"^# {key} = \S+  # FILL IN.*$", f"{key} = {number}", text, flags=re.MULTILINE)
     return text
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_drive_file_says_what_was_found(name: str, motion: Motion, tmp_path: Path):
+def test_drive_file_holds_the_detected_signals(name: str, motion: Motion, tmp_path: Path):
     found = fitting.inspect(SHAPES[name].columns(motion), joint=SHAPES[name].joint)
     path = found.save(tmp_path / "drive.toml")
     drive = read_drive_file(path)
@@ -37,9 +38,9 @@ def test_a_drive_file_says_what_was_found(name: str, motion: Motion, tmp_path: P
     for signal, guess in told.items():
         place = drive.columns[signal]
         assert (place.column, place.unit, place.sign) == (guess.column, guess.unit, float(guess.sign))
-    # A current needs its constant; all else that was found is written.
+    # A current needs its torque constant; all other detected signals are written.
     assert set(found.inspection.joint.signals) - set(told) <= {"motor_current"}
-    # Each thing to fill in has a line.
+    # Each value to fill in has a line.
     assert all(key.split()[-1].strip("'") in path.read_text(encoding="utf-8") for key in found.unknown)
 
 
@@ -48,7 +49,7 @@ READ_WHEN_FILLED = ("own names", "symbols of papers", "German PLC", "degrees tha
 
 
 @pytest.mark.parametrize("name", [*READ_AT_ONCE, *READ_WHEN_FILLED])
-def test_a_drive_file_reads_its_log(name: str, motion: Motion, tmp_path: Path):
+def test_log_is_read_with_its_proposed_drive_file(name: str, motion: Motion, tmp_path: Path):
     columns = SHAPES[name].columns(motion)
     found = fitting.inspect(columns)
     text = found.drive_file()
@@ -63,7 +64,7 @@ def test_a_drive_file_reads_its_log(name: str, motion: Motion, tmp_path: Path):
     if data.kind == "drive":
         log = data.logs[0]
         assert log.motor_angle is not None and log.motor_torque is not None
-        # Units and signs are right: the rig is made ready without a refusal, and twists as the drive did.
+        # Units and signs are correct: the checks pass, and the twist is that of the simulation.
         data.rig(other_holds=False)
         twist = motion.motor_angle / 100 - motion.load_angle
         error = log.dynamic_error - log.dynamic_error.mean() - (twist - twist.mean())
@@ -71,7 +72,7 @@ def test_a_drive_file_reads_its_log(name: str, motion: Motion, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_drive_file_from_a_guess_gives_the_drive(tmp_path: Path):
+def test_fit_with_a_proposed_drive_file_recovers_the_stiffness(tmp_path: Path):
     columns = SHAPES["German PLC"].columns(simulated(count=1200))
     (tmp_path / "drive.toml").write_text(fill_in(fitting.inspect(columns).drive_file()), encoding="utf-8")
     fit = fitting.fit(fitting.load(columns, tmp_path / "drive.toml"))
@@ -81,7 +82,7 @@ def test_a_drive_file_from_a_guess_gives_the_drive(tmp_path: Path):
 
 @settings(max_examples=15)
 @given(st.lists(st.text(min_size=1, max_size=12), min_size=3, max_size=3, unique=True))
-def test_any_name_of_a_column_stands_in_a_drive_file(names: list[str]):
+def test_arbitrary_column_names_are_valid_in_the_drive_file(names: list[str]):
     motion = simulated(count=800)
     channels = {"motor_angle": motion.motor_angle, "load_angle": motion.load_angle, "motor_torque": motion.motor_torque}
     renamed = {f"{n}_{signal}": v for n, (signal, v) in zip(names, channels.items(), strict=True)}
@@ -90,7 +91,7 @@ def test_any_name_of_a_column_stands_in_a_drive_file(names: list[str]):
     assert tables["columns"].items() >= found.drive["columns"].items()
 
 
-def test_a_unit_that_measures_nothing_is_to_be_filled_in(motion: Motion):
+def test_percent_as_unit_is_left_to_be_filled_in(motion: Motion):
     columns = {"t": motion.time, "motor angle [deg]": np.rad2deg(motion.motor_angle)}
     columns |= {"output angle [deg]": np.rad2deg(motion.load_angle), "motor torque [%]": 100 * motion.motor_torque}
     found = fitting.inspect(columns)

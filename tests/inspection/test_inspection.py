@@ -1,4 +1,4 @@
-"""What is said of a log beside its columns: clocks, joints, health, excitation, what a fit could tell."""
+"""Inspection of logs: time column, joint, findings, excitation and what a fit could identify."""
 
 import json
 import tomllib
@@ -9,7 +9,8 @@ import mutations
 import numpy as np
 import polars as pl
 import pytest
-from joint_logs import SHAPES, Motion, simulated
+from joint_logs import SHAPES
+from simulated_joint import Motion, simulated
 
 import fitting
 from fitting import DataError, InputError
@@ -39,28 +40,30 @@ def drive_log(motion: Motion) -> dict[str, np.ndarray]:
         ("Time [ms]", 1e3, 0.0, "ms"),
     ],
 )
-def test_the_unit_of_a_clock(name: str, factor: float, start: float, unit: str, drive_log: dict[str, np.ndarray]):
+def test_time_column_and_its_unit_are_detected(
+    name: str, factor: float, start: float, unit: str, drive_log: dict[str, np.ndarray]
+):
     columns = {name: start + factor * drive_log["time"]} | {k: v for k, v in drive_log.items() if k != "time"}
     found = fitting.inspect(columns).inspection
     assert (found.time.column, found.time.unit) == (name.partition(" [")[0], unit)
     assert found.rates[0] == pytest.approx(1000.0, rel=1e-3)
 
 
-def test_a_counter_and_a_coarse_clock_are_not_the_clock(drive_log: dict[str, np.ndarray]):
+def test_counter_and_whole_seconds_are_not_chosen_as_time_column(drive_log: dict[str, np.ndarray]):
     count = len(drive_log["time"])
     columns = {"seq": np.arange(count), "secs": np.floor(drive_log["time"]), "stamp": drive_log["time"]}
     found = fitting.inspect(columns | {k: v for k, v in drive_log.items() if k != "time"}).inspection
     assert found.time.column == "stamp"
 
 
-def test_a_log_without_a_clock_asks_for_its_rate(drive_log: dict[str, np.ndarray]):
+def test_log_without_a_time_column_asks_for_the_sample_rate(drive_log: dict[str, np.ndarray]):
     found = fitting.inspect({k: v for k, v in drive_log.items() if k != "time"})
     assert found.inspection.time.column is None
     assert "[signals] sample_rate" in found.unknown
     assert set(found.inspection.joint.signals) == {"motor_angle", "load_angle", "motor_torque"}
 
 
-def test_a_repeated_time_column_is_the_clock_of_what_follows(motion: Motion):
+def test_repeated_time_column_is_the_clock_of_the_next_column(motion: Motion):
     late = motion.time + 3e-4
     columns = {
         "Time": motion.time,
@@ -75,7 +78,7 @@ def test_a_repeated_time_column_is_the_clock_of_what_follows(motion: Motion):
     np.testing.assert_array_equal(found.samples("load_angle")[0], late)
 
 
-def test_gaps_jitter_and_health_are_told(drive_log: dict[str, np.ndarray]):
+def test_gaps_and_blank_samples_are_reported(drive_log: dict[str, np.ndarray]):
     kept = np.delete(np.arange(3000), np.arange(1000, 1200))
     columns = {name: values[kept].copy() for name, values in drive_log.items()}
     columns["motor_angle"][5] = np.nan
@@ -86,7 +89,7 @@ def test_gaps_jitter_and_health_are_told(drive_log: dict[str, np.ndarray]):
     assert any("gaps" in finding.what for finding in found.findings[0])
 
 
-def test_excitation_and_promises_of_each_kind(motion: Motion):
+def test_excitation_and_identifiable_parameters_are_reported_for_each_kind(motion: Motion):
     told = {name: fitting.inspect(SHAPES[name].columns(motion)) for name in SHAPES if SHAPES[name].joint is None}
     drive = told["own names"].excitations[0]
     assert drive.band is not None and 0 < drive.band[0] < drive.band[1] < 60
@@ -103,8 +106,8 @@ def test_excitation_and_promises_of_each_kind(motion: Motion):
         assert word in " ".join(told[name].told)
 
 
-def test_a_motor_that_turns_away_follows_its_torque(motion: Motion):
-    """The drift of a side that turns freely hides no response."""
+def test_drift_of_the_motor_angle_does_not_mask_its_response(motion: Motion):
+    """A motor that turns freely drifts, which does not mask its response to the torque."""
     columns = {"time": motion.time, "motor_torque": motion.motor_torque}
     columns["motor_angle"] = motion.motor_angle + 300.0 * motion.time**2
     found = fitting.inspect(columns)
@@ -113,16 +116,16 @@ def test_a_motor_that_turns_away_follows_its_torque(motion: Motion):
     assert f"inside the band of the torque ({moved.band[0]:.3g} to" in " ".join(found.told)
 
 
-def test_the_same_excitation_twice_tells_no_less(motion: Motion):
+def test_second_log_of_equal_excitation_does_not_change_the_signals(motion: Motion):
     columns = SHAPES["symbols of papers"].columns(motion)
     once, twice = (fitting.inspect(logs).inspection.joint for logs in (columns, [columns, columns]))
     assert {s: g.column for s, g in once.signals.items()} == {s: g.column for s, g in twice.signals.items()}
-    # The name of the torque says nothing of its side.
+    # The name of the torque does not state its side.
     columns["tau"] = columns.pop("T_m")
     assert "motor_torque" in fitting.inspect([columns, columns]).inspection.joint.signals
 
 
-def test_several_logs_speak_together(drive_log: dict[str, np.ndarray], motion: Motion):
+def test_several_logs_are_inspected_together(drive_log: dict[str, np.ndarray], motion: Motion):
     # At rest in one log, the drive moves in the other.
     still = drive_log | {name: np.zeros(3000) for name in ("motor_angle", "load_angle", "motor_torque")}
     found = fitting.inspect([still, drive_log])
@@ -131,19 +134,19 @@ def test_several_logs_speak_together(drive_log: dict[str, np.ndarray], motion: M
         fitting.inspect([drive_log, SHAPES["German PLC"].columns(motion)])
 
 
-def test_a_joint_is_chosen_by_its_motion_or_by_its_label(motion: Motion):
+def test_joint_is_selected_by_motion_or_by_label(motion: Motion):
     columns = SHAPES["counts on both sides"].columns(motion)
     assert fitting.inspect(columns).inspection.joint.label == "2"
     other = fitting.inspect(columns, joint=1)
     assert other.inspection.joint.label == "1"
-    # What counts a revolution has, only the joint that moves tells.
+    # The counts of a revolution follow from the joint that moves.
     units = {s: g.unit for s, g in other.inspection.joint.signals.items()}
     assert units["motor_angle"] == units["load_angle"] == "rev / 16777216"
     with pytest.raises(InputError, match="there is no joint '9'; the log has 1, 2, 3"):
         fitting.inspect(columns, joint=9)
 
 
-def test_two_numbered_encoders_of_one_drive_are_no_joints(motion: Motion):
+def test_numbered_encoders_of_one_drive_are_not_detected_as_joints(motion: Motion):
     columns = {
         "t": motion.time,
         "encoder1": motion.motor_angle,
@@ -157,7 +160,7 @@ def test_two_numbered_encoders_of_one_drive_are_no_joints(motion: Motion):
     assert {g.column: s for s, g in found.joint.signals.items()}["encoder1"] == "motor_angle"
 
 
-def test_what_is_no_channel_is_said(tmp_path: Path, drive_log: dict[str, np.ndarray]):
+def test_text_and_blank_columns_are_reported_as_left_out(tmp_path: Path, drive_log: dict[str, np.ndarray]):
     frame = pl.DataFrame(drive_log).with_columns(note=pl.lit("ok"), spare=pl.lit(None, dtype=pl.Float64))
     frame.write_csv(tmp_path / "log.csv")
     found = fitting.inspect(tmp_path / "log.csv")
@@ -170,7 +173,7 @@ def test_what_is_no_channel_is_said(tmp_path: Path, drive_log: dict[str, np.ndar
         fitting.inspect([])
 
 
-def test_matrices_and_structs_are_columns(tmp_path: Path, motion: Motion):
+def test_matrix_columns_of_a_mat_file_are_inspected(tmp_path: Path, motion: Motion):
     scipy_io = pytest.importorskip("scipy.io")
     data = np.stack([motion.time, motion.motor_angle, motion.load_angle, motion.motor_torque], axis=1)
     scipy_io.savemat(tmp_path / "log.mat", {"data": data, "Ts": 1e-3, "title": "run 1"})
@@ -180,7 +183,7 @@ def test_matrices_and_structs_are_columns(tmp_path: Path, motion: Motion):
     assert (told["data(:,2)"], told["data(:,3)"]) == ("motor_angle", "load_angle")
 
 
-def test_a_result_shows_itself(drive_log: dict[str, np.ndarray], tmp_path: Path):
+def test_inspection_result_is_printed_plotted_and_saved(drive_log: dict[str, np.ndarray], tmp_path: Path):
     found = fitting.inspect(drive_log)
     assert found.columns["signal"].to_list() == ["time", "motor_angle", "load_angle", "motor_torque"]
     assert "motor_angle" in found._repr_html_() and str(found) == found.summary()
@@ -195,7 +198,7 @@ def test_a_result_shows_itself(drive_log: dict[str, np.ndarray], tmp_path: Path)
         fitting.inspect({"t": np.arange(500) / 100, "a": np.random.default_rng(0).normal(size=500)}).plot()
 
 
-def test_measured_logs(shared: Path):
+def test_signals_of_measured_logs_are_detected(shared: Path):
     logs = {
         "data/silverbox/silverbox_estimation.mat": ("reduced", {"V1": "forcing", "V2": "dynamic_error"}, None),
         "data/bouc_wen/estimation.h5": ("reduced", {"multisine/u": "forcing", "multisine/y": "dynamic_error"}, None),
@@ -220,7 +223,7 @@ def test_measured_logs(shared: Path):
 
 
 @pytest.mark.parametrize("block", range(2))
-def test_spoilt_logs_give_a_result_or_a_sentence(block: int, tmp_path: Path):
+def test_corrupted_logs_are_inspected_or_refused_in_one_sentence(block: int, tmp_path: Path):
     read = 0
     for seed in range(30 * block, 30 * block + 30):
         path, _ = mutations.spoilt_case(seed, tmp_path / str(seed))
@@ -233,5 +236,5 @@ def test_spoilt_logs_give_a_result_or_a_sentence(block: int, tmp_path: Path):
         tomllib.loads(found.drive_file())
         json.dumps(found.to_dict(), allow_nan=False)
         assert not {"nan", "inf"} & set(found.summary().replace(",", " ").split())
-    # Most can be looked at, though few of them can be fitted.
+    # Most corrupted logs can be inspected, though few can be fitted.
     assert read > 15

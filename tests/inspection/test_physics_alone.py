@@ -1,9 +1,9 @@
-"""Channels whose names say nothing: what they are, their units and signs, from the equations of motion alone."""
+"""Detection of signals, units and signs from the equations of motion where channel names are arbitrary."""
 
 import hypothesis.strategies as st
 import numpy as np
 from hypothesis import given, settings
-from joint_logs import Motion, simulated
+from simulated_joint import Motion, simulated
 
 import fitting
 
@@ -15,7 +15,7 @@ CHANNELS = ("motor_angle", "load_angle", "motor_velocity", "motor_torque")
 def exported(
     motion: Motion, angle: str, velocity: str, load_sign: int, torque_sign: int, order: tuple[str, ...]
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[str, str | None, int]]]:
-    """The channels under names that say nothing, and what each is: signal, unit and sign."""
+    """Channels under arbitrary names, and the signal, unit and sign of each."""
     truth = {
         "motor_angle": (ANGLES[angle] * motion.motor_angle, angle, 1),
         "load_angle": (load_sign * ANGLES[angle] * motion.load_angle, angle, load_sign),
@@ -38,14 +38,16 @@ def exported(
     order=st.permutations(CHANNELS),
     seed=st.integers(0, 5),
 )
-def test_channels_without_names(N, inertias, K, angle, velocity, load_sign, torque_sign, order, seed):
+def test_signals_units_and_signs_are_detected_without_names(
+    N, inertias, K, angle, velocity, load_sign, torque_sign, order, seed
+):
     J_m = 3e-4
     motion = simulated(N=N, J_m=J_m, J_l=inertias * N**2 * J_m, K=K, B_sp=1e-3 * K, seed=seed, count=4000)
     columns, truth = exported(motion, angle, velocity, load_sign, torque_sign, tuple(order))
     found = fitting.inspect(columns).inspection
     assert found.time.column == "ch1"
     guesses = {guess.column: guess for guess in found.joint.signals.values()}
-    # A wrong guess is worse than none; the angles and the velocity give themselves away.
+    # A wrong signal is worse than none; angles and velocity must be detected.
     for column, guess in guesses.items():
         signal, unit, sign = truth[column]
         assert guess.signal == signal, (column, guess.why)
@@ -59,7 +61,7 @@ def test_channels_without_names(N, inertias, K, angle, velocity, load_sign, torq
 
 @settings(max_examples=10)
 @given(seeds=st.lists(st.integers(0, 1000), min_size=4, max_size=4, unique=True), walks=st.booleans())
-def test_channels_of_no_drive_are_no_signals(seeds: list[int], walks: bool):
+def test_unrelated_channels_are_not_detected_as_signals(seeds: list[int], walks: bool):
     columns: dict[str, np.ndarray] = {"t": np.arange(3000) / 500.0}
     for k, seed in enumerate(seeds):
         noise = np.random.default_rng(seed).normal(size=3000)

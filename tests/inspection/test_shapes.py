@@ -1,7 +1,8 @@
-"""Logs in public shapes: what their columns are, in which unit, with which sign."""
+"""Signals, units and signs detected in logs as common robots, drives and loggers export them."""
 
 import pytest
-from joint_logs import SHAPES, simulated
+from joint_logs import SHAPES
+from simulated_joint import simulated
 
 import fitting
 
@@ -12,7 +13,7 @@ def motion():
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_columns_of_a_shape(name: str, motion):
+def test_signals_of_an_exported_log_are_detected(name: str, motion):
     shape = SHAPES[name]
     found = fitting.inspect(shape.columns(motion), joint=shape.joint).inspection
     guesses = {guess.column: (signal, guess) for signal, guess in found.joint.signals.items()}

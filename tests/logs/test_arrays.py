@@ -1,4 +1,4 @@
-"""Structs, groups and matrices in MATLAB files and HDF5; packed and misnamed files; MDF where it is installed."""
+"""Reading of MATLAB, HDF5, parquet, MDF and NumPy files: nested and matrix columns, compressed and misnamed files."""
 
 import gzip
 import shutil
@@ -35,14 +35,14 @@ def values(path: Path, *names: str) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("names", [("run.x.a", "run.b"), ("run/x/a", "run/b"), ("a", "b")])
-def test_nested_structs(tmp_path: Path, names: tuple[str, str]):
+def test_fields_of_nested_structs_are_columns(tmp_path: Path, names: tuple[str, str]):
     path = mat(tmp_path, run={"x": {"a": A}, "b": B[:, None]}, other=np.ones((2, 2)))
     found = values(path, *names)
     np.testing.assert_array_equal(found, [A, B])
     assert set(read_table(path, ()).names) == {"run.x.a", "run.b", "other"}
 
 
-def test_struct_arrays_are_counted_from_one(tmp_path: Path):
+def test_struct_array_elements_are_numbered_from_one(tmp_path: Path):
     signals = np.array([({"values": A},), ({"values": B},)], dtype=[("signals", object)])["signals"]
     path = mat(tmp_path, out={"time": A, "signals": signals})
     np.testing.assert_array_equal(values(path, "out.signals(2).values", "out.time"), [B, A])
@@ -52,7 +52,7 @@ def test_struct_arrays_are_counted_from_one(tmp_path: Path):
 
 @pytest.mark.parametrize("make", [lambda f, m: mat(f, data=m), lambda f, m: hdf5(f, {"data": m})], ids=["mat", "hdf5"])
 @pytest.mark.parametrize("transposed", [False, True])
-def test_columns_of_a_matrix(tmp_path: Path, make, transposed: bool):
+def test_matrix_columns_are_addressed_by_index(tmp_path: Path, make, transposed: bool):
     matrix = np.stack([A, B], axis=1)
     path = make(tmp_path, matrix.T if transposed else matrix)
     np.testing.assert_array_equal(values(path, "data(:,1)", "data(:, 2)"), [A, B])
@@ -62,26 +62,26 @@ def test_columns_of_a_matrix(tmp_path: Path, make, transposed: bool):
         assert word in str(error.value)
 
 
-def test_a_struct_is_not_a_column(tmp_path: Path):
+def test_struct_as_column_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"struct or group.*'run\.a'"):
         values(mat(tmp_path, run={"a": A}), "run")
 
 
-def test_a_cell_is_not_a_column(tmp_path: Path):
+def test_matlab_cell_as_column_is_refused(tmp_path: Path):
     cells = np.empty(2, dtype=object)
     cells[:] = [A, "text"]
     with pytest.raises(InputError, match="MATLAB's own"):
         values(mat(tmp_path, a=cells), "a")
 
 
-def test_the_fields_of_an_hdf5_table(tmp_path: Path):
+def test_fields_of_hdf5_table_are_columns(tmp_path: Path):
     table = np.zeros(300, dtype=[("time", "f8"), ("count", "i4")])
     table["time"], table["count"] = A, B
     path = hdf5(tmp_path, {"rig/log": table})
     np.testing.assert_array_equal(values(path, "rig/log/time", "count"), [A, B])
 
 
-def test_units_of_datasets(tmp_path: Path):
+def test_units_of_hdf5_datasets_are_read(tmp_path: Path):
     path = hdf5(tmp_path, {"a": A, "b": B, "c": B})
     with h5py.File(path, "a") as file:
         file["a"].attrs["unit"] = "deg"
@@ -92,13 +92,13 @@ def test_units_of_datasets(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("name", "value", "rate"), [("fs", 2000.0, 2000.0), ("Ts", 5e-4, 2000.0), ("fs", -1.0, None)])
-def test_a_sample_rate_or_step_beside_the_data(tmp_path: Path, name: str, value: float, rate: float | None):
+def test_scalar_sample_rate_or_step_gives_the_sample_rate(tmp_path: Path, name: str, value: float, rate: float | None):
     for path in (mat(tmp_path, run={"a": A}, **{name: value}), hdf5(tmp_path, {"run/a": A, f"run/{name}": value})):
         assert read_table(path, ("a",)).sample_rate == (None if rate is None else pytest.approx(rate))
 
 
 @pytest.mark.parametrize("kind", ["csv", "mat", "h5", "parquet"])
-def test_packed_and_misnamed_files(tmp_path: Path, kind: str):
+def test_compressed_and_misnamed_files_are_read(tmp_path: Path, kind: str):
     frame = pl.DataFrame({"a": A, "b": B})
     plain = tmp_path / f"log.{kind}"
     if kind == "csv":
@@ -111,7 +111,7 @@ def test_packed_and_misnamed_files(tmp_path: Path, kind: str):
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     np.testing.assert_array_equal(values(packed, "a", "b"), [A, B])
     if kind != "csv":
-        # The first bytes say what it is.
+        # The format follows from the first bytes.
         odd = Path(shutil.copy(plain, tmp_path / "log.dat"))
         np.testing.assert_array_equal(values(odd, "a", "b"), [A, B])
     packed.write_bytes(packed.read_bytes()[:-20])
@@ -123,14 +123,14 @@ def test_packed_and_misnamed_files(tmp_path: Path, kind: str):
     ("head", "words"),
     [(b"PK\x03\x04", "zip archive"), (b"\x89MCAP0\r\n", "MCAP|mcap"), (b"\x1f\x8b", "cannot be read")],
 )
-def test_what_other_formats_are_told(tmp_path: Path, head: bytes, words: str):
+def test_unsupported_formats_are_refused_by_their_first_bytes(tmp_path: Path, head: bytes, words: str):
     path = tmp_path / ("log.csv.gz" if head == b"\x1f\x8b" else "log.csv")
     path.write_bytes(head + bytes(100))
     with pytest.raises(InputError, match=words):
         values(path, "a")
 
 
-def test_parquet_types(tmp_path: Path):
+def test_parquet_column_types_are_converted_to_numbers(tmp_path: Path):
     path = tmp_path / "log.parquet"
     frame = pl.DataFrame({"a": A, "s": [f"{v:.1f}" for v in A], "n": [[1.0]] * 300, "on": A > 5})
     frame.with_columns(
@@ -144,7 +144,7 @@ def test_parquet_types(tmp_path: Path):
         values(path, "n")
 
 
-def test_mdf_without_the_extra(tmp_path: Path):
+def test_mdf_without_asammdf_is_refused_with_the_extra_to_install(tmp_path: Path):
     try:
         import asammdf  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -154,7 +154,7 @@ def test_mdf_without_the_extra(tmp_path: Path):
             values(path, "a")
 
 
-def test_mdf_channels_bring_their_own_clocks(tmp_path: Path):
+def test_mdf_channels_keep_their_own_time_stamps(tmp_path: Path):
     asammdf = pytest.importorskip("asammdf", reason="needs the extra mdf")
     path = tmp_path / "log.mf4"
     with asammdf.MDF(version="4.10") as file:
@@ -170,7 +170,7 @@ def test_mdf_channels_bring_their_own_clocks(tmp_path: Path):
         values(path, "twice")
 
 
-def test_arrays_of_numpy(tmp_path: Path):
+def test_arrays_of_npz_file_are_columns(tmp_path: Path):
     stamps = np.datetime64("2026-11-28T12:00:00", "us") + np.arange(len(A)).astype("timedelta64[ms]")
     np.savez(tmp_path / "log.npz", t=stamps, a=A, data=np.stack([A, B], axis=1))
     table = read_table(tmp_path / "log.npz", ("t", "a", "data(:,2)", "column 2", "column 9"))
@@ -181,7 +181,7 @@ def test_arrays_of_numpy(tmp_path: Path):
     np.testing.assert_allclose(np.diff(table.columns["t"].values), 1e-3, atol=1e-6)
 
 
-def test_a_matrix_and_a_structured_array_of_numpy(tmp_path: Path):
+def test_matrix_and_structured_array_of_npy_file_are_columns(tmp_path: Path):
     np.save(tmp_path / "matrix.npy", np.stack([A, B], axis=1))
     np.testing.assert_array_equal(values(tmp_path / "matrix.npy", "column 1", "column 2"), [A, B])
     made = np.zeros(len(A), dtype=[("a", "f8"), ("b", "f4")])
@@ -192,7 +192,7 @@ def test_a_matrix_and_a_structured_array_of_numpy(tmp_path: Path):
     np.testing.assert_array_equal(values(tmp_path / "log.csv", "b"), [A])
 
 
-def test_objects_of_python_are_refused(tmp_path: Path):
+def test_pickled_objects_in_npy_file_are_refused(tmp_path: Path):
     np.save(tmp_path / "log.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match="objects of Python"):
         read_table(tmp_path / "log.npy", ("a",))

@@ -1,4 +1,4 @@
-"""What names of columns in use say."""
+"""Quantity, side, joint and unit that follow from common column names."""
 
 import pytest
 
@@ -62,16 +62,16 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_names_in_use(name: str):
+def test_column_name_gives_quantity_side_joint_and_unit(name: str):
     quantity, side, commanded, joint, unit = NAMES[name]
     found = sense(name)
     assert (found.quantities[0] if found.quantities else None) == quantity
-    # Neither time nor temperature has a side that matters.
+    # The side of time and temperature does not matter.
     assert found.side == side or quantity in ("time", "temperature", "current", "other")
     assert (found.commanded, found.joint, found.unit) == (commanded, joint, unit)
 
 
-def test_likely_columns_of_a_signal_are_no_columns_of_the_other_side_and_no_commands():
+def test_likely_columns_exclude_commands_and_the_other_side():
     names = ["time", "q_motor", "q_cmd", "link_pos", "encoder", "tau", "temp"]
     assert likely_columns("load_angle", names) == ["link_pos", "encoder"]
     assert likely_columns("motor_angle", names) == ["q_motor", "encoder"]

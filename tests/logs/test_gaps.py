@@ -1,4 +1,4 @@
-"""Gaps of the torque: bridged where that is known to be right, or a border between pieces."""
+"""Gaps of the torque: interpolated where the error is small, else a border between two pieces of the log."""
 
 import numpy as np
 import pytest
@@ -13,34 +13,34 @@ WHITE = np.random.default_rng(0).normal(size=COUNT)
 KNOWN = np.ones(COUNT, dtype=bool)
 
 
-def without(*rows: int) -> np.ndarray:
+def rows_without(*rows: int) -> np.ndarray:
     return np.delete(np.arange(COUNT), rows)
 
 
-def split(torque: np.ndarray, kept: np.ndarray, known: np.ndarray = KNOWN, restarts=()):
+def pieces_of(torque: np.ndarray, kept: np.ndarray, known: np.ndarray = KNOWN, restarts=()):
     return pieces(TIME[kept], torque[kept], known[kept], restarts, "motor_torque")
 
 
-def test_a_whole_log_is_one_piece():
-    assert split(WHITE, without()) == (((0, COUNT),), ())
+def test_log_without_gaps_is_one_piece():
+    assert pieces_of(WHITE, rows_without()) == (((0, COUNT),), ())
 
 
-def test_a_late_stamp_lacks_nothing():
+def test_late_stamp_is_not_a_gap():
     late = TIME.copy()
     late[700] += 0.8 * rig.STEP
     assert len(Sampling(late).gaps) == 0
     assert pieces(late, WHITE, KNOWN, (), "motor_torque") == (((0, COUNT),), ())
 
 
-def test_jitter_is_no_gap():
+def test_jitter_is_not_a_gap():
     jittering = np.cumsum(np.random.default_rng(1).uniform(0.1, 3.0, COUNT)) * rig.STEP
     assert pieces(jittering, WHITE, KNOWN, (), "motor_torque") == (((0, COUNT),), ())
 
 
 @pytest.mark.parametrize("missing", [1, 2, 4])
-def test_smooth_torque_is_bridged(missing: int):
-    kept = without(*range(700, 700 + missing))
-    spans, (finding,) = split(SMOOTH, kept)
+def test_short_gap_in_smooth_torque_is_bridged(missing: int):
+    kept = rows_without(*range(700, 700 + missing))
+    spans, (finding,) = pieces_of(SMOOTH, kept)
     assert spans == ((0, COUNT - missing),)
     assert finding.severity == "note" and f"{missing} samples of motor_torque" in finding.what
     time, torque = bridged(TIME[kept], SMOOTH[kept])
@@ -52,7 +52,7 @@ def test_smooth_torque_is_bridged(missing: int):
 
 
 @pytest.mark.parametrize("missing", [1, 2, 3])
-def test_the_bridge_error_is_what_bridging_would_do(missing: int):
+def test_bridge_error_agrees_with_the_rms_error_of_bridging(missing: int):
     middle = 2 + (missing - 1) // 2
     errors = []
     for row in range(0, COUNT - 60, 7):
@@ -61,60 +61,60 @@ def test_the_bridge_error_is_what_bridging_would_do(missing: int):
         _, values = bridged(TIME[kept], WHITE[kept])
         errors.append(values[26 + middle] - WHITE[span[26 + middle]])
     rms = np.sqrt(np.mean(np.square(errors))) / np.std(WHITE)
-    # A sixth of the places, so that the two differ by chance.
+    # Every seventh row is tried, so that both values differ by chance.
     assert bridge_error(WHITE, missing) == pytest.approx(rms, rel=0.1)
 
 
 @pytest.mark.parametrize("missing", [1, 30, 400])
-def test_white_torque_parts_the_log(missing: int):
-    kept = without(*range(700, 700 + missing))
-    spans, (finding,) = split(WHITE, kept)
+def test_gap_in_white_torque_splits_the_log(missing: int):
+    kept = rows_without(*range(700, 700 + missing))
+    spans, (finding,) = pieces_of(WHITE, kept)
     assert spans == ((0, 700), (700, COUNT - missing))
     assert finding.severity == "warning" and "row 701" in finding.where and "2 stretches" in finding.consequence
 
 
-def test_a_long_gap_parts_even_smooth_torque():
-    spans, _ = split(SMOOTH, without(*range(700, 900)))
+def test_long_gap_in_smooth_torque_splits_the_log():
+    spans, _ = pieces_of(SMOOTH, rows_without(*range(700, 900)))
     assert spans == ((0, 700), (700, COUNT - 200))
 
 
-def test_torque_that_is_blank_in_a_row_is_unknown_there():
+def test_blank_torque_sample_is_bridged_or_splits_the_log():
     known = KNOWN.copy()
     known[700] = False
-    assert split(WHITE, without(), known)[0] == ((0, 700), (701, COUNT))
-    assert split(SMOOTH, without(), known)[0] == ((0, COUNT),)
+    assert pieces_of(WHITE, rows_without(), known)[0] == ((0, 700), (701, COUNT))
+    assert pieces_of(SMOOTH, rows_without(), known)[0] == ((0, COUNT),)
 
 
-def test_torque_at_a_slower_rate_lacks_nothing():
+def test_torque_at_a_slower_rate_has_no_gaps():
     known = np.arange(COUNT) % 4 == 0
-    assert split(WHITE, without(), known) == (((0, COUNT - 3),), ())
+    assert pieces_of(WHITE, rows_without(), known) == (((0, COUNT - 3),), ())
 
 
 def test_short_pieces_are_left_out_and_counted():
-    spans, (finding,) = split(WHITE, without(100, *range(1900, 1905)))
+    spans, (finding,) = pieces_of(WHITE, rows_without(100, *range(1900, 1905)))
     assert spans == ((100, 1899),)
     assert f"{COUNT - 6 - 1799} rows between gaps" in finding.consequence
 
 
-def test_gaps_everywhere_are_bridged_for_better_or_worse():
-    spans, (finding,) = split(WHITE, without(*range(50, COUNT, 50)))
+def test_frequent_gaps_are_bridged_with_a_warning():
+    spans, (finding,) = pieces_of(WHITE, rows_without(*range(50, COUNT, 50)))
     assert spans == ((0, COUNT - 39),)
     assert finding.severity == "warning" and "a guess" in finding.consequence
 
 
-def test_a_log_that_is_wanted_whole_is_bridged_over_short_gaps():
-    kept = without(700, 701)
+def test_short_gaps_of_a_log_needed_whole_are_bridged_with_a_warning():
+    kept = rows_without(700, 701)
     (span,), (finding,) = pieces(TIME[kept], WHITE[kept], KNOWN[kept], (), "motor_torque", whole=True)
     assert span == (0, COUNT - 2) and finding.severity == "warning"
 
 
-def test_pauses_everywhere_leave_nothing():
-    spans, findings = split(WHITE, np.flatnonzero(np.arange(COUNT) % 100 < 50))
+def test_frequent_long_gaps_leave_no_piece():
+    spans, findings = pieces_of(WHITE, np.flatnonzero(np.arange(COUNT) % 100 < 50))
     assert spans == () and len(findings) == 1
     assert SHORTEST > 50
 
 
-def test_a_recording_that_starts_anew_is_a_piece_of_its_own():
+def test_restarted_recording_begins_a_new_piece():
     time = np.concatenate([TIME[:900], TIME[900:] + 0.05])
     spans, _ = pieces(time, SMOOTH, KNOWN, np.array([900]), "motor_torque")
     assert spans == ((0, 900), (900, COUNT))

@@ -1,4 +1,4 @@
-"""Channels refreshed at a lower rate than the log is written; and what only looks like one."""
+"""Channels that are refreshed at a lower rate than the log is written, and channels that are not."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ FORCING = rig.reduced_forcing(COUNT)
 REDUCED = rig.reduced_log(rig.reduced_motion(FORCING)[:, 0], FORCING, noise=1e-3)
 
 
-def held(log: Log, name: str, fresh: np.ndarray) -> Log:
+def with_held_channel(log: Log, name: str, fresh: np.ndarray) -> Log:
     """The log with a channel that keeps its value until it is refreshed."""
     fresh = fresh.copy()
     fresh[0] = True
@@ -42,7 +42,7 @@ def every(period: int, first: int = 0) -> np.ndarray:
 
 
 def own_clock(period: float, jitter: float, seed: int = 0) -> np.ndarray:
-    """Refreshed by a clock of its own, whose period is no multiple of the log's, with jitter."""
+    """Rows refreshed by a separate clock with jitter, whose period is no multiple of the log's."""
     when = np.arange(0.3, COUNT, period)
     when = when + jitter * period * np.random.default_rng(seed).uniform(-0.5, 0.5, size=len(when))
     fresh = np.zeros(COUNT, dtype=bool)
@@ -62,8 +62,8 @@ REFRESHED = {
 
 @pytest.mark.parametrize("fresh", REFRESHED.values(), ids=REFRESHED.keys())
 @pytest.mark.parametrize("name", ["load_angle", "motor_angle", "dynamic_error"])
-def test_only_fresh_rows_count(name: str, fresh: np.ndarray):
-    log = held(REDUCED if name == "dynamic_error" else LOG, name, fresh)
+def test_stale_rows_of_a_held_channel_are_masked(name: str, fresh: np.ndarray):
+    log = with_held_channel(REDUCED if name == "dynamic_error" else LOG, name, fresh)
     found = masked(log)
     assert found.trusted is not None
     stale = ~fresh
@@ -72,13 +72,13 @@ def test_only_fresh_rows_count(name: str, fresh: np.ndarray):
     assert found.trusted.sum() > 0.97 * fresh.sum()
     (finding,) = found.findings
     assert finding.severity == "warning" and "refreshed about every" in finding.what and name in finding.where
-    # What stands in between is nothing that a check could take for a fault.
+    # Fresh values are kept; stale ones are replaced, so that no check reports a fault.
     np.testing.assert_allclose(getattr(found, name)[fresh], getattr(log, name)[fresh])
 
 
 @pytest.mark.parametrize(("a", "b"), [(every(4), every(4, 2)), (own_clock(2.6, 0.3), own_clock(3.7, 0.3, 1))])
-def test_two_slow_angles_meet_at_the_slower_ones_rows(a: np.ndarray, b: np.ndarray):
-    found = masked(held(held(LOG, "motor_angle", a), "load_angle", b))
+def test_two_held_angles_are_valid_at_fresh_rows_of_the_slower_one(a: np.ndarray, b: np.ndarray):
+    found = masked(with_held_channel(with_held_channel(LOG, "motor_angle", a), "load_angle", b))
     assert found.trusted is not None
     slow = min((a, b), key=np.sum) | (np.arange(COUNT) == 0)
     assert not (found.trusted & ~slow).any() and found.trusted.sum() > 0.9 * slow.sum()
@@ -88,8 +88,8 @@ def test_two_slow_angles_meet_at_the_slower_ones_rows(a: np.ndarray, b: np.ndarr
     assert sum("refreshed about" in f.what for f in found.findings) == 2
 
 
-def test_outputs_that_are_not_known_are_not_looked_at():
-    log = held(LOG, "load_angle", every(10))
+def test_outputs_after_the_known_samples_are_not_masked():
+    log = with_held_channel(LOG, "load_angle", every(10))
     found = without_repeats(replace(log, outputs_until=1500))
     assert found.trusted is not None and found.trusted[1500:].all() and found.trusted[:1500].sum() == 150
 
@@ -105,7 +105,7 @@ STOPS = np.where((np.arange(COUNT) // 500) % 2 == 0, np.arange(COUNT), 500 * (np
     size=st.floats(-2.5, 0.0),
     seed=st.integers(0, 9),
 )
-def test_a_coarse_encoder_is_not_held(step: float, noise: float, size: float, seed: int):
+def test_coarse_encoder_is_not_detected_as_held(step: float, noise: float, size: float, seed: int):
     width = 10.0**step
     random = np.random.default_rng(seed)
     load = 10.0**size * MOTION[:, 1] + noise * width * random.normal(size=COUNT)
@@ -115,15 +115,15 @@ def test_a_coarse_encoder_is_not_held(step: float, noise: float, size: float, se
 
 
 @pytest.mark.parametrize("name", ["load_angle", "motor_angle"])
-def test_rest_is_not_held(name: str):
+def test_standstill_is_not_detected_as_held(name: str):
     stopped = replace(LOG, **{name: getattr(LOG, name)[STOPS]})
     assert without_repeats(stopped) is stopped
     slow = rig.drive_log(SLOW, TORQUE, noise=0.0)
     assert without_repeats(slow) is slow
 
 
-def test_a_slow_encoder_is_fitted_where_it_is_fresh():
-    log = held(rig.drive_log(MOTION, TORQUE, noise=20.0), "load_angle", every(10, 4))
+def test_fit_with_a_held_encoder_recovers_the_parameters():
+    log = with_held_channel(rig.drive_log(MOTION, TORQUE, noise=20.0), "load_angle", every(10, 4))
     ready = masked(log)
     tables = {"drive": {"reduction_ratio": rig.N, "motor_inertia": rig.J_M, "load_inertia": rig.J_L}}
     assert not [f for f in examine(ready, drive_of(tables, log.path)) if f.severity == "refusal"]

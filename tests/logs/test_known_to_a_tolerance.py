@@ -1,4 +1,4 @@
-"""Inertias and the torque constant in the drive file: values, tolerances, "fit"; and the motor's current as torque."""
+"""Inertias and torque constant of the drive file: values, tolerances and "fit"; and the motor current as torque."""
 
 import json
 import math
@@ -20,7 +20,7 @@ CONSTANT = 0.12
 SIGNALS = '[signals]\ntorque_hold = "zero-order"\n'
 
 
-def written(folder: Path, drive: str, columns: str = "") -> tuple[Path, Path]:
+def write_log_and_drive_file(folder: Path, drive: str, columns: str = "") -> tuple[Path, Path]:
     log, file = joints.log_of(JOINT, count=2000), folder / "drive.toml"
     assert log.motor_angle is not None and log.load_angle is not None and log.motor_torque is not None
     table = np.stack([log.time, log.motor_angle, log.load_angle, 1e3 * log.motor_torque / CONSTANT], axis=1)
@@ -29,19 +29,19 @@ def written(folder: Path, drive: str, columns: str = "") -> tuple[Path, Path]:
     return folder / "log.csv", file
 
 
-def test_a_current_is_a_torque_by_its_constant(tmp_path: Path):
+def test_motor_current_is_converted_by_the_torque_constant(tmp_path: Path):
     current = f'motor_current = {{ column = "iq", unit = "mA", torque_constant = "{CONSTANT} N m/A" }}'
-    log, file = written(tmp_path, "motor_inertia = 4e-5\nload_inertia = 0.2", current)
+    log, file = write_log_and_drive_file(tmp_path, "motor_inertia = 4e-5\nload_inertia = 0.2", current)
     rig = read_rig([log], file)
     truth = joints.torque_of(JOINT, count=2000)
     np.testing.assert_allclose(rig.logs[0].motor_torque, truth[: len(rig.logs[0])], rtol=1e-12, atol=1e-15)
     assert not rig.model.drive.priors
 
 
-def test_what_is_known_reaches_the_model(tmp_path: Path):
+def test_tolerances_of_the_drive_file_become_priors(tmp_path: Path):
     drive = 'motor_inertia = { value = "0.4 kg cm^2", tolerance = "5 %" }\nload_inertia = "fit"'
     current = 'motor_current = { column = "iq", unit = "mA", torque_constant = { value = 0.12, tolerance = 0.03 } }'
-    log, file = written(tmp_path, drive, current)
+    log, file = write_log_and_drive_file(tmp_path, drive, current)
     rig = read_rig([log], file)
     motor, load, constant = rig.model.drive.priors
     assert motor == Prior("J_m", pytest.approx(4e-5), pytest.approx(0.05))
@@ -65,16 +65,16 @@ def test_what_is_known_reaches_the_model(tmp_path: Path):
         ({"columns": {"motor_torque": {"column": "T", "torque_constant": 0.1}}}, "torque_constant"),
     ],
 )
-def test_what_is_not_understood_is_refused_in_one_sentence(tables, words):
+def test_invalid_prior_or_torque_constant_is_refused_in_one_sentence(tables, words):
     with pytest.raises(InputError, match=words) as refused:
         drive_of(tables, Path("drive.toml"))
     assert "\n" not in str(refused.value)
 
 
-def test_report_and_model_tell_what_was_known(tmp_path: Path, own_cache):
+def test_report_and_stored_model_hold_the_priors(tmp_path: Path, own_cache):
     drive = 'motor_inertia = { value = 4.4e-5, tolerance = "10 %" }\nload_inertia = "fit"'
     current = f'motor_current = {{ column = "iq", unit = "mA", torque_constant = {CONSTANT} }}'
-    log, file = written(tmp_path, drive, current)
+    log, file = write_log_and_drive_file(tmp_path, drive, current)
     with pytest.raises(SystemExit, match="^0$"):
         main(["fit", str(log), "--drive", str(file), "--out", str(tmp_path / "out")])
     report = json.loads((tmp_path / "out/report.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""LabVIEW measurement files: sections, units, and stamps of one, several or no columns."""
+"""LabVIEW measurement files: sections, units, and one, several or no columns of time stamps."""
 
 from pathlib import Path
 
@@ -44,7 +44,9 @@ def lvm(folder: Path, *, columns: str, decimal: str, comment: bool = True, secti
 @pytest.mark.parametrize("comment", [False, True])
 @pytest.mark.parametrize("columns", ["One", "Multi", "No"])
 @pytest.mark.parametrize("sections", [1, 3])
-def test_the_table_is_read(tmp_path: Path, columns: str, decimal: str, comment: bool, sections: int):
+def test_lvm_table_is_read_with_units_and_time_stamps(
+    tmp_path: Path, columns: str, decimal: str, comment: bool, sections: int
+):
     table = lvm(tmp_path, columns=columns, decimal=decimal, comment=comment, sections=sections)
     np.testing.assert_array_equal(table.columns["A"].values, A)
     np.testing.assert_array_equal(table.columns["B"].values, B)

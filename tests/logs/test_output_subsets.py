@@ -1,4 +1,4 @@
-"""Which outputs a drive log is fitted to, and what is said where an angle is lacking."""
+"""Outputs to which a drive log is fitted, and the findings where an angle is missing."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ ALL = joints.log_of_sensors(JOINT, joints.SENSORS, count=600)
 
 
 def read(folder: Path, columns: dict[str, str], text: str = DRIVE, **options) -> Log:
-    """The log with some signals under the names of its columns."""
+    """Write some signals under given column names, and read the log."""
     values = {"time": ALL.time} | {name: getattr(ALL, signal) for name, signal in columns.items()}
     head = ",".join(values)
     np.savetxt(folder / "log.csv", np.stack([*values.values()], 1), "%.12g", ",", header=head, comments="")
@@ -42,7 +42,9 @@ def named(*signals: str) -> dict[str, str]:
         (("motor_angle", "load_angle", "motor_velocity", "joint_torque"), ("motor_angle", "load_angle")),
     ],
 )
-def test_the_outputs_are_those_that_were_logged(tmp_path: Path, signals: tuple[str, ...], outputs: tuple[str, ...]):
+def test_fitted_outputs_follow_from_the_logged_columns(
+    tmp_path: Path, signals: tuple[str, ...], outputs: tuple[str, ...]
+):
     log = read(tmp_path, named("motor_torque", *signals))
     assert log.kind == "drive" and log.outputs == outputs
     measured = base_model(read_drive_file(tmp_path / "drive.toml"), log).measured
@@ -50,20 +52,20 @@ def test_the_outputs_are_those_that_were_logged(tmp_path: Path, signals: tuple[s
     assert (log.dynamic_error is None) == ("load_angle" not in outputs)
 
 
-def test_a_log_without_a_load_angle_says_so_and_names_what_could_be_it(tmp_path: Path):
+def test_missing_load_angle_is_reported_with_a_likely_column(tmp_path: Path):
     log = read(tmp_path, named("motor_torque", "motor_angle"))
     assert [f.severity for f in log.findings] == ["note"] and "no load_angle" in log.findings[0].what
     log = read(tmp_path, named("motor_torque", "motor_angle") | {"q_link": "load_angle"})
     assert log.findings[0].severity == "warning" and "'q_link' could be load_angle" in log.findings[0].consequence
 
 
-def test_a_log_without_a_torque_is_refused_for_the_torque(tmp_path: Path):
+def test_missing_motor_torque_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="no column for motor_torque") as error:
         read(tmp_path, named("motor_angle", "load_velocity"))
     assert "load_angle" not in str(error.value)
 
 
-def test_outputs_beyond_those_asked_for_are_not_looked_at(tmp_path: Path):
+def test_outputs_after_the_known_samples_are_masked(tmp_path: Path):
     columns = named("motor_torque", "motor_angle", "joint_torque")
     log = read(tmp_path, columns, outputs_until=50)
     assert log.trusted is not None and log.trusted.sum() == 50
@@ -72,6 +74,6 @@ def test_outputs_beyond_those_asked_for_are_not_looked_at(tmp_path: Path):
     assert ready.dynamic_error is None and ready.zero == 0.0
 
 
-def test_twist_and_joint_torque_beside_a_torque_stay_quasi_static(tmp_path: Path):
+def test_log_with_twist_and_joint_torque_is_quasi_static(tmp_path: Path):
     columns = named("motor_torque", "joint_torque") | {"twist": "load_angle"}
     assert read(tmp_path, columns).kind == "quasi-static"

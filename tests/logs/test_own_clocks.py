@@ -1,4 +1,4 @@
-"""A time column before each signal: each is read on its own clock."""
+"""Logs with a time column for each signal: each signal is read on its own clock."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -50,27 +50,27 @@ def save(folder: Path, channels: Sequence[Channel], *, time_first: bool = True, 
     return folder / "log.csv"
 
 
-def told(log: Log) -> str:
+def findings_text(log: Log) -> str:
     return " ".join(map(str, log.findings))
 
 
 @pytest.mark.parametrize("time_first", [True, False])
-def test_one_clock_written_before_each_signal(tmp_path: Path, time_first: bool):
+def test_equal_time_columns_give_one_time_base(tmp_path: Path, time_first: bool):
     path = save(tmp_path, [(TIME, MOTOR), (TIME, FINE[::5, 1]), (TIME, TORQUE)], time_first=time_first)
     log = read_log(path, drive(tmp_path))
     np.testing.assert_array_equal(log.time, TIME)
     np.testing.assert_array_equal(log.motor_torque, TORQUE)
-    assert log.trusted is None and log.pieces is None and "3 columns are called 'Time'" in told(log)
+    assert log.trusted is None and log.pieces is None and "3 columns are called 'Time'" in findings_text(log)
 
 
-def test_clocks_that_round_apart_are_one(tmp_path: Path):
+def test_clocks_that_differ_by_rounding_give_one_time_base(tmp_path: Path):
     path = save(tmp_path, [(TIME, MOTOR), (TIME + 1e-9, FINE[::5, 1]), (TIME - 1e-9, TORQUE)])
     log = read_log(path, drive(tmp_path))
     np.testing.assert_allclose(log.time, TIME, atol=2e-9)
     assert log.trusted is None
 
 
-def test_each_signal_keeps_its_clock(tmp_path: Path):
+def test_each_signal_is_read_on_its_own_clock(tmp_path: Path):
     late = TIME[::2] + 0.4 * rig.STEP
     path = save(tmp_path, [(TIME, MOTOR), (late, LOAD[::2]), (TIME, TORQUE)])
     log = read_log(path, drive(tmp_path))
@@ -84,7 +84,7 @@ def test_each_signal_keeps_its_clock(tmp_path: Path):
     np.testing.assert_array_equal(np.asarray(acting.coefficients)[at, 0], TORQUE[5:-5])
 
 
-def test_only_what_all_signals_share_is_kept(tmp_path: Path):
+def test_only_the_time_common_to_all_signals_is_kept(tmp_path: Path):
     path = save(tmp_path, [(TIME[:1500], MOTOR[:1500]), (TIME[100:], FINE[::5, 1][100:]), (TIME, TORQUE)])
     log = read_log(path, drive(tmp_path))
     assert TIME[98] < log.time[0] <= TIME[100] and TIME[1499] <= log.time[-1] < TIME[1502]
@@ -93,15 +93,15 @@ def test_only_what_all_signals_share_is_kept(tmp_path: Path):
         read_log(path, drive(tmp_path))
 
 
-def test_rounded_stamps_of_each_clock_become_steady(tmp_path: Path):
+def test_rounded_stamps_of_each_clock_are_reconstructed(tmp_path: Path):
     rounded = np.round(TIME, 3)
     path = save(tmp_path, [(rounded, MOTOR), (rounded, FINE[::5, 1]), (rounded, TORQUE)])
     log = read_log(path, drive(tmp_path))
     np.testing.assert_allclose(np.diff(log.time), rig.STEP, rtol=1e-3)
-    assert log.rate_std > 0 and "steady clock" in told(log) and log.trusted is None
+    assert log.rate_std > 0 and "steady clock" in findings_text(log) and log.trusted is None
 
 
-def test_frames_number_repeated_names_their_own_way():
+def test_data_frame_with_numbered_time_columns_is_read():
     import polars as pl
 
     names = ("Time", "Motor", "Time.1", "Load", "Time.2", "Torque")
@@ -109,11 +109,11 @@ def test_frames_number_repeated_names_their_own_way():
     padded = [np.pad(column, (0, COUNT - len(column)), constant_values=np.nan) for column in columns]
     frame = pl.DataFrame(dict(zip(names, padded, strict=True)))
     folder = Path("frame")
-    log = read_log(folder, read_drive_file_of(DRIVE), table=frame)
+    log = read_log(folder, drive_file_of(DRIVE), table=frame)
     assert log.trusted is not None and abs(log.trusted.sum() - COUNT // 2) <= 2
 
 
-def read_drive_file_of(text: str) -> DriveFile:
+def drive_file_of(text: str) -> DriveFile:
     import tomllib
 
     from fitting.logs.drive_file import drive_of
@@ -121,7 +121,7 @@ def read_drive_file_of(text: str) -> DriveFile:
     return drive_of(tomllib.loads(text), Path("drive"))
 
 
-def test_mistakes_are_told(tmp_path: Path):
+def test_invalid_clock_columns_are_refused(tmp_path: Path):
     path = save(tmp_path, [(TIME, MOTOR), (TIME, LOAD), (TIME, TORQUE)])
     path.write_text(path.read_text(encoding="utf-8").replace("Load", "Motor", 1), encoding="utf-8")
     with pytest.raises(InputError, match=r"'Motor' appears twice; give .* its number, or the name 'Motor \(2\)'"):
@@ -137,14 +137,14 @@ def test_mistakes_are_told(tmp_path: Path):
         read_log(again, drive(tmp_path))
 
 
-def test_a_prediction_asks_for_so_many_samples_of_each(tmp_path: Path):
+def test_prediction_uses_the_first_samples_of_each_output(tmp_path: Path):
     late = TIME[::2] + 0.4 * rig.STEP
     motor, load = MOTOR.copy(), LOAD[::2].copy()
     path = save(tmp_path, [(TIME, motor), (late, load), (TIME, TORQUE)])
     log = read_log(path, drive(tmp_path), outputs_until=50)
     assert log.outputs_until is not None and log.trusted is not None
     assert 48 <= log.trusted.sum() <= 50 and not log.trusted[log.outputs_until :].any()
-    # What comes later is not looked at.
+    # Later outputs do not matter.
     motor[103:], load[51:] = 0.0, 0.0
     again = read_log(save(tmp_path, [(TIME, motor), (late, load), (TIME, TORQUE)]), drive(tmp_path), outputs_until=50)
     np.testing.assert_array_equal(again.dynamic_error[again.trusted], log.dynamic_error[log.trusted])

@@ -1,4 +1,4 @@
-"""Channels of different rates and clocks meet on one grid, and the torque keeps its own hold."""
+"""Channels of different rates and clocks on one time base; the torque keeps its inter-sample behaviour."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ CLOCKS = "\n".join(
 )
 
 
-def test_channels_with_clocks_of_their_own(tmp_path: Path):
+def test_slow_torque_is_held_between_its_own_samples(tmp_path: Path):
     slow = slice(None, None, 4)
     path = groups(
         tmp_path,
@@ -58,14 +58,14 @@ def test_channels_with_clocks_of_their_own(tmp_path: Path):
     assert log.input_known is not None and log.pieces == ((0, COUNT - 3),)
     np.testing.assert_array_equal(np.flatnonzero(log.input_known), np.arange(0, COUNT, 4))
     experiment = experiment_from_log(log, hold="zero-order", N=rig.N)
-    # A slower torque is held from one of its own samples to the next.
+    # A slow torque is held from one of its own samples to the next.
     held = np.repeat(TORQUE[slow], 4)
     np.testing.assert_array_equal(np.asarray(experiment.torque.coefficients)[:-4, 0], held[:-4])
     assert (np.asarray(experiment.torque.coefficients)[:-4, 1:] == 0).all()
 
 
 @pytest.mark.parametrize("hold", ["linear", "cubic"])
-def test_a_slower_torque_keeps_its_polynomials(tmp_path: Path, hold: str):
+def test_slow_torque_is_interpolated_between_its_own_samples(tmp_path: Path, hold: str):
     slow = slice(None, None, 5)
     columns = np.full((COUNT, 4), np.nan)
     columns[:, 0], columns[:, 1], columns[:, 2] = TIME, MOTION[:, 0], MOTION[:, 1]
@@ -85,13 +85,13 @@ def test_a_slower_torque_keeps_its_polynomials(tmp_path: Path, hold: str):
     else:
         from scipy.interpolate import CubicSpline
 
-        # The last row was logged without torque; it holds the nearest.
+        # The last row has no torque of its own; the nearest one is held.
         own = np.append(TIME[slow], TIME[-1]), np.append(TORQUE[slow], TORQUE[slow][-1])
         expected = CubicSpline(*own)(at)
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_angles_sampled_at_different_times(tmp_path: Path):
+def test_angles_sampled_at_different_times_give_the_dynamic_error(tmp_path: Path):
     torque = rig.drive_torque(COUNT)
     fine = rig.drive_motion(np.repeat(torque, 2), step=rig.STEP / 2)
     time = np.arange(2 * COUNT) * rig.STEP / 2
@@ -111,7 +111,7 @@ def test_angles_sampled_at_different_times(tmp_path: Path):
     np.testing.assert_allclose(log.dynamic_error[known], x[known], atol=0.01 * np.std(x))
 
 
-def test_angles_too_slow_to_meet_are_refused(tmp_path: Path):
+def test_slow_angles_sampled_at_different_times_are_refused(tmp_path: Path):
     time = np.arange(COUNT) * 0.02
     rough = np.random.default_rng(0).normal(size=COUNT)
     path = groups(
@@ -133,7 +133,7 @@ def test_angles_too_slow_to_meet_are_refused(tmp_path: Path):
         (CLOCKS.replace('"load_angle/t"', '"short"'), ["load_angle", "one stamp a sample"]),
     ],
 )
-def test_clocks_that_do_not_fit(tmp_path: Path, columns: str, words: list[str]):
+def test_invalid_clock_of_a_signal_is_refused(tmp_path: Path, columns: str, words: list[str]):
     path = groups(
         tmp_path, motor_angle=(TIME, MOTION[:, 0]), load_angle=(TIME, MOTION[:, 1]), motor_torque=(TIME, TORQUE)
     )

@@ -1,4 +1,4 @@
-"""Recordings of robots: fields of topics are columns with the stamps of their messages."""
+"""ROS recordings: each field of a topic is a column with the time stamps of its messages."""
 
 import json
 from collections.abc import Callable
@@ -96,7 +96,7 @@ FORMATS: dict[str, tuple[str, Callable[[Path], None], bool]] = {
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_fields_of_topics_are_columns(tmp_path: Path, name: str):
+def test_topic_fields_are_columns_with_message_stamps(tmp_path: Path, name: str):
     suffix, write, all_have_headers = FORMATS[name]
     path = tmp_path / f"log{suffix}"
     write(path)
@@ -106,7 +106,7 @@ def test_fields_of_topics_are_columns(tmp_path: Path, name: str):
         np.testing.assert_array_equal(table.columns[column].values, expected)
         time = table.columns[column].time
         assert time is not None
-        # Without a header in all of them, the messages of all topics count from their receipt.
+        # Where one topic has no header, the times of receipt apply to all topics.
         late = 0.0 if all_have_headers else LATE * 1e-9
         np.testing.assert_allclose(time, np.arange(COUNT) * 1e-3 + late, atol=1e-12)
     alone = read_table(path, WANTED[:1]).columns[WANTED[0]].time
@@ -117,7 +117,7 @@ def test_fields_of_topics_are_columns(tmp_path: Path, name: str):
     assert set(missing.columns) == set(WANTED)
 
 
-def test_an_encoding_that_is_not_read_is_named(tmp_path: Path):
+def test_unsupported_message_encoding_is_refused(tmp_path: Path):
     writer = pytest.importorskip("mcap.writer", reason="needs the extra `ros`: mcap is not installed")
     path = tmp_path / "log.mcap"
     with path.open("wb") as file:

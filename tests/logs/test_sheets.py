@@ -1,4 +1,4 @@
-"""Spreadsheets: the table is found wherever it stands, in full precision."""
+"""Spreadsheets: a table at any place of a workbook is found and read in full precision."""
 
 from pathlib import Path
 from zipfile import ZipFile
@@ -15,7 +15,7 @@ ANGLE = np.random.default_rng(0).normal(size=COUNT) * 1e-7
 WANTED = ("Time", "Motor", "Time (2)", "Torque")
 
 
-def test_the_table_is_found_in_full_precision(tmp_path: Path):
+def test_spreadsheet_table_is_found_and_read_in_full_precision(tmp_path: Path):
     pytest.importorskip("fastexcel", reason="needs the extra `xlsx`: fastexcel is not installed")
     path = tmp_path / "log.xlsx"
     rows: dict[int, dict[str, object]] = {
@@ -35,7 +35,7 @@ def test_the_table_is_found_in_full_precision(tmp_path: Path):
     np.testing.assert_array_equal(torque.values[known], 1.0 / (known + 3.0))
 
 
-def test_a_workbook_without_a_table_is_refused(tmp_path: Path):
+def test_workbook_without_a_table_is_refused(tmp_path: Path):
     pytest.importorskip("fastexcel", reason="needs the extra `xlsx`: fastexcel is not installed")
     path = tmp_path / "log.xlsx"
     workbook(path, {1: {"A": "Nothing"}, 2: {"A": "here"}})
@@ -44,7 +44,7 @@ def test_a_workbook_without_a_table_is_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["log.xlsx", "log.xls", "log.csv"])
-def test_what_only_looks_like_a_workbook_is_refused(tmp_path: Path, name: str):
+def test_zip_archive_without_a_workbook_is_refused(tmp_path: Path, name: str):
     path = tmp_path / name
     with ZipFile(path, "w") as file:
         file.writestr("readme.txt", "nothing")

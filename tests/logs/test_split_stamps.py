@@ -1,4 +1,4 @@
-"""Stamps in two columns are joined; one of the two alone is unwrapped."""
+"""Time stamps in two columns (seconds and fractions): both are joined; fractions alone are unwrapped."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ PAIRS = {
 
 @pytest.mark.parametrize(("whole", "part", "scale"), PAIRS.values(), ids=PAIRS.keys())
 @pytest.mark.parametrize("named", [0, 1])
-def test_two_columns_are_joined(tmp_path: Path, whole: str, part: str, scale: int, named: int):
+def test_seconds_and_fractions_in_two_columns_are_joined(tmp_path: Path, whole: str, part: str, scale: int, named: int):
     name = (whole, part)[named].replace("__", ".")
     columns = {whole: SECONDS + 1_700_000_000, part: REST // scale}
     log = read(tmp_path, f'time = "{name}"', **columns)
@@ -47,22 +47,22 @@ def test_two_columns_are_joined(tmp_path: Path, whole: str, part: str, scale: in
     assert "two columns" in finding.what and "joined" in finding.consequence
 
 
-def test_names_that_say_nothing_are_joined_as_the_drive_file_says(tmp_path: Path):
+def test_fraction_column_stated_in_the_drive_file_is_joined(tmp_path: Path):
     columns = {"a": SECONDS, "b": REST // 1_000_000}
     log = read(tmp_path, 'time = { column = "a", fraction = { column = "b", unit = "ms" } }', **columns)
     assert np.max(np.abs(log.time - STAMPS * 1e-9)) < 1.1e-3
     assert "two columns" in log.findings[0].what
 
 
-def test_parts_of_a_second_alone_are_unwrapped(tmp_path: Path):
+def test_fractions_of_a_second_alone_are_unwrapped(tmp_path: Path):
     log = read(tmp_path, 'time = { column = "time_us", unit = "us" }', time_us=REST // 1000)
     np.testing.assert_allclose(log.time, STAMPS * 1e-9, atol=1e-6)
     (finding,) = log.findings
     assert "wraps" in finding.what and "unwrapped" in finding.consequence
 
 
-def test_columns_that_are_no_parts_are_not_joined(tmp_path: Path):
-    # Each holds all of the time.
+def test_two_complete_time_columns_are_not_joined(tmp_path: Path):
+    # Each column holds the complete time.
     log = read(tmp_path, 'time = { column = "t_us", unit = "us" }', t_s=LOG.time, t_us=np.rint(LOG.time * 1e6))
     np.testing.assert_allclose(log.time, LOG.time, atol=1e-6)
     assert log.findings == ()
@@ -76,7 +76,7 @@ def test_columns_that_are_no_parts_are_not_joined(tmp_path: Path):
         ('motor_angle = { fraction = "b" }', ["fraction", "motor_angle"]),
     ],
 )
-def test_mistakes_are_told(tmp_path: Path, columns: str, words: list[str]):
+def test_invalid_fraction_column_is_refused(tmp_path: Path, columns: str, words: list[str]):
     with pytest.raises(InputError) as error:
         read(tmp_path, columns, t_s=LOG.time)
     for word in words:

@@ -1,4 +1,4 @@
-"""The same numbers in every dialect of text."""
+"""Text files: delimiters, decimal signs, encodings, headers, units, dates and invalid cells."""
 
 from pathlib import Path
 
@@ -66,7 +66,7 @@ DIALECTS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("text", DIALECTS.values(), ids=DIALECTS.keys())
-def test_every_dialect_gives_the_same_columns(text: str | bytes):
+def test_every_text_dialect_gives_the_same_columns(text: str | bytes):
     found = read(text)
     np.testing.assert_array_equal(found.columns["time"].values, TIME)
     np.testing.assert_array_equal(found.columns["a"].values, A)
@@ -74,7 +74,7 @@ def test_every_dialect_gives_the_same_columns(text: str | bytes):
 
 
 @pytest.mark.parametrize("name", ["unit row", "bracketed unit row", "units in the header"])
-def test_units_are_read(name: str):
+def test_units_of_text_columns_are_read(name: str):
     found = read(DIALECTS[name])
     assert (found.columns["time"].unit, found.columns["a"].unit) == ("s", "N m")
 
@@ -87,16 +87,16 @@ def test_units_are_read(name: str):
         (["1.234.567", "2.000"], [1234567, 2000]),
         (["1'234.5", "12.25"], [1234.5, 12.25]),
         (["1 234,5", "12,25"], [1234.5, 12.25]),
-        # One comma with three digits behind it is a decimal comma, where semicolons part the cells.
+        # Where semicolons separate the cells, one comma before three digits is a decimal comma.
         (["1,234", "12,345"], [1.234, 12.345]),
     ],
 )
-def test_thousands(cells: list[str], expected: list[float]):
+def test_thousands_separators_are_read(cells: list[str], expected: list[float]):
     found = read("time;a\n" + "".join(f"{i};{c}\n" for i, c in enumerate(cells)))
     np.testing.assert_allclose(found.columns["a"].values, expected, rtol=1e-15)
 
 
-def test_quoted_thousands():
+def test_quoted_thousands_separators_are_read():
     found = read('time,a\n0,"1,234"\n1,"12,345,678"\n')
     np.testing.assert_array_equal(found.columns["a"].values, [1234, 12345678])
 
@@ -134,20 +134,20 @@ def test_dates_and_times_of_day_become_seconds(first: str, second: str):
         ("1 day, 23:59:59.750", "2 days, 0:00:00.250"),
     ],
 )
-def test_durations_as_text(cells: tuple[str, str]):
+def test_durations_as_text_are_read(cells: tuple[str, str]):
     column = read(f'time;a\n"{cells[0]}";1\n"{cells[1]}";2\n').columns["time"]
     assert column.unit is not None and len(column.text_rows) == 0
     np.testing.assert_allclose(np.diff(convert(column.values, column.unit, "s")), 0.5, rtol=1e-12)
 
 
-def test_numbers_with_their_unit_in_each_cell():
+def test_numbers_with_a_unit_in_each_cell_are_read():
     column = read("time;a\n0;1.5 N m\n1;250 mN m\n2;overload\n3;-0,5 N m\n".replace("1.5", "1,5")).columns["a"]
     assert column.unit == "N m" and column.text == "overload"
     np.testing.assert_allclose(column.values, [1.5, 0.25, np.nan, -0.5])
     np.testing.assert_array_equal(column.text_rows, [2])
 
 
-def test_columns_by_number():
+def test_columns_are_selected_by_number():
     rows = "0,1.5,7\n0.5,-2.25,7\n"
     for head in ("", "# no names here\n", "time,a,b\n"):
         found = read(head + rows, wanted=("column 1", "column 2", "column 9"))
@@ -156,7 +156,7 @@ def test_columns_by_number():
     assert read(rows, wanted=()).names == ("column 1", "column 2", "column 3")
 
 
-def test_repeated_names_are_numbered():
+def test_repeated_column_names_are_numbered():
     found = read("time [s],a,time [ms],a\n0,1,2,3\n1,2,3,4\n", wanted=("time", "time (2)", "a (2)", "column 4"))
     assert found.names == ("time [s]", "a", "time (2) [ms]", "a (2)") and found.repeated == {"time", "a"}
     assert (found.columns["time"].unit, found.columns["time (2)"].unit) == ("s", "ms")
@@ -165,31 +165,31 @@ def test_repeated_names_are_numbered():
 
 
 @pytest.mark.parametrize("above", ["Samples\t9\t9\nDelta\t1\t1\n***\t\n", "x\t1\t2\n", ""])
-def test_lines_above_that_look_like_rows_are_not_the_table(above: str):
+def test_numeric_lines_above_the_header_are_skipped(above: str):
     found = read(above + "time\ta\tb\tComment\n0\t1,5\t7\n1\t2,5\t7\tstart\n2\t3,5\t7\n")
     np.testing.assert_array_equal(found.columns["a"].values, [1.5, 2.5, 3.5])
     np.testing.assert_array_equal(found.columns["time"].values, [0, 1, 2])
 
 
-def test_a_spoilt_row_does_not_hide_those_above_it():
+def test_invalid_row_does_not_discard_the_rows_above():
     found = read("time,a\n0,1\n1,2\n,overload\n3,4\n4,5\n5,6\n")
     np.testing.assert_array_equal(found.columns["a"].values, [1, 2, np.nan, 4, 5, 6])
     np.testing.assert_array_equal(found.columns["a"].text_rows, [2])
 
 
-def test_a_date_that_may_be_read_two_ways_is_text():
+def test_ambiguous_date_is_read_as_text():
     column = read("time;a\n09/10/2026 10:00:00;1\n09/10/2026 10:00:01;2\n").columns["time"]
     assert len(column.text_rows) == 2
 
 
-def test_blanks_and_text_are_told_apart():
+def test_blank_cells_are_distinguished_from_text():
     column = read("time,a\n0,1\n1,\n2,NaN\n3,n/a\n4,OVLD\n5,-\n6,2\n").columns["a"]
     np.testing.assert_array_equal(np.isnan(column.values), [False, True, True, True, True, True, False])
     np.testing.assert_array_equal(column.text_rows, [4])
     assert column.text == "OVLD"
 
 
-def test_short_and_long_rows():
+def test_rows_of_wrong_length_are_padded_or_truncated():
     found = read("time,a,b\n0,1,2\n1\n2,3,4,5,6\n3,4,5\n")
     np.testing.assert_array_equal(found.columns["time"].values, [0, 1, 2, 3])
     np.testing.assert_array_equal(found.columns["a"].values, [1, np.nan, 3, 4])
@@ -205,14 +205,14 @@ def test_short_and_long_rows():
         (b"time,a\n\x00\x01\x02,3\n", ["not text"]),
     ],
 )
-def test_what_is_no_table_is_refused(text: str | bytes, words: list[str]):
+def test_text_without_a_table_is_refused(text: str | bytes, words: list[str]):
     with pytest.raises(InputError) as error:
         read(text)
     for word in words:
         assert word in str(error.value)
 
 
-def test_a_header_alone_names_the_columns():
+def test_header_without_rows_gives_the_column_names():
     found = read("time;a;b\n")
     assert found.names == ("time", "a", "b") and found.columns == {}
 
@@ -228,7 +228,7 @@ def test_a_header_alone_names_the_columns():
         ("x", ("x", None)),
     ],
 )
-def test_units_in_headers(header: str, expected: tuple[str, str | None]):
+def test_unit_is_split_from_the_column_name(header: str, expected: tuple[str, str | None]):
     assert split_unit(header) == expected
 
 
@@ -254,7 +254,7 @@ OTHER = {
 
 
 @pytest.mark.parametrize(("text", "delimiter"), PLAIN.values(), ids=PLAIN.keys())
-def test_plain_numbers_are_those_of_the_reader_for_any_spelling(text: str, delimiter: str):
+def test_plain_number_reader_agrees_with_the_general_reader(text: str, delimiter: str):
     lines, places = text.splitlines(), [0, 1]
     plain = plain_columns(lines, delimiter, places)
     assert plain is not None
@@ -267,5 +267,5 @@ def test_plain_numbers_are_those_of_the_reader_for_any_spelling(text: str, delim
 
 
 @pytest.mark.parametrize(("text", "delimiter"), OTHER.values(), ids=OTHER.keys())
-def test_what_is_not_plain_is_left_to_the_reader_for_any_spelling(text: str, delimiter: str):
+def test_plain_number_reader_declines_other_spellings(text: str, delimiter: str):
     assert plain_columns(text.splitlines(), delimiter, [0, 1]) is None

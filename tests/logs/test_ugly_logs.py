@@ -1,4 +1,4 @@
-"""Spoilt logs give a result or one clear sentence: no traceback, no hang, no NaN."""
+"""Corrupted logs give a result or one sentence: no traceback, no endless run, no NaN."""
 
 import json
 import time
@@ -20,8 +20,8 @@ from fitting.logs.log import Log
 LONGEST = 20.0
 
 
-def outcome(log_path: Path, drive_path: Path) -> Log | ValueError:
-    """The log, ready to be fitted, or the refusal."""
+def read_or_refusal(log_path: Path, drive_path: Path) -> Log | ValueError:
+    """The log, ready to be fitted, or the error by which it is refused."""
     try:
         drive = read_drive_file(drive_path)
         log = ready_log(log_path, drive)
@@ -35,8 +35,8 @@ def outcome(log_path: Path, drive_path: Path) -> Log | ValueError:
     return log
 
 
-def assert_sound(found: Log | ValueError, log_path: Path, drive_path: Path) -> None:
-    """A log without a number that is none, or one sentence that names the file."""
+def assert_valid(found: Log | ValueError, log_path: Path, drive_path: Path) -> None:
+    """Assert that a log is finite and ordered in time, or that an error is one sentence that names the file."""
     if isinstance(found, ValueError):
         message = str(found)
         assert len(message.splitlines()) == 1 and message.isprintable(), message
@@ -60,38 +60,38 @@ def fit(log_path: Path, drive_path: Path, out: Path) -> int:
     return 0
 
 
-def check(seed: int, folder: Path) -> bool:
-    """Whether a spoilt log can be fitted all the same."""
+def is_readable(seed: int, folder: Path) -> bool:
+    """Whether a corrupted log passes the checks."""
     log_path, drive_path = mutations.spoilt_case(seed, folder / str(seed))
     begin = time.monotonic()
-    found = outcome(log_path, drive_path)
+    found = read_or_refusal(log_path, drive_path)
     assert time.monotonic() - begin < LONGEST
-    assert_sound(found, log_path, drive_path)
+    assert_valid(found, log_path, drive_path)
     return isinstance(found, Log)
 
 
 @pytest.mark.parametrize("block", range(6))
-def test_spoilt_logs_give_a_log_or_a_sentence(block: int, tmp_path: Path):
-    fitted = [check(seed, tmp_path) for seed in range(20 * block, 20 * block + 20)]
-    # Neither are all refused nor all let through: the mutations bite, and the gate is no wall.
+def test_corrupted_logs_are_read_or_refused_in_one_sentence(block: int, tmp_path: Path):
+    fitted = [is_readable(seed, tmp_path) for seed in range(20 * block, 20 * block + 20)]
+    # Some logs are refused and some pass, so that both outcomes are tested.
     assert 0 < sum(fitted) < len(fitted)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(10))
-def test_a_thousand_spoilt_logs(block: int, tmp_path: Path):
+def test_a_thousand_corrupted_logs_are_read_or_refused(block: int, tmp_path: Path):
     for seed in range(1000 + 100 * block, 1100 + 100 * block):
-        check(seed, tmp_path)
+        is_readable(seed, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
-def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    """The fit itself, on spoilt logs that the gate lets through: a report without a NaN, or one sentence."""
+def test_corrupted_logs_that_pass_the_checks_are_fitted_or_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    """A fit of corrupted logs that pass the checks gives a report without NaN, or one sentence."""
     fitted = 0
     for seed in range(200, 300):
         log_path, drive_path = mutations.spoilt_case(seed, tmp_path / str(seed))
-        if isinstance(outcome(log_path, drive_path), ValueError):
+        if isinstance(read_or_refusal(log_path, drive_path), ValueError):
             continue
         out = tmp_path / str(seed) / "out"
         capfd.readouterr()
@@ -112,8 +112,8 @@ def test_what_passes_the_gate_is_fitted_or_refused(tmp_path: Path, capfd: pytest
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("own_cache")
-def test_an_ugly_log_gives_the_same_drive(tmp_path: Path):
-    """Latin-1, decimal commas, degrees, a gap, a dropped sample, blanks, spikes, encoders that were never zeroed."""
+def test_parameters_are_recovered_from_a_log_with_many_defects(tmp_path: Path):
+    """Latin-1, decimal commas, degrees, a gap, a dropped sample, blanks, spikes, encoders without a common zero."""
     count, random = 6000, np.random.default_rng(0)
     torque = rig.drive_torque(count)
     log = rig.drive_log(rig.drive_motion(torque), torque)
@@ -131,7 +131,7 @@ def test_an_ugly_log_gives_the_same_drive(tmp_path: Path):
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     found = report["before"]["parameters"]
     for name, truth in {"K": rig.K, "alpha": rig.ALPHA, "B_sp": rig.B_SP}.items():
-        # Four standard errors, and the bridged sample's share of one.
+        # Four standard errors, and one for the interpolated sample.
         assert abs(found[name]["value"] - truth) < 5 * found[name]["std"], name
     noise = np.hypot(rig.MOTOR_NOISE / rig.N, rig.LOAD_NOISE)
     assert report["before"]["rmse"]["test"] < 1.1 * noise

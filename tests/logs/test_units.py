@@ -1,4 +1,4 @@
-"""Units as people write them: what a table knows is what pint says."""
+"""Units as commonly written: the table of common units against pint, and expressions with factors."""
 
 import subprocess
 import sys
@@ -15,14 +15,14 @@ def registry() -> pint.UnitRegistry:
     return pint.UnitRegistry()
 
 
-# pint takes the last two spellings for others.
+# pint reads these two spellings as other units.
 @pytest.mark.parametrize("unit", [u for u in USUAL if u not in ("Nm", "mNm")])
-def test_usual_units_are_those_of_pint(unit: str, registry: pint.UnitRegistry):
+def test_common_units_agree_with_pint(unit: str, registry: pint.UnitRegistry):
     target, factor = USUAL[unit]
     assert factor == pytest.approx(float(registry.Quantity(1.0, unit.replace("rev", "turn")).m_as(target)), rel=1e-15)
     values = np.array([-1.5, 0.0, 2.0])
     np.testing.assert_allclose(convert(values, unit, target), factor * values, rtol=1e-15)
-    # A factor before it takes the unit to pint, as any expression that is not in the table.
+    # With a factor the expression is not in the table, so that pint converts it.
     slow, name = to_base(values, f"1 * ({unit})")
     quick, quick_name = to_base(values, unit)
     assert quick_name == name == target
@@ -45,19 +45,19 @@ def test_usual_units_are_those_of_pint(unit: str, registry: pint.UnitRegistry):
         ("10 N cm", "N m", 0.1),
     ],
 )
-def test_numbers_with_their_units(text: str, target: str, value: float):
+def test_number_with_unit_is_converted(text: str, target: str, value: float):
     assert parse_number(text, target) == pytest.approx(value, rel=1e-14)
 
 
 @pytest.mark.parametrize(
     "text", ["0 deg", "rev / 0", "N m / deg", "Nm / 2 / 3 furlong", "5 kg m^2", "deg deg", "1e999 rad"]
 )
-def test_what_is_no_angle_is_refused(text: str):
+def test_unit_that_is_not_an_angle_is_refused(text: str):
     with pytest.raises(UnitError):
         convert(np.ones(2), text, "rad")
 
 
-def test_usual_units_need_no_pint():
+def test_common_units_do_not_import_pint():
     program = (
         "import sys, numpy\n"
         "from fitting.logs.units import convert, to_base\n"

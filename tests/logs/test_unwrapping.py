@@ -1,4 +1,4 @@
-"""Wrapped angles and overflowed integers run on; what only looks like them is left alone."""
+"""Unwrapping of angles and overflowed integers; other signals are unchanged."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(("running", "span", "low", "revolution"), CASES.values(), ids=CASES.keys())
-def test_wrapped_angles_run_on(running: np.ndarray, span: float, low: float, revolution: float):
+def test_wrapped_angle_is_unwrapped(running: np.ndarray, span: float, low: float, revolution: float):
     wrapped = np.mod(running - low, span) + low
     found, told, rows = unwrapped_angle(wrapped, revolution)
     assert told == span
@@ -34,7 +34,7 @@ def test_wrapped_angles_run_on(running: np.ndarray, span: float, low: float, rev
     np.testing.assert_array_equal(rows, np.flatnonzero(np.abs(np.diff(wrapped)) > span / 2) + 1)
 
 
-def test_blanks_in_a_wrapped_angle():
+def test_wrapped_angle_with_blank_samples_is_unwrapped():
     wrapped = np.mod(ANGLE, 2 * np.pi)
     wrapped[::7] = np.nan
     found, _, rows = unwrapped_angle(wrapped, 2 * np.pi)
@@ -48,7 +48,7 @@ def test_blanks_in_a_wrapped_angle():
     [ANGLE, ANGLE / 20, np.random.default_rng(1).uniform(0, 2 * np.pi, COUNT), np.full(COUNT, np.nan), np.zeros(COUNT)],
     ids=["running", "small", "noise", "blank", "still"],
 )
-def test_other_angles_stay(values: np.ndarray):
+def test_angle_that_does_not_wrap_is_unchanged(values: np.ndarray):
     found, span, rows = unwrapped_angle(values, 2 * np.pi)
     np.testing.assert_array_equal(found, values)
     assert span == 0 and len(rows) == 0
@@ -58,7 +58,7 @@ TORQUE = 40 * np.sin(40 * TIME) + 0.1 * np.random.default_rng(2).normal(size=COU
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0 / 1024])
-def test_an_overflowed_torque_runs_on(unit: float):
+def test_overflowed_torque_is_unwrapped(unit: float):
     whole = np.rint(TORQUE / unit)
     overflowed = np.mod(whole + 2**15, 2.0**16) - 2**15
     found, span, rows = unwrapped_overflow(overflowed * unit)
@@ -76,7 +76,7 @@ def test_an_overflowed_torque_runs_on(unit: float):
     ],
     ids=["integers", "switched", "noise", "real numbers"],
 )
-def test_other_torques_stay(values: np.ndarray):
+def test_torque_that_does_not_overflow_is_unchanged(values: np.ndarray):
     found, span, _ = unwrapped_overflow(values)
     np.testing.assert_array_equal(found, values)
     assert span == 0

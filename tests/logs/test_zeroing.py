@@ -1,4 +1,4 @@
-"""Sensors that were never zeroed together: the spring's zero comes from the motion, and goes back into a prediction."""
+"""Encoders without a common zero: the zero of the twist is estimated from the motion."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,57 +20,57 @@ def drive_log(seed: int = 0, **physics) -> Log:
     return rig.drive_log(rig.drive_motion(torque, **physics), torque, seed=seed)
 
 
-def shifted(log: Log, offset: float) -> Log:
+def with_offset(log: Log, offset: float) -> Log:
     load = None if log.load_angle is None else log.load_angle - offset
     return replace(log, load_angle=load, dynamic_error=log.dynamic_error + offset)
 
 
 @pytest.mark.parametrize("offset", [0.7, -2.0, 24.0, 5e-3])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_zero_of_a_drive(offset: float, seed: int):
+def test_zero_of_a_drive_log_is_estimated(offset: float, seed: int):
     log = drive_log(seed)
-    found = zeroed(shifted(log, offset), DRIVE)
-    # The mean of the motion is off by some 1e-6 rad; the zero is known to a hundredth of the noise of one sample.
+    found = zeroed(with_offset(log, offset), DRIVE)
+    # The mean of the motion has an error of 1e-6 rad; the zero is known to 1 % of one sample's noise.
     assert found.zero == pytest.approx(offset, abs=1e-7)
     np.testing.assert_allclose(found.dynamic_error, log.dynamic_error, atol=1e-7)
     (finding,) = found.findings
     assert "off zero" in finding.what and "not zeroed together" in finding.consequence
 
 
-def test_the_zero_of_a_strongly_nonlinear_drive():
-    """A preload from gravity shifts the median of the twist, not the spring's zero."""
+def test_zero_of_a_strongly_nonlinear_drive_is_estimated():
+    """A preload by gravity shifts the median of the twist, but not the zero of the spring."""
     log = drive_log(alpha=4e5)
-    found = zeroed(shifted(log, 0.3), DRIVE)
+    found = zeroed(with_offset(log, 0.3), DRIVE)
     assert found.zero == pytest.approx(0.3, abs=1e-6)
 
 
-def test_the_zero_of_a_reduced_log():
+def test_zero_of_a_reduced_log_is_estimated():
     forcing = rig.reduced_forcing(4000)
     log = rig.reduced_log(rig.reduced_motion(forcing)[:, 0], forcing, noise=1e-3)
     offset = 5 * np.std(log.dynamic_error)
-    found = zeroed(shifted(log, offset), replace(DRIVE, reduction_ratio=None))
+    found = zeroed(with_offset(log, offset), replace(DRIVE, reduction_ratio=None))
     # A thousandth of the motion, which is a tenth of the noise of one sample.
     assert found.zero == pytest.approx(offset, abs=1e-3 * np.std(log.dynamic_error))
 
 
 @pytest.mark.parametrize("physics", [{}, {"gravity": 20.0}, {"torque_bias": 0.05}, {"mesh_friction": (2.0, 1e-3)}])
-def test_what_a_load_could_explain_stays(physics: dict):
+def test_offset_that_a_load_explains_is_not_removed(physics: dict):
     log = drive_log(**physics)
     assert zeroed(log, DRIVE) is log
 
 
-def test_a_preload_that_the_motor_holds_stays():
+def test_offset_that_a_motor_torque_explains_is_not_removed():
     log = drive_log()
     held = replace(log, motor_torque=log.motor_torque + 5.0, dynamic_error=log.dynamic_error + 5e-3)
     assert zeroed(held, DRIVE) is held
 
 
-def test_wrong_samples_do_not_move_the_zero():
-    log = shifted(drive_log(), 0.7)
+def test_masked_samples_do_not_change_the_zero():
+    log = with_offset(drive_log(), 0.7)
     spoilt = log.dynamic_error.copy()
     spoilt[::50] += 0.1
     trusted = np.arange(COUNT) % 50 != 0
-    # Every window of any length holds a masked row, so that the median must do.
+    # Each window holds a masked row, so that the zero follows from the median.
     assert zeroed(replace(log, dynamic_error=spoilt, trusted=trusted), DRIVE).zero == pytest.approx(0.7, abs=1e-4)
     spoilt = log.dynamic_error.copy()
     spoilt[::500] += 0.1
@@ -78,8 +78,8 @@ def test_wrong_samples_do_not_move_the_zero():
     assert zeroed(replace(log, dynamic_error=spoilt, trusted=trusted), DRIVE).zero == pytest.approx(0.7, abs=1e-6)
 
 
-def test_the_zero_from_the_beginning_of_a_log():
-    log = shifted(drive_log(), 1.5)
+def test_zero_for_a_prediction_follows_from_the_known_samples():
+    log = with_offset(drive_log(), 1.5)
     found = zeroed(replace(log, outputs_until=50), DRIVE)
     assert found.zero == pytest.approx(1.5, abs=0.05 * np.std(log.dynamic_error))
     spoilt = log.dynamic_error.copy()

@@ -1,5 +1,5 @@
-"""The proposed command tells what it promises: the prediction against real refits of noisy data, its gradient against
-differences, its limits in simulation."""
+"""The proposed experiment: its predicted separation against refits of noisy data, its gradient against finite
+differences, and its limits in simulation."""
 
 import csv
 import dataclasses
@@ -46,7 +46,7 @@ PATHS = ("K", "alpha", "B_sp")
 
 
 def with_friction(name: str, excess: float) -> Explanation:
-    """A drive with motor friction that near standstill is larger by what is not fitted; both rivals run one program."""
+    """A drive with motor friction and a fixed excess near standstill; both models share one compiled program."""
     own = StribeckMotorFriction(T_c=0.01, T_excess=excess, b=0.0, transition=1.0, omega_s=4.0)
     model = rig.drive_model().with_effects(own)
     return explanation(name, model, (*PATHS, "stribeck_motor_friction.T_c"), hold="zero-order")
@@ -59,14 +59,14 @@ def rivals() -> tuple[Explanation, Explanation]:
 
 @pytest.fixture(scope="module")
 def proposal(rivals: tuple[Explanation, Explanation]) -> Candidate:
-    """The best command from two of the usual ones."""
+    """The best command found from two standard excitations."""
     starts = [e for e in excitations(LIMITS, rivals[0].model, logged=np.zeros(10)) if "triangle" in e.name]
     found = search(rivals, starts, BENCH, progress=lambda message: None)
     assert found is not None
     return found
 
 
-def test_limits_are_those_that_the_log_has_reached():
+def test_limits_are_the_largest_values_of_the_log():
     experiment = rig.drive_experiment(1000)
     training, _ = split([experiment])
     found = reached(training, most_samples=600)
@@ -77,7 +77,7 @@ def test_limits_are_those_that_the_log_has_reached():
     assert found.samples == 600 and found.time_step == pytest.approx(rig.STEP)
 
 
-def test_a_reduced_log_limits_the_forcing_alone():
+def test_reduced_log_limits_only_the_forcing():
     stretch = Stretch(rig.reduced_experiment(300), 0, 300)
     found = reached([stretch], most_samples=1000)
     assert np.isinf([found.speed, found.travel]).all()
@@ -85,7 +85,7 @@ def test_a_reduced_log_limits_the_forcing_alone():
     assert np.max(np.abs(first.command(first.coefficients))) == pytest.approx(0.98 * found.torque)
 
 
-def test_usual_commands_keep_the_limits_of_a_free_drive():
+def test_standard_excitations_keep_the_limits_of_a_free_drive():
     drive = rig.drive_model(B_sp=3.0)
     for excitation in excitations(LIMITS, drive, logged=rig.drive_torque(900)):
         command = excitation.command(excitation.coefficients)
@@ -94,24 +94,24 @@ def test_usual_commands_keep_the_limits_of_a_free_drive():
         speed = np.cumsum(command) * rig.STEP / inertia
         travel = np.cumsum(speed) * rig.STEP / rig.N
         peaks = [np.max(np.abs(command)) / 0.5, np.max(np.abs(speed)) / 30.0, np.max(np.abs(travel)) / 0.3]
-        # One of the limits is reached but for a margin.
+        # One of the limits is reached, up to a margin.
         assert max(peaks) == pytest.approx(0.98)
         assert abs(command[0]) < 1e-9
 
 
-def test_the_response_is_that_of_the_simulator(rivals: tuple[Explanation, Explanation], proposal: Candidate):
+def test_predicted_response_agrees_with_the_simulator(rivals: tuple[Explanation, Explanation], proposal: Candidate):
     truth, _ = rivals
     own = proposal.evaluation.own[0]
     time = np.arange(LIMITS.samples) * rig.STEP
     motion = simulate(truth.model, sampled(time, proposal.command, hold="zero-order"), time, rtol=1e-10, atol=1e-13)
     white = np.asarray(motion.outputs) / NOISE_STD
-    # Fixed steps of a fifth-order solver: a hundredth of the noise.
+    # The error of fixed steps of a fifth-order solver is below a hundredth of the noise.
     np.testing.assert_allclose(own.outputs.reshape(-1, 2), white, atol=1e-2)
     np.testing.assert_allclose(own.motion[:, 0] * LIMITS.speed, np.asarray(motion.states)[:, 2], rtol=1e-6, atol=1e-6)
 
 
-def test_friction_that_turns_within_no_time_has_derivatives():
-    """A motor that sticks and slides, with a sign as sharp as can be."""
+def test_response_derivative_is_accurate_under_sharp_friction():
+    """Stick-slip motion with nearly discontinuous friction."""
     blunt = with_friction("coulomb", 0.0)
     model = blunt.model.replace({"stribeck_motor_friction.transition": 1e-12})
     friction = "stribeck_motor_friction.T_c"
@@ -130,7 +130,9 @@ def test_friction_that_turns_within_no_time_has_derivatives():
     assert error < 0.05 * np.linalg.norm(by_difference)
 
 
-def test_gradient_of_the_separation(rivals: tuple[Explanation, Explanation], monkeypatch: pytest.MonkeyPatch):
+def test_separation_gradient_agrees_with_finite_differences(
+    rivals: tuple[Explanation, Explanation], monkeypatch: pytest.MonkeyPatch
+):
     # The envelope theorem holds at the minimum.
     monkeypatch.setattr(discrimination, "_ARRIVED", 1e-9)
     monkeypatch.setattr(discrimination, "_NOTHING", 1e-9)
@@ -144,7 +146,7 @@ def test_gradient_of_the_separation(rivals: tuple[Explanation, Explanation], mon
 
     at = excitation.coefficients
     found, target = separation(at)
-    # The rival had to move, and something stays.
+    # The rival's parameters changed, and a residual remains.
     assert np.max(np.abs(found.unknowns - start(rival))) > 1e-3 and found.squares > 1.0
     slope = found.slope(target)
     step = 1e-3
@@ -154,7 +156,7 @@ def test_gradient_of_the_separation(rivals: tuple[Explanation, Explanation], mon
         assert slope[i] == pytest.approx((up - down) / (2 * step), rel=1e-3, abs=1e-3 * np.max(np.abs(slope))), i
 
 
-def test_a_model_is_not_told_from_itself(rivals: tuple[Explanation, Explanation]):
+def test_model_is_not_separated_from_itself(rivals: tuple[Explanation, Explanation]):
     truth, _ = rivals
     excitation = excitations(LIMITS, truth.model, logged=np.zeros(10))[0]
     shapes = signals(excitation, hold="zero-order", bench=BENCH)
@@ -166,7 +168,9 @@ def test_a_model_is_not_told_from_itself(rivals: tuple[Explanation, Explanation]
     assert before @ before > 1e3 and same.squares < 1e-3
 
 
-def test_the_search_gains_and_keeps_the_limits(rivals: tuple[Explanation, Explanation], proposal: Candidate):
+def test_command_search_increases_the_separation_within_the_limits(
+    rivals: tuple[Explanation, Explanation], proposal: Candidate
+):
     excitation = proposal.excitation
     shapes = signals(excitation, hold="zero-order", bench=BENCH)
     begun = excitation.coefficients
@@ -182,8 +186,10 @@ def test_the_search_gains_and_keeps_the_limits(rivals: tuple[Explanation, Explan
         assert np.max(np.abs(states[:, 0])) / rig.N <= LIMITS.travel * 1.001
 
 
-def test_the_promised_ratio_is_what_noisy_data_give(rivals: tuple[Explanation, Explanation], proposal: Candidate):
-    """Data from the rig's own equations; both models are refitted to each draw of the noise."""
+def test_predicted_likelihood_ratio_agrees_with_refits_to_noisy_data(
+    rivals: tuple[Explanation, Explanation], proposal: Candidate
+):
+    """Data of the rig's own equations; both models are refitted for each draw of the noise."""
     command = proposal.evaluation.coefficients
     shapes = signals(proposal.excitation, hold="zero-order", bench=BENCH)
     ratios = []
@@ -193,13 +199,15 @@ def test_the_promised_ratio_is_what_noisy_data_give(rivals: tuple[Explanation, E
         truth, rival = (refit(r, data, command, signals=shapes, bench=BENCH).squares for r in rivals)
         ratios.append(0.5 * (rival - truth))
     promised = 0.5 * proposal.evaluation.forward[0].squares
-    # A ratio's variance is twice its mean. Data with noise are fitted by as many numbers on both sides.
+    # The variance of the ratio is twice its mean; both models have the same number of parameters.
     assert promised > 5.0
     assert np.mean(ratios) == pytest.approx(promised, abs=3 * np.sqrt(2 * promised / _DRAWS))
 
 
 @pytest.mark.slow
-def test_the_promised_ratio_is_what_the_fit_of_logs_finds(rivals: tuple[Explanation, Explanation], proposal: Candidate):
+def test_predicted_likelihood_ratio_agrees_with_the_fit_of_logs(
+    rivals: tuple[Explanation, Explanation], proposal: Candidate
+):
     data = [stretch_of(proposal.command, measured(proposal.command, 0))]
     squares = []
     for r in rivals:
@@ -217,7 +225,7 @@ def test_the_promised_ratio_is_what_the_fit_of_logs_finds(rivals: tuple[Explanat
 
 
 def measured(command: np.ndarray, seed: int) -> np.ndarray:
-    """What the encoders of the rig with motor friction read."""
+    """Encoder readings of the rig with motor friction."""
     motion = rig.drive_motion(command, motor_friction=(0.01, 1.0))
     outputs = np.stack([motion[:, 0] / rig.N, motion[:, 0] / rig.N - motion[:, 1]], axis=1)
     return outputs + NOISE_STD * np.random.default_rng(seed).normal(size=outputs.shape)
@@ -261,7 +269,7 @@ UNITS = {"dynamic_error": "rad", "forcing": "N m"}
         ({"on_logs": None, "proposed": None}, ["not smooth enough"]),
     ],
 )
-def test_what_is_said_of_a_tie(ratios, words):
+def test_proposal_states_how_well_a_tie_is_separated(ratios, words):
     told = proposal_dict(proposed(**ratios), UNITS, logs_reach=1e-5)
     assert told is not None
     (sentence,) = told["says"]
@@ -269,24 +277,24 @@ def test_what_is_said_of_a_tie(ratios, words):
 
 
 @pytest.mark.parametrize(("fitted", "torque"), [(50.0, None), (0.5, 0.5 * np.cbrt(1.959964 * 2.0 / 0.5))])
-def test_what_is_said_of_alpha(fitted: float, torque: float | None):
+def test_proposal_states_the_standard_error_of_alpha(fitted: float, torque: float | None):
     told = proposal_dict(proposed(Precision(fitted, 40.0, 2.0, np.ones(5), "rad^-2")), UNITS, logs_reach=1e-5)
     assert told is not None and told["question"] == "alpha"
     assert "from 40 rad^-2 on the logs to 2 rad^-2" in told["says"][0]
     assert told["alpha"]["visible"] == pytest.approx(3.92, rel=1e-3)
-    # Twice the torque shows an eighth of the alpha.
+    # Twice the torque makes an eighth of alpha significant.
     assert told["alpha"]["needed_torque"] == (None if torque is None else pytest.approx(torque))
     assert ("No excitation within the limits" in told["says"][0]) == (torque is not None)
 
 
-def test_the_command_is_a_table():
+def test_proposed_command_is_written_as_a_table():
     rows = list(csv.reader(io.StringIO(command_table(proposed(on_logs=None, proposed=(1.0, 1.0))))))
     assert rows[0] == ["time", "motor_torque"]
     values = np.array(rows[1:], dtype=float)
     np.testing.assert_allclose(values, np.stack([np.arange(5) * 0.1, np.sin(np.arange(5) * 0.1)], axis=1), rtol=1e-8)
 
 
-def test_a_twist_that_must_not_be_passed(
+def test_command_search_keeps_the_limit_of_the_twist(
     rivals: tuple[Explanation, Explanation], proposal: Candidate, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(command_search, "_ITERATIONS", 3)
@@ -299,7 +307,7 @@ def test_a_twist_that_must_not_be_passed(
     assert found.merit < proposal.merit
 
 
-def test_what_is_drawn():
+def test_proposal_plot_shows_command_motion_and_separation():
     for made in (
         proposed(on_logs=(0.2, 0.3), proposed=(50.0, 60.0)),
         proposed(Precision(0.5, 40.0, 2.0, np.ones(5), "rad^-2")),
@@ -317,8 +325,8 @@ def test_what_is_drawn():
 
 
 @pytest.mark.slow
-def test_a_fit_proposes_what_tells_alpha():
-    """A reduced log too gentle for alpha; the command that is found tells it in a fit of its own."""
+def test_proposed_experiment_identifies_alpha():
+    """The amplitude of the log is too small for alpha; a fit under the proposed command identifies it."""
     gentle = rig.reduced_experiment(1200, noise=2e-3, rms=0.5)
     limits = {"torque": 20.0}
     hold: Hold = "zero-order"
@@ -342,8 +350,8 @@ def test_a_fit_proposes_what_tells_alpha():
 
 
 @pytest.mark.slow
-def test_a_loop_proposes_what_tells_ties_apart(tmp_path: Path):
-    """Friction on the motor with and without a peak near standstill, on a short log."""
+def test_proposed_experiment_separates_a_tie(tmp_path: Path):
+    """Motor friction with and without a peak near standstill is a tie on a short log."""
     log = rig.drive_experiment(2000, motor_friction=(0.01, 1.0), noise=3.0)
     start_model = rig.drive_model(K=1e4, alpha=0.0, B_sp=0.0)
     data: dict[Hold, tuple[Experiment, ...]] = {"zero-order": (log,)}

@@ -1,4 +1,4 @@
-"""Joints whose spring twists far, and logs that hardly tell the stiffness or the torque's sign."""
+"""Quasi-static logs with a large twist, or with little information on the stiffness or the sign of the torque."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,32 +32,32 @@ def soft_spring(twist: float) -> Log:
     return replace(log, dynamic_error=log.dynamic_error - 0.4)
 
 
-def wide_told(log: Log, **known) -> bool:
+def large_twist_is_reported(log: Log, **known) -> bool:
     data = prepare([log], drive_file(**known))
     return any("strain-wave gears" in finding.what for finding in data.findings["log"])
 
 
-def test_a_spring_that_twists_far_is_fitted_with_a_warning():
+def test_large_twist_is_fitted_with_a_warning():
     log = soft_spring(0.15)
-    assert wide_told(log)
+    assert large_twist_is_reported(log)
     found = fit_quasi_static(prepare([log], drive_file()).logs)
     stiffness = found.known[found.chosen]["K"]
     assert stiffness.ci95 is not None and stiffness.ci95[0] < SOFT < stiffness.ci95[1]
 
 
-def test_the_drive_file_may_say_how_far_it_twists():
+def test_largest_twist_of_the_drive_file_sets_the_limit():
     log = soft_spring(0.15)
-    assert not wide_told(log, largest_twist=0.5)
-    assert not wide_told(cycles(line))
+    assert not large_twist_is_reported(log, largest_twist=0.5)
+    assert not large_twist_is_reported(cycles(line))
     with pytest.raises(DataError, match=r"largest_twist of 0\.2 rad"):
         prepare([log], drive_file(largest_twist=0.2))
     with pytest.raises(DataError, match="full turn"):
         prepare([soft_spring(4.0)], drive_file())
-    assert not wide_told(soft_spring(4.0), largest_twist=10.0)
+    assert not large_twist_is_reported(soft_spring(4.0), largest_twist=10.0)
 
 
 def drifting_joint(sign: float) -> Log:
-    """One way, at a torque that swings once at the beginning, while the encoders drift apart with the angle."""
+    """A joint that moves one way under a nearly constant torque, while the encoders drift with the angle."""
     log, _ = slow_joint(
         [lambda motion: -6e-6 * motion.motor + 5e-5 * np.cos(motion.motor) + 2e-5 * np.cos(0.05 * motion.motor)],
         moves="one way",
@@ -71,8 +71,8 @@ def drifting_joint(sign: float) -> Log:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wrong_sign_is_refused_though_the_angle_moves_the_twist_more(seed):
-    """The torque alone would leave the sign to the kinematic error."""
+def test_wrong_torque_sign_is_refused_beside_a_large_kinematic_error(seed):
+    """The kinematic error moves the twist more than the torque does."""
     log, _ = slow_joint(
         [lambda motion: 2e-5 * motion.motor + 1e-3 * np.cos(motion.motor)], moves="one way", cycles=6.0, seed=seed
     )
@@ -82,20 +82,20 @@ def test_a_wrong_sign_is_refused_though_the_angle_moves_the_twist_more(seed):
         prepare([replace(log, joint_torque=-log.joint_torque)], drive_file())
 
 
-def findings_of(log: Log) -> str:
+def findings_text(log: Log) -> str:
     return " ".join(finding.what for finding in prepare([log], drive_file(), at_rest=True).findings["log"])
 
 
-def test_where_the_logs_tell_little_a_wrong_sign_is_doubted_and_the_right_one_not():
-    assert "seems to fall" not in findings_of(drifting_joint(1.0))
+def test_wrong_torque_sign_is_reported_where_the_logs_hardly_determine_it():
+    assert "seems to fall" not in findings_text(drifting_joint(1.0))
     try:
-        assert "seems to fall" in findings_of(drifting_joint(-1.0))
+        assert "seems to fall" in findings_text(drifting_joint(-1.0))
     except DataError as refused:
         assert "sign = -1" in str(refused)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_what_is_not_determined_makes_no_headline_and_nothing_unphysical_is_found(sign):
+def test_undetermined_stiffness_is_not_stated_in_the_summary(sign):
     log, motion = slow_joint(
         [lambda m: -4e-5 * m.motor + 3e-4 * np.cos(0.02 * m.motor)],
         moves="one way",

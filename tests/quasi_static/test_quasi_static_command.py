@@ -1,4 +1,4 @@
-"""`hdjax fit` on quasi-static logs: the files it writes, and one sentence where it can't."""
+"""`hdjax fit` and `close-loop` on quasi-static logs: the files that are written, and one sentence per refusal."""
 
 import json
 from pathlib import Path
@@ -45,15 +45,15 @@ def write(folder: Path, columns: dict[str, np.ndarray], drive: str = DRIVE) -> t
     return log, file
 
 
-def no_constant(name: str) -> float:
+def refuse_constant(name: str) -> float:
     raise AssertionError(f"{name} in JSON")
 
 
-def test_fit_writes_page_and_json_and_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_fit_writes_and_prints_the_report(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log, drive = write(tmp_path, table())
     assert run("fit", log, "--drive", drive, "--out", tmp_path / "out") == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.html", "report.json"]
-    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=no_constant)
+    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=refuse_constant)
     assert report["schema"] == "hdjax-report/1" and report["kind"] == "quasi-static"
     assert report["decision"] == "fit_only"
     parameters = report["before"]["parameters"]
@@ -61,7 +61,7 @@ def test_fit_writes_page_and_json_and_says_what_it_found(tmp_path: Path, capsys:
     assert parameters["K"]["ci95"][0] < K1 < parameters["K"]["ci95"][1]
     assert parameters["K"]["unit"] == "N m/rad"
     assert parameters["lost_motion"]["value"] == pytest.approx(2 * 0.04 * 54 / K1, rel=0.02)
-    # The cycles reach some 34 N m, so that figures of rated torque and of knees are told to be unknown.
+    # The cycles reach 34 N m, so that figures at rated torque and beyond knees are unknown.
     for name in ("K2", "K3", "hysteresis_loss"):
         assert parameters[name]["value"] is None and not parameters[name]["identifiable"]
         assert any(name in note for note in report["cannot_tell"])
@@ -72,17 +72,17 @@ def test_fit_writes_page_and_json_and_says_what_it_found(tmp_path: Path, capsys:
     assert "straight line" in text and "hysteresis_width" in text and "Report:" in text
 
 
-def test_without_rated_torque_its_figures_are_unknown(tmp_path: Path) -> None:
+def test_lost_motion_without_rated_torque_is_unknown(tmp_path: Path) -> None:
     log, drive = write(tmp_path, table(), "")
     assert run("fit", log, "--drive", drive, "--out", tmp_path / "out") == 0
     parameters = json.loads((tmp_path / "out/report.json").read_text())["before"]["parameters"]
     assert parameters["lost_motion"]["value"] is None and "rated_torque" in parameters["lost_motion"]["reason"]
 
 
-def test_rows_without_a_number_are_left_out_and_told(tmp_path: Path) -> None:
+def test_blank_rows_are_left_out_and_reported(tmp_path: Path) -> None:
     columns = table()
     blank = np.arange(400) % 50 == 7
-    # Taken for a measurement, what is put in there would be far off the curve.
+    # A value filled in and counted as measured would be far from the curve.
     columns["joint_torque"] = np.where(blank, np.nan, columns["joint_torque"])
     columns["twist"] = np.where(np.roll(blank, 1), np.nan, columns["twist"])
     log, drive = write(tmp_path, columns)
@@ -126,7 +126,7 @@ def angles(turn: float = 0.0) -> dict[str, np.ndarray]:
     ],
     ids=["twist", "dynamic error", "both angles", "no time", "locked motor", "other units"],
 )
-def test_every_spelling_is_the_same_log(tmp_path: Path, columns: dict[str, np.ndarray], drive: str) -> None:
+def test_equivalent_columns_give_the_same_log(tmp_path: Path, columns: dict[str, np.ndarray], drive: str) -> None:
     path, file = write(tmp_path, columns, drive)
     log = read_log(path, read_drive_file(file))
     assert log.kind == "quasi-static"
@@ -134,7 +134,7 @@ def test_every_spelling_is_the_same_log(tmp_path: Path, columns: dict[str, np.nd
     np.testing.assert_allclose(log.joint_torque, table()["joint_torque"], rtol=1e-10)
 
 
-def test_rows_at_rest_of_a_moving_joint_are_left_out_and_told(tmp_path: Path) -> None:
+def test_rows_at_rest_of_a_moving_joint_are_left_out_and_reported(tmp_path: Path) -> None:
     columns = angles()
     joint = np.interp(np.arange(400), [0, 80, 399], [0.0, 0.0, 2.0])
     columns |= {"motor_angle": columns["motor_angle"] + 100 * joint, "load_angle": columns["load_angle"] + joint}
@@ -142,19 +142,19 @@ def test_rows_at_rest_of_a_moving_joint_are_left_out_and_told(tmp_path: Path) ->
     drive = read_drive_file(file)
     data = prepare([read_log(path, drive)], drive)
     assert data.motion == ("one way",)
-    # The speed is smoothed over a few rows.
+    # The speed is smoothed over several rows.
     assert 310 <= len(data.logs[0]) <= 325
     assert any("left out" in finding.consequence for finding in data.findings["log"])
 
 
-def turned_round() -> dict[str, np.ndarray]:
+def reversed_twist() -> dict[str, np.ndarray]:
     return table() | {"twist": -table()["twist"]}
 
 
 @pytest.mark.parametrize(
     ("columns", "drive", "code", "words"),
     [
-        (turned_round(), "", 1, "sign = -1"),
+        (reversed_twist(), "", 1, "sign = -1"),
         (table() | {"twist": 180 / np.pi * table()["twist"] * 60}, "", 1, "arcmin"),
         (angles(turn=2.0), ANGLES.replace("100", "90"), 1, "reduction_ratio"),
         (angles(), ANGLES.replace("reduction_ratio = 100", ""), 2, "reduction_ratio"),
@@ -167,7 +167,7 @@ def turned_round() -> dict[str, np.ndarray]:
         ({"time": table()["time"], "joint_torque": table()["joint_torque"]}, "", 2, "motor_angle"),
     ],
 )
-def test_what_cannot_be_fitted_is_refused_in_one_sentence(
+def test_invalid_quasi_static_log_is_refused_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture, columns: dict[str, np.ndarray], drive: str, code: int, words: str
 ) -> None:
     log, file = write(tmp_path, columns, drive)
@@ -177,11 +177,11 @@ def test_what_cannot_be_fitted_is_refused_in_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_close_loop_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_close_loop_writes_and_prints_the_hysteresis(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log, drive = write(tmp_path, table(friction=sliders, rows=1000, twist_noise=1e-6))
     assert run("close-loop", log, "--drive", drive, "--out", tmp_path / "out") == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.html", "report.json"]
-    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=no_constant)
+    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=refuse_constant)
     assert report["schema"] == "hdjax-report/1" and report["kind"] == "quasi-static"
     assert report["decision"] == "effect_found"
     (effect,) = report["after"]["effects"]
@@ -200,10 +200,10 @@ def test_close_loop_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureF
     assert "effect_found" in text and "hysteresis.width" in text and "arcmin" in text and "TIE" in text
 
 
-def test_close_loop_says_that_the_line_suffices(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_close_loop_reports_that_the_linear_curve_suffices(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log, drive = write(tmp_path, table(friction=no_friction, rows=1000))
     assert run("close-loop", log, "--drive", drive, "--out", tmp_path / "out") == 0
-    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=no_constant)
+    report = json.loads((tmp_path / "out/report.json").read_text(), parse_constant=refuse_constant)
     assert report["decision"] == "model_sufficient" and report["after"]["effects"] == []
     assert "suffices" in capsys.readouterr().out
 
@@ -211,13 +211,13 @@ def test_close_loop_says_that_the_line_suffices(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("columns", "options", "code", "words"),
     [
-        (turned_round(), [], 1, "sign = -1"),
+        (reversed_twist(), [], 1, "sign = -1"),
         (table() | {"twist": np.full(400, 1e-3)}, [], 1, "dynamic_error"),
         (table(), ["--max-effects", "-1"], 2, "--max-effects"),
         (table(), ["--next-experiment"], 2, "quasi-static"),
     ],
 )
-def test_what_close_loop_cannot_do_is_one_sentence(
+def test_close_loop_refuses_invalid_input_in_one_sentence(
     tmp_path: Path,
     capsys: pytest.CaptureFixture,
     columns: dict[str, np.ndarray],
@@ -232,7 +232,7 @@ def test_what_close_loop_cannot_do_is_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
-def test_predict_says_what_to_do_instead(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_predict_refuses_a_quasi_static_log_and_names_fit(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log, drive = write(tmp_path, table())
     model = tmp_path / "model.json"
     stored = StoredModel(TwoInertiaModel(hdc_40_050()), "zero-order", 2, 4, jnp.diag(jnp.asarray([4e-14, 1e-12])))
@@ -243,7 +243,7 @@ def test_predict_says_what_to_do_instead(tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "prediction.csv").exists()
 
 
-def test_logs_of_two_kinds_are_not_mixed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_logs_of_two_kinds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     log, drive = write(tmp_path, table())
     other = tmp_path / "reduced.csv"
     values = table()
@@ -270,13 +270,13 @@ joint_torque = {{ column = "joint_torque_current_{joint}", sign = {sign} }}
 """
 
 
-# Measured drives: the intervals must hold what a ruler on the torque-twist plot gives, and for joint 3 the mean
+# Measured drives: intervals must cover the slope read from the torque-twist plot. For joint 3 it is the mean
 # stiffness of the curve that the authors of the data use, over the same torques (48 100 N m/rad).
 @pytest.mark.parametrize(
     ("joint", "ratio", "sign", "motion", "ruler"),
     [(2, 121, -1, "held", 108e3), (3, 101, 1, "one way", 48.1e3), (5, 101, 1, "held", 12e3)],
 )
-def test_measured_joints(
+def test_stiffness_intervals_of_measured_joints_cover_the_graphical_value(
     shared: Path, tmp_path: Path, joint: int, ratio: int, sign: int, motion: str, ruler: float
 ) -> None:
     file = tmp_path / "drive.toml"
@@ -287,5 +287,5 @@ def test_measured_joints(
     fit = fit_quasi_static(data.logs, hysteresis=motion == "held")
     low, high = fit.known["linear"]["K"].ci95 or (0.0, 0.0)
     assert low < ruler < high and high < 3 * low
-    # One cycle of coloured residuals: no bend is determined.
+    # One cycle with coloured residuals does not determine a nonlinearity.
     assert fit.chosen == "linear"

@@ -1,4 +1,4 @@
-"""Fits of torque-twist logs against the parameters that the logs were made with."""
+"""Fits of torque-twist curves against the true parameters of simulated logs."""
 
 from dataclasses import replace
 
@@ -25,17 +25,17 @@ def covers(known: Known, truth: float) -> bool:
 
 
 @pytest.fixture(scope="module")
-def whole() -> QuasiStaticFit:
-    """A fit of all shapes to four cycles through both knees, with a biased torque sensor."""
+def three_slopes_fit() -> QuasiStaticFit:
+    """A fit of all shapes to cycles through both knees, with a biased torque sensor."""
     return fit_quasi_static([cycles(bias=2.5, drift=1e-7)], rated_torque=54.0)
 
 
-def test_recovers_vendors_figures_bias_and_hysteresis(whole: QuasiStaticFit) -> None:
-    assert whole.chosen == "three slopes"
-    known = whole.known["three slopes"]
+def test_fit_recovers_slopes_knees_bias_and_hysteresis(three_slopes_fit: QuasiStaticFit) -> None:
+    assert three_slopes_fit.chosen == "three slopes"
+    known = three_slopes_fit.known["three slopes"]
     for name, truth in TRUTH.items():
         assert known[name].identifiable, name
-        # Four standard errors, since eight figures are looked at.
+        # Four standard errors, since eight figures are compared.
         assert abs(known[name].value - truth) < 4 * known[name].std, name
     assert abs(known["torque_bias"].value - 2.5) < 4 * known["torque_bias"].std
     assert covers(known["hysteresis_width"], WIDTH)
@@ -43,25 +43,25 @@ def test_recovers_vendors_figures_bias_and_hysteresis(whole: QuasiStaticFit) -> 
     assert known["K1"].std < 0.01 * K1
 
 
-def test_lost_motion_is_that_of_the_true_curve(whole: QuasiStaticFit) -> None:
-    known = whole.known["three slopes"]
-    # 4 % of 54 N m stays inside the first slope: twist along the middle, and with the full width of the loop.
+def test_lost_motion_agrees_with_the_true_curve(three_slopes_fit: QuasiStaticFit) -> None:
+    known = three_slopes_fit.known["three slopes"]
+    # 4 % of 54 N m is on the first slope: twist along the mean curve, and with the full width of the loop.
     small = 0.04 * 54.0
     assert known["lost_motion"].value == pytest.approx(2 * small / K1, rel=0.02)
     assert known["lost_motion_outer"].value == pytest.approx(2 * small / K1 + WIDTH, rel=0.02)
-    # The cycles go beyond rated torque, and the loop is as wide at zero for any of them that turn the sliders over.
+    # The cycles exceed rated torque; the width at zero is equal for all cycles in which the sliders reverse.
     assert known["hysteresis_loss"].value == pytest.approx(WIDTH, rel=0.02)
 
 
-def test_the_loop_of_bouc_and_wen_is_as_wide_as_it_is() -> None:
+def test_hysteresis_width_of_a_bouc_wen_loop_is_recovered() -> None:
     fit = fit_quasi_static([cycles(torque_cycles.line, torque_cycles.bouc_wen, rows=3000)])
     assert fit.chosen == "linear"
-    # Bouc and Wen's law rises along x; seen along the torque it is Dahl's only nearly, hence the tolerance.
+    # Bouc and Wen's law evolves along x; along the torque it is Dahl's only approximately, hence the tolerance.
     assert fit.known["linear"]["hysteresis_width"].value == pytest.approx(WIDTH, rel=0.03)
     assert fit.known["linear"]["K"].value == pytest.approx(K1, rel=0.01)
 
 
-def test_a_cubic_is_chosen_where_it_is_the_truth() -> None:
+def test_cubic_curve_is_chosen_when_true() -> None:
     fit = fit_quasi_static([cycles(torque_cycles.cubic)])
     assert fit.chosen == "cubic"
     known = fit.known["cubic"]
@@ -69,38 +69,38 @@ def test_a_cubic_is_chosen_where_it_is_the_truth() -> None:
     assert known["alpha"].identifiable
 
 
-def test_below_the_second_knee_no_third_slope_is_claimed() -> None:
+def test_three_slopes_are_not_chosen_below_the_second_knee() -> None:
     fit = fit_quasi_static([cycles(largest=1.1e-3)])
     assert fit.chosen in ("cubic", "two slopes")
     assert covers(fit.known["two slopes"]["K2"], K2)
 
 
-def test_below_the_first_knee_only_a_line_is_claimed() -> None:
+def test_linear_curve_is_chosen_below_the_first_knee() -> None:
     fit = fit_quasi_static([cycles(largest=4.5e-4)])
     assert fit.chosen == "linear"
     assert covers(fit.known["linear"]["K"], K1)
     assert not fit.known["cubic"]["alpha"].identifiable
 
 
-def test_without_hysteresis_the_width_may_be_zero() -> None:
+def test_hysteresis_width_interval_covers_zero_without_hysteresis() -> None:
     fit = fit_quasi_static([cycles(friction=torque_cycles.no_friction)])
     width = fit.best.curve.memory and fit.known[fit.chosen]["hysteresis_width"]
     assert isinstance(width, Known) and covers(width, 0.0) and not width.identifiable
 
 
-def test_an_exact_line_is_a_line() -> None:
+def test_noise_free_linear_curve_is_recovered() -> None:
     fit = fit_quasi_static([cycles(torque_cycles.line, torque_cycles.no_friction, twist_noise=0.0, torque_noise=0.0)])
     assert fit.chosen == "linear"
     assert fit.known["linear"]["K"].value == pytest.approx(K1, rel=1e-9)
 
 
-def test_torque_that_never_turns_back_says_nothing_of_hysteresis() -> None:
+def test_hysteresis_is_not_fitted_without_torque_reversals() -> None:
     fit = fit_quasi_static([cycles(torque_cycles.line, count=0.24)])
     assert fit.best.curve.memory is None
     assert "hysteresis_width" not in fit.known["linear"]
 
 
-def test_logs_of_one_drive_share_the_curve_but_not_the_zero() -> None:
+def test_logs_of_one_drive_share_the_curve_but_not_the_offset() -> None:
     logs = [cycles(seed=1), cycles(seed=2, count=2.0, rows=900)]
     logs[1] = replace(logs[1], dynamic_error=logs[1].dynamic_error - 3e-3, name="other")
     fit = fit_quasi_static(logs)
@@ -115,7 +115,7 @@ def one_fit(blocks: Blocks, curve: Curve) -> CurveFit:
 
 
 @pytest.mark.parametrize("side", ["twist", "torque"])
-def test_noise_on_either_axis_leaves_the_stiffness_unbiased(side: str) -> None:
+def test_stiffness_is_unbiased_under_noise_on_either_axis(side: str) -> None:
     loud = {"torque_noise": 20.0} if side == "torque" else {"twist_noise": 4e-4}
     curve = Curve("linear", None, biased=False, drifting=False, logs=1)
     found, naive = [], []
@@ -127,12 +127,12 @@ def test_noise_on_either_axis_leaves_the_stiffness_unbiased(side: str) -> None:
     error = np.std(found) / np.sqrt(len(found))
     assert abs(np.mean(found) - K1) < 3 * error
     if side == "torque":
-        # What the regression of twist on torque would have said.
+        # Regression of twist on torque is biased.
         assert np.mean(naive) - K1 > 3 * error
 
 
 def coverage(draws: int, **options) -> dict[str, int]:
-    """How many of the 95 % intervals cover the truth."""
+    """Number of 95 % intervals that cover the true value, by parameter."""
     curve = Curve("three slopes", "abrupt", biased=True, drifting=False, logs=1)
     hits = dict.fromkeys(TRUTH, 0)
     for seed in range(draws):
@@ -146,26 +146,26 @@ def coverage(draws: int, **options) -> dict[str, int]:
 NOISES = [{"torque_noise": 1.0}, {"colour": 0.95, "twist_noise": 1e-5}]
 
 
-def refuse_low_coverage(draws: int, options: dict[str, float]) -> None:
-    # Binomial at 0.93, the least that is asked for: chance goes below this once in 500 for each of 12 figures.
+def assert_nominal_coverage(draws: int, options: dict[str, float]) -> None:
+    # Binomial at the required coverage of 0.93: chance falls below this once in 500 for each of 12 figures.
     least = binom.ppf(0.002, draws, 0.93)
     for name, hits in coverage(draws, **options).items():
         assert hits >= least, (name, hits)
 
 
 @pytest.mark.parametrize("options", NOISES)
-def test_intervals_cover_as_often_as_they_say(options: dict[str, float]) -> None:
-    refuse_low_coverage(10, options)
+def test_intervals_have_nominal_coverage(options: dict[str, float]) -> None:
+    assert_nominal_coverage(10, options)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", NOISES)
-def test_intervals_cover_as_often_as_they_say_over_many_draws(options: dict[str, float]) -> None:
-    refuse_low_coverage(300, options)
+def test_intervals_have_nominal_coverage_over_many_draws(options: dict[str, float]) -> None:
+    assert_nominal_coverage(300, options)
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.97])
-def test_the_jackknife_covers_whatever_the_colour(colour: float) -> None:
+def test_jackknife_interval_has_nominal_coverage_under_coloured_noise(colour: float) -> None:
     curve, draws = Curve("linear", None, biased=False, drifting=False, logs=1), 100
     hits = naive = 0
     for seed in range(draws):
@@ -183,33 +183,33 @@ def test_the_jackknife_covers_whatever_the_colour(colour: float) -> None:
         assert naive / draws < 0.85
 
 
-def test_a_wrong_truth_is_not_covered() -> None:
+def test_intervals_do_not_cover_a_wrong_value() -> None:
     blocks = average([cycles()])
     known = figures(one_fit(blocks, Curve("three slopes", "abrupt", True, False, 1)), blocks, None)
     assert not covers(known["K1"], 1.05 * K1)
     assert not covers(known["T2"], 1.1 * T2)
 
 
-def test_blocks_stop_at_reversals_and_keep_the_extremes() -> None:
+def test_blocks_end_at_reversals_and_keep_the_extremes() -> None:
     log = cycles(torque_cycles.line, torque_cycles.no_friction, count=2.0, rows=1000, torque_noise=0.0)
     blocks = average([log])
     assert blocks.reversals == (4,)
-    # Between the last point before a reversal and the first after it stand two blocks and the extreme.
+    # Two blocks and the extreme are between the last point before a reversal and the first after it.
     extremes = blocks.seat[:-1][np.diff(blocks.seat) == 4] + 2
     assert len(extremes) == 4
     np.testing.assert_allclose(np.abs(blocks.paths[0][extremes]), 2.2e-3 * K1, rtol=0.005)
     np.testing.assert_array_equal(blocks.paths[0][blocks.seat], blocks.torque)
 
 
-def test_noise_is_measured_beside_a_course() -> None:
+def test_noise_is_estimated_beside_a_smooth_signal() -> None:
     random = np.random.default_rng(3)
     values = 10 * np.sin(np.linspace(0, 6, 5000)) + 0.2 * random.normal(size=5000)
-    # The median of 5000 differences, neighbours of which are correlated, scatters by some 3 %.
+    # The median of 5000 correlated differences has a standard deviation of 3 %.
     assert noise(values) == pytest.approx(0.2, rel=0.1)
     assert len(turns(values, 25)) == 2
 
 
-def test_stretches_are_longer_than_the_correlation() -> None:
+def test_stretches_are_longer_than_the_correlation_length() -> None:
     random = np.random.default_rng(4)
     coloured = np.convolve(random.normal(size=4009), np.ones(10), mode="valid")
     # A running mean of ten has triangular autocorrelation, whose sum is ten.

@@ -1,4 +1,4 @@
-"""The loop on quasi-static logs: what it finds, what it must not find, and what it can't tell apart."""
+"""The loop on quasi-static logs: identified effects, false alarms and look-alikes, on simulated and measured logs."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def figures(loop: QuasiStaticLoop, family: str) -> dict:
     return strengths_of(loop.held.points, loop.after.model, own.forms[0])
 
 
-NOTHING = [
+NO_EFFECT = [
     {"moves": "held"},
     {"moves": "held", "colour": 0.9, "twist_noise": 2e-5},
     {"moves": "held", "torque_noise": 3.0, "kind": "triangle", "cycles": 6.0},
@@ -42,22 +42,22 @@ NOTHING = [
 ]
 
 
-def refuse_false_alarms(draws: int, most: int, options: dict) -> None:
+def assert_few_false_alarms(draws: int, most: int, options: dict) -> None:
     alarms = [seed for seed in range(draws) if closed(slow_joint(seed=seed, **options)).decision != "model_sufficient"]
     assert len(alarms) <= most, alarms
 
 
-@pytest.mark.parametrize("options", NOTHING)
-def test_where_nothing_is_hidden_nothing_is_found(options: dict) -> None:
-    # At a rate of 2 % more than one alarm in five comes once in 260.
-    refuse_false_alarms(5, 1, options)
+@pytest.mark.parametrize("options", NO_EFFECT)
+def test_no_effect_is_found_where_none_is_missing(options: dict) -> None:
+    # At a false-alarm rate of 2 %, more than one alarm in five occurs once in 260.
+    assert_few_false_alarms(5, 1, options)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", NOTHING)
+@pytest.mark.parametrize("options", NO_EFFECT)
 def test_false_alarms_are_rare_over_many_draws(options: dict) -> None:
-    # Twice the 2 % that are stated for coloured noise, and two binomial standard deviations.
-    refuse_false_alarms(200, 13, options)
+    # Twice the stated 2 % for coloured noise, and two binomial standard deviations.
+    assert_few_false_alarms(200, 13, options)
 
 
 @pytest.mark.parametrize(
@@ -73,17 +73,17 @@ def test_false_alarms_are_rare_over_many_draws(options: dict) -> None:
         ("creep", slow_joints.relaxation(0.3, 0.4), {"cycles": 1.6, "kind": "triangle", "rows": 3000}),
     ],
 )
-def test_the_hidden_effect_is_named(family: str, effect: slow_joints.Effect, options: dict) -> None:
+def test_missing_effect_is_identified(family: str, effect: slow_joints.Effect, options: dict) -> None:
     loop = closed(slow_joint([effect], **options))
     assert loop.decision == "effect_found"
     assert loop.findings[0].family == family and families(loop) == {family}
     assert loop.after.rmse < 0.8 * loop.before.rmse
-    # Of the draws behind the p-value at most one in a hundred did as well.
+    # At most 1 % of the draws of noise have as large a gain.
     assert loop.findings[0].p_value <= 0.01
 
 
 @pytest.mark.parametrize("moves", ["one way", "both ways"])
-def test_friction_of_a_moving_motor_is_named_and_sized(moves: str) -> None:
+def test_motor_friction_is_identified_and_estimated(moves: str) -> None:
     loop = closed(slow_joint(moves=moves, cycles=3.0, friction=slow_joints.coulomb(4.0)))
     assert families(loop) == {"motor_friction"}
     if moves == "both ways":
@@ -91,17 +91,17 @@ def test_friction_of_a_moving_motor_is_named_and_sized(moves: str) -> None:
         assert low < 4.0 < high and high - low < 2.0
 
 
-def test_a_ripple_comes_with_its_amplitude_phase_and_stiffness() -> None:
+def test_ripple_amplitude_phase_and_stiffness_are_estimated() -> None:
     loop = closed(slow_joint([slow_joints.ripple(RIPPLE, 2, phase=0.7)], moves="both ways"))
     known = figures(loop, "kinematic_error")
     assert known["amplitude_2"].value == pytest.approx(RIPPLE, rel=0.03)
     assert known["phase_2"].value == pytest.approx(0.7, abs=0.05)
     assert all(known[name].identifiable for name in known)
-    # Smoothing rounds off the torque's peaks by some 1e-4.
+    # Smoothing reduces the torque's peaks by 1e-4.
     assert stiffness_of(loop.held.points, loop.after.model)["K"].value == pytest.approx(K, rel=1e-3)
 
 
-def test_intervals_of_a_ripple_cover_its_amplitude() -> None:
+def test_ripple_amplitude_interval_has_nominal_coverage() -> None:
     hits = 0
     for seed in range(40):
         log = slow_joint([slow_joints.ripple(RIPPLE, 2)], moves="one way", colour=0.9, twist_noise=2e-5, seed=seed)
@@ -114,7 +114,7 @@ def test_intervals_of_a_ripple_cover_its_amplitude() -> None:
     assert hits >= 35
 
 
-def test_two_effects_are_both_found() -> None:
+def test_two_missing_effects_are_both_identified() -> None:
     effects = [slow_joints.ripple(RIPPLE, 2), slow_joints.hardening(1e5)]
     loop = closed(slow_joint(effects, moves="both ways", cycles=1.6))
     assert families(loop) == {"kinematic_error", "stiffness_shape"}
@@ -124,22 +124,22 @@ def test_two_effects_are_both_found() -> None:
     )
 
 
-def test_orders_of_one_error_are_one_effect() -> None:
+def test_orders_of_a_kinematic_error_are_one_effect() -> None:
     effects = [slow_joints.ripple(RIPPLE, 2), slow_joints.ripple(0.5 * RIPPLE, 4)]
     loop = closed(slow_joint(effects, moves="one way"), max_effects=1)
     assert [one.family for one in loop.findings] == ["kinematic_error"]
     assert [form.name for form in loop.findings[0].forms] == ["order 2 of the motor", "order 4 of the motor"]
 
 
-def test_without_effects_allowed_only_the_line_is_fitted() -> None:
+def test_only_the_linear_curve_is_fitted_when_no_effect_is_allowed() -> None:
     loop = closed(slow_joint([slow_joints.sliders(WIDTH)]), max_effects=0)
     assert not loop.findings and loop.after is loop.before
-    # The loop is there, and a smooth function of torque or its rate tells so.
+    # The hysteresis remains, and a smooth function of torque or its rate explains a part of it.
     assert loop.decision == "unexplained" and loop.left is not None
 
 
-def test_what_no_form_explains_is_unexplained() -> None:
-    def dent(motion: slow_joints.Motion_) -> np.ndarray:
+def test_residual_that_no_form_explains_is_unexplained() -> None:
+    def dent(motion: slow_joints.JointMotion) -> np.ndarray:
         angle = motion.motor / slow_joints.RATIO
         return 4e-5 * np.exp(-(((angle - np.mean(angle)) / 0.05) ** 2))
 
@@ -148,8 +148,8 @@ def test_what_no_form_explains_is_unexplained() -> None:
     assert loop.left is not None and loop.left.depends_on == "load angle"
 
 
-def test_a_slow_wander_that_follows_nothing_is_unexplained() -> None:
-    def wander(motion: slow_joints.Motion_) -> np.ndarray:
+def test_slow_residual_unrelated_to_any_signal_is_unexplained() -> None:
+    def wander(motion: slow_joints.JointMotion) -> np.ndarray:
         count = len(motion.motor)
         return 3e-4 * np.sin(3.7 * 2 * np.pi * np.arange(count) / count + 1.0)
 
@@ -158,35 +158,35 @@ def test_a_slow_wander_that_follows_nothing_is_unexplained() -> None:
     assert loop.decision == "unexplained"
 
 
-def test_logs_of_one_drive_are_explained_together() -> None:
+def test_logs_of_one_drive_are_attributed_together() -> None:
     logs = [slow_joint([slow_joints.sliders(WIDTH)], seed=seed, name=f"log {seed}", cycles=1.6) for seed in range(3)]
     loop = closed(*logs)
     assert families(loop) == {"hysteresis"}
     assert figures(loop, "hysteresis")["width"].value == pytest.approx(WIDTH, rel=0.1)
 
 
-def test_the_same_logs_give_the_same_answer() -> None:
+def test_loop_is_reproducible_with_equal_seed() -> None:
     one, other = (closed(slow_joint([slow_joints.sliders(WIDTH)]), seed=3) for _ in range(2))
     assert one.after.rmse == other.after.rmse and one.findings[0].p_value == other.findings[0].p_value
 
 
-def test_a_held_fold_has_no_say_in_its_own_prediction() -> None:
+def test_held_out_fold_does_not_influence_its_prediction() -> None:
     log, how = slow_joint([slow_joints.sliders(WIDTH)])
     points = points_of([log], [how], None)
     (form, *_) = (f for f in catalogue(points) if f.family == "hysteresis")
     fold = np.arange(len(points.twist)) * 5 // len(points.twist)
     changed = points.twist + np.where(fold == 2, 1e-3, 0.0)
-    other = Points(**{**vars_of(points), "twist": changed})
+    other = Points(**{**fields_of(points), "twist": changed})
     before, after = (hold_out(p, fit_twist(points, ((form, form.shapes[4]),)), fold) for p in (points, other))
     np.testing.assert_allclose((after - before)[fold == 2], 1e-3, rtol=1e-6)
 
 
-def vars_of(points: Points) -> dict:
+def fields_of(points: Points) -> dict:
     return {name: getattr(points, name) for name in points.__dataclass_fields__}
 
 
-def test_screened_gains_are_those_of_refits() -> None:
-    """The inner products give what fitting without each fold gives."""
+def test_screened_gain_equals_the_gain_of_a_refit() -> None:
+    """Inner products give the same as fits that leave out each fold."""
     log, how = slow_joint([slow_joints.hardening(1e5)])
     points = points_of([log], [how], None)
     stretch = np.arange(len(points.twist)) * 7 // len(points.twist)
@@ -198,7 +198,7 @@ def test_screened_gains_are_those_of_refits() -> None:
     assert found.leads[0].gain == pytest.approx(refitted.gain_over(base), rel=1e-6)
 
 
-def test_a_process_is_known_by_its_draws() -> None:
+def test_autoregression_and_its_draws_agree_with_the_noise_process() -> None:
     random = np.random.default_rng(0)
     truth = np.array([1.0, -1.6, 0.8])
     series = np.zeros(6000)
@@ -213,7 +213,7 @@ def test_a_process_is_known_by_its_draws() -> None:
 
 
 @pytest.mark.parametrize("kind", ["sine", "triangle"])
-def test_the_error_of_the_torque_is_as_large_as_it_says(kind: str) -> None:
+def test_stated_error_of_the_smoothed_torque_is_unbiased(kind: str) -> None:
     ratios = []
     for seed in range(30):
         log, _ = slow_joint(kind=kind, torque_noise=2.0, cycles=5.0, seed=seed)
@@ -221,13 +221,13 @@ def test_the_error_of_the_torque_is_as_large_as_it_says(kind: str) -> None:
         assert log.joint_torque is not None and truth.joint_torque is not None
         smooth, error = without_noise(log.joint_torque)
         ratios.append(np.mean((smooth - truth.joint_torque) ** 2) / error**2)
-        # About half of the noise is gone, or more.
+        # At least about half of the noise is removed.
         assert error < 1.2
-    # Stein's estimate is unbiased, but for having chosen the least of several.
+    # Stein's estimate is unbiased, apart from the choice of the least of several.
     assert 0.8 < np.mean(ratios) < 1.5
 
 
-def test_what_can_not_be_told_apart_is_listed_with_its_experiment() -> None:
+def test_lookalike_effects_depend_on_the_motion() -> None:
     one_way, both_ways = (
         points_of(*([part] for part in slow_joint(moves=moves)), slow_joints.RATIO)
         for moves in ("one way", "both ways")
@@ -238,7 +238,7 @@ def test_what_can_not_be_told_apart_is_listed_with_its_experiment() -> None:
     assert "motor_friction" in dict(lookalikes("hysteresis", both_ways))
 
 
-def lara(shared: Path, folder: Path, log: str, joint: int, ratio: int, sign: int) -> Points:
+def lara8_points(shared: Path, folder: Path, log: str, joint: int, ratio: int, sign: int) -> Points:
     file = folder / "drive.toml"
     file.write_text(lara_drive(joint, ratio, sign), encoding="utf-8")
     drive = read_drive_file(file)
@@ -246,19 +246,19 @@ def lara(shared: Path, folder: Path, log: str, joint: int, ratio: int, sign: int
     return points_of(data.logs, data.motion, drive.reduction_ratio)
 
 
-def test_a_measured_gear_has_two_ripples_in_a_motor_revolution(shared: Path, tmp_path: Path) -> None:
-    loop = close_loop(lara(shared, tmp_path, "ML2_jogging_joint_mass", 2, 121, -1))
+def test_second_order_kinematic_error_of_a_measured_gear_is_identified(shared: Path, tmp_path: Path) -> None:
+    loop = close_loop(lara8_points(shared, tmp_path, "ML2_jogging_joint_mass", 2, 121, -1))
     assert loop.decision == "effect_found" and loop.findings[0].family == "kinematic_error"
     known = figures(loop, "kinematic_error")["amplitude_2"]
-    # 0.217 arcmin is what a spectrum of the trace shows.
+    # A spectrum of the log has a line of 0.217 arcmin.
     assert known.ci95 is not None and known.ci95[0] < np.deg2rad(0.217 / 60) < known.ci95[1]
     assert known.value == pytest.approx(np.deg2rad(0.217 / 60), rel=0.1)
     assert loop.after.rmse < 0.7 * loop.before.rmse
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_the_ripple_of_one_half_predicts_the_other(shared: Path, tmp_path: Path, first: bool) -> None:
-    points = lara(shared, tmp_path, "ML2_jogging_joint_mass", 2, 121, -1)
+def test_ripple_fitted_to_one_half_predicts_the_other_half(shared: Path, tmp_path: Path, first: bool) -> None:
+    points = lara8_points(shared, tmp_path, "ML2_jogging_joint_mass", 2, 121, -1)
     assert points.direction is not None and points.motor_angle is not None
     moving = np.flatnonzero(points.direction != 0)
     halves = moving[: len(moving) // 2], moving[len(moving) // 2 :]
@@ -267,30 +267,32 @@ def test_the_ripple_of_one_half_predicts_the_other(shared: Path, tmp_path: Path,
     ripple = form.columns(points, np.zeros(0))
     slow = np.vander(points.time, 4)
     strengths = np.linalg.lstsq(np.column_stack([ripple, slow])[seen], points.twist[seen], rcond=None)[0][:2]
-    # What is slow in the other half is its own affair.
+    # The slow part of the other half is fitted there.
     rest = points.twist[unseen] - slow[unseen] @ np.linalg.lstsq(slow[unseen], points.twist[unseen], rcond=None)[0]
     wave = ripple[unseen] @ strengths
     assert np.var(rest - wave) < 0.6 * np.var(rest)
 
 
-def test_a_held_measured_joint_shows_hysteresis(shared: Path, tmp_path: Path) -> None:
-    loop = close_loop(lara(shared, tmp_path, "ML1_validate", 2, 121, -1))
+def test_hysteresis_of_a_measured_held_joint_is_identified(shared: Path, tmp_path: Path) -> None:
+    loop = close_loop(lara8_points(shared, tmp_path, "ML1_validate", 2, 121, -1))
     assert loop.decision == "effect_found" and families(loop) == {"hysteresis"}
-    # hdjax fit says 220 µrad, by other columns and weights.
+    # `hdjax fit` gives 220 µrad from other columns and weights.
     low, high = figures(loop, "hysteresis")["width"].ci95 or (0.0, 0.0)
     assert low < 220e-6 < high and low > 0
     assert loop.after.rmse < 0.3 * loop.before.rmse
 
 
-def test_a_bend_and_a_loop_that_hide_each_other_are_found_together(shared: Path, tmp_path: Path) -> None:
-    loop = close_loop(lara(shared, tmp_path, "ML1_validate", 5, 101, 1))
+def test_stiffness_shape_and_hysteresis_of_a_measured_joint_are_identified_together(
+    shared: Path, tmp_path: Path
+) -> None:
+    loop = close_loop(lara8_points(shared, tmp_path, "ML1_validate", 5, 101, 1))
     assert families(loop) == {"stiffness_shape", "hysteresis"}
     assert loop.after.rmse < 0.6 * loop.before.rmse
-    # As vendors' tables have it.
+    # The range of vendors' tables.
     assert 1.1e5 < figures(loop, "stiffness_shape")["alpha"].value < 4.5e5
 
 
-def test_forms_are_named_once() -> None:
+def test_forms_of_the_catalogue_have_unique_names() -> None:
     names = [form.name for form in catalogue(points_of(*([p] for p in slow_joint(moves="both ways")), 100.0))]
     assert len(set(names)) == len(names)
     assert all(isinstance(form, Form) for form in catalogue(points_of(*([p] for p in slow_joint()), None)))

@@ -1,4 +1,4 @@
-"""Test data of quasi-static logs: what an equation errs by where no fit has looked."""
+"""Test data of quasi-static logs: the error of the model on data that were not fitted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,21 +41,21 @@ def report(drive_file: DriveFile, log: Log, *test: Log) -> dict[str, Any]:
     ],
 )
 @pytest.mark.parametrize("named", [False, True])
-def test_what_was_found_predicts_test_data_to_the_noise(
+def test_identified_effect_predicts_test_data_to_the_noise(
     effect: slow_joints.Effect, options: dict[str, Any], named: bool, drive_file: DriveFile
 ):
     log, _ = slow_joint([effect], **LONG, **options)
-    # A log of its own has another zero, and begins elsewhere in the cycle.
+    # A separate log has another zero, and begins at another point of the cycle.
     other = replace(slow_joint([effect], **LONG, **options, seed=5)[0].rows(700, 4000), name="other")
     found = report(drive_file, log, *([other] if named else []))
     assert found["decision"] == "effect_found" and found["judged_on"] == "test"
     before, after = (found[stage]["rmse"]["test"] for stage in ("before", "after"))
-    # The torque's noise makes up the rest.
+    # The rest of the error is the torque's noise.
     assert after < 1.5 * NOISE < 0.3 * before
     assert [log["test"] > 0 for log in found["logs"]] == ([False, True] if named else [True])
 
 
-def test_scrambled_test_data_change_nothing_but_test_figures(drive_file: DriveFile):
+def test_scrambled_test_data_change_only_test_figures(drive_file: DriveFile):
     log, _ = slow_joint([slow_joints.ripple(3e-5, 2)], moves="both ways", **LONG)
     scrambled = log.dynamic_error.copy()
     border = len(log) - round(0.2 * len(log))
@@ -68,21 +68,21 @@ def test_scrambled_test_data_change_nothing_but_test_figures(drive_file: DriveFi
     assert one == other
 
 
-def test_too_short_a_log_claims_no_error_on_test_data(drive_file: DriveFile):
+def test_short_log_has_no_error_on_test_data(drive_file: DriveFile):
     found = report(drive_file, slow_joint([slow_joints.sliders(1e-4)], cycles=1.6)[0])
     assert found["decision"] == "effect_found" and found["judged_on"] == "selection"
     assert found["after"]["rmse"]["test"] is None and found["logs"][0]["test"] == 0
     assert any("too short to set test data aside" in note for note in found["cannot_tell"])
 
 
-def test_torques_beyond_the_fitted_ones_are_told(drive_file: DriveFile):
+def test_extrapolation_to_larger_torques_is_reported(drive_file: DriveFile):
     small, _ = slow_joint(**LONG)
     large = replace(slow_joint(**LONG, largest=90.0)[0], name="large")
     told = [note for note in report(drive_file, small, large)["cannot_tell"] if "extrapolates" in note]
     assert len(told) == 1
 
 
-def test_every_rule_stands_in_the_report(drive_file: DriveFile):
+def test_report_lists_every_rule_with_its_outcome(drive_file: DriveFile):
     found = report(drive_file, slow_joint([slow_joints.sliders(1e-4)], **LONG)[0])
     names = {check["name"] for check in found["rules"]}
     assert {"least_gain", "significance", "excess", "explained"} <= names

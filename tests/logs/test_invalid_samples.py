@@ -1,0 +1,135 @@
+"""Logs with blank samples, text, gaps or too few rows: masked, split into stretches or refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from log_files import ROWS, drive_table, one_sentence, read_drive, save, save_text
+
+from fitting.errors import DataError, InputError
+from fitting.logs.log import read_log
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 9.96920996838687e36])
+@pytest.mark.parametrize("kind", ["csv", "mat5", "hdf5", "parquet"])
+def test_blank_outputs_are_masked_and_counted(tmp_path: Path, kind: str, value: float) -> None:
+    table = drive_table()
+    table["motor_angle"][[16, 99]] = value
+    table["load_angle"][[99, 300]] = value
+    log = read_log(save(tmp_path, table, kind), read_drive(tmp_path))
+    assert log.trusted is not None
+    np.testing.assert_array_equal(np.flatnonzero(~log.trusted), [16, 99, 300])
+    assert np.isfinite(log.dynamic_error).all()
+    first, second = log.findings
+    assert "motor_angle is blank or not finite in 2 rows" in first.what and "row 17" in first.where
+    assert first.severity == "warning" and "row 100" in second.where
+
+
+@pytest.mark.parametrize("kind", ["csv", "hdf5"])
+def test_blank_torque_splits_the_log(tmp_path: Path, kind: str) -> None:
+    """White torque can't be interpolated: the log ends before the blank sample and begins again after it."""
+    table = drive_table(1000)
+    table["motor_torque"][500] = np.nan
+    log = read_log(save(tmp_path, table, kind), read_drive(tmp_path))
+    assert log.pieces == ((0, 500), (501, 1000))
+    assert log.input_known is not None and not log.input_known[500] and log.input_known.sum() == 999
+    (finding,) = log.findings
+    assert "fitted as 2 stretches" in finding.consequence
+
+
+def test_blank_time_stamp_of_steady_sampling_is_reconstructed(tmp_path: Path) -> None:
+    table = drive_table()
+    table["time"][[16, 99]] = np.nan
+    log = read_log(save(tmp_path, table), read_drive(tmp_path))
+    np.testing.assert_allclose(log.time, drive_table()["time"], rtol=1e-12)
+    (finding,) = log.findings
+    assert "2 stamps are blank" in finding.what and "row 17" in finding.where
+
+
+def test_empty_cells_and_text_are_masked(tmp_path: Path) -> None:
+    def spoil(cells: list[list[str]]) -> None:
+        cells[5][1] = ""
+        cells[7][2] = "overload"
+
+    log = read_log(save_text(tmp_path, spoil), read_drive(tmp_path))
+    assert log.trusted is not None
+    np.testing.assert_array_equal(np.flatnonzero(~log.trusted), [4, 6])
+    assert any("'overload'" in f.what and "row 7" in f.where for f in log.findings)
+
+
+def test_column_with_much_text_is_refused(tmp_path: Path) -> None:
+    def spoil(cells: list[list[str]]) -> None:
+        for row in cells[100:200]:
+            row[2] = "overload"
+
+    with pytest.raises(InputError) as error:
+        read_log(save_text(tmp_path, spoil), read_drive(tmp_path))
+    one_sentence(error, "'load_angle'", "'overload'", "100 rows", "row 100", "mend")
+
+
+def test_blank_rows_at_the_ends_are_left_out_and_counted(tmp_path: Path) -> None:
+    def pad(cells: list[list[str]]) -> None:
+        cells[1:1] = [["", "", "", ""]] * 2
+        cells.extend([[""] * 4] * 3)
+
+    log = read_log(save_text(tmp_path, pad), read_drive(tmp_path))
+    np.testing.assert_array_equal(log.motor_angle, drive_table()["motor_angle"])
+    (finding,) = log.findings
+    assert "2 blank rows before" in finding.what and "3 after" in finding.what
+
+
+def test_gaps_split_the_log(tmp_path: Path) -> None:
+    table = drive_table(1000)
+    table["time"][300:] += 0.25
+    table["time"][950:] += 0.1
+    log = read_log(save(tmp_path, table), read_drive(tmp_path))
+    assert log.pieces == ((0, 300), (300, 950))
+    (finding,) = log.findings
+    assert finding.severity == "warning" and "row 301" in finding.where
+    assert "0.2505 s" in finding.what and "50 rows between gaps" in finding.consequence
+
+
+def test_log_without_a_long_stretch_is_refused(tmp_path: Path) -> None:
+    table = drive_table(1000)
+    table["time"] += 0.25 * (np.arange(1000) // 100)
+    with pytest.raises(DataError) as error:
+        read_log(save(tmp_path, table), read_drive(tmp_path))
+    one_sentence(error, "9 gaps", "no stretch of 200 rows")
+
+
+def test_log_of_fewer_than_200_rows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as error:
+        read_log(save(tmp_path, drive_table(199)), read_drive(tmp_path))
+    one_sentence(error, "199 rows", "200")
+    assert len(read_log(save(tmp_path, drive_table(200)), read_drive(tmp_path))) == 200
+
+
+def test_prediction_ignores_outputs_after_the_initial_state_window(tmp_path: Path) -> None:
+    full = read_log(save(tmp_path, drive_table()), read_drive(tmp_path))
+
+    def spoil(cells: list[list[str]]) -> None:
+        for number, row in enumerate(cells[51:]):
+            row[1] = ["", "nan", "withheld", "1e9"][number % 4]
+            row[2] = ""
+
+    path = save_text(tmp_path, spoil)
+    log = read_log(path, read_drive(tmp_path), outputs_until=50)
+    assert len(log) == ROWS and log.outputs_until == 50
+    np.testing.assert_array_equal(log.dynamic_error[:50], full.dynamic_error[:50])
+    np.testing.assert_array_equal(log.motor_torque, full.motor_torque)
+    np.testing.assert_array_equal(log.time, full.time)
+    assert log.trusted is not None and log.trusted[:50].all() and not log.trusted[50:].any()
+    assert np.isfinite(log.dynamic_error).all() and log.findings == ()
+    # Outputs that are not known are constant, whatever the file holds.
+    assert np.ptp(log.dynamic_error[50:]) == 0
+    with pytest.raises(InputError) as error:
+        read_log(path, read_drive(tmp_path))
+    one_sentence(error, "'motor_angle'", "'withheld'")
+
+
+def test_prediction_without_the_whole_torque_is_refused(tmp_path: Path) -> None:
+    table = drive_table()
+    table["motor_torque"][300:330] = np.nan
+    with pytest.raises(DataError) as error:
+        read_log(save(tmp_path, table), read_drive(tmp_path), outputs_until=50)
+    one_sentence(error, "motor_torque", "throughout")

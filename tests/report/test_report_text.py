@@ -1,0 +1,151 @@
+"""Sentences, units and rounded numbers in reports."""
+
+import math
+from typing import Any, Literal
+
+import pytest
+
+from fitting import formatting
+from fitting.report import separating_experiment
+from fitting.report.intervals import is_withheld, say_what_intervals_hold
+from fitting.report.summary import _change, _remembering
+from hdjax.effects import FAMILIES
+
+
+def test_sentences_use_the_units_of_a_reduced_log():
+    sentence = "alpha is at most 2 1/[x]^2, and gain 3 [x]/s^2/[u]"
+    assert formatting.in_log_words(sentence, response="V", forcing="N m") == (
+        "alpha is at most 2 1/V^2, and gain 3 V/s^2/(N m)"
+    )
+    assert formatting.superscripts("K^-2 and omega_0^-2.1") == "K⁻² and omega_0^-2.1"
+
+
+def test_separating_experiment_exists_and_is_symmetric_for_every_pair():
+    for one in FAMILIES:
+        for other in FAMILIES:
+            assert separating_experiment(one, other) == separating_experiment(other, one) or one != other
+            assert len(separating_experiment(one, other)) > 20
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (1.05e-6, "rad", "1.05 µrad"),
+        (-0.0123, "N m", "−12.3 mN m"),
+        (2.0, "rad", "2.00 rad"),
+        (1.2e5, "rad^-2", "120 000 rad⁻²"),
+        (3.4e-7, "N m s/rad", "3.40 × 10⁻⁷ N m s/rad"),
+        (0.0, "1", "0"),
+        (None, "rad", "—"),
+        (math.nan, "rad", "—"),
+    ],
+)
+def test_quantity_is_formatted_with_its_unit(value: float | None, unit: str, shown: str):
+    assert formatting.quantity(value, unit).replace("\N{NARROW NO-BREAK SPACE}", " ") == shown
+
+
+def test_value_is_rounded_to_its_standard_error():
+    def shown(*args) -> str:
+        return formatting.measured(*args).replace("\N{NARROW NO-BREAK SPACE}", " ")
+
+    assert shown(17432.123, 12.3, "N m/rad") == "17 432 ± 12 N m/rad"
+    assert shown(1.2345e7, 3.4e4, "rad^-2") == "(1.2345 ± 0.0034) × 10⁷ rad⁻²"
+    assert shown(4.05e-5, 1.2e-8, "rad") == "40.500 ± 0.012 µrad"
+    assert shown(0.3, None, "rad") == "300.0 mrad"
+
+
+@pytest.mark.parametrize(
+    ("unit", "place", "shown"),
+    [
+        ("N m", "mesh", "V/s^2"),
+        ("N m", "actuator", "A"),
+        ("N m s^2/rad^2", "mesh", "1/V"),
+        ("rad^-4", "mesh", "1/V^4"),
+        ("rad/s", "mesh", "V/s"),
+        ("rad/s", "drive", "rad/s"),
+        ("[x]/s^2/[u]", "drive", "V/(s^2 A)"),
+        ("1/[x]^2", "drive", "1/V^2"),
+        ("1", "mesh", "1"),
+    ],
+)
+def test_units_are_converted_to_those_of_a_reduced_log(
+    unit: str, place: Literal["drive", "mesh", "actuator"], shown: str
+):
+    """In a reduced log, mesh torque is an acceleration of the response, and actuator torque is the forcing."""
+    assert formatting.in_log_units(unit, response="V", forcing="A", place=place) == shown
+
+
+@pytest.mark.parametrize(("share", "shown"), [(0.98, "98 %"), (0.9996, "99.96 %"), (-0.013, "−1.3 %"), (1.0, "100 %")])
+def test_share_below_one_is_not_rounded_to_100_percent(share: float, shown: str):
+    assert formatting.percent(share) == shown
+
+
+@pytest.mark.parametrize(
+    ("after", "said"),
+    [
+        (2e-6, "It removes 80 % of the error on test data, which falls from 10"),
+        (3e-5, "It explains short segments alone; over whole stretches of test data the error rises from 10"),
+        (None, "to a simulation that diverged."),
+    ],
+)
+def test_summary_states_no_gain_where_the_error_rises(after: float | None, said: str):
+    assert said in _change("It", _report_with_errors(1e-5, after, motor=(None, None)))
+
+
+@pytest.mark.parametrize(
+    ("after", "motor", "said"),
+    [
+        (
+            8.7e-7,
+            (0.2, 1e-4),
+            "It affects the motor's angle, whose error on test data falls by 99.95 %, from 200 mrad to 0.1",
+        ),
+        (8.8e-7, (0.2, 1e-4), "It affects the motor's angle"),
+        (8.7e-7, (None, 1e-4), "from a simulation that diverged to 100 µrad"),
+        (8.7e-7, (0.2, 0.2), "It removes 0 % of the error on test data"),
+        (1e-7, (0.2, 1e-4), "It removes 89 % of the error on test data"),
+    ],
+)
+def test_summary_states_the_motor_angle_error_where_the_dynamic_error_is_unchanged(
+    after: float, motor: tuple[float | None, float], said: str
+):
+    assert said in _change("It", _report_with_errors(8.7e-7, after, motor=motor))
+
+
+@pytest.mark.parametrize(("memory", "said"), [(0.028, "correlation time of about 28 ms"), (None, "")])
+def test_summary_states_the_correlation_time_of_the_noise(memory: float | None, said: str):
+    sentence = _remembering({"noise": {"memory": memory}})
+    assert said in sentence and bool(sentence) == (memory is not None)
+
+
+def _report_with_errors(
+    before: float, after: float | None, *, motor: tuple[float | None, float | None]
+) -> dict[str, Any]:
+    stages = zip(("before", "after"), (before, after), motor, strict=True)
+    found = {s: {"rmse": {"test": x}, "rmse_motor_angle": {"test": m}} for s, x, m in stages}
+    told = {"output": "dynamic_error", "units": {"dynamic_error": "rad"}, "noise": {"dynamic_error": 1e-6}}
+    return found | told | {"judged_on": "test"}
+
+
+@pytest.mark.parametrize(
+    ("decision", "times_noise", "withheld", "flagged"),
+    [
+        ("effect_found", 1.1, False, False),
+        ("effect_found", 2.7, False, True),
+        ("unexplained", 44.0, True, True),
+        ("unexplained", 1.1, False, True),
+    ],
+)
+def test_intervals_are_withheld_or_flagged_where_the_residual_is_large(
+    decision: str, times_noise: float, withheld: bool, flagged: bool
+):
+    def account() -> dict[str, Any]:
+        omega_0 = {"ci95": [1.0, 2.0], "flag": None}
+        return {"parameters": {"K": omega_0 | {"interval": "quadratic", "note": None}}, "derived": {"omega_0": omega_0}}
+
+    report = {"decision": decision, "before": account(), "after": account()}
+    say_what_intervals_hold(report, times_noise)
+    K = report["after"]["parameters"]["K"]
+    assert (K["ci95"] == [None, None]) == withheld == is_withheld(report["after"]["derived"]["omega_0"])
+    assert (K["flag"] is not None) == (K["note"] is not None) == flagged
+    assert not flagged or "K may be off" in K["note"]
