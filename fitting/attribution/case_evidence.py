@@ -69,7 +69,7 @@ class RoundEvidence:
 
     Attributes:
         asked: evidence for the leading candidate, and for better ones that the data do not support.
-        behind: score difference of the best candidate and each refitted one, block by block.
+        behind: score difference of the chosen candidate and each refitted one, block by block.
         rivals: those that competed over whole stretches.
     """
 

@@ -64,11 +64,11 @@ def support(seen: EffectEvidence, rules: DecisionRules = RULES) -> tuple[Check, 
 
 
 def tie(name: str, behind: Float[np.ndarray, " blocks"], rules: DecisionRules = RULES) -> Check:
-    """Whether a candidate is tied with the best one: one-sided test of paired differences over blocks.
+    """Whether a candidate is tied with the chosen one: one-sided test of paired differences over blocks.
 
     Args:
         name: of the candidate.
-        behind: log predictive density of the best one minus that of the candidate, block by block.
+        behind: log predictive density of the chosen one minus that of the candidate, block by block.
         rules: the thresholds.
     """
     count = behind.size

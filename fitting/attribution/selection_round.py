@@ -132,6 +132,9 @@ def look(standing: Standing, study: Study, *, catalogue: Sequence[type[Effect]])
     verdicts, asked, accepted = _supported_first(found, ask)
     if accepted:
         found, rivals = _simplest_first(found, before, study)
+        if rivals and leader(rivals)[0].tied:
+            # Others may be tied with the chosen one that are not with the best one.
+            found, behind = _with_ties(found)
         verdicts, asked, accepted = _supported_first(found, ask)
     return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(asked, behind, rivals))
 
@@ -235,13 +238,13 @@ def _reaches(trial: Trial | None, objective: float) -> bool:
 
 
 def _with_ties(verdicts: list[Verdict]) -> tuple[list[Verdict], dict[str, tuple[float, ...]]]:
-    """The candidates, with ties of the best one marked; and the score difference of each refitted one, block by
+    """The candidates, with ties of the first one marked; and the score difference of each refitted one, block by
     block."""
-    best = verdicts[0].trial if verdicts else None
-    if best is None:
+    first = verdicts[0].trial if verdicts else None
+    if first is None:
         return verdicts, {}
-    whitening = np.asarray(best.held_out.problem.whitening)
-    reference = block_scores(best, whitening)
+    whitening = np.asarray(first.held_out.problem.whitening)
+    reference = block_scores(first, whitening)
     behind = {v.name: reference - block_scores(v.trial, whitening) for v in verdicts if v.trial is not None}
     apart = [v.name not in behind or not tie(v.name, behind[v.name]).holds for v in verdicts]
     marked = [eqx.tree_at(lambda v: v.separable, v, a) for v, a in zip(verdicts, apart, strict=True)]
