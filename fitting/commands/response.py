@@ -50,11 +50,14 @@ def seed_tables() -> None:
     """Recompute the seed document's Tables 1 to 4 and its figure, and compare them with the printed values, cell by
     cell."""
     start_jax()
+    from fitting.commands.spinner import spinning
     from hdjax.response.seed_fit import best_fit_of_table_2
     from hdjax.response.seed_tables import as_text
     from hdjax.response.seed_tables import seed_tables as computed
 
-    print(as_text(computed(), best_fit_of_table_2()))
+    with spinning("recomputing the tables"):
+        found = as_text(computed(), best_fit_of_table_2())
+    print(found)
 
 
 def speeds(

@@ -13,6 +13,7 @@ from rich.table import Table
 from fitting.commands.chosen_drive import read_drive
 from fitting.commands.options import DriveOptions
 from fitting.commands.pictures import png, show_files
+from fitting.commands.spinner import spinning
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from hdjax import Drive, ReducedDrive
@@ -45,8 +46,12 @@ def show_amplitudes(
         raise InputError("--motor-torque and --load-torque must not cancel to zero")
     omega_0 = float(made.omega_0)
     frequencies = omega or [0.6 * omega_0, 1.7 * omega_0, omega_0 / 3, omega_0, 3 * omega_0]
-    checks: list[AmplitudeCheck] = [check_amplitudes(made, A, w) for w in frequencies]
     files: dict[Path, str | bytes] = {}
+    with spinning("checking amplitudes") as say:
+        checks: list[AmplitudeCheck] = [check_amplitudes(made, A, w) for w in frequencies]
+        if out is not None:
+            say("computing the plots")
+            files |= {out / name: png(figure) for name, figure in _amplitude_pictures(made, A).items()}
     if out is not None:
         document = {
             "schema": "hdjax-amplitudes/1",
@@ -55,7 +60,6 @@ def show_amplitudes(
             "checks": [{"omega": c.omega, "kind": c.kind, "motions": [_row(r) for r in c.rows]} for c in checks],
         }
         files[out / "amplitudes.json"] = json.dumps(document, indent=1, allow_nan=False) + "\n"
-        files |= {out / name: png(figure) for name, figure in _amplitude_pictures(made, A).items()}
         write_whole(files)
     _show_checks(made, A, checks)
     show_files(files)

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fitting.api.inspection import inspected
+from fitting.commands.spinner import spinning
 from fitting.errors import InputError
 from fitting.inspection.columns import Table, read_columns
 from fitting.inspection.inspection import alike
@@ -21,8 +22,11 @@ def show_logs(logs: Iterable[Path], joint: str | None) -> None:
     Raises:
         InputError: A file can't be read, or has no such joint.
     """
-    groups = alike(_tables(logs))
-    print("\n\n".join(inspected(group, joint=joint).summary() for group in groups))
+    with spinning("reading the logs") as say:
+        groups = alike(_tables(logs))
+        say("inspecting the logs")
+        found = [inspected(group, joint=joint).summary() for group in groups]
+    print("\n\n".join(found))
 
 
 def write_drive_file(logs: Iterable[Path], out: Path, joint: str | None) -> None:
@@ -36,8 +40,10 @@ def write_drive_file(logs: Iterable[Path], out: Path, joint: str | None) -> None
     Raises:
         InputError: A file can't be read, or the logs have different columns.
     """
-    tables = _tables(logs)
-    found = inspected(tables, joint=joint)
+    with spinning("reading the logs") as say:
+        tables = _tables(logs)
+        say("inspecting the logs")
+        found = inspected(tables, joint=joint)
     found.save(out, force=True)
     print(f"Drive file: {out}")
     if found.inspection.joint.label is not None:

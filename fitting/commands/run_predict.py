@@ -5,6 +5,7 @@ from pathlib import Path
 
 from fitting.api.data import load
 from fitting.api.prediction import predict
+from fitting.commands.spinner import spinning
 from fitting.estimation.free_run import WINDOW
 
 
@@ -21,7 +22,8 @@ def write_prediction(model: Path, log: Path, drive: Path, out: Path) -> None:
         InputError: bad files, or a log that does not suit the model.
         DataError: the log can't be used, or the simulation diverges.
     """
-    found = predict(model, load(log, drive, outputs_until=WINDOW))
+    with spinning("simulating"):
+        found = predict(model, load(log, drive, outputs_until=WINDOW))
     found.save(out)
     for finding in found.findings:
         if finding.severity == "warning":

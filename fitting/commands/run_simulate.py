@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from fitting.commands.options import ForcingOptions
+from fitting.commands.spinner import spinning
 from fitting.commands.table import write_table
 from fitting.errors import InputError
 from fitting.stored_model import read_model
@@ -34,7 +35,10 @@ def write_simulation(
     system = TwoInertiaModel(PRESETS[preset]()) if model is None else read_model(model).model
     time = np.arange(max(2, round(torque.duration * torque.rate))) / torque.rate
     applied = np.asarray(jax.vmap(_function(torque, seed))(time))
-    motion = simulate(system, sampled(time, applied, hold="zero-order"), time, rtol=1e-9, atol=1e-12)
+    with spinning("simulating"):
+        motion = jax.block_until_ready(
+            simulate(system, sampled(time, applied, hold="zero-order"), time, rtol=1e-9, atol=1e-12)
+        )
     random = np.random.default_rng(seed)
     if isinstance(system, TwoInertiaModel):
         outputs = np.asarray(motion.outputs)

@@ -11,6 +11,7 @@ import numpy as np
 from fitting.commands.chosen_drive import read_drive
 from fitting.commands.options import DriveOptions
 from fitting.commands.pictures import png, show_files
+from fitting.commands.spinner import spinning
 from fitting.errors import DataError, InputError
 from fitting.files import write_whole
 from hdjax import Drive, TwoInertiaModel
@@ -64,7 +65,8 @@ def show_speeds(
     orders = [n for n in KinematicError.orders if jnp.hypot(getattr(error, f"cos_{n}"), getattr(error, f"sin_{n}"))]
 
     model = TwoInertiaModel(made, (error,))
-    branches = from_both_ends(model, None, slowest / _RPM, fastest / _RPM, rotating=True, harmonics=12)
+    with spinning("following the response over the speed"):
+        branches = from_both_ends(model, None, slowest / _RPM, fastest / _RPM, rotating=True, harmonics=12)
     if not any(bool(b.complete) for b in branches):
         raise DataError(
             "the response could not be followed from --slowest to --fastest; narrow the range, or give more --B_sp"

@@ -12,7 +12,7 @@ from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import FreeParameters, free_parameters
 from fitting.estimation.problem import Segmentation, suggested_substeps
-from fitting.estimation.reach import Quantity, reach
+from fitting.estimation.reach import Condition, Quantity, Range, ranges, reach
 from fitting.estimation.residual import Problem, Unknowns
 from fitting.estimation.segments import cut
 from hdjax import Model, TwoInertiaModel
@@ -51,6 +51,7 @@ class FreeRun(eqx.Module):
         weight: 1 for a valid sample, 0 for the others; None where all are valid.
         output: name of the principal output.
         reach: largest twist, speed and torque of the stretch, as in [`fitting.estimation.reach`][].
+        ranges: range of each angle and of the temperature that matters to the model, likewise.
     """
 
     name: str = eqx.field(static=True)
@@ -61,6 +62,7 @@ class FreeRun(eqx.Module):
     weight: Float[np.ndarray, " n"] | None = None
     output: str = eqx.field(static=True, default="dynamic_error")
     reach: dict[Quantity, float] = eqx.field(default_factory=dict)
+    ranges: dict[Condition, Range] = eqx.field(default_factory=dict)
 
     @property
     def outputs(self) -> dict[str, Pair]:
@@ -152,6 +154,7 @@ def free_run(
                 weight=stretch.weight,
                 output=principal,
                 reach=reach(stretch, model),
+                ranges=ranges(stretch, model),
             )
         )
     return tuple(runs)

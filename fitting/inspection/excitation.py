@@ -6,13 +6,13 @@ import numpy as np
 import scipy.signal
 
 from fitting.inspection.inspection import Inspection
+from fitting.inspection.resonances import Resonances, resonances, window
 from fitting.logs.channels import SI
 
 COHERENT = 0.9
 """Coherence above which a response counts as linear in its input; assumed."""
 
 _POWER = (0.05, 0.95)  # shares of a torque's power that limit its band
-_SEGMENTS = 16
 # How many times a side that turns freely integrates the torque: what drifts would hide what follows.
 _ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1}
 _FEWEST = 256
@@ -29,6 +29,7 @@ class Excitation:
         band: Hz, limits of 90 % of the driver's power, or None.
         coherent: Hz, the widest band of coherent response, or None.
         twist: Range of the twist from both angles [rad], or None.
+        shows: What the response of the motor to its torque shows; None without a motor-side signal.
     """
 
     ranges: dict[str, tuple[float, float, str]]
@@ -37,6 +38,7 @@ class Excitation:
     band: tuple[float, float] | None
     coherent: tuple[float, float] | None
     twist: float | None
+    shows: Resonances | None = None
 
 
 def excitation(inspection: Inspection, log: int = 0) -> Excitation:
@@ -53,7 +55,7 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
     names = ("dynamic_error", "twist", "load_angle", "motor_angle", "motor_velocity")
     response = "both angles" if twist is not None else next((s for s in names if s in signals), None)
     rate = inspection.rates[log]
-    band = coherent = None
+    band = coherent = shows = None
     if driver is not None and rate is not None:
         torque = _even(*inspection.samples(driver, log), rate)
         answer = twist if twist is not None or response is None else _even(*inspection.samples(response, log), rate)
@@ -61,8 +63,12 @@ def excitation(inspection: Inspection, log: int = 0) -> Excitation:
             band = _band(torque, rate)
             if answer is not None and len(answer) >= _FEWEST and np.ptp(answer) > 0:
                 coherent = _coherent(torque, np.diff(answer, n=_ORDER.get(response or "", 0)), rate, band)
+            motor = next((s for s in ("motor_angle", "motor_velocity") if s in signals), None)
+            if motor is not None and driver.startswith("motor"):
+                turned = _even(*inspection.samples(motor, log), rate)
+                shows = resonances(torque, np.diff(turned, n=_ORDER[motor]), rate)
     spread = None if twist is None else float(np.ptp(twist))
-    return Excitation(ranges, driver, response, band, coherent, spread)
+    return Excitation(ranges, driver, response, band, coherent, spread, shows)
 
 
 def _range(inspection: Inspection, signal: str, log: int) -> tuple[float, float, str]:
@@ -107,8 +113,8 @@ def _coherent(
     driver: np.ndarray, response: np.ndarray, rate: float, band: tuple[float, float]
 ) -> tuple[float, float] | None:
     count = min(len(driver), len(response))
-    length = count // _SEGMENTS * 2
-    if length < 32:
+    length = window(count)
+    if length is None:
         return None
     frequencies, share = scipy.signal.coherence(driver[:count], response[:count], rate, nperseg=length)
     driven = (frequencies >= band[0]) & (frequencies <= band[1])

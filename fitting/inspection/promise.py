@@ -38,6 +38,34 @@ def _of_drive(inspection: Inspection, moved: Excitation) -> Iterator[str]:
             "B_sp and the inertias are determined near the resonance: it must lie inside the band of the torque "
             f"({moved.band[0]:.3g} to {moved.band[1]:.3g} Hz)."
         )
+    yield from _of_resonances(moved)
+
+
+def _of_resonances(moved: Excitation) -> Iterator[str]:
+    """What the frequency response of the motor shows."""
+    if moved.shows is None:
+        return
+    dip, peak = moved.shows.antiresonance, moved.shows.resonance
+    if dip is not None and peak is not None:
+        yield (
+            f"The motor's response shows the antiresonance at {dip:.3g} Hz and the resonance at {peak:.3g} Hz: they give "
+            f"K/J_l and J_l/(N^2 J_m), about {(peak / dip) ** 2 - 1.0:.2g}; with the scale of the torque K, J_l and J_m."
+        )
+    elif peak is not None:
+        yield (
+            f"The motor's response shows a resonance at {peak:.3g} Hz, but no antiresonance below it: torque at lower "
+            "frequencies would separate K, J_l and J_m."
+        )
+    elif dip is not None:
+        yield (
+            f"The motor's response shows an antiresonance at {dip:.3g} Hz, which gives K/J_l, but no resonance above it: "
+            "torque at higher frequencies would separate K, J_l and J_m."
+        )
+    else:
+        yield (
+            "The motor's response shows neither antiresonance nor resonance in the excited band, which would separate K, "
+            "J_l and J_m."
+        )
 
 
 def _of_alpha(moved: Excitation) -> Iterator[str]:
@@ -63,6 +91,7 @@ def _of_motor_side(inspection: Inspection, moved: Excitation) -> Iterator[str]:
     yield "The motor side has antiresonance and resonance, which give both inertias and K with the ratio."
     if moved.band is not None:
         yield f"Both must lie inside the band of the torque ({moved.band[0]:.3g} to {moved.band[1]:.3g} Hz)."
+    yield from _of_resonances(moved)
     yield "alpha and effects of the mesh are poorly determined: a second angle would help, so look for one in the log."
 
 

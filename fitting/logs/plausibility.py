@@ -1,24 +1,21 @@
 """Plausibility checks across signals: ratio, sides, signs, units, time base."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
+from fitting.logs.momenta import FEWEST, RATIO_TOLERANCE, both_sides, closest, motor_alone
 
 # All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
-RATIO_TOLERANCE = 0.02
 FREE_MOTION = 0.02  # rad of the output, more than any gear's twist; below it a load may be locked
 LARGE_TWIST = 5e-3  # rad, more than a gear's twist within its ratings, assumed
 SLOW_MODES = 8
 SLOW_SHARE = 0.5
 SLOW_CORRELATION = 0.999
 VELOCITY_TOLERANCE = 0.02
-MOMENTUM_CORRELATION = 0.98
-MOMENTUM_TOLERANCE = 0.15
-FEWEST = 50
 _GAP = 5.0
 # Largest condition number of two columns that are to be separated.
 _APART = 30.0
@@ -40,8 +37,8 @@ def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     yield from _velocity(log, drive_file, "motor")
     yield from _velocity(log, drive_file, "load")
     # With a wrong ratio or side the sum of momenta adds no information.
-    if both and not any(finding.severity == "refusal" for finding in found):
-        yield from _momentum(log, drive_file)
+    if not any(finding.severity == "refusal" for finding in found):
+        yield from both_sides(log, drive_file) if both else motor_alone(log, drive_file)
 
 
 def _slow(values: np.ndarray) -> tuple[np.ndarray, float]:
@@ -167,7 +164,7 @@ def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
         'looks like rpm, so give it unit = "rpm"': 2 * np.pi / 60,
         'looks like degrees, so give it unit = "deg/s"': np.pi / 180,
     }
-    mend = _closest(factor, units, 1.0)
+    mend = closest(factor, units, 1.0)
     harmless = mend is not None or abs(factor - 1) <= 0.2
     yield Finding(
         "warning" if harmless else "refusal",
@@ -177,76 +174,3 @@ def _velocity(log: Log, drive_file: DriveFile, side: str) -> Iterator[Finding]:
         if mend
         else f"the time base, the side or a unit is wrong, so correct [columns] time, {side}_angle or {name}",
     )
-
-
-def _closest(factor: float, known: Mapping[str, float], usual: float, tolerance: float = RATIO_TOLERANCE) -> str | None:
-    """The explanation of a factor, unless it is as close to the default."""
-    words, value = min(known.items(), key=lambda item: abs(factor / item[1] - 1))
-    likely = abs(value / usual - 1) > 2 * tolerance and abs(factor / value - 1) < tolerance
-    return words if likely else None
-
-
-def _momentum(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
-    """Compare the rate of change of both inertias' momenta with the external torque; the mesh torque cancels.
-
-    N J_m theta_m'' + J_l theta_l'' = N T_m + T_l, multiplied by test functions and integrated by parts, so that no
-    angle is differentiated.
-    """
-    N, J_m, J_l = drive_file.reduction_ratio, drive_file.motor_inertia, drive_file.load_inertia
-    if None in (N, J_m, J_l) or log.motor_torque is None or log.outputs_until is not None or log.pieces is not None:
-        return
-    assert log.motor_angle is not None and log.load_angle is not None
-    assert N is not None and J_m is not None and J_l is not None
-    momentum = N * J_m * (log.motor_angle - log.motor_angle[0]) + J_l * (log.load_angle - log.load_angle[0])
-    torque = N * log.motor_torque + (0.0 if log.load_torque is None else log.load_torque)
-    best, gain = 0.0, 1.0
-    for count in (8, 32, 128):
-        changes, pushes = _weak_momentum(log.time, momentum, torque, count)
-        norms = float(changes @ changes), float(pushes @ pushes)
-        if min(norms) == 0 or not np.isfinite(norms).all():
-            continue
-        together = float(changes @ pushes)
-        if abs(together) > best * np.sqrt(norms[0] * norms[1]):
-            best, gain = abs(together) / np.sqrt(norms[0] * norms[1]), together / norms[1]
-    if best < MOMENTUM_CORRELATION or (0.33 < gain < 3.0):
-        return
-    units = {
-        "motor_torque acts against the motion, so give it, or both angles, sign = -1": -1.0,
-        'motor_torque looks like mN m, so give it unit = "mN m"': 1e-3,
-        'motor_torque looks like kN m, so give it unit = "kN m"': 1e3,
-        f'motor_torque looks like that of the output side, so give it unit = "N m / {N:g}"': 1 / N,
-        f'motor_torque looks too small by the ratio, so give it unit = "{N:g} N m"': N,
-        'both angles look like degrees, so give them unit = "deg"': 180 / np.pi,
-        'both angles look like revolutions, so give them unit = "rev"': 1 / (2 * np.pi),
-        'the time looks like milliseconds, so give it unit = "ms"': 1e-6,
-        'the time looks like microseconds, so give it unit = "us"': 1e-12,
-    }
-    mend = _closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
-    yield Finding(
-        "refusal" if mend else "warning",
-        f"both inertias together accelerate {gain:.3g} times as much as the torque explains",
-        "motor_torque against motor_angle and load_angle",
-        f"{mend} in [columns]"
-        if mend
-        else "check motor_inertia and load_inertia in [drive], and the unit of motor_torque",
-    )
-
-
-def _weak_momentum(
-    time: np.ndarray, momentum: np.ndarray, torque: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals of phi'' times momentum and of phi times torque over `count` windows, phi = (1 - s^2)^4."""
-    edges = np.linspace(0, len(time), count + 1).astype(int)
-    changes, pushes = np.zeros(count), np.zeros(count)
-    for i, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        if b - a < 16:
-            continue
-        t = time[a:b]
-        half = 0.5 * (t[-1] - t[0])
-        s = (t - t[0]) / half - 1.0
-        weight = np.gradient(t)
-        bump = (1 - s**2) ** 4
-        curvature = 8 * (1 - s**2) ** 2 * (7 * s**2 - 1) / half**2
-        changes[i] = np.sum(weight * curvature * (momentum[a:b] - momentum[a]))
-        pushes[i] = np.sum(weight * bump * torque[a:b])
-    return changes, pushes

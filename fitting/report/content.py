@@ -115,6 +115,8 @@ def _extrapolation(outcome: Outcome, units: Mapping[str, str]) -> list[dict[str,
     }
     if isinstance(outcome.stored.model, TwoInertiaModel):
         told = {"twist": ("twist", twist), "speed": ("motor speed", "rad/s"), "torque": ("torque", forcing)}
+        told |= {angle: (angle, "rad") for angle in ("motor angle", "output angle")}
+    told["temperature"] = ("temperature", "K")
     return [
         {"quantity": told[one.quantity][0], "unit": told[one.quantity][1], "fitted": one.fitted, "test": one.test}
         for one in extrapolations(outcome.after)

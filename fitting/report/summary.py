@@ -1,6 +1,6 @@
 """The decision in a few sentences."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fitting import formatting
@@ -12,12 +12,14 @@ from fitting.report.unknown import place_and_variables
 # Smallest relative change of the error that is stated.
 _HARDLY = 0.1
 
+# A temperature from zero kelvin differs by parts of a kelvin only in its fourth digit.
+_DIGITS_OF_TEMPERATURE = 4
 _COUNTS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
 
 
 def summary(report: Mapping[str, Any]) -> str:
     """The decision in a few sentences, and the extrapolation of test data."""
-    return _decision(report) + _extrapolating(report)
+    return _decision(report) + summary_of_extrapolation(report["extrapolation"])
 
 
 def _decision(report: Mapping[str, Any]) -> str:
@@ -73,13 +75,15 @@ def _decision(report: Mapping[str, Any]) -> str:
     )
 
 
-def _extrapolating(report: Mapping[str, Any]) -> str:
+def summary_of_extrapolation(told: Sequence[Mapping[str, Any]]) -> str:
     """A sentence on test data beyond the fitted range; empty without any."""
-    beyond = [
-        f"{one['quantity']} up to {formatting.quantity(one['test'], one['unit'])} (fitted up to "
-        f"{formatting.quantity(one['fitted'], one['unit'], like=one['test'])})"
-        for one in report["extrapolation"]
-    ]
+    beyond = []
+    for one in told:
+        to = "up to" if one["test"] > one["fitted"] else "down to"
+        digits = _DIGITS_OF_TEMPERATURE if one["unit"] == "K" else 3
+        test = formatting.quantity(one["test"], one["unit"], digits=digits)
+        fitted = formatting.quantity(one["fitted"], one["unit"], like=one["test"], digits=digits)
+        beyond.append(f"{one['quantity']} {to} {test} (fitted {to} {fitted})")
     if not beyond:
         return ""
     return f" Test data go beyond what was fitted, so that the model extrapolates: {formatting.words(beyond)}."

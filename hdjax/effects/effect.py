@@ -11,6 +11,9 @@ from hdjax.drive import Drive, ReducedDrive
 from hdjax.signals import PiecewisePolynomial
 
 
+_ANGLES = frozenset(("theta_m", "theta_l"))
+
+
 class Rubbing(eqx.Module):
     """Dry friction against a rate during one step of an explicit solver.
 
@@ -161,6 +164,11 @@ class Effect(eqx.Module):
         """Whether it depends on the drive's temperature."""
         return False
 
+    @property
+    def angles(self) -> frozenset[str]:
+        """The angles, fields of [`Motion`][], whose position matters to it and not only their rate or twist."""
+        return _ANGLES & {self.drawn_against}
+
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         """Derived quantities for reports, as name -> (value, unit)."""
         return {}
@@ -236,6 +244,10 @@ class MeshGeometryEffect(Effect):
     """Changes the mesh twist to `x_s = x + e(theta_m)` while the encoders measure x, and loads the motor through e'."""
 
     needs_motor: ClassVar[bool] = True
+
+    @property
+    def angles(self) -> frozenset[str]:
+        return frozenset(("theta_m",))
 
     @abc.abstractmethod
     def error(self, theta_m: Array) -> Array:

@@ -120,6 +120,11 @@ class KinematicSidebands(MeshGeometryEffect):
         return tuple(cls(n=n, ratio=scales.reduction_ratio) for n in (2.0, 1.0))
 
     @property
+    def angles(self) -> frozenset[str]:
+        # It repeats after a revolution of the output only.
+        return frozenset(("theta_l",))
+
+    @property
     def _terms(self) -> tuple[Term, ...]:
         away = 1.0 / self.ratio
         return (self.n - away, self.cos_below, self.sin_below), (self.n + away, self.cos_above, self.sin_above)

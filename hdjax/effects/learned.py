@@ -26,7 +26,7 @@ from hdjax.effects.effect import (
     Scales,
     SensorEffect,
 )
-from hdjax.effects.learned_axes import Axis, PeriodicAxis, SignAxis, combined, functions
+from hdjax.effects.learned_axes import ANGLES, Axis, PeriodicAxis, SignAxis, combined, functions
 from hdjax.parameters import Scalar, parameter
 
 FAMILY = "unknown"
@@ -75,6 +75,10 @@ class Learned(Effect):
     @property
     def needs_temperature(self) -> bool:
         return any(axis.variable == "temperature" for axis in self.axes)
+
+    @property
+    def angles(self) -> frozenset[str]:
+        return frozenset(axis.variable for axis in self.axes if axis.variable in ANGLES)
 
     def value(self, motion: Motion) -> Array:
         """The function, at one instant."""

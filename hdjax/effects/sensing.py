@@ -32,6 +32,10 @@ class MotorEncoderEccentricity(SensorEffect):
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n) for n in (1.0, 2.0))
 
+    @property
+    def angles(self) -> frozenset[str]:
+        return frozenset(("theta_m",))
+
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m + ripple(theta_m, self.n, self.cosine, self.sine), theta_l
 
@@ -56,6 +60,10 @@ class LoadEncoderEccentricity(SensorEffect):
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:
         return tuple(cls(n=n) for n in (1.0, 2.0))
+
+    @property
+    def angles(self) -> frozenset[str]:
+        return frozenset(("theta_l",))
 
     def reading(self, theta_m: Array, theta_l: Array, omega_m: Array, omega_l: Array) -> tuple[Array, Array]:
         return theta_m, theta_l + ripple(theta_l, self.n, self.cosine, self.sine)

@@ -1,0 +1,210 @@
+"""Torque against the rate of change of momentum: its sign and its unit."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.logs.drive_file import DriveFile
+from fitting.logs.findings import Finding
+from fitting.logs.log import Log
+
+# All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
+RATIO_TOLERANCE = 0.02
+FEWEST = 50
+MOMENTUM_CORRELATION = 0.98
+MOMENTUM_TOLERANCE = 0.15
+# Largest factor of an inertia that may be the inertia's own error.
+_INERTIA_FACTOR = 3.0
+# Windows over a log: from slow motion to quick motion.
+_COUNTS = (8, 32, 128)
+# With the motor alone friction and gravity are estimated as well, which takes more windows. The range in which a drive
+# is rigid may be narrow.
+_COUNTS_OF_MOTOR = (16, 32, 64, 128, 256)
+# Share of a regressor that must differ from the others for it to count.
+_INDEPENDENT = 1e-6
+
+
+def closest(factor: float, known: Mapping[str, float], usual: float, tolerance: float = RATIO_TOLERANCE) -> str | None:
+    """The explanation of a factor, unless it is as close to the default."""
+    words, value = min(known.items(), key=lambda item: abs(factor / item[1] - 1))
+    likely = abs(value / usual - 1) > 2 * tolerance and abs(factor / value - 1) < tolerance
+    return words if likely else None
+
+
+def both_sides(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    """Compare the rate of change of both inertias' momenta with the external torque; the mesh torque cancels.
+
+    N J_m theta_m'' + J_l theta_l'' = N T_m + T_l, multiplied by test functions and integrated by parts, so that no
+    angle is differentiated.
+    """
+    N, J_m, J_l = drive_file.reduction_ratio, drive_file.motor_inertia, drive_file.load_inertia
+    if None in (N, J_m, J_l) or not _usable(log):
+        return
+    assert log.motor_angle is not None and log.load_angle is not None and log.motor_torque is not None
+    assert N is not None and J_m is not None and J_l is not None
+    momentum = N * J_m * (log.motor_angle - log.motor_angle[0]) + J_l * (log.load_angle - log.load_angle[0])
+    torque = N * log.motor_torque + (0.0 if log.load_torque is None else log.load_torque)
+    best, gain = 0.0, 1.0
+    for count in _COUNTS:
+        changes, pushes = _weak(log.time, [(momentum, 2), (torque, 0)], count).T
+        alike, slope = _slope(changes, pushes)
+        if alike > best:
+            best, gain = alike, slope
+    if best < MOMENTUM_CORRELATION:
+        return
+    if not _has_scale(drive_file):
+        gain = float(np.sign(gain))
+    if 1.0 / _INERTIA_FACTOR < gain < _INERTIA_FACTOR:
+        return
+    units = _torque_units(N, "both angles") | {
+        'both angles look like degrees, so give them unit = "deg"': 180 / np.pi,
+        'both angles look like revolutions, so give them unit = "rev"': 1 / (2 * np.pi),
+    }
+    what = f"both inertias together accelerate {gain:.3g} times as much as the torque explains"
+    yield _finding(
+        what, "motor_torque against motor_angle and load_angle", closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
+    )
+
+
+def motor_alone(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    """Compare the motor's acceleration with its torque, where the other side's angle was not logged.
+
+    T_m + T_l / N = J theta_m'' + friction + gravity + k theta_m, in weak form. J is J_m + J_l/N^2 in slow motion and
+    J_m above the resonance. Between antiresonance and resonance J is negative without k, but not with it: the dynamic
+    stiffness falls with frequency (Foster 1924). So only what both estimates agree on counts.
+    """
+    name = next((s for s in ("motor_angle", "motor_velocity") if getattr(log, s) is not None), None)
+    if name is None or not _usable(log):
+        return
+    J, work = _apparent_inertia(log, name, drive_file.reduction_ratio)
+    # Work that the drive returns: friction consumes work, so that a torque of the right sign supplies it.
+    where = f"motor_torque against {name}"
+    if J < 0.0 and work < 0.0:
+        mend = f"motor_torque acts against the motion, so give it, or {name}, sign = -1"
+        yield _finding("the motor accelerates against its torque", where, mend)
+    N, J_m, J_l = drive_file.reduction_ratio, drive_file.motor_inertia, drive_file.load_inertia
+    if N is None or J_m is None or J_l is None or not J > 0.0 or not _has_scale(drive_file):
+        return
+    whole = J_m + J_l / N**2
+    if J_m / _INERTIA_FACTOR < J < whole * _INERTIA_FACTOR:
+        return
+    gain = whole / J
+    units = _torque_units(N, name) | (
+        {
+            'motor_angle looks like degrees, so give it unit = "deg"': 180 / np.pi,
+            'motor_angle looks like revolutions, so give it unit = "rev"': 1 / (2 * np.pi),
+        }
+        if name == "motor_angle"
+        else {
+            'motor_velocity looks like degrees, so give it unit = "deg/s"': 180 / np.pi,
+            'motor_velocity looks like rpm, so give it unit = "rpm"': 30 / np.pi,
+        }
+    )
+    mend = closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
+    # Near the antiresonance J is large; a factor that is no unit's tells nothing.
+    if mend is not None:
+        yield _finding(f"motor and load accelerate {gain:.3g} times as much as the torque explains", where, mend)
+
+
+def _usable(log: Log) -> bool:
+    """Whether momenta can be compared over the whole log."""
+    return log.motor_torque is not None and log.outputs_until is None and log.pieces is None
+
+
+def _has_scale(drive_file: DriveFile) -> bool:
+    """Whether the torque has a scale: a free torque constant has none."""
+    return np.isfinite(drive_file.tolerances.get("k_T", 0.0))
+
+
+def _finding(what: str, where: str, mend: str | None) -> Finding:
+    otherwise = "check motor_inertia and load_inertia in [drive], and the unit of motor_torque"
+    return Finding("refusal" if mend else "warning", what, where, f"{mend} in [columns]" if mend else otherwise)
+
+
+def _torque_units(N: float, motion: str) -> dict[str, float]:
+    """What may be wrong with a torque or the time, by the factor by which the drive then seems to accelerate."""
+    return {
+        f"motor_torque acts against the motion, so give it, or {motion}, sign = -1": -1.0,
+        'motor_torque looks like mN m, so give it unit = "mN m"': 1e-3,
+        'motor_torque looks like kN m, so give it unit = "kN m"': 1e3,
+        f'motor_torque looks like that of the output side, so give it unit = "N m / {N:g}"': 1 / N,
+        f'motor_torque looks too small by the ratio, so give it unit = "{N:g} N m"': N,
+        'the time looks like milliseconds, so give it unit = "ms"': 1e-6,
+        'the time looks like microseconds, so give it unit = "us"': 1e-12,
+    }
+
+
+def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, float]:
+    """Inertia at the motor [kg m^2] and work done by its torque [J]; inertia zero where the log does not tell it."""
+    assert log.motor_torque is not None
+    seen, order = getattr(log, name), int(name == "motor_velocity")
+    step = np.diff(log.time)
+    path = np.cumsum(np.append(0.0, 0.5 * (seen[1:] + seen[:-1]) * step)) if order else seen - seen[0]
+    direction = np.sign(seen if order else np.gradient(seen, log.time))
+    torque = log.motor_torque + (0.0 if log.load_torque is None or ratio is None else log.load_torque / ratio)
+    friction = [(direction, 0), (seen, 1 - order), (np.ones_like(seen), 0)]
+    position = [(path, 0)]
+    if ratio is not None:
+        position += [(np.sin(path / ratio), 0), (np.cos(path / ratio), 0)]
+    best, inertia = MOMENTUM_CORRELATION, 0.0
+    for count in _COUNTS_OF_MOTOR:
+        table = _weak(log.time, [(torque, 0), (seen, 2 - order), *friction, *position], count)
+        if not np.isfinite(table**2).all():
+            continue
+        pushes, changes = table[:, 0], table[:, 1]
+        found = [_slope(*_beside(pushes, changes, table[:, 2:stop])) for stop in (2 + len(friction), table.shape[1])]
+        (rigid, J), (alike, J_beside) = found
+        agree = J * J_beside > 0.0 and abs(J_beside / J - 1.0) < MOMENTUM_TOLERANCE
+        if agree and min(rigid, alike) > best:
+            best, inertia = min(rigid, alike), J
+    work = float(np.sum(0.5 * (torque[1:] + torque[:-1]) * np.diff(path)))
+    return inertia, work
+
+
+def _beside(
+    pushes: Float[np.ndarray, " windows"],
+    changes: Float[np.ndarray, " windows"],
+    others: Float[np.ndarray, "windows others"],
+) -> tuple[Float[np.ndarray, " windows"], Float[np.ndarray, " windows"]]:
+    """Two series less what other regressors explain (Frisch and Waugh 1933); zero where nothing of them is left."""
+    norms = np.linalg.norm(others, axis=0)
+    others = others[:, norms > 0] / norms[norms > 0]
+    both = np.stack([pushes, changes], axis=1)
+    left = both - others @ np.linalg.lstsq(others, both, rcond=_INDEPENDENT)[0]
+    left[:, np.linalg.norm(left, axis=0) < _INDEPENDENT * np.linalg.norm(both, axis=0)] = 0.0
+    return left[:, 0], left[:, 1]
+
+
+def _slope(one: Float[np.ndarray, " windows"], other: Float[np.ndarray, " windows"]) -> tuple[float, float]:
+    """Size of the correlation of two series about zero, and the slope of the first over the second."""
+    norms = float(one @ one), float(other @ other)
+    if min(norms) == 0 or not np.isfinite(norms).all():
+        return 0.0, 1.0
+    together = float(one @ other)
+    return abs(together) / np.sqrt(norms[0] * norms[1]), together / norms[1]
+
+
+def _weak(
+    time: Float[np.ndarray, " n"], signals: Sequence[tuple[Float[np.ndarray, " n"], int]], count: int
+) -> Float[np.ndarray, "windows signals"]:
+    """Integrals of derivatives of signals times phi = (1 - s^2)^4 over `count` windows; zero where these are short.
+
+    Args:
+        time: stamps [s].
+        signals: each with the order of its derivative, which is moved to phi.
+        count: number of windows.
+    """
+    edges = np.linspace(0, len(time), count + 1).astype(int)
+    found = np.zeros((count, len(signals)))
+    for i, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        if b - a < 16:
+            continue
+        t = time[a:b]
+        half = 0.5 * (t[-1] - t[0])
+        s = (t - t[0]) / half - 1.0
+        weight = np.gradient(t)
+        phi = (1 - s**2) ** 4, 8 * s * (1 - s**2) ** 3 / half, 8 * (1 - s**2) ** 2 * (7 * s**2 - 1) / half**2
+        for k, (values, order) in enumerate(signals):
+            found[i, k] = np.sum(weight * phi[order] * (values[a:b] - (values[a] if order else 0.0)))
+    return found
