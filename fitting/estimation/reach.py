@@ -1,4 +1,4 @@
-"""How far a stretch of a log takes its drive: the largest twist, speed and torque, and ranges of angle and temperature."""
+"""How far a stretch of a log takes its drive: largest twist, speed and torque, ranges of angle and temperature."""
 
 from typing import Literal
 

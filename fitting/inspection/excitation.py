@@ -6,11 +6,8 @@ import numpy as np
 import scipy.signal
 
 from fitting.inspection.inspection import Inspection
-from fitting.inspection.resonances import Resonances, resonances, window
+from fitting.inspection.resonances import COHERENT, Resonances, resonances, window
 from fitting.logs.channels import SI
-
-COHERENT = 0.9
-"""Coherence above which a response counts as linear in its input; assumed."""
 
 _POWER = (0.05, 0.95)  # shares of a torque's power that limit its band
 # How many times a side that turns freely integrates the torque: what drifts would hide what follows.

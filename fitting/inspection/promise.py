@@ -48,23 +48,23 @@ def _of_resonances(moved: Excitation) -> Iterator[str]:
     dip, peak = moved.shows.antiresonance, moved.shows.resonance
     if dip is not None and peak is not None:
         yield (
-            f"The motor's response shows the antiresonance at {dip:.3g} Hz and the resonance at {peak:.3g} Hz: they give "
-            f"K/J_l and J_l/(N^2 J_m), about {(peak / dip) ** 2 - 1.0:.2g}; with the scale of the torque K, J_l and J_m."
+            f"The motor's response shows an antiresonance at about {dip:.3g} Hz and a resonance at {peak:.3g} Hz: with "
+            "the scale of the torque they give K, J_l and J_m."
         )
     elif peak is not None:
         yield (
-            f"The motor's response shows a resonance at {peak:.3g} Hz, but no antiresonance below it: torque at lower "
+            f"The motor's response shows a resonance at about {peak:.3g} Hz, but no antiresonance below it: torque at lower "
             "frequencies would separate K, J_l and J_m."
         )
     elif dip is not None:
         yield (
-            f"The motor's response shows an antiresonance at {dip:.3g} Hz, which gives K/J_l, but no resonance above it: "
-            "torque at higher frequencies would separate K, J_l and J_m."
+            f"The motor's response shows an antiresonance at about {dip:.3g} Hz, which gives K/J_l, but no resonance "
+            "above it: torque at higher frequencies would separate K, J_l and J_m."
         )
     else:
         yield (
-            "The motor's response shows neither antiresonance nor resonance in the excited band, which would separate K, "
-            "J_l and J_m."
+            "The motor's response shows neither antiresonance nor resonance in the excited band: together they would "
+            "separate K, J_l and J_m."
         )
 
 

@@ -10,9 +10,12 @@ SEGMENTS = 16
 """Halves of overlapping windows in a log, for averages."""
 
 _FEWEST_SAMPLES = 32
-# Coherence below which a line tells nothing, as in `fitting.validation.frequency_response`; and the least height of a peak
-# or dip over its surroundings [dB], four standard deviations of a line at this coherence (Bendat and Piersol 2010, 9.1).
-_COHERENT, _PROMINENT = 0.6, 6.0
+COHERENT = 0.9
+"""Coherence above which a response counts as linear in its input; assumed."""
+
+# Least height of a peak or dip over its surroundings [dB]: ten standard deviations of a line so coherent, since the
+# extremes of many lines lie six apart (Bendat and Piersol 2010, 9.1).
+_PROMINENT = 6.0
 # Power of the torque over that of its strongest line, above which a line is excited and not leakage (Harris 1978).
 _EXCITED = 1e-4
 
@@ -56,7 +59,7 @@ def resonances(
     u, y = torque[:count], acceleration[:count]
     frequency, S_uy = scipy.signal.csd(u, y, rate, nperseg=length)
     S_uu, S_yy = (scipy.signal.welch(own, rate, nperseg=length)[1] for own in (u, y))
-    follows = np.abs(S_uy) ** 2 > _COHERENT * S_uu * S_yy
+    follows = np.abs(S_uy) ** 2 > COHERENT * S_uu * S_yy
     kept = follows & (S_uu > _EXCITED * np.max(S_uu))
     frequency, level = frequency[kept], 20.0 * np.log10(np.abs(S_uy[kept]) / S_uu[kept])
     peak = _most_prominent(level)

@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fitting.inspection.drive_text import unknowns
-from fitting.inspection.excitation import COHERENT, Excitation
+from fitting.inspection.excitation import Excitation
 from fitting.inspection.inspection import Inspection, JointInspection
+from fitting.inspection.resonances import COHERENT
 from fitting.logs.findings import Finding
 
 _GAP = 5.0  # in median steps; a longer pause is a gap

@@ -1,5 +1,6 @@
 """Torque against the rate of change of momentum: its sign and its unit."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -114,7 +115,7 @@ def _usable(log: Log) -> bool:
 
 def _has_scale(drive_file: DriveFile) -> bool:
     """Whether the torque has a scale: a free torque constant has none."""
-    return np.isfinite(drive_file.tolerances.get("k_T", 0.0))
+    return math.isfinite(drive_file.tolerances.get("k_T", 0.0))
 
 
 def _finding(what: str, where: str, mend: str | None) -> Finding:

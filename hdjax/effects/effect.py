@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.signals import PiecewisePolynomial
 
-
 _ANGLES = frozenset(("theta_m", "theta_l"))
 
 

@@ -20,9 +20,9 @@ def responded(K: float) -> tuple[np.ndarray, np.ndarray]:
 def test_dip_and_peak_are_those_of_the_drive(K: float):
     found = resonances(*responded(K), 1000.0)
     assert found is not None and found.antiresonance is not None and found.resonance is not None
-    # Lines lie 1.3 Hz apart; damping moves a dip and a peak by less.
-    assert found.antiresonance == pytest.approx(np.sqrt(K / J_L) / (2 * np.pi), abs=1.4)
-    assert found.resonance == pytest.approx(np.sqrt(K * (1 / J_L + 1 / (N**2 * J_M))) / (2 * np.pi), abs=1.4)
+    # Lines lie 1.3 Hz apart, and a Hann window is two of them wide.
+    assert found.antiresonance == pytest.approx(np.sqrt(K / J_L) / (2 * np.pi), abs=2.7)
+    assert found.resonance == pytest.approx(np.sqrt(K * (1 / J_L + 1 / (N**2 * J_M))) / (2 * np.pi), abs=2.7)
 
 
 def test_a_rigid_drive_and_noise_show_none():
@@ -39,9 +39,8 @@ def test_inspection_tells_what_shows(signal: str):
     motion = simulated(N=N, J_m=J_M, J_l=J_L)
     columns = {name: getattr(motion, name) for name in ("time", "motor_torque", signal)}
     (sentence,) = [s for s in fitting.inspect(columns).told if "The motor's response shows" in s]
-    # J_l/(N^2 J_m) is 0.4; a line more or less changes it by half.
-    assert "the antiresonance at" in sentence and "the resonance at" in sentence
-    # Below a third of the antiresonance the drive turns as one.
+    assert "an antiresonance at about" in sentence and "a resonance at" in sentence
+    # In slow motion the drive turns as one.
     slow = np.fft.rfft(motion.motor_torque)
     slow[np.fft.rfftfreq(6000, 1e-3) > 6.0] = 0.0
     torque = np.fft.irfft(slow, 6000)

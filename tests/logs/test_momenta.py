@@ -29,10 +29,8 @@ def log_of(torque: np.ndarray, signal: str = "motor_angle", joint: joints.Joint 
     motion = joints.motion_of(joint, torque)
     log = rig.log_of_angles(motion[:, 0], motion[:, 1], torque, ratio=joint.N, step=joints.STEP, name="log")
     none = {"motor_angle": None, "load_angle": None, "dynamic_error": None}
-    values = (
-        motion[:, 0] + 1e-4 * np.random.default_rng(0).normal(size=COUNT) if signal == "motor_angle" else motion[:, 2]
-    )
-    return replace(log, **(none | {signal: values}))
+    noisy = motion[:, 0] + 1e-4 * np.random.default_rng(0).normal(size=COUNT)
+    return replace(log, **(none | {signal: noisy if signal == "motor_angle" else motion[:, 2]}))
 
 
 def refusals(log: Log, drive_file: DriveFile) -> list[Finding]:
@@ -58,8 +56,8 @@ def moving(request: pytest.FixtureRequest) -> Log:
 )
 def test_sign_and_unit_of_a_torque_on_the_motor_alone(moving: Log, changes: dict[str, float], stated: str, free: str):
     log = replace(moving, **{name: factor * getattr(moving, name) for name, factor in changes.items()})
-    files = {drive(): stated, drive(stated=False): free, drive(tolerances={"k_T": np.inf}): free}
-    for drive_file, words in files.items():
+    files = [(drive(), stated), (drive(stated=False), free), (drive(tolerances={"k_T": np.inf}), free)]
+    for drive_file, words in files:
         found = refusals(log, drive_file)
         assert [f.severity for f in found] == (["refusal"] if words else [])
         assert not words or words in str(found[0])

@@ -12,20 +12,20 @@ from hypothesis import strategies as st
 import joints
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.free_run import FreeRun
-from fitting.estimation.reach import ranges
+from fitting.estimation.reach import Quantity, ranges
 from fitting.report.summary import summary_of_extrapolation
 from fitting.validation.account import Account
 from fitting.validation.extrapolation import BEYOND, extrapolations
 from hdjax import Drive, TwoInertiaModel, sampled
 from hdjax.effects.cogging import Cogging
-from hdjax.effects.friction import MotorFriction
+from hdjax.effects.friction import ViscousMotorFriction
 from hdjax.effects.load import GravityLoad
 from hdjax.effects.thermal import ThermalStiffness
 
 JOINT = joints.Joint(N=50.0, J_m=4e-5, J_l=0.2, K=300.0, B_sp=0.4, rms=0.05)
 DRIVE = Drive(N=JOINT.N, J_m=JOINT.J_m, J_l=JOINT.J_l, K=JOINT.K, B_sp=JOINT.B_sp)
 NOTHING = np.zeros(3)
-SAME = {"twist": 1.0, "speed": 1.0, "torque": 1.0}
+SAME: dict[Quantity, float] = {"twist": 1.0, "speed": 1.0, "torque": 1.0}
 
 
 def beyond(condition: Any, fitted: tuple[float, float], *test: tuple[float, float]) -> list[tuple[float, float]]:
@@ -60,7 +60,7 @@ def test_only_what_matters_to_the_model_has_a_range():
     warmed = Stretch(replace(experiment, temperature=warm), 0, 500)
     motor, load = log.motor_angle, log.load_angle
     assert motor is not None and load is not None
-    effects = (Cogging(), GravityLoad(), MotorFriction(), ThermalStiffness())
+    effects = (Cogging(), GravityLoad(), ViscousMotorFriction(), ThermalStiffness())
     found = ranges(warmed, TwoInertiaModel(DRIVE, effects))
     # The twist is negligible.
     span = pytest.approx((motor[:500].min() / JOINT.N, motor[:500].max() / JOINT.N), abs=np.ptp(motor / JOINT.N - load))
@@ -69,7 +69,7 @@ def test_only_what_matters_to_the_model_has_a_range():
     )
     assert found["temperature"] == pytest.approx((300.0, 300.0 + experiment.time[499]))
     assert set(ranges(plain, TwoInertiaModel(DRIVE, effects))) == {"output angle", "motor angle"}
-    assert ranges(warmed, TwoInertiaModel(DRIVE, (MotorFriction(),))) == {}
+    assert ranges(warmed, TwoInertiaModel(DRIVE, (ViscousMotorFriction(),))) == {}
 
 
 def test_the_summary_says_to_which_end():
