@@ -6,10 +6,11 @@ import numpy as np
 import scipy.signal
 
 from fitting.inspection.inspection import Inspection
-from fitting.inspection.resonances import COHERENT, Resonances, resonances, window
+from fitting.inspection.resonances import COHERENT, Resonances, resonances
 from fitting.logs.channels import SI
 
 _POWER = (0.05, 0.95)  # shares of a torque's power that limit its band
+_SEGMENTS = 16
 # How many times a side that turns freely integrates the torque: what drifts would hide what follows.
 _ORDER = {"motor_angle": 2, "load_angle": 2, "motor_velocity": 1}
 _FEWEST = 256
@@ -110,8 +111,8 @@ def _coherent(
     driver: np.ndarray, response: np.ndarray, rate: float, band: tuple[float, float]
 ) -> tuple[float, float] | None:
     count = min(len(driver), len(response))
-    length = window(count)
-    if length is None:
+    length = count // _SEGMENTS * 2
+    if length < 32:
         return None
     frequencies, share = scipy.signal.coherence(driver[:count], response[:count], rate, nperseg=length)
     driven = (frequencies >= band[0]) & (frequencies <= band[1])

@@ -53,8 +53,8 @@ def _of_resonances(moved: Excitation) -> Iterator[str]:
         )
     elif peak is not None:
         yield (
-            f"The motor's response shows a resonance at about {peak:.3g} Hz, but no antiresonance below it: torque at lower "
-            "frequencies would separate K, J_l and J_m."
+            f"The motor's response shows a resonance at about {peak:.3g} Hz, but no antiresonance below it: torque at "
+            "lower frequencies would separate K, J_l and J_m."
         )
     elif dip is not None:
         yield (

@@ -78,10 +78,10 @@ def motor_alone(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     name = next((s for s in ("motor_angle", "motor_velocity") if getattr(log, s) is not None), None)
     if name is None or not _usable(log):
         return
-    J, work = _apparent_inertia(log, name, drive_file.reduction_ratio)
-    # Work that the drive returns: friction consumes work, so that a torque of the right sign supplies it.
+    J, lost = _apparent_inertia(log, name, drive_file.reduction_ratio)
     where = f"motor_torque against {name}"
-    if J < 0.0 and work < 0.0:
+    # Any drive loses energy: what seems to gain some has a torque of the wrong sign.
+    if J < 0.0 and lost < 0.0:
         mend = f"motor_torque acts against the motion, so give it, or {name}, sign = -1"
         yield _finding("the motor accelerates against its torque", where, mend)
     N, J_m, J_l = drive_file.reduction_ratio, drive_file.motor_inertia, drive_file.load_inertia
@@ -137,14 +137,15 @@ def _torque_units(N: float, motion: str) -> dict[str, float]:
 
 
 def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, float]:
-    """Inertia at the motor [kg m^2] and work done by its torque [J]; inertia zero where the log does not tell it."""
+    """Inertia at the motor [kg m^2], zero where the log does not tell it, and the work of the torque less the kinetic
+    energy of this inertia [J]."""
     assert log.motor_torque is not None
     seen, order = getattr(log, name), int(name == "motor_velocity")
     step = np.diff(log.time)
     path = np.cumsum(np.append(0.0, 0.5 * (seen[1:] + seen[:-1]) * step)) if order else seen - seen[0]
-    direction = np.sign(seen if order else np.gradient(seen, log.time))
+    velocity = seen if order else np.gradient(seen, log.time)
     torque = log.motor_torque + (0.0 if log.load_torque is None or ratio is None else log.load_torque / ratio)
-    friction = [(direction, 0), (seen, 1 - order), (np.ones_like(seen), 0)]
+    friction = [(np.sign(velocity), 0), (seen, 1 - order), (np.ones_like(seen), 0)]
     position = [(path, 0)]
     if ratio is not None:
         position += [(np.sin(path / ratio), 0), (np.cos(path / ratio), 0)]
@@ -160,7 +161,7 @@ def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, 
         if agree and min(rigid, alike) > best:
             best, inertia = min(rigid, alike), J
     work = float(np.sum(0.5 * (torque[1:] + torque[:-1]) * np.diff(path)))
-    return inertia, work
+    return inertia, work - 0.5 * inertia * float(velocity[-1] ** 2 - velocity[0] ** 2)
 
 
 def _beside(
