@@ -194,18 +194,10 @@ class CaseEvidence:
     final: FinalEvidence
 
 
-# Fields that may be infinite, for which JSON has no number.
-_UNBOUNDED = (
-    "removed",
-    "strength_errors",
-    "over_noise",
-    "gain",
-    "long_gain",
-    "training",
-    "selection",
-    "noise",
-    "longer_worse",
-)
+# Fields that may be infinite, for which JSON has no number. Free runs of a rival may diverge, which no gain offsets.
+_INFINITE = dict.fromkeys(
+    ("removed", "strength_errors", "over_noise", "gain", "training", "selection", "noise", "longer_worse"), math.inf
+) | {"long_gain": -math.inf}
 
 
 def case_evidence(stored: Mapping[str, Any]) -> CaseEvidence:
@@ -244,4 +236,4 @@ def _model(stored: Mapping[str, Any]) -> ModelEvidence:
 
 def _finite(stored: Mapping[str, Any]) -> dict[str, Any]:
     """The fields, with infinity where a report has a null."""
-    return {k: math.inf if v is None and k in _UNBOUNDED else v for k, v in stored.items()}
+    return {k: _INFINITE[k] if v is None and k in _INFINITE else v for k, v in stored.items()}
