@@ -34,7 +34,6 @@ OFF: Mapping[str, float] = {
     "little": 0.0,
     "come_out": 0.0,
     "lasting": -np.inf,
-    "many": np.inf,
     "noise_gain": -np.inf,
     "innovations": np.inf,
     "surprise": np.inf,

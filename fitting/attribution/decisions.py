@@ -130,20 +130,19 @@ def next_question(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> Ques
         seen: the evidence so far.
         rules: the thresholds.
     """
-    enough = seen.enough
-    if enough and seen.names < rules.many:
+    if seen.enough:
         return None
     little = _leaves_little(seen, rules)
-    if seen.names and not enough and not little and "instead" not in seen.asked:
+    if seen.names and not little and "instead" not in seen.asked:
         return "instead"
     if seen.instead is not None and seen.instead.white and seen.come_out < rules.come_out:
         # No further term could improve the named model.
         return None
-    if not enough and "beside" not in seen.asked:
+    if "beside" not in seen.asked:
         return "beside"
     if not seen.names or "instead" in seen.asked:
         return None
-    settled = _adds_little(seen, rules) if seen.beside is not None else little and not enough
+    settled = _adds_little(seen, rules) if seen.beside is not None else little
     return None if settled else "instead"
 
 
@@ -160,13 +159,12 @@ def names_stand(seen: ChallengeEvidence, rules: DecisionRules = RULES) -> tuple[
     if seen.instead is None:
         return (Check("come_out", "no learned term contradicts the names", 1.0, rules.come_out, True),)
     beside, instead = seen.beside, seen.instead
-    enough = seen.enough
     rival = seen.named if beside is None else beside
     better_by = rival.selection - instead.selection
     gain = seen.base.selection - instead.selection
     fewer = rival.parameters - instead.parameters
     by_far = better_by > rules.little * gain
-    as_good = by_far or ((beside is not None or (enough and fewer > 0)) and better_by >= -rules.least_gain)
+    as_good = by_far or (beside is not None and better_by >= -rules.least_gain)
     come_out = seen.come_out >= rules.come_out and seen.shown
     simpler = (by_far and fewer > 0) or (seen.one_shape and fewer >= 0)
     if beside is not None and _adds_little(seen, rules):

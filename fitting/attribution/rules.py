@@ -81,7 +81,6 @@ class DecisionRules:
         "largest excess of a learned term's free-run error over that of the names that it replaces",
         "a lag in place of creep had 40 times the error (study, seed 95)",
     )
-    many: float = _rule(3.0, "names", "least number of names that may be the terms of one function", _UNDECLARED)
     noise_gain: float = _rule(
         5.0,
         "nats",
