@@ -1,12 +1,14 @@
 """Decide stored cases anew under other rules: which rule changes anything. See benchmarks/README.md.
 
     python benchmarks/undeclared/replay.py study/results
+    python benchmarks/undeclared/replay.py study/results --pairs
     python benchmarks/undeclared/replay.py study/results --set significance=0.02
 
 The cases are results of `run.py`, or reports of `hdjax close-loop`, which store their evidence.
 """
 
 import argparse
+import itertools
 import json
 import sys
 from collections.abc import Mapping
@@ -44,6 +46,7 @@ def main() -> None:
     """Print how many cases each rule changes when it is switched off, or those that a change of thresholds changes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="+", help="of results, or of reports")
+    parser.add_argument("--pairs", action="store_true", help="which rules hide each other: two switched off at once")
     parser.add_argument("--set", nargs="+", default=[], metavar="RULE=VALUE", help="thresholds to decide with")
     args = parser.parse_args()
     cases = read_cases(args.folder)
@@ -53,6 +56,9 @@ def main() -> None:
             print(f"{name}: {what}")
         return
     print(f"{len(cases)} cases\n")
+    if args.pairs:
+        _print_hidden(cases)
+        return
     print("| rule switched off | decisions that change | candidates or questions that change | cases |")
     print("|---|---|---|---|")
     for rule, value in OFF.items():
@@ -60,6 +66,16 @@ def main() -> None:
         outcomes = [name for name, what in found.items() if "->" in what]
         shown = ", ".join(list(found)[:4]) + (", ..." if len(found) > 4 else "")
         print(f"| `{rule}` | {len(outcomes)} | {len(found) - len(outcomes)} | {shown} |")
+
+
+def _print_hidden(cases: Mapping[str, CaseEvidence]) -> None:
+    """Print the pairs of rules that together change cases that neither changes alone."""
+    alone = {rule: set(differing(cases, replace(RULES, **{rule: value}))) for rule, value in OFF.items()}
+    for (one, off), (other, also) in itertools.combinations(OFF.items(), 2):
+        both = differing(cases, replace(RULES, **{one: off, other: also}))
+        further = sorted(set(both) - alone[one] - alone[other])
+        if further:
+            print(f"{one} and {other}: {len(further)} further, {', '.join(further[:4])}")
 
 
 def read_cases(folders: list[Path]) -> dict[str, CaseEvidence]:

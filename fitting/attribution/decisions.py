@@ -4,7 +4,7 @@ Pure functions without fits or simulations: stored evidence can be decided again
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -273,8 +273,9 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
             lacking.append(f"round {number}: another candidate would be accepted")
         elif this.rivals and not last and leader(this.rivals, rules)[0].name != this.asked[-1].name:
             lacking.append(f"round {number}: another candidate would lead")
-    if evidence.challenge.left is not None:
-        checks += only_noise(evidence.challenge.left, rules)
+    noise = () if evidence.challenge.left is None else only_noise(evidence.challenge.left, rules)
+    checks += noise
+    explains = bool(noise) and evidence.challenge.beside is None and all(check.holds for check in noise)
     question = next_question(evidence.challenge, rules)
     if question is not None:
         lacking.append(f"a learned term {question}")
@@ -284,5 +285,5 @@ def decide(evidence: CaseEvidence, rules: DecisionRules = RULES) -> Decision:
         checks += stand
         if any(check.holds for check in stand) != bool(names):
             lacking.append("the final model with other names")
-    outcome, last_checks = conclude(evidence.final, rules)
+    outcome, last_checks = conclude(replace(evidence.final, noise_explains=explains), rules)
     return Decision(outcome, names, (*checks, *last_checks), lacking[0] if lacking else None)
