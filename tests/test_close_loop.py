@@ -195,6 +195,7 @@ def test_single_precision_is_refused():
 def test_effect_that_does_not_explain_free_runs_is_unexplained(monkeypatch: pytest.MonkeyPatch):
     """An effect found over short segments is reported where no term can be learned; the decision is `unexplained`."""
     module = import_module("fitting.conclusion")
+    monkeypatch.setattr(module, "share_explained", lambda *args: 0.5)
     monkeypatch.setattr(module, "surprise", lambda *args, **options: 1.4)
     monkeypatch.setattr(module, "learn_supported", lambda *args, **options: None)
     loop = reduced_loop(rig.reduced_experiment(REDUCED_COUNT, noise=REDUCED_NOISE, friction=FRICTION))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from joint_logs import simulated
+from simulated_joint import simulated
 
 import fitting
 from fitting.inspection.resonances import resonances
