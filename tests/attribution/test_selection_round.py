@@ -156,6 +156,27 @@ def test_form_without_memory_is_preferred_at_equal_parameter_count(verdicts, mon
     assert [v.name for v in ordered] == ["motor_friction", "dahl_motor_friction"]
 
 
+def test_ties_are_those_of_the_first_candidate(verdicts, monkeypatch: pytest.MonkeyPatch):
+    """A candidate that is worse than the best one may be tied with the simpler one that was chosen."""
+    _, found = verdicts
+    names = ("best", "chosen", "third")
+    trials = [replace(found["torque_bias"].trial, lasting=share) for share in (1.0, 0.9, 0.8)]
+    blocks = {
+        1.0: np.array([1.0, 1.0, 1.0, 5.0]),
+        0.9: np.array([0.0, 0.5, 1.5, 5.0]),
+        0.8: np.array([0.0, 0.4, 0.6, 4.7]),
+    }
+    monkeypatch.setattr(attribution, "block_scores", lambda trial, whitening: blocks[trial.lasting])
+    candidates = [Verdict(n, "family", t, 1.0, 0.001, True) for n, t in zip(names, trials, strict=True)]
+
+    def tied(order: list[Verdict]) -> list[str]:
+        return [v.name for v in attribution._with_ties(order)[0] if not v.separable]
+
+    best, chosen, third = candidates
+    assert tied([best, chosen, third]) == ["best", "chosen"]
+    assert tied([chosen, best, third]) == ["chosen", "best", "third"]
+
+
 def test_removed_share_is_relative_to_earlier_effects(verdicts):
     """With errors of 1000 and 1 in units of the noise, the last unit is 1e-3 of what was removed before."""
     trial, _ = verdicts
