@@ -1,4 +1,4 @@
-"""Logs, drive files and models for the tests of commands, and how a command is run."""
+"""Logs, drive files and models for the tests of commands."""
 
 from pathlib import Path
 
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import rig
-from fitting.commands.main import main
 from fitting.stored_model import StoredModel, to_json
 from hdjax import Model, TwoInertiaModel
 
@@ -23,15 +22,6 @@ load_inertia = 5.0e-2
 [signals]
 torque_hold = "zero-order"
 """
-
-
-def run(*arguments: object) -> int:
-    """The exit code of a command."""
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as end:
-        return 0 if end.code is None else int(end.code)
-    return 0
 
 
 def table() -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_files import assert_one_line, reduced_table, run, table, write_drive, write_model, write_table
+from command_files import assert_one_line, reduced_table, table, write_drive, write_model, write_table
+from invocation import run
 
 import rig
 from fitting.commands import main as command_line

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import polars as pl
 import pytest
+from invocation import run
 
 from fitting.commands.design_file import read_design_file
-from fitting.commands.main import main
 from fitting.commands.parameter_draws import drawn_from_report, spread_around
 from fitting.errors import DataError, InputError
 from fitting.stored_model import StoredModel, to_json
@@ -50,14 +50,6 @@ def write_design_file(folder: Path, text: str) -> Path:
     path = folder / "spec.toml"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def run(*arguments: object) -> int:
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
 
 
 def test_design_command_writes_the_confirmed_best_design(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -4,18 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from invocation import run
 
-from fitting.commands.main import main
 from fitting.logs.drive_file import read_drive_file
-
-
-def run(*arguments: object) -> int:
-    """The exit code of a command."""
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as end:
-        return 0 if end.code is None else int(end.code)
-    return 0
 
 
 def write_slow_log(path: Path, *, twist: str = "deflection", rows: int = 2000) -> Path:

@@ -13,12 +13,12 @@ from command_files import (
     assert_one_line,
     read_table,
     reduced_table,
-    run,
     table,
     write_drive,
     write_model,
     write_table,
 )
+from invocation import run
 
 import rig
 from fitting.estimation.free_run import WINDOW

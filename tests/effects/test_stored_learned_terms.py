@@ -13,6 +13,7 @@ from learned_effects import jumping_torque, learned_effect, periodic_torque, rat
 import rig
 from fitting.errors import InputError
 from fitting.stored_model import StoredModel, read_model, to_json
+from hdjax import Model
 from hdjax.effects.friction import CoulombFriction
 from hdjax.effects.learned import (
     LearnedFriction,
@@ -31,13 +32,18 @@ def test_stored_mesh_error_of_other_variables_than_the_angle_is_refused(tmp_path
         read_stored(json.dumps(content), tmp_path)
 
 
+def stored(model: Model) -> str:
+    """A model file."""
+    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+
+
 def stored_torque() -> str:
     axes = (axis_over("omega_m", -30.0, 1e2 / 3), axis_over("theta_l", 0.0, 1.0, beside="omega_m"))
     count = axes[0].count * axes[1].count
     mixing = np.random.default_rng(0).normal(size=(count, 3))
     effect = LearnedMotorTorque(axes=axes, mixing=mixing, c=[1 / 3, -1e-5, 2.0])
     model = rig.drive_model().with_effects(CoulombFriction(T_c=1.0, v_0=0.1), effect)
-    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+    return stored(model)
 
 
 def read_stored(text: str, folder: Path):
@@ -60,8 +66,7 @@ def test_stored_torque_is_read_back_unchanged(tmp_path: Path):
 )
 def test_stored_axis_is_read_back_unchanged(axis: Axis, tmp_path: Path):
     model = rig.drive_model().with_effects(learned_effect(LearnedMeshTorque, axis))
-    stored_torque = to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
-    effect = read_stored(stored_torque, tmp_path).model.effect("learned_mesh_torque")
+    effect = read_stored(stored(model), tmp_path).model.effect("learned_mesh_torque")
     assert isinstance(effect, LearnedMeshTorque)
     assert eqx.tree_equal(effect.axes, (axis,))
 
@@ -69,7 +74,7 @@ def test_stored_axis_is_read_back_unchanged(axis: Axis, tmp_path: Path):
 def stored_jump() -> str:
     effect = jumping_torque(LearnedMotorTorque, level=1 / 3, corner=3e-3, on=AngleAxis("theta_m", 2))
     model = rig.drive_model().with_effects(effect).replace({"learned_motor_torque.transition": 1 / 7})
-    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+    return stored(model)
 
 
 def test_stored_jump_is_read_back_unchanged(tmp_path: Path):
@@ -83,7 +88,7 @@ def test_stored_jump_is_read_back_unchanged(tmp_path: Path):
 def stored_periodic_torque() -> str:
     effect = periodic_torque(LearnedMotorTorque, 20.0, [1 / 3, 0.1, 0.0])
     model = rig.drive_model().with_effects(effect).replace({"learned_motor_torque.omega": 61 / 3})
-    return to_json(StoredModel(model, "zero-order", 2, 4, 1e-12 * jnp.eye(2)))
+    return stored(model)
 
 
 def test_stored_periodic_torque_is_read_back_unchanged(tmp_path: Path):

@@ -7,9 +7,9 @@ from pathlib import Path
 import mutations
 import numpy as np
 import pytest
+from invocation import run
 
 import rig
-from fitting.commands.main import main
 from fitting.drive_data import ready_log
 from fitting.errors import DataError, InputError
 from fitting.logs.checks import examine, refuse_unfit
@@ -53,11 +53,7 @@ def assert_valid(found: Log | ValueError, log_path: Path, drive_path: Path) -> N
 
 def fit(log_path: Path, drive_path: Path, out: Path) -> int:
     """The exit code of a fit on the command line."""
-    try:
-        main(["fit", str(log_path), "--drive", str(drive_path), "--out", str(out)])
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
+    return run("fit", log_path, "--drive", drive_path, "--out", out)
 
 
 def is_readable(seed: int, folder: Path) -> bool:

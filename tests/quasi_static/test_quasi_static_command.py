@@ -6,9 +6,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from invocation import run
 from torque_cycles import FRICTION, K1, cycles, line, no_friction, sliders
 
-from fitting.commands.main import main
 from fitting.logs.drive_file import read_drive_file
 from fitting.logs.log import read_log
 from fitting.quasi_static.fit import fit_quasi_static
@@ -20,14 +20,6 @@ DRIVE = "[drive]\nrated_torque = 54.0\n"
 
 
 pytestmark = pytest.mark.usefixtures("own_cache")
-
-
-def run(*arguments: object) -> int:
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as end:
-        return 0 if end.code is None else int(end.code)
-    return 0
 
 
 def table(**options) -> dict[str, np.ndarray]:
