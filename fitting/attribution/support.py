@@ -104,7 +104,7 @@ def noise_of_torque(left: NoiseModel | None) -> float | None:
     return left.std if left is not None and left.likelihood - left.without > RULES.noise_gain else None
 
 
-def _noise_of(trial: Trial, outputs: Float[np.ndarray, "outputs outputs"]) -> NoiseModel:
+def _noise_of(trial: Trial, outputs: Float[np.ndarray, "outputs outputs"]) -> NoiseModel | None:
     return noise_model(trial.training, outputs, predictable=RULES.innovations)
 
 
@@ -121,8 +121,8 @@ class Standing:
         self.before, self.base, self.noise = before, base, noise
 
     @cached_property
-    def left(self) -> NoiseModel:
-        """Fitted noise model of the current model: coloured sensor noise and torque noise."""
+    def left(self) -> NoiseModel | None:
+        """Fitted noise model of the current model: coloured sensor noise and torque noise; None where it diverges."""
         return _noise_of(self.before, np.asarray(self.noise.covariance))
 
     def over_noise(self, trial: Trial) -> float:
@@ -134,9 +134,11 @@ class Standing:
             trial: the model.
         """
         left = self.left
-        if not is_noise(left):
+        if left is None or not is_noise(left):
             return np.inf
         own = _noise_of(trial, np.asarray(self.noise.covariance))
+        if own is None:
+            return -np.inf
         further = len(trial.training.free.paths) - len(self.before.training.free.paths)
         return own.likelihood - left.likelihood - 0.5 * further * float(np.log(left.count))
 

@@ -7,18 +7,20 @@ residual, the drive's parameters are fixed at that fit's values.
 """
 
 import functools
+import statistics
 from collections.abc import Sequence
 
+from fitting.estimation.driven_load import friction_from_motor
 from fitting.estimation.estimate import Fit, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import base_paths, fitted_paths
 from fitting.estimation.problem import Segmentation, segment_length, short_horizon, suggested_substeps
 from fitting.estimation.scales import largest_torque, scales
-from hdjax import Model
+from hdjax import Model, TwoInertiaModel
 from hdjax.effects import MotorFriction
 
-# Starting value of friction over the largest torque; it is fitted by its logarithm.
-_BEGIN = 0.05
+# Least starting value of Coulomb friction over the largest torque; it is fitted by its logarithm.
+_LEAST = 1e-3
 # Iterations of a trial fit, enough to rank the starts.
 _TRIAL_STEPS = 10
 # Share of the rms speed over which the sign of friction turns.
@@ -33,8 +35,8 @@ def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: i
         training: the data.
         halo: intervals of torque before a segment.
     """
-    # Equally short segments for all starts make their objectives comparable.
-    horizon = min(short_horizon(s, training) for s in starts)
+    # Equally short segments make the starts' objectives comparable; one wrong start must not decide their length.
+    horizon = statistics.median_low(short_horizon(s, training) for s in starts)
     substeps = max(suggested_substeps(s, training) for s in starts)
     segmentation = Segmentation(horizon, segment_length(horizon), halo, substeps)
     fitted = functools.partial(_fitted, training=training, segmentation=segmentation)
@@ -50,10 +52,12 @@ def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: i
 
 
 def beside_friction(model: Model, training: Sequence[Stretch]) -> Model:
-    """The model with motor friction at its starting value."""
+    """The model with motor friction at its starting values, from the balance of the motor's momentum."""
+    assert isinstance(model, TwoInertiaModel)
+    T_c, b = friction_from_motor(model, training)
+    T_c = max(T_c, _LEAST * largest_torque(training))
     speed = scales(training, model).omega_m
-    friction = MotorFriction(T_c=_BEGIN * largest_torque(training), transition=_TURN * speed)
-    return model.with_effects(friction)
+    return model.with_effects(MotorFriction(T_c=T_c, b=max(b, 0.0), transition=_TURN * speed))
 
 
 def held_beside(beside: Fit, start: Model, training: Sequence[Stretch], halo: int) -> Fit:

@@ -92,6 +92,21 @@ def starts_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> l
     return [values for _, values in sorted(found, key=lambda pair: pair[0])]
 
 
+def friction_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[float, float]:
+    """Coulomb torque [N m] and viscous coefficient [N m s/rad] of the motor's friction, by the balance of its momentum
+    with the model's drive; not positive where the balance shows no friction.
+
+    Args:
+        model: the drive.
+        stretches: the data.
+    """
+    drive, balances = model.drive, (_Balance.of(model, stretches, width) for width in WIDTHS)
+    found = [b.missed(float(drive.K / drive.J_l), float(drive.B_sp / drive.J_l)) for b in balances if b is not None]
+    _, _, (direction, speed) = min(found, key=lambda solution: solution[0])
+    N = float(drive.N)
+    return direction / N, speed / N**2
+
+
 class _Part(NamedTuple):
     """Inner products of one stretch's signals with test functions."""
 
@@ -180,8 +195,9 @@ class _Balance:
             self._against(part.torque, part, 0),
         ]
 
-    def missed(self, c_K: float, c_B: float) -> tuple[float, dict[str, float]]:
-        """The unexplained share of the measured signals, and the estimated inertias."""
+    def missed(self, c_K: float, c_B: float) -> tuple[float, dict[str, float], tuple[float, float]]:
+        """The unexplained share of the measured signals, the estimated inertias, and the friction's coefficients of
+        direction and speed at the output."""
         equations = [
             equation
             for part, of_motor in zip(self.parts, self.motor, strict=True)
@@ -192,10 +208,10 @@ class _Balance:
         norm[norm == 0] = 1.0
         solution = np.linalg.lstsq(a / norm, b, rcond=1e-10)[0]
         share = float(np.sum((b - a / norm @ solution) ** 2)) / len(equations)
-        inertias = (solution / norm)[: len(self.wanted)]
+        inertias, (direction, speed, _) = np.split(solution / norm, [len(self.wanted)])
         if not (np.all(inertias > 0) and np.isfinite(share)):
             share = _NO_START
-        return share, dict(zip(self.wanted, map(float, inertias), strict=True))
+        return share, dict(zip(self.wanted, map(float, inertias), strict=True)), (float(direction), float(speed))
 
     def _equations(self, part: _Part, of_motor: list[Rows], c_K: float, c_B: float) -> Iterator["_Equation"]:
         """The balances of one stretch."""
@@ -233,7 +249,7 @@ class _Balance:
         options = {"maxiter": _STEPS, "initial_simplex": around}
         found = minimize(share, first, method="Nelder-Mead", options=options)
         c_K, c_B = _coefficients(found.x)
-        missed, inertias = self.missed(c_K, c_B)
+        missed, inertias, _ = self.missed(c_K, c_B)
         J_l = inertias.get("J_l", float(self.model.drive.J_l))
         return missed, {"K": J_l * c_K, "B_sp": J_l * c_B, "alpha": 0.0} | inertias
 

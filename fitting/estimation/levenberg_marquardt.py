@@ -28,7 +28,7 @@ from hdjax.compilation import library_of, on_host
 _KEPT, _WELL = 0.01, 0.75
 _LONGER, _SHORTER = 30.0, 0.1
 # Relative changes of the sum of squares that are none; shares of the gaps that are left by a step that closes them, and
-# of the residual that it may cost.
+# of the residual that it may leave: of the present one, or of what closing them costs to first order.
 _SLIGHT, _CLOSED, _DEAREST = 1e-4, 0.25, 1.5
 # With less damping than this, relative to the diagonal, rounding decides whether the normal equations are definite.
 _LEAST_DAMPING = 1e-12
@@ -255,6 +255,7 @@ class Iteration(eqx.Module):
         rows: sum of squares of the residual at the best point.
         gap: of the weighted gaps.
         promised: by how much the next step is to lower half the sum of squares, negative.
+        expected: sum of squares of the residual after the next step, to first order.
         size: inverse of the damping in units of the first one.
         yardstick: the largest diagonal of J^T J so far, of the shared parameters.
         count: how many steps were taken.
@@ -267,6 +268,7 @@ class Iteration(eqx.Module):
     rows: Float[Array | np.ndarray | np.float64, ""]
     gap: Float[Array | np.ndarray | np.float64, ""]
     promised: Float[Array | np.ndarray | np.float64, ""]
+    expected: Float[Array | np.ndarray | np.float64, ""]
     size: Float[Array | np.ndarray | np.float64, ""]
     yardstick: Float[Array | np.ndarray, " parameters"]
     count: Int[Array | np.ndarray | np.int64, ""]
@@ -279,8 +281,9 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     this returns as a second result.
 
     A step is taken where it lowers the sum of squares by a share of what it promised. Two more kinds are taken in any
-    case: one that hardly changes the sum of squares, and one that closes most of the gaps for a little more residual.
-    No finite weight of the gaps repays what closing the last of them costs.
+    case: one that hardly changes the sum of squares, and one that closes most of the gaps for little more residual than
+    it has, or than closing them costs a linear model. No finite weight of the gaps repays what closing the last of them
+    costs: where a model can't follow the log, pieces fit far better than the whole.
 
     It ends where a step promises next to nothing: less than `rtol` of what one more degree of freedom explains of
     noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) Corners
@@ -320,6 +323,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             rows=zero,
             gap=zero,
             promised=np.array(-np.inf),
+            expected=zero,
             size=np.ones(()),
             yardstick=np.zeros(y.parameters.shape),
             count=np.zeros((), int),
@@ -335,7 +339,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         kept = first | (cost - before <= _KEPT * state.promised)
         well = ~first & (cost - before < _WELL * state.promised)
         slight = library.abs(cost - before) < _SLIGHT * before
-        closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * state.rows)
+        closing = (gap < _CLOSED * state.gap) & (rows < _DEAREST * library.maximum(state.rows, state.expected))
         accepted = kept | slight | closing
         size = state.size * where(kept, where(well, _LONGER, 1.0), where(accepted, 1.0, _SHORTER))
         costs = library.concatenate([cost[None], state.costs[:-1]])
@@ -346,7 +350,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # most that it has ever shown (Moré 1978).
         system = normal_equations(found, self.joined, state.yardstick)
         step = system.step(library.maximum(self.damping / size, _LEAST_DAMPING), self.longest)
-        promised = self._promised(found, step)
+        promised, expected = self._promised(found, step)
         # Where the system has no solution to working precision, another step from here is more damped.
         solved = library.isfinite(promised)
         after = Iteration(
@@ -356,6 +360,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             rows=rows,
             gap=gap,
             promised=where(solved, promised, -jnp.inf),
+            expected=where(solved, expected, 0.0),
             size=where(solved, size, _SHORTER * size),
             yardstick=system.yardstick,
             count=state.count + 1,
@@ -363,8 +368,9 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         return best, after, found
 
-    def _promised(self, found: Products, step: Unknowns) -> Any:
-        """By how much half the sum of squares changes along a step, to second order."""
+    def _promised(self, found: Products, step: Unknowns) -> tuple[Any, Any]:
+        """By how much half the sum of squares changes along a step, to second order, and that of the residual after
+        it."""
         library = library_of(found.gap, step.states)
         segments = step.states.shape[0]
         own = library.broadcast_to(step.parameters, (segments, step.parameters.size))
@@ -372,7 +378,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         changed = (found.products @ column[:, :, None])[:, :, 0]
         gap, moved = (g * self.gap_weight[None] for g in (found.gap, moved_gap(found, self.joined, step)))
         rows = library.sum(changed[:, -1]) + 0.5 * library.sum(column * changed)
-        return rows + library.sum(moved * (gap + 0.5 * moved))
+        return rows + library.sum(moved * (gap + 0.5 * moved)), found.square + 2.0 * rows
 
     def ended(self, y: Unknowns, state: Iteration) -> tuple[Any, Any]:
         """Whether the next step promises next to nothing; and whether to stop all the same."""

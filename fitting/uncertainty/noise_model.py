@@ -15,7 +15,7 @@ from scipy.special import expit
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, segments_of_logs
 from fitting.estimation.linear_response import follow
-from fitting.estimation.residual import Problem, Unknowns
+from fitting.estimation.residual import RUNAWAY, Problem, Unknowns
 from fitting.uncertainty.input_noise import torque_pushes
 from hdjax import Model, TwoInertiaModel
 
@@ -132,8 +132,10 @@ class _Steps(eqx.Module):
         return eqx.tree_at(lambda s: (s.transition, s.push, s.readout, s.error, s.counts, s.log), self, fewer)
 
 
-def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float) -> NoiseModel:
-    """Estimate the noise model of a fit's residual.
+def noise_model(
+    fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float
+) -> NoiseModel | None:
+    """Estimate the noise model of a fit's residual; None where the model diverges.
 
     Each log has its own torque noise, since its torque sensor may have another range. The sensors' white noise is at
     most the estimate from short pieces, which includes torque noise. Correlated sensor noise is added only where
@@ -148,6 +150,8 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
         Ljung (1999), System Identification, 2nd edition, sections 7.3 and 16.6.
     """
     steps = _steps(fit)
+    if not np.all(np.abs(steps.transition) < RUNAWAY):
+        return None
     known = white_noise(np.asarray(outputs))
     count = len(known.white)
 

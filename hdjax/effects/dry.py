@@ -103,6 +103,16 @@ class DryLoadFriction(DryFriction, LoadSideEffect):
         return -self.dry(motion, drive) - self.b * load_rate(motion)
 
 
+def dissipative(level: Array) -> Array:
+    """A friction's level [N m] where it is positive, and zero elsewhere: friction never drives the motion.
+
+    Args:
+        level: mean and ripple of the law.
+    """
+    # A selection: the slope of a maximum is halved at zero, where screening needs it.
+    return jnp.where(level >= 0.0, level, 0.0)
+
+
 def load_rate(motion: Motion) -> Array:
     """The load's rate, which a reduced drive lacks."""
     assert motion.omega_l is not None

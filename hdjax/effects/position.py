@@ -6,7 +6,7 @@ from typing import ClassVar
 from jaxtyping import Array
 
 from hdjax.drive import Drive, ReducedDrive, restoring
-from hdjax.effects.dry import DryMeshFriction, DryMotorFriction
+from hdjax.effects.dry import DryMeshFriction, DryMotorFriction, dissipative
 from hdjax.effects.effect import Effect, MeshTorqueEffect, Motion, Scales
 from hdjax.effects.ripple import Term, amplitude_and_phase, amplitudes_and_phases, ripple, ripple_slope, ripples
 from hdjax.parameters import Scalar, parameter
@@ -73,9 +73,9 @@ class ConservativePositionDependentStiffness(PositionDependentStiffness):
 
 
 class _MotorFrictionOverAngle(DryMotorFriction):
-    """Friction `(T_c + ripple(theta_m)) sgn(omega_m)` against the motor.
+    """Friction `max(T_c + ripple(theta_m), 0) sgn(omega_m)` against the motor.
 
-    The ripple changes its sign with the direction, unlike cogging. It dissipates where it is smaller than T_c.
+    The ripple changes its sign with the direction, unlike cogging.
     """
 
     family: ClassVar[str] = "position_dependent_friction"
@@ -96,7 +96,7 @@ class _MotorFrictionOverAngle(DryMotorFriction):
 
     def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         assert motion.theta_m is not None
-        return self.T_c + self._ripple(motion.theta_m)
+        return dissipative(self.T_c + self._ripple(motion.theta_m))
 
 
 class PositionDependentMotorFriction(_MotorFrictionOverAngle):
@@ -179,7 +179,7 @@ class PositionDependentMeshFriction(DryMeshFriction):
 
     def level(self, motion: Motion, drive: Drive | ReducedDrive) -> Array:
         assert motion.theta_m is not None
-        return self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine)
+        return dissipative(self.T_c + ripple(motion.theta_m, self.n, self.cosine, self.sine))
 
     def derived(self, drive: Drive | ReducedDrive) -> dict[str, tuple[Array, str]]:
         return amplitude_and_phase(self.cosine, self.sine, "N m")

@@ -175,3 +175,14 @@ def test_input_delay_equals_a_torque_shifted_in_time(fine):
     found = outputs(BASE.with_effects(InputDelay(delay=fine * STEP / 50)), held, START, substeps=4)[:, 1]
     undelayed = outputs(BASE, held, START, substeps=4)[:, 1]
     assert rms(found - exact) < 1e-3 * rms(undelayed - exact)
+
+
+@pytest.mark.parametrize("form", ["position_dependent_motor_friction", "rippling_motor_friction"])
+def test_friction_over_the_angle_never_drives_the_motor(form: str):
+    """Where its ripple is larger than its mean, there is none."""
+    ripple = "cosine" if form.startswith("position") else "cos_1"
+    effect = next(f for f in CATALOGUE if f.name == form)(T_c=0.1, transition=0.1, **{ripple: 0.3})
+    angles, nothing = jnp.linspace(0.0, 2 * np.pi, 101), jnp.zeros(())
+    motions = [Motion(nothing, nothing, a, jnp.asarray(rate)) for a in angles for rate in (-3.0, 3.0)]
+    power = np.array([float(effect.torque(m, DRIVE, jnp.zeros(0)) * m.omega_m) for m in motions])
+    assert np.max(power) <= 0.0 < np.mean(power == 0.0) and np.min(power) < -1.0

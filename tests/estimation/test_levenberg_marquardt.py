@@ -291,3 +291,19 @@ def test_minimum_of_joined_segments_equals_that_of_one_simulation(small_problem)
     np.testing.assert_allclose(closed.value.parameters, solution.value.parameters, rtol=1e-6)
     found = np.concatenate([np.asarray(solution.value.parameters), np.asarray(solution.value.states)[0]])
     assert_minimum_equals_that_of_peer(rows, found, peer, found.size)
+
+
+def test_gaps_close_where_a_model_cannot_follow_the_log(small_problem):
+    """Separate segments then fit far better than one simulation."""
+    problem, start = small_problem
+    wrong = start.parameters.at[0].set(jnp.log(0.6 * rig.OMEGA_0))
+    held = eqx.tree_at(lambda p: p.active, problem, jnp.zeros_like(problem.active))
+    joined = eqx.tree_at(lambda p: p.segments.joined, held, jnp.asarray([False, True, True, True]))
+    joined = eqx.tree_at(lambda p: p.gap_weight, joined, 0.1 / 2e-3 / jnp.asarray([1.0, rig.OMEGA_0]))
+    whole = cut([Stretch(rig.reduced_experiment(160, noise=2e-3), 0, 160)], 160)
+    single = eqx.tree_at(lambda p: p.segments, held, whole)
+    apart, one = Unknowns(wrong, start.states), Unknowns(wrong, start.states[:1])
+    separate, expected = (solve_by_steps(*pair, 60, 1e-3) for pair in ((held, apart), (single, one)))
+    found = solve_by_steps(joined, separate.unknowns, 60, 1e-3)
+    assert found.success and np.sum(expected.left_over.squares) > 3.0 * np.sum(separate.left_over.squares)
+    assert np.sum(found.left_over.squares) == pytest.approx(np.sum(expected.left_over.squares), rel=1e-3)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 import joints
 from fitting.estimation.base_fit import base_fit, fit_behind_fixed_values, is_held
-from fitting.estimation.driven_load import through_load, twist
+from fitting.estimation.beside_friction import fits_of_starts
+from fitting.estimation.driven_load import friction_from_motor, through_load, twist
 from fitting.estimation.experiment import Stretch, experiment_from_log, whole
 from fitting.estimation.linear_drive import readings
 from fitting.estimation.linear_response import readout
@@ -54,6 +55,18 @@ def true_model(measured: tuple[str, ...]) -> TwoInertiaModel:
     return TwoInertiaModel(drive, measured=measured)
 
 
+@pytest.fixture(scope="module")
+def rubbing() -> joints.Joint:
+    """The joint with strong friction of the motor."""
+    return joints.with_friction(JOINT, 0.5, 0.4)
+
+
+@pytest.fixture(scope="module")
+def motor_of_rubbing(rubbing: joints.Joint) -> tuple[Stretch, ...]:
+    """Its motor angle."""
+    return stretches_of(rubbing, ("motor_angle",))
+
+
 @pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
 @pytest.mark.parametrize("sensors", SUBSETS, ids="+".join)
 def test_base_fit_recovers_stiffness_and_inertias_from_any_outputs(sensors: tuple[str, ...], free: bool):
@@ -65,9 +78,8 @@ def test_base_fit_recovers_stiffness_and_inertias_from_any_outputs(sensors: tupl
         assert abs(estimates[path].value - getattr(JOINT, path)) < 4.0 * estimates[path].std, (path, estimates[path])
 
 
-def test_fit_without_twist_is_unbiased_under_motor_friction():
-    stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
-    found = base_fit(model_of(stretches, free=True), stretches)
+def test_fit_without_twist_is_unbiased_under_motor_friction(motor_of_rubbing: tuple[Stretch, ...]):
+    found = base_fit(model_of(motor_of_rubbing, free=True), motor_of_rubbing)
     told = fit_behind_fixed_values(found)
     assert is_held(found) and told is not None
     estimates = uncertainty(told).estimates
@@ -76,12 +88,22 @@ def test_fit_without_twist_is_unbiased_under_motor_friction():
         assert abs(float(found.model.get(path)) - getattr(JOINT, path)) < 4.0 * estimates[path].std
 
 
-def test_starting_values_are_near_the_truth_under_strong_motor_friction():
-    stretches = stretches_of(joints.with_friction(JOINT, 0.5, 0.4), ("motor_angle",))
-    model = model_of(stretches, free=True)
-    starts = starting_models(model, stretches)
+def test_starting_values_are_near_the_truth_under_strong_motor_friction(motor_of_rubbing: tuple[Stretch, ...]):
+    starts = starting_models(model_of(motor_of_rubbing, free=True), motor_of_rubbing)
     off = [max(abs(float(s.get(p)) / getattr(JOINT, p) - 1.0) for p in ("K", "J_m", "J_l")) for s in starts]
     assert min(off) < 0.2, off
+
+
+def test_friction_of_the_motor_follows_from_its_momentum(rubbing: joints.Joint, motor_of_rubbing: tuple[Stretch, ...]):
+    T_c, b = friction_from_motor(true_model(("motor_angle",)), motor_of_rubbing)
+    assert T_c == pytest.approx(rubbing.coulomb, rel=0.05) and b == pytest.approx(rubbing.viscous, rel=0.05)
+
+
+def test_one_wrong_start_does_not_decide_the_length_of_simulations(motor_of_rubbing: tuple[Stretch, ...]):
+    near = true_model(("motor_angle",)).replace({"K": 1.05 * JOINT.K})
+    wrong = near.replace({"K": 15.0 * JOINT.K})
+    _, beside, _ = fits_of_starts((near, near, wrong), motor_of_rubbing, 0)
+    assert float(beside.model.get("K")) == pytest.approx(JOINT.K, rel=0.02)
 
 
 @given(st.floats(1.0, 30.0), st.floats(0.01, 3.0))

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -73,8 +74,13 @@ def fitted(experiment: Experiment) -> Fit:
 
 
 def noise_model_of(found: Fit) -> NoiseModel:
-    outputs = measurement_noise(found).covariance
-    return noise_model(found, outputs, predictable=RULES.innovations)
+    return _noise_model(found, measurement_noise(found).covariance)
+
+
+def _noise_model(found: Fit, outputs: Any) -> NoiseModel:
+    made = noise_model(found, outputs, predictable=RULES.innovations)
+    assert made is not None
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +89,7 @@ def noisy() -> Fit:
 
 
 def test_torque_noise_is_estimated_with_its_true_size(noisy: Fit):
-    found = noise_model(noisy, OUTPUTS, predictable=RULES.innovations)
+    found = _noise_model(noisy, OUTPUTS)
     assert found.std == pytest.approx(STD, rel=0.05)
     assert found.size == pytest.approx(1.0, abs=0.05)
     assert found.predictable < 0.02 and found.sensors.memory(rig.STEP) is None
@@ -98,7 +104,7 @@ def test_torque_noise_is_estimated_from_the_motor_angle_alone():
 
 
 def test_torque_noise_is_estimated_despite_overrated_sensor_noise(noisy: Fit):
-    found = noise_model(noisy, 1e5 * OUTPUTS, predictable=RULES.innovations)
+    found = _noise_model(noisy, 1e5 * OUTPUTS)
     assert found.std == pytest.approx(STD, rel=0.1) and np.isfinite(found.likelihood)
 
 
@@ -135,7 +141,7 @@ def test_response_to_torque_noise_is_not_assigned_to_the_sensors():
     found = fitted(noisy_experiment(std=10.0 * STD, count=8000))
     known = measurement_noise(found).covariance
     assert known[0, 0] > 2.0 * OUTPUTS[0, 0]
-    seen = noise_model(found, known, predictable=RULES.innovations)
+    seen = _noise_model(found, known)
     assert seen.std == pytest.approx(10.0 * STD, rel=0.05)
     assert np.sqrt(np.diag(seen.sensors.covariance)) == pytest.approx(np.sqrt(np.diag(OUTPUTS)), rel=0.2)
 
@@ -148,8 +154,14 @@ def test_noise_model_of_a_noiseless_log_is_finite():
     known = np.asarray(measurement_noise(found).covariance)
     assert np.all(np.diag(np.asarray(found.covariance)) < RULES.excess**2 * np.diag(known))
     assert known[-1, -1] ** 0.5 < 1e-3 * rig.LOAD_NOISE
-    seen = noise_model(found, known, predictable=RULES.innovations)
+    seen = _noise_model(found, known)
     assert np.isfinite([seen.std, seen.size, seen.predictable, seen.likelihood]).all()
+
+
+def test_a_diverging_model_has_no_noise_model(noisy: Fit):
+    softening = noisy.model.replace({"alpha": -1e12})
+    lost = eqx.tree_at(lambda f: (f.model, f.problem.model), noisy, (softening, softening))
+    assert noise_model(lost, OUTPUTS, predictable=RULES.innovations) is None
 
 
 def test_likelihood_of_innovations_equals_the_gaussian_density_of_all_samples():
