@@ -96,7 +96,7 @@ class DecisionRules:
     free_run_explained: float = _rule(
         0.9,
         "share of variance",
-        "of the free runs' error beyond noise: if effects remove more, bands are checked only where noise explains the rest",
+        "of the free runs' error beyond noise: if effects remove more, bands matter only where noise explains the rest",
         "laws are not exact, and bands do not include their error",
     )
     surprise: float = _rule(

@@ -100,7 +100,7 @@ class _MotorFrictionOverAngle(DryMotorFriction):
 
 
 class PositionDependentMotorFriction(_MotorFrictionOverAngle):
-    """Friction `(T_c + cosine cos(n theta_m) + sine sin(n theta_m)) sgn(omega_m)` against the motor: one order."""
+    """Friction `max(T_c + cosine cos(n theta_m) + sine sin(n theta_m), 0) sgn(omega_m)` against the motor: one order."""
 
     name: ClassVar[str] = "position_dependent_motor_friction"
     named_for: ClassVar[tuple[str, ...]] = ("cosine", "sine")
@@ -122,7 +122,7 @@ class PositionDependentMotorFriction(_MotorFrictionOverAngle):
 
 
 class RipplingMotorFriction(_MotorFrictionOverAngle):
-    """Friction `(T_c + sum over n of cos_n cos(n theta_m) + sin_n sin(n theta_m)) sgn(omega_m)`, n = 1, 2, 4."""
+    """Friction `max(T_c + sum over n of cos_n cos(n theta_m) + sin_n sin(n theta_m), 0) sgn(omega_m)`, n = 1, 2, 4."""
 
     name: ClassVar[str] = "rippling_motor_friction"
     named_for: ClassVar[tuple[str, ...]] = ("cos_1", "sin_1", "cos_2", "sin_2", "cos_4", "sin_4")
@@ -151,7 +151,7 @@ class RipplingMotorFriction(_MotorFrictionOverAngle):
 
 
 class PositionDependentMeshFriction(DryMeshFriction):
-    """Friction `(T_c + cosine cos(n theta_m) + sine sin(n theta_m)) sgn(v)` between the mesh's two sides."""
+    """Friction `max(T_c + cosine cos(n theta_m) + sine sin(n theta_m), 0) sgn(v)` between the mesh's two sides."""
 
     family: ClassVar[str] = "position_dependent_friction"
     name: ClassVar[str] = "position_dependent_mesh_friction"
