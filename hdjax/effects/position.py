@@ -100,7 +100,7 @@ class _MotorFrictionOverAngle(DryMotorFriction):
 
 
 class PositionDependentMotorFriction(_MotorFrictionOverAngle):
-    """Friction `max(T_c + cosine cos(n theta_m) + sine sin(n theta_m), 0) sgn(omega_m)` against the motor: one order."""
+    """Friction `max(T_c + cosine cos(n theta_m) + sine sin(n theta_m), 0) sgn(omega_m)` against the motor: one n."""
 
     name: ClassVar[str] = "position_dependent_motor_friction"
     named_for: ClassVar[tuple[str, ...]] = ("cosine", "sine")
