@@ -6,8 +6,6 @@ K. Where both angles were measured, the load's equation of motion determines K (
 residual, the drive's parameters are fixed at that fit's values.
 """
 
-import functools
-import statistics
 from collections.abc import Sequence
 
 from fitting.estimation.driven_load import friction_from_motor
@@ -31,22 +29,24 @@ def fits_of_starts(starts: Sequence[Model], training: Sequence[Stretch], halo: i
     """The fit of the drive alone, that of the drive with motor friction, and their starting model.
 
     Args:
-        starts: models with starting values.
+        starts: models with starting values, the most likely one first.
         training: the data.
         halo: intervals of torque before a segment.
     """
-    # Equally short segments make the starts' objectives comparable; one wrong start must not decide their length.
-    horizon = statistics.median_low(short_horizon(s, training) for s in starts)
-    substeps = max(suggested_substeps(s, training) for s in starts)
-    segmentation = Segmentation(horizon, segment_length(horizon), halo, substeps)
-    fitted = functools.partial(_fitted, training=training, segmentation=segmentation)
-    rubbing = [(fitted(beside_friction(s, training), Strategy(_TRIAL_STEPS)), s) for s in starts]
+    # Equally short segments make the starts' objectives comparable.
+    horizon = short_horizon(starts[0], training)
+
+    def fitted(model: Model, like: Sequence[Model], strategy: Strategy = Strategy()) -> Fit:
+        substeps = max(suggested_substeps(m, training) for m in like)
+        segmentation = Segmentation(horizon, segment_length(horizon), halo, substeps)
+        return _fitted(model, strategy, training=training, segmentation=segmentation)
+
+    rubbing = [(fitted(beside_friction(s, training), starts, Strategy(_TRIAL_STEPS)), s) for s in starts]
     best, start = min(rubbing, key=lambda pair: pair[0].objective)
-    beside = fitted(best.model)
-    alone = fitted(start)
+    beside, alone = fitted(best.model, [best.model]), fitted(start, [best.model])
     if beside.objective < alone.objective:
         # Where friction is small, both fits have similar parameters.
-        other = fitted(beside.model.without_effect(MotorFriction.name))
+        other = fitted(beside.model.without_effect(MotorFriction.name), [best.model])
         alone = min(alone, other, key=lambda f: f.objective)
     return alone, beside, start
 

@@ -77,19 +77,20 @@ def through_load(signal: Signal, c_K: float, c_B: float, time_step: float) -> Si
 
 def starts_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> list[dict[str, float]]:
     """Starting values of K, B_sp and the unknown inertias, for each width of test functions that explains the measured
-    signals; none where the motor was not measured.
+    signals, the median antiresonance first; none where the motor was not measured.
 
     Args:
         model: supplies the known parameters.
         stretches: the data.
     """
-    found = []
-    for width in WIDTHS:
-        balance = _Balance.of(model, stretches, width)
-        if balance is not None:
-            found.append(balance.solved())
-    found = [(missed, values) for missed, values in found if missed < _MOST_MISSED]
-    return [values for _, values in sorted(found, key=lambda pair: pair[0])]
+    balances = (_Balance.of(model, stretches, width) for width in WIDTHS)
+    solved = [balance.solved() for balance in balances if balance is not None]
+    found = [values for missed, values in solved if missed < _MOST_MISSED]
+    if not found:
+        return []
+    # Narrow functions see mostly noise, wide ones only slow motion: most widths agree, and single ones are far off.
+    antiresonances = [np.log(values["K"] / values.get("J_l", float(model.drive.J_l))) for values in found]
+    return [found[i] for i in np.argsort(np.abs(antiresonances - np.median(antiresonances)))]
 
 
 def friction_from_motor(model: TwoInertiaModel, stretches: Sequence[Stretch]) -> tuple[float, float]:
