@@ -104,10 +104,6 @@ def noise_of_torque(left: NoiseModel | None) -> float | None:
     return left.std if left is not None and left.likelihood - left.without > RULES.noise_gain else None
 
 
-def _noise_of(trial: Trial, outputs: Float[np.ndarray, "outputs outputs"]) -> NoiseModel | None:
-    return noise_model(trial.training, outputs, predictable=RULES.innovations)
-
-
 class Standing:
     """The current model, which a further effect must improve.
 
@@ -123,7 +119,11 @@ class Standing:
     @cached_property
     def left(self) -> NoiseModel | None:
         """Fitted noise model of the current model: coloured sensor noise and torque noise; None where it diverges."""
-        return _noise_of(self.before, np.asarray(self.noise.covariance))
+        return self._noise_of(self.before)
+
+    def _noise_of(self, trial: Trial) -> NoiseModel | None:
+        known = {"predictable": RULES.innovations, "residual": self.before.training.covariance}
+        return noise_model(trial.training, self.noise.covariance, **known)
 
     def over_noise(self, trial: Trial) -> float:
         """Log likelihood ratio [nats] of a model against the current one, each with its own noise model, minus the
@@ -136,7 +136,7 @@ class Standing:
         left = self.left
         if left is None or not is_noise(left):
             return np.inf
-        own = _noise_of(trial, np.asarray(self.noise.covariance))
+        own = self._noise_of(trial)
         if own is None:
             return -np.inf
         further = len(trial.training.free.paths) - len(self.before.training.free.paths)

@@ -64,8 +64,14 @@ class NoiseModel(eqx.Module):
     count: int = eqx.field(static=True)
 
 
-def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"], *, predictable: float) -> NoiseModel:
-    """Estimate the noise model of a fit's residual.
+def noise_model(
+    fit: Fit,
+    outputs: Float[Array | np.ndarray, "outputs outputs"],
+    *,
+    predictable: float,
+    residual: Float[Array | np.ndarray, "outputs outputs"] | None = None,
+) -> NoiseModel | None:
+    """Estimate the noise model of a fit's residual; None where the model diverges.
 
     Each log has its own torque noise, since its torque sensor may have another range. The sensors' white noise is at
     most the estimate from short pieces, which includes torque noise. Correlated sensor noise is added only where
@@ -75,11 +81,14 @@ def noise_model(fit: Fit, outputs: Float[Array | np.ndarray, "outputs outputs"],
         fit: of a model that is assumed complete, over short horizons.
         outputs: covariance of the measurement noise, estimated from short pieces.
         predictable: share of the innovations' variance that is negligible.
+        residual: covariance of a residual, which sets how far initial states may be off; that of the fit if None.
+            Likelihoods of two models can be compared only for the same one.
 
     References:
         Ljung (1999), System Identification, 2nd edition, sections 7.3 and 16.6.
     """
-    steps = _steps(fit)
+    with np.errstate(all="ignore"):
+        steps = _steps(fit, np.asarray(fit.covariance if residual is None else residual))
     if not np.all(np.abs(steps.transition) < RUNAWAY):
         return None
     known = white_noise(np.asarray(outputs))
@@ -182,7 +191,7 @@ def _likeliest(
     return at(solution.x)
 
 
-def _steps(fit: Fit) -> Steps:
+def _steps(fit: Fit, residual: Float[np.ndarray, "outputs outputs"]) -> Steps:
     problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
     weight = np.asarray(problem.segments.weight)
@@ -192,7 +201,7 @@ def _steps(fit: Fit) -> Steps:
     logs = [own[spread_evenly(own.size, _SEGMENTS)] for own in logs]
     used = np.concatenate(logs)
     read = followed.readout[used]
-    rms = np.sqrt(np.diag(np.asarray(fit.covariance)))
+    rms = np.sqrt(np.diag(residual))
     torque = np.asarray(problem.segments.torque.coefficients)
 
     def in_time(values: np.ndarray) -> np.ndarray:

@@ -161,7 +161,7 @@ def test_noise_model_of_a_noiseless_log_is_finite():
 
 def test_a_diverging_model_has_no_noise_model(noisy: Fit):
     softening = noisy.model.replace({"alpha": -1e12})
-    lost = eqx.tree_at(lambda f: (f.model, f.problem.model), noisy, (softening, softening))
+    lost = eqx.tree_at(lambda f: (f.model, f.unknowns.parameters), noisy, (softening, noisy.free.pack(softening)))
     assert noise_model(lost, OUTPUTS, predictable=RULES.innovations) is None
 
 
