@@ -10,7 +10,7 @@ from fitting.logs.findings import Finding
 from fitting.logs.log import Log
 from fitting.logs.log_kind import OUTPUTS
 from fitting.logs.masks import clipped, glitches
-from fitting.logs.plausibility import mix_ups
+from fitting.logs.plausibility import mix_ups, wide_twist
 
 # All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
 JITTER = 0.01
@@ -35,6 +35,8 @@ def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
     checks = [_jitter(log), _excitation(log), _response(log), _channels(log, drive_file)]
     if log.kind == "drive" or (log.motor_angle is not None and log.load_angle is not None):
         checks += [_wrapped(log), mix_ups(log, drive_file)]
+    if log.kind != "reduced" and log.dynamic_error is not None:
+        checks.append(wide_twist(log, drive_file))
     # Files may contain numbers of any size; overflow is handled like other wrong values.
     with np.errstate(all="ignore"):
         return (*log.findings, *(finding for check in checks for finding in check))

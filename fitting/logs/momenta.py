@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -15,8 +16,8 @@ RATIO_TOLERANCE = 0.02
 FEWEST = 50
 MOMENTUM_CORRELATION = 0.98
 MOMENTUM_TOLERANCE = 0.15
-# Largest factor of an inertia that may be the inertia's own error.
-_INERTIA_FACTOR = 3.0
+# Largest factor of an inertia that may be the inertia's own error, and least one that no inertia is wrong by.
+_INERTIA_FACTOR, _IMPOSSIBLE_FACTOR = 3.0, 10.0
 # Windows over a log: from slow motion to quick motion.
 _COUNTS = (8, 32, 128)
 # With the motor alone friction and gravity are estimated as well, which takes more windows. The range in which a drive
@@ -48,7 +49,7 @@ def both_sides(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     torque = N * log.motor_torque + (0.0 if log.load_torque is None else log.load_torque)
     best, gain = 0.0, 1.0
     for count in _COUNTS:
-        changes, pushes = _weak(log.time, [(momentum, 2), (torque, 0)], count).T
+        changes, pushes = _weak(log, [(momentum, 2), (torque, 0)], count).T
         alike, slope = _slope(changes, pushes)
         if alike > best:
             best, gain = alike, slope
@@ -63,9 +64,9 @@ def both_sides(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
         'both angles look like revolutions, so give them unit = "rev"': 1 / (2 * np.pi),
     }
     what = f"both inertias together accelerate {gain:.3g} times as much as the torque explains"
-    yield _finding(
-        what, "motor_torque against motor_angle and load_angle", closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
-    )
+    possible = 1.0 / _IMPOSSIBLE_FACTOR < gain < _IMPOSSIBLE_FACTOR
+    mend = closest(gain, units, 1.0, MOMENTUM_TOLERANCE)
+    yield _finding(what, "motor_torque against motor_angle and load_angle", mend, possible=possible)
 
 
 def motor_alone(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
@@ -109,8 +110,8 @@ def motor_alone(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
 
 
 def _usable(log: Log) -> bool:
-    """Whether momenta can be compared over the whole log."""
-    return log.motor_torque is not None and log.outputs_until is None and log.pieces is None
+    """Whether momenta can be compared."""
+    return log.motor_torque is not None and log.outputs_until is None
 
 
 def _has_scale(drive_file: DriveFile) -> bool:
@@ -118,9 +119,10 @@ def _has_scale(drive_file: DriveFile) -> bool:
     return math.isfinite(drive_file.tolerances.get("k_T", 0.0))
 
 
-def _finding(what: str, where: str, mend: str | None) -> Finding:
-    otherwise = "check motor_inertia and load_inertia in [drive], and the unit of motor_torque"
-    return Finding("refusal" if mend else "warning", what, where, f"{mend} in [columns]" if mend else otherwise)
+def _finding(what: str, where: str, mend: str | None, *, possible: bool = True) -> Finding:
+    otherwise = "check motor_inertia and load_inertia in [drive], and the units of motor_torque, angles and time"
+    severity = "refusal" if mend or not possible else "warning"
+    return Finding(severity, what, where, f"{mend} in [columns]" if mend else otherwise)
 
 
 def _torque_units(N: float, motion: str) -> dict[str, float]:
@@ -141,9 +143,10 @@ def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, 
     energy of this inertia [J]."""
     assert log.motor_torque is not None
     seen, order = getattr(log, name), int(name == "motor_velocity")
-    step = np.diff(log.time)
-    path = np.cumsum(np.append(0.0, 0.5 * (seen[1:] + seen[:-1]) * step)) if order else seen - seen[0]
-    velocity = seen if order else np.gradient(seen, log.time)
+    path = np.cumsum(np.append(0.0, 0.5 * (seen[1:] + seen[:-1]) * np.diff(log.time))) if order else seen - seen[0]
+    velocity = seen if order else np.zeros_like(seen)
+    for a, b in () if order else _pieces(log):
+        velocity[a:b] = np.gradient(seen[a:b], log.time[a:b])
     torque = log.motor_torque + (0.0 if log.load_torque is None or ratio is None else log.load_torque / ratio)
     friction = [(np.sign(velocity), 0), (seen, 1 - order), (np.ones_like(seen), 0)]
     position = [(path, 0)]
@@ -151,7 +154,7 @@ def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, 
         position += [(np.sin(path / ratio), 0), (np.cos(path / ratio), 0)]
     best, inertia = MOMENTUM_CORRELATION, 0.0
     for count in _COUNTS_OF_MOTOR:
-        table = _weak(log.time, [(torque, 0), (seen, 2 - order), *friction, *position], count)
+        table = _weak(log, [(torque, 0), (seen, 2 - order), *friction, *position], count)
         if not np.isfinite(table**2).all():
             continue
         pushes, changes = table[:, 0], table[:, 1]
@@ -160,8 +163,11 @@ def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, 
         agree = J * J_beside > 0.0 and abs(J_beside / J - 1.0) < MOMENTUM_TOLERANCE
         if agree and min(rigid, alike) > best:
             best, inertia = min(rigid, alike), J
-    work = float(np.sum(0.5 * (torque[1:] + torque[:-1]) * np.diff(path)))
-    return inertia, work - 0.5 * inertia * float(velocity[-1] ** 2 - velocity[0] ** 2)
+    lost = 0.0
+    for a, b in _pieces(log):
+        work = np.sum(0.5 * (torque[a + 1 : b] + torque[a : b - 1]) * np.diff(path[a:b]))
+        lost += float(work - 0.5 * inertia * (velocity[b - 1] ** 2 - velocity[a] ** 2))
+    return inertia, lost
 
 
 def _beside(
@@ -188,21 +194,21 @@ def _slope(one: Float[np.ndarray, " windows"], other: Float[np.ndarray, " window
 
 
 def _weak(
-    time: Float[np.ndarray, " n"], signals: Sequence[tuple[Float[np.ndarray, " n"], int]], count: int
+    log: Log, signals: Sequence[tuple[Float[np.ndarray, " n"], int]], count: int
 ) -> Float[np.ndarray, "windows signals"]:
-    """Integrals of derivatives of signals times phi = (1 - s^2)^4 over `count` windows; zero where these are short.
+    """Integrals of derivatives of signals times phi = (1 - s^2)^4 over windows; zero where these are short.
 
     Args:
-        time: stamps [s].
+        log: for its stamps [s], and its pieces, which no window leaves.
         signals: each with the order of its derivative, which is moved to phi.
-        count: number of windows.
+        count: number of windows of a log without gaps.
     """
-    edges = np.linspace(0, len(time), count + 1).astype(int)
-    found = np.zeros((count, len(signals)))
-    for i, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    windows = _windows(log, count)
+    found = np.zeros((len(windows), len(signals)))
+    for i, (a, b) in enumerate(windows):
         if b - a < 16:
             continue
-        t = time[a:b]
+        t = log.time[a:b]
         half = 0.5 * (t[-1] - t[0])
         s = (t - t[0]) / half - 1.0
         weight = np.gradient(t)
@@ -210,3 +216,15 @@ def _weak(
         for k, (values, order) in enumerate(signals):
             found[i, k] = np.sum(weight * phi[order] * (values[a:b] - (values[a] if order else 0.0)))
     return found
+
+
+def _windows(log: Log, count: int) -> list[tuple[int, int]]:
+    """First row of each window and one past its last; pieces have windows in proportion to their length."""
+    total = sum(b - a for a, b in _pieces(log))
+    edges = [np.linspace(a, b, max(1, round(count * (b - a) / total)) + 1).astype(int).tolist() for a, b in _pieces(log)]
+    return [window for piece in edges for window in pairwise(piece)]
+
+
+def _pieces(log: Log) -> tuple[tuple[int, int], ...]:
+    """The stretches without gaps."""
+    return log.pieces or ((0, len(log)),)

@@ -1,5 +1,6 @@
 """Plausibility checks across signals: ratio, sides, signs, units, time base."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +13,10 @@ from fitting.logs.momenta import FEWEST, RATIO_TOLERANCE, both_sides, closest, m
 # All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
 FREE_MOTION = 0.02  # rad of the output, more than any gear's twist; below it a load may be locked
 LARGE_TWIST = 5e-3  # rad, more than a gear's twist within its ratings, assumed
+# Ten times the twist of strain-wave gears at peak torque (vendors' catalogues); springs of elastic joints twist more.
+GEAR_TWIST = 0.1
+# Largest possible twist of a spring between motor and load, unless the drive file states another.
+_TURN = 2.0 * math.pi
 SLOW_MODES = 8
 SLOW_SHARE = 0.5
 SLOW_CORRELATION = 0.999
@@ -39,6 +44,38 @@ def mix_ups(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     # With a wrong ratio or side the sum of momenta adds no information.
     if not any(finding.severity == "refusal" for finding in found):
         yield from both_sides(log, drive_file) if both else motor_alone(log, drive_file)
+
+
+def wide_twist(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
+    """A twist that exceeds that of gears, unless the drive file states the largest twist.
+
+    Args:
+        log: With a twist in radians. Outputs after `log.outputs_until` rows are not used.
+        drive_file: The drive that it was read with.
+    """
+    twist = log.twist[: log.outputs_until]
+    known = np.isfinite(twist) if log.trusted is None else np.isfinite(twist) & log.trusted[: len(twist)]
+    most = drive_file.largest_twist
+    span = float(np.ptp(twist[known])) if known.any() else 0.0
+    if span <= (most or GEAR_TWIST):
+        return
+    moved = log.motor_angle is not None and log.load_angle is not None
+    remedy = (
+        "check reduction_ratio, and the columns, units and signs of the two angles in [columns]"
+        if moved
+        else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, '
+        "lock the motor or log both angles"
+    )
+    if span > (most or _TURN):
+        known_as = "a full turn" if most is None else f"the largest_twist of {most:.3g} rad in [drive]"
+        yield Finding("refusal", f"the twist spans {span:.3g} rad, which is more than {known_as}", "twist", remedy)
+        return
+    yield Finding(
+        "warning",
+        f"the twist spans {span:.3g} rad, more than ten times the range of strain-wave gears",
+        "twist",
+        f"unless its spring is so soft (then state largest_twist in [drive]), {remedy}",
+    )
 
 
 def _slow(values: np.ndarray) -> tuple[np.ndarray, float]:

@@ -85,7 +85,7 @@ def test_motion_beyond_the_antiresonance_is_not_reported_as_wrong_ratio() -> Non
         load_angle=-0.8 * np.sin(385 * time),
         dynamic_error=2.8 * np.sin(385 * time),
     )
-    assert examine(log, drive_file()) == ()
+    only_finding(examine(log, drive_file()), "warning", "the twist spans 5.6 rad")
 
 
 def test_wrapped_load_angle_is_refused() -> None:
@@ -144,3 +144,24 @@ def test_soft_spring_is_not_reported_as_wrong_ratio():
     assert not [f for f in examine(log, drive_file(joint.N)) if "the angles give" in f.what]
     (refused,) = [f for f in examine(log, drive_file(1.2 * joint.N)) if "the angles give" in f.what]
     assert refused.severity == "refusal"
+
+
+@pytest.mark.parametrize(
+    ("twist", "stated", "severity"),
+    [(0.04, None, None), (0.2, None, "warning"), (0.2, 0.5, None), (0.2, 0.3, "refusal"), (3.5, None, "refusal")],
+)
+def test_twist_beyond_that_of_gears(twist: float, stated: float | None, severity: str | None):
+    """Nothing else contradicts a wrong column whose motion is unrelated to the other angle's."""
+    motor, load = angles(drive_log())
+    wobble = twist * np.sin(np.arange(ROWS) ** 1.5 * 1e-2)
+    log = replace(drive_log(), load_angle=load - wobble, dynamic_error=motor / N - load + wobble)
+    findings = [f for f in examine(log, replace(drive_file(), largest_twist=stated)) if f.where == "twist"]
+    assert [f.severity for f in findings] == ([] if severity is None else [severity])
+
+
+def test_spike_of_an_encoder_is_no_wide_twist():
+    log = drive_log()
+    twist = log.twist.copy()
+    twist[77] = 9.0
+    spiky = replace(log, dynamic_error=twist, trusted=np.arange(ROWS) != 77)
+    assert not [f for f in examine(spiky, drive_file()) if f.where == "twist"]

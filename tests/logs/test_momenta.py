@@ -63,6 +63,15 @@ def test_sign_and_unit_of_a_torque_on_the_motor_alone(moving: Log, changes: dict
         assert not words or words in str(found[0])
 
 
+@pytest.mark.parametrize(("factor", "severity"), [(-1.0, ["refusal"]), (1.0, [])])
+def test_sign_of_a_torque_in_a_log_with_a_gap(moving: Log, factor: float, severity: list[str]):
+    signal = "motor_angle" if moving.motor_angle is not None else "motor_velocity"
+    seen = getattr(moving, signal) + 40.0 * (np.arange(COUNT) >= 1600) * (signal == "motor_angle")
+    torque = factor * moving.motor_torque
+    log = replace(moving, motor_torque=torque, pieces=((0, 1500), (1600, COUNT)), **{signal: seen})
+    assert [f.severity for f in refusals(log, drive())] == severity
+
+
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", ["one", "two", "band", "slow and one", "through"])
 def test_a_load_that_moves_against_the_motor_is_no_wrong_sign(kind: str, seed: int):
