@@ -52,7 +52,7 @@ class Record(eqx.Module):
     present: float
 
     def bases(self) -> Iterator[tuple[int, Float[np.ndarray, "samples outputs directions"]]]:
-        """First sample and an orthonormal basis of the initial state's effect, of each simulation with valid samples."""
+        """First sample and orthonormal basis of the initial state's effect, of each simulation with valid samples."""
         for start, columns in self.states:
             flat = columns.reshape(-1, columns.shape[2])
             length = np.linalg.norm(flat, axis=0)
