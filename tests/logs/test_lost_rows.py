@@ -29,7 +29,7 @@ def changed(log: Log, count: int, copies: int) -> Log:
 
 
 @pytest.mark.parametrize(("copies", "words"), [(0, "rows were lost"), (2, "rows repeat")])
-@pytest.mark.parametrize(("count", "severity"), [(0, []), (4, ["warning"]), (40, ["refusal"])])
+@pytest.mark.parametrize(("count", "severity"), [(0, []), (3, ["warning"]), (40, ["refusal"])])
 def test_lost_and_repeated_rows_are_found(copies: int, words: str, count: int, severity: list[str]):
     found: list[Finding] = list(lost_rows(changed(drive_log(), count, copies)))
     assert [f.severity for f in found] == severity
