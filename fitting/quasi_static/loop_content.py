@@ -267,8 +267,8 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
         (vague, f"{not_identifiable(vague)}." if vague else ""),
         (
             loop.dropped and not loop.findings,
-            f"{formatting.words(loop.dropped).capitalize()} had a significant gain, but the logs do not determine how "
-            "large the effect is.",
+            f"{formatting.words(loop.dropped or ('none',)).capitalize()} had a significant gain, but the logs do not "
+            "determine how large the effect is.",
         ),
         (friction < 0, _WRONG_WAY),
         (friction > 0, _ALL_FRICTION),
