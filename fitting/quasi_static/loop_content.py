@@ -267,7 +267,7 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
         (vague, f"{not_identifiable(vague)}." if vague else ""),
         (
             loop.dropped and not loop.findings,
-            f"{formatting.words(loop.dropped or ('none',)).capitalize()} had a significant gain, but the logs do not "
+            f"{formatting.words([*loop.dropped] or ['none']).capitalize()} had a significant gain, but the logs do not "
             "determine how large the effect is.",
         ),
         (friction < 0, _WRONG_WAY),
