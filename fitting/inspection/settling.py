@@ -16,7 +16,7 @@ SURE = 0.8
 
 _NOTED = 0.02  # least share of a unit to be mentioned
 _SIGN_ODDS = 1.0  # log odds of a relation for its sign to be used
-_COPIES = ("load_angle", "motor_velocity", "load_velocity")  # signals proportional to an angle or its rate
+_COPIES = ("load_angle", "motor_velocity", "load_velocity", "joint_torque")  # proportional to an angle, a rate, a twist
 _CORRELATED = 0.3  # unexplained share below which the sign of a correlation is used
 _SEEN_RATIO = 0.02  # largest share of non-common motion for the ratio to be determined
 _LARGEST_TWIST, _SOFT_TWIST = (

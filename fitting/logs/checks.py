@@ -9,8 +9,9 @@ from fitting.logs.drive_file import DriveFile
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
 from fitting.logs.log_kind import OUTPUTS
+from fitting.logs.lost_rows import lost_rows
 from fitting.logs.masks import clipped, glitches
-from fitting.logs.plausibility import mix_ups
+from fitting.logs.plausibility import mix_ups, wide_twist
 
 # All thresholds are assumed; they separate healthy logs from faulty ones by a wide margin.
 JITTER = 0.01
@@ -32,9 +33,11 @@ def examine(log: Log, drive_file: DriveFile) -> tuple[Finding, ...]:
     Returns:
         The findings of the reader, then those of the checks; refusals are among them.
     """
-    checks = [_jitter(log), _excitation(log), _response(log), _channels(log, drive_file)]
+    checks = [_jitter(log), lost_rows(log), _excitation(log), _response(log), _channels(log, drive_file)]
     if log.kind == "drive" or (log.motor_angle is not None and log.load_angle is not None):
         checks += [_wrapped(log), mix_ups(log, drive_file)]
+    if log.kind != "reduced" and log.dynamic_error is not None:
+        checks.append(wide_twist(log, drive_file))
     # Files may contain numbers of any size; overflow is handled like other wrong values.
     with np.errstate(all="ignore"):
         return (*log.findings, *(finding for check in checks for finding in check))

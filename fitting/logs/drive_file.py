@@ -156,6 +156,12 @@ def drive_of(tables: Mapping[str, Any], path: Path) -> DriveFile:
     drive, signals = tables.get("drive", {}), tables.get("signals", {})
     stated = {k: _stated(path, k, drive.get(k)) for k in _DRIVE_UNITS}
     numbers = {k: _positive(path, "drive", k, stated[k].value, u) for k, u in _DRIVE_UNITS.items()}
+    ratio = numbers["reduction_ratio"]
+    if ratio is not None and ratio < 1.0:
+        raise InputError(
+            f"{path}: [drive] reduction_ratio is the motor's angle over the load's, at least 1, but is {ratio:g}; "
+            f"write {1.0 / ratio:g} if it is inverted"
+        )
     columns = {s: _column_map(path, s, e) for s, e in tables.get("columns", {}).items()}
     tolerances = {_SYMBOLS[k]: one.tolerance for k, one in stated.items() if one.tolerance is not None}
     if "motor_current" in columns:

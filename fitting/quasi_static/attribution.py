@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from fitting.attribution.case_evidence import EffectEvidence, RoundEvidence
 from fitting.attribution.decisions import support
@@ -24,6 +25,8 @@ _RIVAL = 0.25
 _PLAUSIBLE = 0.5
 # A multiple of the few percent of creep that real drives show.
 _LARGEST_CREEP = 0.5
+# Share of a searched range, logarithmic, at either end: what is found there would lie beyond it.
+_EDGE = 0.01
 # Number of forms of one family that are refitted.
 _FORMS = 3
 
@@ -212,12 +215,21 @@ def _simplest_first(
 
 
 def is_determined(points: Points, model: TwistModel, form: Form) -> bool:
-    """Whether the logs determine at least one figure of a form other than phases."""
+    """Whether the logs determine at least one figure of a form other than phases, and its values are physical."""
     figures = strengths_of(points, model, form)
-    return any(one.identifiable for name, one in figures.items() if not name.startswith("phase"))
+    known = any(one.identifiable for name, one in figures.items() if not name.startswith("phase"))
+    share = figures["share"].value if "share" in figures else 0.0
+    return known and share is not None and share <= 1.0 and is_within(form, dict(model.terms)[form])
+
+
+def is_within(form: Form, shape: Float[np.ndarray, " parameters"]) -> bool:
+    """Whether a time constant, if any, is inside the searched range; at an end of it, it would lie beyond."""
+    low, high = form.range
+    where = zip(form.shape_names, (shape - low) / (high - low), strict=True)
+    return all(bool(_EDGE < at < 1.0 - _EDGE) for name, at in where if name.endswith("time constant"))
 
 
 def _is_possible(model: TwistModel) -> bool:
     """Whether strengths are plausible: delayed twist is a fraction of immediate twist."""
     creeps = [model.coefficients[model.own(form)[0].start] for form in model.forms if form.family == "creep"]
-    return max(map(abs, creeps), default=0.0) <= _LARGEST_CREEP * abs(model.coefficients[0])
+    return bool(max(map(abs, creeps), default=0.0) <= _LARGEST_CREEP * abs(model.coefficients[0]))

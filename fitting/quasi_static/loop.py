@@ -1,7 +1,7 @@
 """The loop for quasi-static logs: fit the line, attribute its residual to an effect, add that, refit."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from fitting.attribution.case_evidence import FinalEvidence
@@ -14,7 +14,7 @@ from fitting.quasi_static.motion_forms import motion_forms
 from fitting.quasi_static.points import Points
 from fitting.quasi_static.rests import RestAnalysis, analyse_rests
 from fitting.quasi_static.torque_forms import torque_forms
-from fitting.quasi_static.twist_model import TwistModel, stiffness_of
+from fitting.quasi_static.twist_model import TwistModel
 
 # Most forms of one family in a model: orders of an angle, parallel sliders.
 _MOST_OF_A_FAMILY = 4
@@ -113,7 +113,7 @@ def close_loop(
         current = rounds[-1].winner.trial
         progress(f"found {rounds[-1].winner.name}")
     current, dropped = _without_superfluous(held, current, base)
-    current, untold = _without_undetermined(held, current)
+    current, untold = _without_undetermined(held, current, rounds)
     dropped += untold
     at_rest = None
     families = {form.family for form in current.model.forms}
@@ -174,16 +174,17 @@ def _without_superfluous(held: Held, trial: TwistTrial, base: TwistTrial) -> tup
     return trial, tuple(dropped)
 
 
-def _without_undetermined(held: Held, trial: TwistTrial) -> tuple[TwistTrial, tuple[str, ...]]:
-    """The model without undetermined forms, if the stiffness is not determined beside them either: such forms are
-    confounded."""
-    dropped = []
-    while not stiffness_of(held.points, trial.model)["K"].identifiable:
-        untold = [form for form in trial.model.forms if not is_determined(held.points, trial.model, form)]
-        if not untold:
-            break
-        trial = held.without(trial, untold[-1:])
-        dropped.append(untold[-1].name)
+def _without_undetermined(
+    held: Held, trial: TwistTrial, rounds: Sequence[TwistRound]
+) -> tuple[TwistTrial, tuple[str, ...]]:
+    """The model without undetermined forms, nor those that were significant only together with one."""
+    dropped: list[str] = []
+    while untold := [form for form in trial.model.forms if not is_determined(held.points, trial.model, form)]:
+        pairs = (r.winner.trial.beyond(r.before) for r in rounds if r.accepted)
+        pair = next(pair for pair in pairs if untold[-1] in pair)
+        gone = [form for form in trial.model.forms if form in pair]
+        trial = held.without(trial, gone)
+        dropped += [form.name for form in gone]
     return trial, tuple(dropped)
 
 

@@ -236,6 +236,8 @@ def _nothing_found(report: Mapping[str, Any], before: float) -> str:
         f"({formatting.number(before / noise)} times the twist's noise)"
     )
     tried = f"none of the {report['forms_tried']} tried forms of missing physics has a significant gain"
+    if report["dropped"]:
+        tried += " and a size that the logs determine"
     if before < _NOISE * noise:
         return f"The straight line suffices: {errs}, and {tried}."
     return (
@@ -263,6 +265,11 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
     own = next((one.at_rest.own_stiffness for one in loop.findings if one.at_rest is not None), None)
     notes = [
         (vague, f"{not_identifiable(vague)}." if vague else ""),
+        (
+            loop.dropped and not loop.findings,
+            f"{formatting.words([*loop.dropped] or ['none']).capitalize()} had a significant gain, but the logs do not "
+            "determine how large the effect is.",
+        ),
         (friction < 0, _WRONG_WAY),
         (friction > 0, _ALL_FRICTION),
         (slower, _SLOWER),

@@ -1,6 +1,5 @@
 """Preparation of quasi-static logs: motion of the joint, valid rows, and checks that refuse a log."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -21,10 +20,6 @@ from fitting.quasi_static.torque_sign import compliance
 Motion = Literal["held", "one way", "both ways", "unknown"]
 MOVES: tuple[Motion, ...] = ("one way", "both ways")
 
-# Ten times the twist of strain-wave gears at peak torque (vendors' catalogues); springs of elastic joints twist more.
-GEAR_TWIST = 0.1
-# Largest possible twist of a spring between motor and load, unless the drive file states another.
-_TURN = 2.0 * math.pi
 # Assumed: share of the typical speed above which the motion counts as steady.
 _STEADY = 0.7
 # Least correlation of means over a hundredth of the log; even a wide loop has more.
@@ -70,7 +65,6 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
         known = believed(log)
         speed = speed_of(known, drive_file.reduction_ratio)
         motion = _motion(known, speed)
-        wide = _wide_twist(log, drive_file.largest_twist)
         moves = motion in MOVES
         steady, more = _steady(known, speed) if moves else (known, ())
         rows = _is_steady(speed) if moves else slice(None)
@@ -78,7 +72,7 @@ def prepare(logs: Sequence[Log], drive_file: DriveFile, *, at_rest: bool = False
         kept, more = (known, ()) if at_rest else (steady, more)
         ready.append(kept)
         motions.append(motion)
-        findings[log.name] = (*seen, *wide, *doubt, *more)
+        findings[log.name] = (*seen, *doubt, *more)
     return QuasiStaticData(drive_file, tuple(ready), tuple(motions), findings)
 
 
@@ -92,40 +86,6 @@ def torque_of(log: Log) -> np.ndarray:
     """Joint torque of a quasi-static log, which always has one [N m], (n,)."""
     assert log.joint_torque is not None
     return log.joint_torque
-
-
-def _wide_twist(log: Log, most: float | None) -> tuple[Finding, ...]:
-    """A warning where the twist exceeds that of gears, unless the drive file states the largest twist.
-
-    Args:
-        log: The log.
-        most: Largest twist of the drive file [rad], or None.
-
-    Raises:
-        DataError: The twist exceeds that of the drive file.
-    """
-    span = float(np.ptp(log.twist))
-    if span <= (most or GEAR_TWIST):
-        return ()
-    limit = most or _TURN
-    moved = log.motor_angle is not None and log.load_angle is not None
-    remedy = (
-        "check reduction_ratio, and the units and signs of the two angles in [columns]"
-        if moved
-        else 'give the column unit = "deg" or "arcmin" in [columns] if that is what it is; if it is a joint angle, '
-        "lock the motor or log both angles"
-    )
-    if span > limit:
-        known = "a full turn" if most is None else f"the largest_twist of {most:.3g} rad in [drive]"
-        raise DataError(f"{log.path}: the twist spans {span:.3g} rad, which is more than {known}; {remedy}")
-    return (
-        Finding(
-            "warning",
-            f"the twist spans {span:.3g} rad, ten times the range of strain-wave gears",
-            "twist",
-            f"unless its spring is so soft (then state largest_twist in [drive]), {remedy}",
-        ),
-    )
 
 
 def _refuse_mix_ups(log: Log, speed: np.ndarray, *, moves: bool, must_follow: bool) -> tuple[Finding, ...]:

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from fitting.attribution.rules import RULES
-from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, look
+from fitting.quasi_static.attribution import Held, TwistRound, TwistTrial, is_within, look
 from fitting.quasi_static.form import START, Form, Terms
 from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
@@ -94,7 +94,7 @@ def analyse_rests(held: Held, current: TwistTrial, seed: int) -> RestAnalysis | 
         follows = stiffness_of(turned, free.before.model)["K"].identifiable
         own_stiffness = slope if follows and _chance(free) > _SIGNIFICANCE else None
     terms: Terms = ()
-    if this.accepted and p_value <= _SIGNIFICANCE:
+    if this.accepted and p_value <= _SIGNIFICANCE and all(is_within(*term) for term in this.winner.trial.model.terms):
         ((_, shape),) = this.winner.trial.model.terms
         terms = ((_relaxation(points.step, rest, since, initial=f"{START} "), shape),)
     return RestAnalysis(points, this, p_value, own_stiffness, terms)

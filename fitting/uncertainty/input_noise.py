@@ -94,6 +94,8 @@ def _variances(
         expected.append(columns.reshape(outputs + 1, -1).T)
     power, shapes = np.concatenate(measured), np.concatenate(expected)
     known = shapes.sum(axis=1) > 1e-9 * shapes.sum(axis=1).max()
+    if not known.any():
+        return None
     power, shapes = power[known], shapes[known]
     level = np.full(power.size, power.mean())
     found = np.zeros(shapes.shape[1])

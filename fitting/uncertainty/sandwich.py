@@ -52,12 +52,13 @@ class Record(eqx.Module):
     present: float
 
     def bases(self) -> Iterator[tuple[int, Float[np.ndarray, "samples outputs directions"]]]:
-        """First sample of each simulation, and an orthonormal basis of its initial state's effect."""
+        """First sample and orthonormal basis of the initial state's effect, of each simulation with valid samples."""
         for start, columns in self.states:
             flat = columns.reshape(-1, columns.shape[2])
             length = np.linalg.norm(flat, axis=0)
-            basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
-            yield start, basis.reshape(*columns.shape[:2], -1)
+            if (length > 0).any():
+                basis, _ = np.linalg.qr(flat[:, length > 0] / length[length > 0])
+                yield start, basis.reshape(*columns.shape[:2], -1)
 
 
 class Linearised(eqx.Module):

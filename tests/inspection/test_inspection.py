@@ -238,3 +238,15 @@ def test_corrupted_logs_are_inspected_or_refused_in_one_sentence(block: int, tmp
         assert not {"nan", "inf"} & set(found.summary().replace(",", " ").split())
     # Most corrupted logs can be inspected, though few can be fitted.
     assert read > 15
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_sign_of_a_joint_torque_beside_a_twist_gives_a_complete_drive_file(sign: int, tmp_path: Path):
+    """The twist is nearly proportional to the torque, without inertia or resonance."""
+    time = np.arange(2000) * 0.01
+    twist = 0.04 * np.sin(0.7 * time) + 0.01 * np.sin(2.0 * time)
+    noise = 0.02 * np.random.default_rng(0).normal(size=time.size)
+    columns = {"t": time, "deflection": twist, "effort": sign * (120.0 * twist + 500.0 * twist**3) + noise}
+    found = fitting.inspect(columns)
+    assert found.inspection.joint.signals["joint_torque"].sign == sign
+    assert fitting.load(columns, tomllib.loads(found.drive_file())).kind == "quasi-static"

@@ -180,6 +180,8 @@ RIG = DriveFile(Path("drive.toml"), "rig", rig.N, rig.J_M, rig.J_L, "zero-order"
         ({"motor_angle": -1.0, "load_angle": -1.0}, "refusal", ["or both angles"]),
         ({"time": 1e3}, "refusal", ["milliseconds", '"ms"']),
         ({"motor_torque": 1 / 7.0}, "warning", ["6.99 times as much", "motor_inertia"]),
+        ({"motor_torque": 1 / 300.0}, "refusal", ["times as much", "motor_inertia", "time"]),
+        ({"time": 1 / 60.0}, "refusal", ["times as much", "angles and time"]),
         ({"motor_torque": 1.5}, None, []),
     ],
 )
@@ -192,6 +194,25 @@ def test_torque_is_checked_against_the_motion(
         assert findings == ()
     else:
         only_finding(findings, severity, *words)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(-1.0, "against the motion"), (1e3, '"mN m"'), (1 / 7.0, "times as much"), (1.0, "")]
+)
+def test_torque_of_a_log_with_gaps_is_checked(simulated_log: Log, factor: float, words: str):
+    """The motion inside gaps is unknown: here angles change by any amount."""
+    pieces = ((0, 1300), (1400, 2100), (2101, ROWS))
+    steps = np.repeat([0.0, 3.0, 1.0], [1300, 801, ROWS - 2101])
+    motor, load = angles(simulated_log)
+    log = replace(
+        simulated_log,
+        motor_angle=motor + rig.N * steps,
+        load_angle=load + steps,
+        motor_torque=factor * simulated_log.motor_torque,
+        pieces=pieces,
+    )
+    findings = [str(f) for f in examine(log, RIG) if f.where.startswith("motor_torque against")]
+    assert len(findings) == bool(words) and all(words in f for f in findings)
 
 
 @pytest.mark.parametrize(

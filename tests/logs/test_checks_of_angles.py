@@ -85,7 +85,7 @@ def test_motion_beyond_the_antiresonance_is_not_reported_as_wrong_ratio() -> Non
         load_angle=-0.8 * np.sin(385 * time),
         dynamic_error=2.8 * np.sin(385 * time),
     )
-    assert examine(log, drive_file()) == ()
+    only_finding(examine(log, drive_file()), "warning", "the twist spans 5.6 rad")
 
 
 def test_wrapped_load_angle_is_refused() -> None:
@@ -115,18 +115,22 @@ def test_wrong_ratio_of_a_practice_log_is_refused(tmp_path: Path, shared: Path, 
         refuse_unfit(examine(log, drive), log)
 
 
-@pytest.mark.parametrize(("ratio", "refused"), [(121, False), (101, True), (120, False)])
-def test_wrong_ratio_of_lara8_joint_2_is_refused(tmp_path: Path, shared: Path, ratio: int, refused: bool) -> None:
+@pytest.mark.parametrize(
+    ("ratio", "sign", "refused"), [(121, -1, False), (101, -1, True), (120, -1, False), (121, 1, True)]
+)
+def test_wrong_ratio_or_sign_of_lara8_joint_2_is_refused(
+    tmp_path: Path, shared: Path, ratio: int, sign: int, refused: bool
+) -> None:
     (tmp_path / "drive.toml").write_text(f"""
     [drive]
     reduction_ratio = {ratio}
     motor_inertia = 1e-4
-    load_inertia = 1.0
+    load_inertia = 12.0
     [columns]
     time = "Timestamp"
     motor_angle = {{ column = "encoder_motorinc_2", unit = "rev / 16777216" }}
     load_angle = {{ column = "encoder_loadinc_2", unit = "rev / 16777216" }}
-    motor_torque = {{ column = "joint_torque_current_2", unit = "N m / 121" }}
+    motor_torque = {{ column = "joint_torque_current_2", unit = "N m / 121", sign = {sign} }}
     """)
     drive = read_drive_file(tmp_path / "drive.toml")
     log = ready_log(shared / "data/lara8/ML2_jogging_joint_mass.csv", drive)
@@ -144,3 +148,49 @@ def test_soft_spring_is_not_reported_as_wrong_ratio():
     assert not [f for f in examine(log, drive_file(joint.N)) if "the angles give" in f.what]
     (refused,) = [f for f in examine(log, drive_file(1.2 * joint.N)) if "the angles give" in f.what]
     assert refused.severity == "refusal"
+
+
+@pytest.mark.parametrize(
+    ("twist", "stated", "severity"),
+    [(0.04, None, None), (0.2, None, "warning"), (0.2, 0.5, None), (0.2, 0.3, "refusal"), (3.5, None, "refusal")],
+)
+def test_twist_beyond_that_of_gears(twist: float, stated: float | None, severity: str | None):
+    """Nothing else contradicts a wrong column whose motion is unrelated to the other angle's."""
+    motor, load = angles(drive_log())
+    wobble = twist * np.sin(np.arange(ROWS) ** 1.5 * 1e-2)
+    log = replace(drive_log(), load_angle=load - wobble, dynamic_error=motor / N - load + wobble)
+    findings = [f for f in examine(log, replace(drive_file(), largest_twist=stated)) if f.where == "twist"]
+    assert [f.severity for f in findings] == ([] if severity is None else [severity])
+
+
+def test_spike_of_an_encoder_is_no_wide_twist():
+    log = drive_log()
+    twist = log.twist.copy()
+    twist[77] = 9.0
+    spiky = replace(log, dynamic_error=twist, trusted=np.arange(ROWS) != 77)
+    assert not [f for f in examine(spiky, drive_file()) if f.where == "twist"]
+
+
+@pytest.mark.parametrize("motor", ["motor_angle", "motor_velocity"])
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1.0, ""),
+        (-1.0, "sign = -1"),
+        (N, "referred to one side"),
+        (30 / np.pi, '"rpm"'),
+        (180 / np.pi, '"deg/s"'),
+        (1.7, "correct the ratio"),
+        (N**2, "swapped"),
+    ],
+)
+def test_load_velocity_is_compared_with_the_motor(motor: str, factor: float, words: str):
+    """The integral of a velocity drifts with its zero error."""
+    log = drive_log(swing=1.0)
+    angle, load = angles(log)
+    seen = {"motor_angle": angle, "motor_velocity": np.gradient(angle, log.time) + 0.3}
+    log = replace(log, motor_angle=None, load_angle=None, dynamic_error=None)
+    log = replace(log, **{motor: seen[motor]}, load_velocity=factor * (np.gradient(load, log.time) - 0.02))
+    found = [f for f in examine(log, drive_file()) if f.where.startswith("load_velocity")]
+    assert [f.severity for f in found] == (["refusal"] if words else [])
+    assert not words or words in str(found[0])

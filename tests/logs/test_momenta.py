@@ -63,6 +63,15 @@ def test_sign_and_unit_of_a_torque_on_the_motor_alone(moving: Log, changes: dict
         assert not words or words in str(found[0])
 
 
+@pytest.mark.parametrize(("factor", "severity"), [(-1.0, ["refusal"]), (1.0, [])])
+def test_sign_of_a_torque_in_a_log_with_a_gap(moving: Log, factor: float, severity: list[str]):
+    signal = "motor_angle" if moving.motor_angle is not None else "motor_velocity"
+    seen = getattr(moving, signal) + 40.0 * (np.arange(COUNT) >= 1600) * (signal == "motor_angle")
+    torque = factor * moving.motor_torque
+    log = replace(moving, motor_torque=torque, pieces=((0, 1500), (1600, COUNT)), **{signal: seen})
+    assert [f.severity for f in refusals(log, drive())] == severity
+
+
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", ["one", "two", "band", "slow and one", "through"])
 def test_a_load_that_moves_against_the_motor_is_no_wrong_sign(kind: str, seed: int):
@@ -81,3 +90,35 @@ def test_a_load_that_moves_against_the_motor_is_no_wrong_sign(kind: str, seed: i
         "through": rig.multisine(COUNT, joints.STEP, rms=1.0, low=0.5, high=high, seed=seed),
     }[kind]
     assert refusals(log_of(0.1 * torque, joint=joint), drive()) == []
+
+
+@pytest.mark.parametrize("motion", ["motor_angle", "motor_velocity"])
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(1.0, ""), (1.5, ""), (-1.0, "sign = -1"), (1e3, '"mN m"'), (1 / 50.0, '"50 N m"'), (100.0, "reduction_ratio")],
+)
+def test_sign_and_unit_of_a_joint_torque(motion: str, factor: float, words: str):
+    """What the motor's torque leaves, beside its friction and inertia, is the joint torque."""
+    log = joints.log_of_sensors(JOINT, (motion, "joint_torque"), count=COUNT)
+    log = replace(log, joint_torque=factor * log.joint_torque)
+    for stated in (True, False):
+        found = [f for f in examine(log, drive(stated=stated)) if f.where == "joint_torque"]
+        assert [f.severity for f in found] == (["refusal"] if words else [])
+        assert not words or words in str(found[0])
+
+
+@pytest.fixture(scope="module", params=[(0.06, 1e-4), (0.02, 1e-3)])
+def braked(request: pytest.FixtureRequest) -> Log:
+    """Both angles of a joint whose motor's friction takes most of its torque."""
+    coulomb, viscous = request.param
+    joint = replace(JOINT, coulomb=coulomb, viscous=viscous)
+    return joints.log_of_sensors(joint, ("motor_angle", "load_angle"), count=COUNT)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(1.0, ""), (1.8, ""), (-1.0, "sign = -1"), (1e3, "motor_torque"), (100.0, "motor_torque")]
+)
+def test_torque_is_checked_where_friction_dominates(braked: Log, factor: float, words: str):
+    (found, *more) = refusals(replace(braked, motor_torque=factor * braked.motor_torque), drive()) or (None,)
+    assert (found is None) == (not words) and not more
+    assert found is None or (found.severity == "refusal" and words in str(found))

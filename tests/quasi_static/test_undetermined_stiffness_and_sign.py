@@ -5,19 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from slow_joints import RATIO, slow_joint
 from torque_cycles import cycles, line
 
 from fitting.errors import DataError
 from fitting.logs.drive_file import DriveFile
 from fitting.logs.log import Log
+from fitting.quasi_static.attribution import Held, is_determined, is_within
 from fitting.quasi_static.content import report_dict
 from fitting.quasi_static.fit import fit_quasi_static
-from fitting.quasi_static.loop import close_loop
+from fitting.quasi_static.loop import catalogue, close_loop
 from fitting.quasi_static.loop_content import loop_report
 from fitting.quasi_static.points import points_of
 from fitting.quasi_static.preparation import prepare
 from fitting.quasi_static.test_part import Parted
+from fitting.quasi_static.twist_model import strengths_of
 from fitting.quasi_static.unseen_logs import UnseenLogs
 
 SOFT = 120.0
@@ -118,3 +121,25 @@ def test_undetermined_stiffness_is_not_stated_in_the_summary(sign):
         assert stiffness is None or stiffness > 0
     for effect in told["after"]["effects"]:
         assert any(one["identifiable"] for one in effect["parameters"].values())
+
+
+def test_time_constant_at_an_end_of_its_range_is_not_determined():
+    log, motion = slow_joint(cycles=4.0)
+    points = points_of([log], [motion], RATIO)
+    creep = next(form for form in catalogue(points) if form.family == "creep")
+    low, high = creep.range
+    assert is_within(creep, 0.5 * (low + high))
+    assert not is_within(creep, high) and not is_within(creep, low)
+
+
+def test_creep_larger_than_the_elastic_twist_is_not_determined():
+    """A twist that follows the torque with a lag of most of a cycle, and hardly at once."""
+    log, motion = slow_joint(cycles=4.0, twist_noise=1e-6, torque_noise=0.05)
+    assert log.joint_torque is not None
+    slow = lfilter([0.004], [1.0, -0.996], log.joint_torque)
+    points = points_of([replace(log, dynamic_error=log.joint_torque / 4e5 + slow / 2e4)], [motion], RATIO)
+    held = Held.of(points)
+    creep = next(form for form in catalogue(points) if form.family == "creep")
+    trial = held.attempt(((creep, np.array([np.log(1.0), 0.0])),))
+    assert strengths_of(points, trial.model, creep)["share"].value > 1.0
+    assert not is_determined(points, trial.model, creep)

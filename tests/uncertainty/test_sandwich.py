@@ -278,3 +278,10 @@ def test_intervals_of_refitted_drive_logs_have_nominal_coverage(colour: str):
         estimates = uncertainty(drive_fit(experiment, 10**6)).estimates
         hits += [estimates[p].ci95[0] < truth[p] < estimates[p].ci95[1] for p in PATHS]
     assert_nominal_coverage(hits, draws, most=0.98)
+
+
+def test_simulation_without_valid_samples_has_no_basis():
+    given = broadband(1, simulations=2)
+    (record,) = given.records
+    blind = dataclasses.replace(record, states=((0, record.states[0][1]), (COUNT // 2, 0.0 * record.states[1][1])))
+    assert [start for start, _ in blind.bases()] == [0]
