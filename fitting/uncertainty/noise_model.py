@@ -9,20 +9,19 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 from scipy.special import expit
 
 from fitting.estimation.engines import linearise
 from fitting.estimation.estimate import Fit, segments_of_logs
 from fitting.estimation.linear_response import follow
 from fitting.estimation.residual import RUNAWAY, Problem, Unknowns
+from fitting.uncertainty.innovations import SensorNoise, Steps, filtered, spread_evenly, white_noise
 from fitting.uncertainty.input_noise import torque_pushes
 from hdjax import Model, TwoInertiaModel
 
 # Prior standard deviation of a segment's initial state, in units of the residual.
 _FREE = 10.0
-# Lead-in samples of a segment in which the filter converges.
-_LEAD = 12
 # Starting values of torque noise, as shares of the torque's rms: the smallest (up to one), and their number.
 _LEAST, _SHARES = 1e-5, 11
 # Most logs that are used, and segments of each, evenly spaced: some thousand samples determine a variance to a few
@@ -38,40 +37,6 @@ _LEAST_OF_IT = 1e-6
 # Step of its differences, gradient of the likelihood at which it ends [nats per sample], and most iterations; where
 # only noise is left, about ten suffice.
 _STEP, _FLAT, _ITERATIONS = 1e-4, 1e-4, 15
-
-
-class SensorNoise(eqx.Module):
-    """Noise of the outputs, in combinations with independent noise.
-
-    Each is the sum of a white part and an exponentially correlated (slow) part.
-
-    Attributes:
-        combined: the outputs as combinations of independent ones of unit variance.
-        white: variance of each one's white part.
-        slow: variance of each one's slow part.
-        correlation: of neighbouring samples of the slow part.
-    """
-
-    combined: Float[np.ndarray, "outputs outputs"]
-    white: Float[np.ndarray, "*settings outputs"]
-    slow: Float[np.ndarray, "*settings outputs"]
-    correlation: Float[np.ndarray, "*settings outputs"]
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "outputs outputs"]:
-        """Covariance of the outputs' noise."""
-        return self.combined @ np.diag(self.white + self.slow) @ self.combined.T
-
-    def memory(self, time_step: float) -> float | None:
-        """Correlation time [s] of the slow part of the last output's noise; None without one."""
-        slow = self.combined[-1] ** 2 * self.slow
-        return -time_step / float(np.log(slow @ self.correlation / slow.sum())) if slow.any() else None
-
-
-def white_noise(covariance: Float[np.ndarray, "outputs outputs"]) -> SensorNoise:
-    """White noise of the outputs."""
-    one = np.ones(len(covariance))
-    return SensorNoise(np.linalg.cholesky(covariance), one, 0.0 * one, 0.0 * one)
 
 
 class NoiseModel(eqx.Module):
@@ -97,39 +62,6 @@ class NoiseModel(eqx.Module):
     likelihood: float
     without: float
     count: int = eqx.field(static=True)
-
-
-class _Steps(eqx.Module):
-    """The linearised motion of several segments, sample by sample.
-
-    Attributes:
-        transition: of the state's deviation over a sample interval.
-        push: its change by a unit of torque.
-        readout: of the outputs.
-        error: of the outputs, and its derivatives by the free parameters.
-        counts: whether a sample is valid.
-        log: of each segment.
-        prior: covariance of the initial states.
-        torque: rms torque of each log.
-        lead: lead-in samples of the filter, which the likelihood omits.
-    """
-
-    transition: Float[np.ndarray, "samples segments states states"]
-    push: Float[np.ndarray, "samples segments states"]
-    readout: Float[np.ndarray, "samples segments outputs states"]
-    error: Float[np.ndarray, "samples segments outputs columns"]
-    counts: Bool[np.ndarray, "samples segments"]
-    log: Int[np.ndarray, " segments"]
-    prior: Float[np.ndarray, "states states"]
-    torque: Float[np.ndarray, " logs"]
-    lead: int = eqx.field(static=True, default=_LEAD)
-
-    def fewer(self, segments: int) -> "_Steps":
-        """The same for at most so many segments, evenly spaced."""
-        chosen = _spread(self.log.size, segments)
-        places = (self.transition, self.push, self.readout, self.error, self.counts)
-        fewer = (*(place[:, chosen] for place in places), self.log[chosen])
-        return eqx.tree_at(lambda s: (s.transition, s.push, s.readout, s.error, s.counts, s.log), self, fewer)
 
 
 def noise_model(
@@ -171,9 +103,9 @@ def noise_model(
     return _judged(steps, *_likeliest(steps.fewer(_SEGMENTS_OF_MEMORY), shares, with_memory, first))
 
 
-def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoise) -> NoiseModel:
+def _judged(steps: Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNoise) -> NoiseModel:
     """Innovation statistics under noise of given size."""
-    innovations, logarithms = _filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
+    innovations, logarithms = filtered(steps, np.stack([shares, 0.0 * shares]) * steps.torque, sensors)
     std, share = (float(np.sqrt(np.mean(np.square(v)))) for v in (shares * steps.torque, shares))
     each = [_size_and_colour(innovations[0, steps.log == log]) for log in range(shares.size)]
     size, colour = np.max(each, axis=0)
@@ -182,17 +114,17 @@ def _judged(steps: _Steps, shares: Float[np.ndarray, " logs"], sensors: SensorNo
     return NoiseModel(std, share, sensors, float(size), float(colour), float(likelihood), float(without), count)
 
 
-def _first_shares(steps: _Steps, sensors: SensorNoise) -> Float[np.ndarray, " logs"]:
+def _first_shares(steps: Steps, sensors: SensorNoise) -> Float[np.ndarray, " logs"]:
     """The most likely starting value of torque noise for each log."""
     shares = np.geomspace(_LEAST, 1.0, _SHARES)
-    innovations, logarithms = _filtered(steps, shares[:, None] * steps.torque, sensors)
+    innovations, logarithms = filtered(steps, shares[:, None] * steps.torque, sensors)
     unlikely = np.sum(0.5 * innovations**2 + logarithms, axis=(2, 3))
     by_log = unlikely @ (steps.log[:, None] == np.arange(steps.torque.size))
     return shares[np.argmin(by_log, axis=0)]
 
 
 def _likeliest(
-    steps: _Steps,
+    steps: Steps,
     shares: Float[np.ndarray, " logs"],
     noise: Callable[[np.ndarray], SensorNoise],
     first: Float[np.ndarray, " unknowns"],
@@ -221,7 +153,7 @@ def _likeliest(
         apart = np.concatenate([np.zeros((1, first.size)), np.eye(first.size)])
         varied = unknowns + _STEP * np.concatenate([0.0 * unknowns[None], np.hstack([together, apart])])
         varied_shares, sensors = at(varied)
-        innovations, logarithms = _filtered(steps, varied_shares * steps.torque, sensors)
+        innovations, logarithms = filtered(steps, varied_shares * steps.torque, sensors)
 
         def slopes(values: np.ndarray) -> np.ndarray:
             found = (values[1:] - values[0]) / _STEP
@@ -252,23 +184,23 @@ def _likeliest(
     return at(solution.x)
 
 
-def _steps(fit: Fit) -> _Steps:
+def _steps(fit: Fit) -> Steps:
     problem = fit.at_solution
     followed = follow(problem, fit.unknowns)
     weight = np.asarray(problem.segments.weight)
     logs = [np.flatnonzero(weight.any(axis=1) & own) for own in segments_of_logs(fit)]
     logs = [own for own in logs if own.size]
-    logs = [logs[i] for i in _spread(len(logs), _LOGS)]
-    logs = [own[_spread(own.size, _SEGMENTS)] for own in logs]
+    logs = [logs[i] for i in spread_evenly(len(logs), _LOGS)]
+    logs = [own[spread_evenly(own.size, _SEGMENTS)] for own in logs]
     used = np.concatenate(logs)
     read = followed.readout[used]
     rms = np.sqrt(np.diag(np.asarray(fit.covariance)))
     torque = np.asarray(problem.segments.torque.coefficients)
 
     def in_time(values: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(np.swapaxes(values, 0, 1))
+        return np.ascontiguousarray(np.moveaxis(values, 0, -1))
 
-    return _Steps(
+    return Steps(
         in_time(followed.transition[used]),
         in_time(torque_pushes(problem.model, followed)[used]),
         in_time(read),
@@ -301,68 +233,6 @@ def _freedom(model: Model, states: np.ndarray, read: np.ndarray, rms: np.ndarray
     angle = np.where(angle > 0, angle, sides * np.max(angle / sides))
     hidden = np.std(states.reshape(-1, states.shape[-1]), axis=0)[2 * angles :]
     return np.concatenate([angle, angle * omega_0, hidden])
-
-
-def _spread(count: int, most: int) -> np.ndarray:
-    """At most so many indices below a count, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
-
-
-def _filtered(
-    steps: _Steps, std: Float[np.ndarray, "settings logs"], sensors: SensorNoise
-) -> tuple[
-    Float[np.ndarray, "settings segments samples outputs"], Float[np.ndarray, "settings segments samples outputs"]
-]:
-    """Standardised innovations after the lead-in, at the parameters that minimise them, and logarithms of their
-    standard deviations, for several noise settings at once.
-
-    Outputs with independent noise are processed sequentially (Anderson and Moore 1979, section 6.4). The slow part of
-    each one's noise is a further state.
-    """
-    variance = np.square(std)[:, steps.log, None, None]
-    white, slow, correlation = (np.atleast_2d(v) for v in (sensors.white, sensors.slow, sensors.correlation))
-    apart = np.linalg.inv(sensors.combined)
-    readout, error = apart @ steps.readout, apart @ steps.error
-    samples, segments, outputs, columns = error.shape
-    settings, size = len(variance), steps.push.shape[2]
-    remembers = outputs if slow.any() else 0
-    own = np.arange(size, size + remembers)
-    mean = np.zeros((settings, segments, size + remembers, columns))
-    spread = np.zeros((settings, segments, size + remembers, size + remembers))
-    spread[..., :size, :size] = steps.prior
-    spread[..., own, own] = slow[:, None, :remembers]
-    transition = np.zeros_like(spread)
-    transition[..., own, own] = correlation[:, None, :remembers]
-    fresh = (slow * (1.0 - correlation**2))[:, None, :remembers]
-    found = np.zeros((settings, segments, samples, outputs, columns))
-    logarithms, read = np.zeros(found.shape[:-1]), np.zeros((segments, size + remembers))
-    for i in range(samples):
-        counts = steps.counts[i][:, None]
-        for j in range(outputs):
-            read[:, :size], read[:, size:] = readout[i, :, j], np.arange(remembers) == j
-            expected = (spread @ read[:, :, None])[..., 0]
-            total = np.sum(expected * read, axis=-1) + white[:, None, j]
-            new = error[i, :, j] - (read[:, None, :] @ mean)[..., 0, :]
-            gain = counts * expected / total[..., None]
-            mean += gain[..., None] * new[..., None, :]
-            spread -= gain[..., None] * expected[..., None, :]
-            found[:, :, i, j] = counts * new / np.sqrt(total)[..., None]
-            logarithms[:, :, i, j] = 0.5 * counts[:, 0] * np.log(total)
-        transition[..., :size, :size] = steps.transition[i]
-        mean = transition @ mean
-        spread = transition @ spread @ np.swapaxes(transition, 2, 3)
-        push = steps.push[i]
-        spread[..., :size, :size] += variance * (push[:, :, None] * push[:, None, :])
-        spread[..., own, own] += fresh
-    found, logarithms = found[:, :, steps.lead :], logarithms[:, :, steps.lead :]
-    used = found.reshape(settings, -1, columns)
-    derivatives = used[..., 1:]
-    size_of = np.maximum(np.linalg.norm(derivatives, axis=1), 1e-300)
-    derivatives = derivatives / size_of[:, None]
-    across = np.swapaxes(derivatives, 1, 2)
-    moved = np.linalg.pinv(across @ derivatives, hermitian=True) @ (across @ used[..., :1])
-    moved = moved[..., 0] / size_of
-    return found[..., 0] - (found[..., 1:] @ moved[:, None, None, :, None])[..., 0], logarithms
 
 
 def _size_and_colour(innovations: Float[np.ndarray, "segments samples outputs"]) -> tuple[float, float]:

@@ -22,8 +22,9 @@ from fitting.estimation.free_parameters import base_paths
 from fitting.estimation.problem import Segmentation
 from fitting.estimation.residual import Unknowns
 from fitting.loop import close_loop
+from fitting.uncertainty.innovations import SensorNoise, Steps, filtered
 from fitting.uncertainty.measurement_noise import measurement_noise
-from fitting.uncertainty.noise_model import NoiseModel, SensorNoise, _filtered, _Steps, noise_model, spread_by_torque
+from fitting.uncertainty.noise_model import NoiseModel, noise_model, spread_by_torque
 from fitting.uncertainty.prediction_band import prediction_bands
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax import Hold
@@ -173,12 +174,12 @@ def test_likelihood_of_innovations_equals_the_gaussian_density_of_all_samples():
     sensors = SensorNoise(
         np.array([[1.0, 0.0], [0.4, 0.8]]), np.array([0.2, 0.5]), np.array([0.7, 0.1]), np.full(2, 0.9)
     )
-    error = random.normal(size=(samples, 1, 2, 1))
+    error = random.normal(size=(samples, 2, 1, 1))
     shapes = {"transition": transition, "push": push, "readout": readout}
-    stacked = {name: np.broadcast_to(v, (samples, 1, *v.shape)) for name, v in shapes.items()}
+    stacked = {name: np.broadcast_to(v[..., None], (samples, *v.shape, 1)) for name, v in shapes.items()}
     one = {"log": np.zeros(1, int), "prior": np.eye(size), "torque": np.ones(1), "lead": 0}
-    steps = _Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), **one)
-    innovations, logarithms = _filtered(steps, np.array([[std]]), sensors)
+    steps = Steps(**stacked, error=error, counts=np.ones((samples, 1), bool), **one)
+    innovations, logarithms = filtered(steps, np.array([[std]]), sensors)
     spread = np.zeros((samples, size, samples, size))
     variance = np.eye(size)
     for i in range(samples):
@@ -195,7 +196,7 @@ def test_likelihood_of_innovations_equals_the_gaussian_density_of_all_samples():
     # In units of the sensors' independent combinations.
     units = samples * np.log(np.linalg.det(sensors.combined)) + samples * np.log(2.0 * np.pi)
     likelihood = -np.sum(0.5 * innovations**2 + logarithms) - units
-    assert likelihood == pytest.approx(law.logpdf(error[:, 0, :, 0].ravel()), rel=1e-9)
+    assert likelihood == pytest.approx(law.logpdf(error.ravel()), rel=1e-9)
 
 
 def test_spread_by_torque_noise_equals_the_scatter_of_simulations(noisy: Fit):
