@@ -9,14 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _Tree = TypeVar("_Tree")
 
-# Programs are compiled for multiples of this number of lanes.
-_LANES = 32
 # Options for fast compilation, since optimisation takes longer than it saves for little work.
 _SMALL: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
@@ -49,23 +46,6 @@ def is_traced(*trees: Any) -> bool:
 def library_of(*arrays: Any) -> Any:
     """The array library: JAX under tracing; numpy outside, where JAX would compile each operation and shape."""
     return jnp if any(isinstance(array, Tracer) for array in arrays) else np
-
-
-def some_at_a_time(program: Callable[..., Any], *arrays: Array | np.ndarray, most: int = _LANES) -> Any:
-    """Apply a JAX program to lanes in batches of few sizes, so that data of all sizes share few compilations.
-
-    Args:
-        program: from arrays whose first axis is one of lanes to a tree of such arrays.
-        arrays: of all lanes.
-        most: lanes per batch; for a frequently called program, calls cost more than compilations.
-    """
-    count = len(arrays[0])
-    if count <= _LANES:
-        return on_host(program(*(jnp.asarray(np.asarray(a)) for a in arrays)))
-    size = -(-count // (_LANES * -(-count // most))) * _LANES
-    places = (np.minimum(np.arange(start, start + size), count - 1) for start in range(0, count, size))
-    found = [on_host(program(*(jnp.asarray(np.asarray(a)[own]) for a in arrays))) for own in places]
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *found)
 
 
 def on_host(tree: _Tree) -> _Tree:

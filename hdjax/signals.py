@@ -1,15 +1,13 @@
 """Inter-sample behaviour of sampled signals: one polynomial per interval for every hold."""
 
+import functools
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-
-from hdjax.where import where
+from jaxtyping import Array, Float, Inexact
 
 DEGREE = 5
 """Degree of the polynomial of an interval; 5 matches value, slope and curvature at both ends."""
@@ -20,16 +18,21 @@ HOLDS: tuple[Hold, ...] = get_args(Hold)
 """All of them."""
 
 
+_Number = Array | np.ndarray | float | complex
+
+
 class PiecewisePolynomial(eqx.Module):
     """A signal that is a polynomial in `t - knots[k]` on each interval `knots[k] <= t < knots[k + 1]`.
+
+    Several signals, along first axes, are changed together by numpy, with real or complex numbers.
 
     Attributes:
         knots: interval ends [s], rising.
         coefficients: `coefficients[k, j]` multiplies `(t - knots[k])**j`.
     """
 
-    knots: Float[Array, "*batch knots"]
-    coefficients: Float[Array, "*batch intervals powers"]
+    knots: Float[Array | np.ndarray, "*batch knots"]
+    coefficients: Inexact[Array | np.ndarray, "*batch intervals powers"]
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """The signal's value at time `t` [s]; the end polynomials continue beyond the ends."""
@@ -37,12 +40,12 @@ class PiecewisePolynomial(eqx.Module):
         k = jnp.clip(jnp.searchsorted(self.knots, t, side="right") - 1, 0, last)
         return polynomial(self.coefficients[k], t - self.knots[k])
 
-    def affine(self, gain: Array, offset: Array) -> "PiecewisePolynomial":
+    def affine(self, gain: _Number, offset: _Number) -> "PiecewisePolynomial":
         """The signal `gain * self + offset`."""
-        scaled = gain * self.coefficients
-        return PiecewisePolynomial(self.knots, scaled.at[:, 0].add(offset))
+        first = np.eye(1, self.coefficients.shape[-1])
+        return PiecewisePolynomial(self.knots, gain * self.coefficients + offset * first)
 
-    def delayed(self, delay: Array) -> "PiecewisePolynomial":
+    def delayed(self, delay: _Number) -> "PiecewisePolynomial":
         """The signal `self(t - delay)` on the same knots.
 
         A jump that the delay moves inside an interval can't be represented by one polynomial. Each interval gets the
@@ -52,30 +55,35 @@ class PiecewisePolynomial(eqx.Module):
         Args:
             delay: of the signal [s].
         """
-        start = self.knots[:-1] - delay
-        width = jnp.diff(self.knots)
-        last = self.coefficients.shape[0] - 1
-        source = jnp.clip(jnp.searchsorted(self.knots, start, side="right") - 1, 0, last)
+        library = _library_of(self.knots, delay)
+        start: Any = self.knots[..., :-1] - delay
+        width = library.diff(self.knots)
+        last = self.coefficients.shape[-2] - 1
+        search = functools.partial(library.searchsorted, side="right")
+        before = library.vectorize(search, signature="(m),(n)->(n)")(self.knots, start.real)
+        source = library.clip(before - 1, 0, last)
 
-        def moments(coefficients, shift, begin, end):
+        def moments(piece, begin, end):
             """Moments of one source piece over [begin, end] of the target interval, in Legendre polynomials."""
-            half = 0.5 * (end - begin)
-            at = begin[:, None] + half[:, None] * (_NODES[None, :] + 1.0)
-            value = polynomial(coefficients[:, None, :], at + shift[:, None])
-            shape = _legendre(2.0 * at / width[:, None] - 1.0)
-            return half[:, None] * jnp.einsum("knd,kn,n->kd", shape, value, jnp.asarray(_WEIGHTS))
+            coefficients = library.take_along_axis(self.coefficients, piece[..., None], axis=-2)
+            shift = start - library.take_along_axis(self.knots, piece, axis=-1)
+            half = 0.5 * (end - begin)[..., None]
+            at = begin[..., None] + half * (_NODES[None, :] + 1.0)
+            value = polynomial(coefficients[..., None, :], at + shift[..., None])
+            shape = _legendre(2.0 * at / width[..., None] - 1.0)
+            return half * library.einsum("...nd,...n->...d", shape, value * library.asarray(_WEIGHTS)[None, :])
 
-        total = jnp.zeros((width.size, _NORMS.size), width.dtype)
-        begin = jnp.zeros_like(width)
+        total, begin = 0.0, library.zeros_like(width)
         for j in range(_PIECES):
-            piece = jnp.minimum(source + j, last)
-            end = jnp.clip(self.knots[piece + 1] - start, begin, width) if j < _PIECES - 1 else width
-            total = total + moments(self.coefficients[piece], start - self.knots[piece], begin, end)
+            piece = library.minimum(source + j, last)
+            following = library.take_along_axis(self.knots, piece + 1, axis=-1)
+            end = library.clip(following - start, begin, width) if j < _PIECES - 1 else width
+            total = total + moments(piece, begin, end)
             begin = end
-        legendre = total * jnp.asarray(_NORMS)[None, :] / width[:, None]
+        legendre = total * library.asarray(_NORMS)[None, :] / width[..., None]
         return PiecewisePolynomial(self.knots, _powers(legendre, width))
 
-    def lagged(self, lag: Array) -> "PiecewisePolynomial":
+    def lagged(self, lag: _Number) -> "PiecewisePolynomial":
         """The signal y of `lag y' + y = self`, in steady state at the first knot, on the same knots.
 
         On each interval y is a polynomial and a decaying exponential; the latter is replaced by the quintic with the
@@ -84,50 +92,66 @@ class PiecewisePolynomial(eqx.Module):
         Args:
             lag: time constant [s], above zero.
         """
-        width = jnp.diff(self.knots)
+        library = _library_of(self.knots, lag)
+        width = library.diff(self.knots)
         # The polynomial part: self - lag self' + lag^2 self'' - ...
         part = derivative = self.coefficients
         for _ in range(DEGREE):
-            orders = jnp.arange(1.0, derivative.shape[1])
-            derivative = -lag * jnp.pad(derivative[:, 1:] * orders[None, :], ((0, 0), (0, 1)))
+            orders = np.arange(1.0, derivative.shape[-1])
+            risen = derivative[..., 1:] * orders[None, :]
+            derivative = -lag * library.concatenate([risen, library.zeros_like(risen[..., :1])], axis=-1)
             part = part + derivative
-        decay = jnp.exp(-width / lag)
-        end = polynomial(part, width)
-
-        def interval(y, inputs):
-            first, last, factor = inputs
-            away = y - first
-            return last + away * factor, away
-
-        _, away = jax.lax.scan(interval, part[0, 0], (part[:, 0], end, decay))
-        legendre = away[:, None] * _decay_moments(width / lag) * jnp.asarray(_NORMS)[None, :]
+        first, end = part[..., 0], polynomial(part, width)
+        # The exponential part at the start of each interval.
+        away = _summed(library.exp(-width / lag)[..., :-1], end[..., :-1] - first[..., 1:])
+        away = library.concatenate([library.zeros_like(first[..., :1]), away], axis=-1)
+        legendre = away[..., None] * _decay_moments(width / lag) * library.asarray(_NORMS)[None, :]
         return PiecewisePolynomial(self.knots, part + _powers(legendre, width))
 
 
-def _powers(legendre: Array, width: Array) -> Array:
+def _library_of(*arrays: Any) -> Any:
+    """The array library: numpy where none of the arrays is one of JAX."""
+    return jnp if any(isinstance(array, Array) for array in arrays) else np
+
+
+def _summed(factor: Any, push: Any) -> Any:
+    """The sequence `next = factor * now + push` that starts from zero, without the zero. Each pass doubles the number
+    of terms."""
+    library, step = _library_of(push), 1
+
+    def earlier(terms: Any) -> Any:
+        return library.concatenate([library.zeros_like(terms[..., :step]), terms[..., :-step]], axis=-1)
+
+    while step < push.shape[-1]:
+        push, factor, step = push + factor * earlier(push), factor * earlier(factor), 2 * step
+    return push
+
+
+def _powers(legendre: Any, width: Any) -> Any:
     """Coefficients in powers of the time into each interval, from those of Legendre polynomials over it."""
-    powers = jnp.einsum("kd,dj->kj", legendre, jnp.asarray(_LEGENDRE_TO_POWERS))
-    return powers / width[:, None] ** jnp.arange(DEGREE + 1.0)[None, :]
+    powers = legendre @ _library_of(legendre).asarray(_LEGENDRE_TO_POWERS)
+    return powers / width[..., None] ** np.arange(DEGREE + 1.0)[None, :]
 
 
-def _decay_moments(rate: Float[Array, " n"]) -> Float[Array, "n d"]:
+def _decay_moments(rate: Inexact[Array | np.ndarray, "*batch n"]) -> Inexact[Array | np.ndarray, "*batch n d"]:
     """Integrals over u from 0 to 1 of exp(-rate u) times the Legendre polynomials there."""
-    slow = where(rate < _FAST, rate, 1.0)
-    u = 0.5 * (_FINE_NODES + 1.0)
-    weighted = jnp.asarray(0.5 * _FINE_WEIGHTS)[None, :] * jnp.exp(-slow[:, None] * jnp.asarray(u)[None, :])
-    by_quadrature = jnp.einsum("kn,nd->kd", weighted, _legendre(jnp.asarray(_FINE_NODES)))
+    library = _library_of(rate)
+    slow = library.where(rate < _FAST, rate, 1.0)
+    u = library.asarray(0.5 * (_FINE_NODES + 1.0))
+    weighted = library.asarray(0.5 * _FINE_WEIGHTS)[None, :] * library.exp(-slow[..., None] * u[None, :])
+    by_quadrature = weighted @ _legendre(library.asarray(_FINE_NODES))
     # Modified spherical Bessel functions of half the rate, scaled; their recurrence is stable where it is large.
-    half = 0.5 * where(rate < _FAST, _FAST, rate)
-    tail = jnp.exp(-2.0 * half)
+    half = 0.5 * library.where(rate < _FAST, _FAST, rate)
+    tail = library.exp(-2.0 * half)
     found = [0.5 * (1.0 - tail) / half, 0.5 * ((1.0 + tail) / half - (1.0 - tail) / half**2)]
     for d in range(1, DEGREE):
         found.append(found[d - 1] - (2 * d + 1) / half * found[d])
     signs = (-1.0) ** np.arange(DEGREE + 1)
-    by_recurrence = jnp.stack(found, axis=-1) * jnp.asarray(signs)[None, :]
-    return where((rate < _FAST)[:, None], by_quadrature, by_recurrence)
+    by_recurrence = library.stack(found, axis=-1) * library.asarray(signs)[None, :]
+    return library.where((rate < _FAST)[..., None], by_quadrature, by_recurrence)
 
 
-def polynomial(coefficients: Float[Array, "*a d"], s: Float[Array, "*b"]) -> Float[Array, "*c"]:
+def polynomial(coefficients: Inexact[Array | np.ndarray, "*a d"], s: Inexact[Array | np.ndarray, "*b"]) -> Any:
     """Value of `sum_j coefficients[..., j] s**j` by Horner's rule."""
     value = coefficients[..., -1]
     for j in range(coefficients.shape[-1] - 2, -1, -1):
@@ -155,12 +179,13 @@ _LEGENDRE_TO_POWERS = np.array(
 )
 
 
-def _legendre(z: Array) -> Array:
+def _legendre(z: Any) -> Any:
     """The Legendre polynomials up to DEGREE at `z`, stacked last."""
-    found = [jnp.ones_like(z), z]
+    library = _library_of(z)
+    found = [library.ones_like(z), z]
     for d in range(1, DEGREE):
         found.append(((2 * d + 1) * z * found[d] - d * found[d - 1]) / (d + 1))
-    return jnp.stack(found, axis=-1)
+    return library.stack(found, axis=-1)
 
 
 def sampled(time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], *, hold: Hold) -> PiecewisePolynomial:

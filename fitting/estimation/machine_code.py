@@ -1,6 +1,7 @@
 """The residual by machine code: equal to that of [`fitting.estimation.residual`][] by XLA, without compilation per
 model."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float
 from fitting.estimation.free_parameters import LARGEST_LOG
 from fitting.estimation.residual import LOST, Blocks, Problem, Products, Unknowns
 from hdjax import PiecewisePolynomial
-from hdjax.compilation import is_traced, jit_small, library_of, on_host, some_at_a_time
+from hdjax.compilation import is_traced, library_of, on_host
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
 from hdjax.engine.equations import split_model
@@ -22,8 +23,8 @@ from hdjax.engine.kernel import Mode, Wanted, march_arrays
 
 # Sizes of the tables of model constants are multiples of this, so that few programs suffice.
 _CONSTANTS = 32
-# Segments per call of the JAX program that applies actuator effects.
-_SEGMENTS = 256
+# A complex step: its square vanishes beside any parameter.
+_TINY = 1e-60
 
 
 def lanes_of(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
@@ -93,7 +94,7 @@ class Acting(eqx.Module):
     def on(self, lanes: Lanes) -> Lanes:
         """Lanes with the torque after actuator effects, and its derivatives by the parameters at the paths, in place of
         the logged one."""
-        values = jnp.asarray(lanes.free[np.array(self.places, dtype=int)])
+        values = lanes.free[np.array(self.places, dtype=int)]
         torque, slopes = actuated(self.effects, self.paths, values, self.torque)
         return replace(lanes, signals=(torque, *lanes.signals[1:], *slopes))
 
@@ -106,45 +107,33 @@ def _acting(problem: Problem, kernel: Kernel) -> Acting | None:
 
 
 def actuated(
-    actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
+    actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Any, torque: PiecewisePolynomial
 ) -> tuple[Any, tuple[Any, ...]]:
     """The torque after actuator effects, and its derivatives by the parameters at the paths."""
     if is_traced(values, torque):
-        return _actuated(tuple(actuators), paths, values, torque)
-    return some_at_a_time(
-        lambda *own: _actuated(tuple(actuators), paths, values, PiecewisePolynomial(*own)),
-        torque.knots,
-        torque.coefficients,
-        most=_SEGMENTS,
-    )
+        acts = jax.vmap(functools.partial(_after, tuple(actuators), paths), in_axes=(None, 0))
+        along = jax.vmap(lambda unit: jax.jvp(lambda v: acts(v, torque), (values,), (unit,))[1])
+        return acts(values, torque), tuple(along(jnp.eye(len(paths)))) if paths else ()
+    # Outside JAX programs by complex steps (Squire and Trapp 1998): exact, and nothing is compiled.
+    effects, logged = jax.tree.map(np.asarray, (tuple(actuators), torque))
+    steps = np.asarray(values) + 1j * _TINY * np.eye(len(paths))
+    moved = [_after(effects, paths, step, logged) for step in steps]
+    found = moved[0].real if moved else _after(effects, paths, (), logged)
+    return found, tuple(each.imag / _TINY for each in moved)
 
 
-@jit_small
-def _actuated(
-    actuators: tuple[ActuatorEffect, ...], paths: tuple[str, ...], values: Array, torque: PiecewisePolynomial
-) -> tuple[Array, tuple[Array, ...]]:
-    """[`actuated`][] of a batch of segments."""
+def _after(
+    actuators: tuple[ActuatorEffect, ...], paths: tuple[str, ...], values: Any, torque: PiecewisePolynomial
+) -> Any:
+    """Coefficients of the torque after actuator effects with given parameters at the paths."""
 
     def places(own: tuple[ActuatorEffect, ...]) -> list[Any]:
         by_name = {e.name: e for e in own}
         return [getattr(by_name[name], field) for name, field in (p.split(".") for p in paths)]
 
-    def acts(values: Array) -> Array:
-        own = actuators
-        if paths:
-            own = eqx.tree_at(places, own, list(values))
-
-        def one(torque: PiecewisePolynomial) -> Array:
-            for effect in own:
-                torque = effect.actuate(torque)
-            return torque.coefficients
-
-        return jax.vmap(one)(torque)
-
-    if not paths:
-        return acts(values), ()
-    found, moved = jax.vmap(lambda unit: jax.jvp(acts, (values,), (unit,)), out_axes=(None, 0))(jnp.eye(len(paths)))
-    return found, tuple(moved)
+    for effect in eqx.tree_at(places, actuators, list(values)) if paths else actuators:
+        torque = effect.actuate(torque)
+    return torque.coefficients
 
 
 def blocks_by_machine_code(problem: Problem, unknowns: Unknowns) -> Blocks:

@@ -1,6 +1,5 @@
 """Regressors of effects at zero strength along a motion: forces, or changes of the encoders' readings."""
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,10 +13,10 @@ from jaxtyping import Array, Float
 
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.linear_response import Forces, Inputs, acting, inputs_at, polynomial
+from fitting.estimation.machine_code import actuated
 from fitting.first_order.internal_states import Memory, memory_of, own_between, own_states
 from fitting.first_order.motion import ERROR, INPUT, PART, SLOPE, Along, carriers, place_of
 from hdjax import Drive, Model, PiecewisePolynomial
-from hdjax.compilation import jit_small, some_at_a_time
 from hdjax.dynamics import JOINT_TORQUE
 from hdjax.effects import (
     ActuatorEffect,
@@ -69,7 +68,7 @@ def regressors(
     if isinstance(stacked, ShaftEffect) and stacked.takes_inertia():
         return _with_inertia(seen, stacked, states), memory
     if isinstance(stacked, ActuatorEffect):
-        added = {INPUT: _inputs(seen, stacked)}
+        added = {INPUT: _inputs(seen, proposals)}
     else:
         motion, own = seen.between, own_between(states)
         if isinstance(stacked, SensorEffect):
@@ -148,33 +147,18 @@ def _added(strengths: Array, effect: Effect, bare: Model, motion: Motion, own: A
     return torques
 
 
-def _inputs(seen: Along, stacked: Effect) -> Float[np.ndarray, "segments samples nodes columns"]:
-    """Derivatives of the torque after actuator effects, at the nodes."""
+def _inputs(seen: Along, proposals: Sequence[Effect]) -> Float[np.ndarray, "segments samples nodes columns"]:
+    """Derivatives of the torque after actuator effects, at the nodes. These act on the torque signal as a whole, not at
+    an instant."""
     segments = seen.segments
-    knots, logged = np.asarray(segments.torque.knots), acting(seen.model, segments)
-    found = some_at_a_time(functools.partial(_actuated, stacked), knots, logged)[:, segments.halo :]
+    logged = PiecewisePolynomial(np.asarray(segments.torque.knots), acting(seen.model, segments))
+    found = []
+    for effect in proposals:
+        assert isinstance(effect, ActuatorEffect)
+        _, slopes = actuated((effect,), tuple(strength_paths(effect)), np.stack(_strengths(effect)), logged)
+        found += [slope[:, segments.halo :] for slope in slopes]
     # By columns, and then by powers.
-    return polynomial(found[:, :, None], (PART * segments.width[..., None])[..., None])
-
-
-@jit_small
-def _actuated(stacked: Effect, knots: Array, coefficients: Array) -> Float[Array, "segments intervals columns powers"]:
-    """Derivatives of the torque after actuator effects by the strengths of each proposal. Actuator effects act on the
-    torque signal as a whole, not at an instant."""
-
-    def changed(effect: Effect, strengths: Array) -> Array:
-        whole = _with(effect, strengths)
-        assert isinstance(whole, ActuatorEffect)
-        return jax.vmap(lambda *own: whole.actuate(PiecewisePolynomial(*own)).coefficients)(knots, coefficients)
-
-    columns = []
-    # A loop: there are few, and nested vmap takes long to compile.
-    for i in range(len(jax.tree.leaves(stacked)[0])):
-        effect = jax.tree.map(lambda a, i=i: a[i], stacked)
-        strengths = jnp.stack(_strengths(effect))
-        along = functools.partial(changed, effect)
-        columns += [jax.jvp(along, (strengths,), (unit,))[1] for unit in np.eye(strengths.size)]
-    return jnp.stack(columns, axis=2)
+    return polynomial(np.stack(found, axis=2)[:, :, None], (PART * segments.width[..., None])[..., None])
 
 
 def _with_inertia(seen: Along, stacked: Effect, states: np.ndarray) -> Regressors:

@@ -1,5 +1,7 @@
 """Innovations of a Kalman filter along linearised segments, for given noise of torque and sensors."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -7,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 # Lead-in samples of a segment in which the filter converges.
 _LEAD = 12
 # Axes of matrices, for `numpy.matmul`.
-_FIRST_TWO = [(0, 1)] * 3
+_FIRST_TWO: list[Any] = [(0, 1)] * 3
 
 
 class SensorNoise(eqx.Module):

@@ -2,8 +2,6 @@
 
 from typing import ClassVar
 
-import jax.numpy as jnp
-
 from hdjax.effects.effect import ActuatorEffect, Effect, Scales
 from hdjax.parameters import Scalar, parameter
 from hdjax.signals import PiecewisePolynomial
@@ -28,7 +26,7 @@ class TorqueBias(ActuatorEffect):
         return (cls(),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
-        return logged.affine(jnp.ones_like(self.bias), self.bias)
+        return logged.affine(1.0, self.bias)
 
 
 class TorqueGain(ActuatorEffect):
@@ -56,7 +54,7 @@ class TorqueGain(ActuatorEffect):
         return (cls(),)
 
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
-        return logged.affine(1.0 + self.gain_error, jnp.zeros_like(self.gain_error))
+        return logged.affine(1.0 + self.gain_error, 0.0)
 
 
 class InputDelay(ActuatorEffect):
