@@ -141,16 +141,15 @@ def _predicted(
         values[:moving] = moved.reshape(values[:moving].shape)
         values[moving:] *= correlation[:, None]
 
-    for i in range(samples):
+    for i, (step, push, counts) in enumerate(zip(steps.transition, steps.push, steps.counts, strict=True)):
         for j in range(outputs):
             seen = np.einsum("is,ijbs->jbs", read[i, j], known)
             seen[size:] -= error[i, j][:, None]
             variances[i, j] = np.einsum("is,ibs->bs", read[i, j], seen[:size]) + white[j]
-            known -= (steps.counts[i] * seen[:size] / variances[i, j])[:, None] * seen
+            known -= (counts * seen[:size] / variances[i, j])[:, None] * seen
             errors[i, j] = -seen[size:]
-        carry(known, steps.transition[i])
-        carry(spread, steps.transition[i])
-        push = steps.push[i]
+        carry(known, step)
+        carry(spread, step)
         spread[:moving, :moving] += torque * (push[:, None] * push)[:, :, None]
         spread[own, own] += slow * (1.0 - correlation**2)
     return errors, variances

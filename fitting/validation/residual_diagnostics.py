@@ -101,12 +101,14 @@ def order_amplitude(residual: np.ndarray, angle: np.ndarray, orders: np.ndarray)
     Args:
         residual: of samples.
         angle: at the same samples [rad].
-        orders: cycles per revolution.
+        orders: cycles per revolution, evenly spaced.
     """
     amplitude = np.empty(orders.size)
-    for i, order in enumerate(orders):
-        basis = np.stack([np.cos(order * angle), np.sin(order * angle)])
+    turn, rotation = (np.exp(1j * factor * angle) for factor in (orders[0], orders[1] - orders[0]))
+    for i in range(orders.size):
+        basis = np.stack([turn.real, turn.imag])
         amplitude[i] = np.hypot(*np.linalg.pinv(basis @ basis.T, hermitian=True) @ (basis @ residual))
+        turn *= rotation
     return amplitude
 
 
