@@ -18,7 +18,7 @@ from hdjax import PiecewisePolynomial
 from hdjax.compilation import is_traced, library_of, on_host
 from hdjax.effects import ActuatorEffect
 from hdjax.engine import Kernel, Lanes, Marched, march_lanes, threads
-from hdjax.engine.equations import split_model
+from hdjax.engine.equations import numbers_of
 from hdjax.engine.kernel import Mode, Wanted, march_arrays
 
 # Sizes of the tables of model constants are multiples of this, so that few programs suffice.
@@ -55,8 +55,8 @@ def _as_logged(problem: Problem, unknowns: Unknowns, kernel: Kernel) -> Lanes:
 def _data(problem: Problem, kernel: Kernel, free: Any, slopes: Any, states: Any, *, library: Any) -> Lanes:
     """The same for given free parameters and initial states."""
     segments = problem.segments
-    _, others, _ = split_model(problem.model, kernel.paths)
-    constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in others)])
+    own = numbers_of(problem.model)
+    constants = library.concatenate([np.zeros(0), *(library.ravel(library.asarray(a)) for a in own)])
     whole = library.any(library.asarray(segments.joined))
     numbers = [library.asarray(problem.substeps), whole, threads()]
     named = {"load torque": segments.load_torque, "temperature": segments.temperature}
@@ -240,15 +240,13 @@ def _ends(lanes: Lanes, found: Marched) -> tuple[Any, Any, Any]:
     library = library_of(lanes.states, found.end)
     joined, gap = library.asarray(lanes.joined)[:, None] > 0, _gap(lanes, found)
     near = library.abs(gap) < LOST
-
-    def before(slope: Any) -> Any:
-        moved = library.roll(slope, 1, axis=0)
-        return library.where((joined & near)[:, :, None] & library.isfinite(moved), moved, 0.0)
-
+    slopes = (library.roll(slope, 1, axis=0) for slope in (found.end_by_parameter, found.end_by_state))
+    by_parameter, by_state = (
+        library.where((joined & near)[:, :, None] & library.isfinite(slope), slope, 0.0) for slope in slopes
+    )
     # A diverged state has no derivative: the gap does not depend on what precedes it.
     own = library.where((joined & ~near)[:, :, None], library.eye(gap.shape[1]), 0.0)
-    by_parameter, by_state = before(found.end_by_parameter), before(found.end_by_state) + own
-    return gap, by_parameter, by_state
+    return gap, by_parameter, by_state + own
 
 
 def residual_by_machine_code(

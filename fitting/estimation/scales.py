@@ -1,6 +1,6 @@
 """Orders of magnitude of the measured signals."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -37,20 +37,14 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
     x = np.concatenate([twist(s, model) for s in stretches])
     x = x - np.median(x)
     step = stretches[0].experiment.time_step
-
-    def rate(values: np.ndarray) -> float:
-        """Rms slope over a few samples, so that encoder noise does not dominate."""
-        span = 8
-        return float(np.sqrt(np.mean(((values[span:] - values[:-span]) / (span * step)) ** 2)))
-
     angles = [s.experiment.motor_angle[s.start : s.stop] for s in stretches if s.experiment.motor_angle is not None]
-    motor = float(np.sqrt(np.mean([rate(a) ** 2 for a in angles]))) if angles else 1.0
-    output = [_speed(s, model, rate) for s in stretches]
+    motor = float(np.sqrt(np.mean([_rate(a, step) ** 2 for a in angles]))) if angles else 1.0
+    output = [_speed(s, model, step) for s in stretches]
     temperature, change = _temperature(stretches)
     return Scales(
         x=float(np.std(x)),
         x_max=float(np.max(np.abs(x))),
-        v=rate(x),
+        v=_rate(x, step),
         omega_m=motor,
         omega_l=float(np.sqrt(np.mean(np.square(output)))),
         time_step=step,
@@ -62,7 +56,13 @@ def scales(stretches: Sequence[Stretch], model: Model | None = None) -> Scales:
     )
 
 
-def _speed(stretch: Stretch, model: Model | None, rate: Callable[[np.ndarray], float]) -> float:
+def _rate(values: np.ndarray, step: float) -> float:
+    """Rms slope over a few samples, so that encoder noise does not dominate."""
+    span = 8
+    return float(np.sqrt(np.mean(((values[span:] - values[:-span]) / (span * step)) ** 2)))
+
+
+def _speed(stretch: Stretch, model: Model | None, step: float) -> float:
     """Rms rate of the first output, or of the measured side where the first output is not an angle of the output side
     [rad/s]."""
     experiment, part = stretch.experiment, slice(stretch.start, stretch.stop)
@@ -70,7 +70,7 @@ def _speed(stretch: Stretch, model: Model | None, rate: Callable[[np.ndarray], f
     if isinstance(model, TwoInertiaModel) and experiment.output("motor_turn") is None:
         seen = seen_motor(experiment, float(model.drive.N)) or seen_load(experiment) or seen
     values = seen.values[part]
-    return float(np.sqrt(np.mean(values**2))) if seen.order else rate(values)
+    return float(np.sqrt(np.mean(values**2))) if seen.order else _rate(values, step)
 
 
 def _temperature(stretches: Sequence[Stretch]) -> tuple[float | None, float]:

@@ -112,12 +112,9 @@ def _by_strength(function: Callable[..., Any], stacked: Effect, model: Model, *l
     ]
     states = own.reshape(own.shape[0], math.prod(instants), own.shape[-1])
     found = slopes_at_instants(function, (strengths, 2), (each, 2), (model, 0), *flat, (states, 2))
-
-    def side_by_side(values: np.ndarray) -> np.ndarray:
-        whole = np.moveaxis(values, 0, -2)
-        return whole.reshape(*instants, *whole.shape[1:-2], -1)
-
-    return jax.tree.map(side_by_side, found)
+    # Columns of all proposals side by side.
+    whole = jax.tree.map(lambda values: np.moveaxis(values, 0, -2), found)
+    return jax.tree.map(lambda values: values.reshape(*instants, *values.shape[1:-2], -1), whole)
 
 
 def _strengths(effect: Any) -> list[Any]:

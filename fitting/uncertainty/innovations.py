@@ -135,12 +135,6 @@ def _predicted(
     read[:, range(remembers), own] = 1.0
     errors = np.zeros((samples, outputs, columns, *torque.shape))
     variances = np.zeros((samples, outputs, *torque.shape))
-
-    def carry(values: np.ndarray, step: np.ndarray) -> None:
-        moved = np.matmul(step, values[:moving].reshape(moving, -1, segments), axes=_FIRST_TWO)
-        values[:moving] = moved.reshape(values[:moving].shape)
-        values[moving:] *= correlation[:, None]
-
     for i, (step, push, counts) in enumerate(zip(steps.transition, steps.push, steps.counts, strict=True)):
         for j in range(outputs):
             seen = np.einsum("is,ijbs->jbs", read[i, j], known)
@@ -148,8 +142,10 @@ def _predicted(
             variances[i, j] = np.einsum("is,ibs->bs", read[i, j], seen[:size]) + white[j]
             known -= (counts * seen[:size] / variances[i, j])[:, None] * seen
             errors[i, j] = -seen[size:]
-        carry(known, step)
-        carry(spread, step)
+        for values in (known, spread):
+            moved = np.matmul(step, values[:moving].reshape(moving, -1, segments), axes=_FIRST_TWO)
+            values[:moving] = moved.reshape(values[:moving].shape)
+            values[moving:] *= correlation[:, None]
         spread[:moving, :moving] += torque * (push[:, None] * push)[:, :, None]
         spread[own, own] += slow * (1.0 - correlation**2)
     return errors, variances

@@ -89,8 +89,13 @@ class DryStep:
         return dataclasses.replace(conditions, rubbing=rubbing)
 
 
+def numbers_of(model: Any) -> list[Any]:
+    """All arrays of a model, or of a tree with one."""
+    return jax.tree.leaves(eqx.filter(model, eqx.is_inexact_array))
+
+
 def split_model(model: Model, paths: Sequence[str]) -> tuple[list[Array], list[Array], Callable[..., Model]]:
-    """A model as numbers: the parameters at the paths, all other arrays, and the inverse function."""
+    """A model as numbers: the parameters at the paths, all arrays, and the inverse function."""
     arrays, rest = eqx.partition(model, eqx.is_inexact_array)
     leaves, tree = jax.tree.flatten(arrays)
 

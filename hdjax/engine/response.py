@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hdjax.drive import Drive, ReducedDrive
 from hdjax.dynamics import Model, State
 from hdjax.effects import Conditions, Effect, Motion
-from hdjax.engine.equations import LOAD, TEMPERATURE, split_model
+from hdjax.engine.equations import LOAD, TEMPERATURE, numbers_of
 from hdjax.engine.kernel import Lanes, Marched, Wanted, kernel, march_arrays, threads
 
 
@@ -128,7 +128,7 @@ def response(
     pushed = Pushed.of(model, zeros, zeros)
     around = {"loaded": LOAD in beside, "warm": TEMPERATURE in beside}
     made = kernel(pushed, pushed.forces, **around, solver=solver)
-    _, others, _ = split_model(pushed, pushed.forces)
+    others = numbers_of(pushed)
     signals = [torque, *(beside[name] for name in made.signals)]
 
     def marched(states: np.ndarray, knots: np.ndarray, signals: list[np.ndarray], wanted: Wanted) -> Marched:
