@@ -110,7 +110,8 @@ def actuated(
     actuators: Sequence[ActuatorEffect], paths: tuple[str, ...], values: Any, torque: PiecewisePolynomial
 ) -> tuple[Any, tuple[Any, ...]]:
     """The torque after actuator effects, and its derivatives by the parameters at the paths."""
-    if is_traced(values, torque):
+    if is_traced(values, torque) or not all(effect.takes_numpy for effect in actuators):
+        values, torque = jax.tree.map(jnp.asarray, (values, torque))
         acts = jax.vmap(functools.partial(_after, tuple(actuators), paths), in_axes=(None, 0))
         along = jax.vmap(lambda unit: jax.jvp(lambda v: acts(v, torque), (values,), (unit,))[1])
         return acts(values, torque), tuple(along(jnp.eye(len(paths)))) if paths else ()

@@ -12,6 +12,7 @@ class TorqueBias(ActuatorEffect):
 
     family: ClassVar[str] = "torque_sensor"
     name: ClassVar[str] = "torque_bias"
+    takes_numpy: ClassVar[bool] = True
 
     bias: Scalar = parameter(
         0.0,
@@ -37,6 +38,7 @@ class TorqueGain(ActuatorEffect):
 
     family: ClassVar[str] = "torque_sensor"
     name: ClassVar[str] = "torque_gain"
+    takes_numpy: ClassVar[bool] = True
     needs_motor: ClassVar[bool] = True
     one_shape_of: ClassVar[str | None] = "T_m"
 
@@ -62,6 +64,7 @@ class InputDelay(ActuatorEffect):
 
     family: ClassVar[str] = "input_delay"
     name: ClassVar[str] = "input_delay"
+    takes_numpy: ClassVar[bool] = True
 
     delay: Scalar = parameter(
         0.0,
@@ -87,6 +90,7 @@ class InputLag(ActuatorEffect):
 
     family: ClassVar[str] = "input_delay"
     name: ClassVar[str] = "input_lag"
+    takes_numpy: ClassVar[bool] = True
 
     lag: Scalar = parameter(
         0.0,

@@ -272,7 +272,14 @@ class SensorEffect(Effect):
 
 
 class ActuatorEffect(Effect):
-    """Changes the logged torque (or forcing) on its way to the drive."""
+    """Changes the logged torque (or forcing) on its way to the drive.
+
+    Attributes:
+        takes_numpy: whether `actuate` also takes many signals of numpy at once, and parameters with an imaginary part,
+            so that outside JAX programs nothing is compiled for it.
+    """
+
+    takes_numpy: ClassVar[bool] = False
 
     @abc.abstractmethod
     def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:

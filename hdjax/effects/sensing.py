@@ -101,6 +101,7 @@ class MotorEncoderDelay(_EncoderDelay, ActuatorEffect):
     """
 
     name: ClassVar[str] = "motor_encoder_delay"
+    takes_numpy: ClassVar[bool] = True
 
     @classmethod
     def proposals(cls, scales: Scales) -> tuple[Effect, ...]:

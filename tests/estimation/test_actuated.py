@@ -1,5 +1,7 @@
 """The torque after actuator effects, and its derivatives, outside JAX programs."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +9,38 @@ import pytest
 
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.machine_code import actuated
-from hdjax import sampled
-from hdjax.effects import CATALOGUE, ActuatorEffect
+from hdjax import PiecewisePolynomial, sampled
+from hdjax.effects import CATALOGUE, ActuatorEffect, Scales
 from hdjax.effects.actuation import TorqueGain
+from hdjax.parameters import Scalar, parameter
 
 STEP, SAMPLES = 1e-3, 12
 FORMS = [form for form in CATALOGUE if issubclass(form, ActuatorEffect)]
+
+
+class Saturation(ActuatorEffect):
+    """An actuator effect that a user wrote, for JAX alone."""
+
+    name: ClassVar[str] = "saturation"
+    family: ClassVar[str] = "unknown"
+
+    limit: Scalar = parameter(1.0, unit="N m", doc="largest torque", role="strength")
+
+    @classmethod
+    def proposals(cls, scales: Scales) -> tuple[ActuatorEffect, ...]:
+        return (cls(),)
+
+    def actuate(self, logged: PiecewisePolynomial) -> PiecewisePolynomial:
+        held = logged.coefficients.at[:, 0].min(self.limit)
+        return PiecewisePolynomial(logged.knots, held)
+
+
+def test_an_actuator_effect_for_jax_alone_is_applied_outside_jax_programs():
+    random = np.random.default_rng(0)
+    torque = PiecewisePolynomial(np.arange(6.0)[None], random.normal(size=(1, 5, 6)))
+    found, (slope,) = actuated((Saturation(),), ("saturation.limit",), np.array([0.2]), torque)
+    np.testing.assert_allclose(found[..., 0], np.minimum(torque.coefficients[..., 0], 0.2))
+    np.testing.assert_allclose(slope[..., 0], torque.coefficients[..., 0] > 0.2)
 
 
 @pytest.mark.parametrize("form", FORMS)
