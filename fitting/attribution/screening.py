@@ -18,7 +18,6 @@ from typing_extensions import TypeVar
 from fitting.estimation.estimate import Fit
 from fitting.estimation.free_parameters import strength_paths
 from fitting.estimation.scales import scales
-from fitting.estimation.starting_values import sees_twist
 from fitting.estimation.whole_log_fit import follows
 from fitting.first_order.linearised_fit import (
     Answered,
@@ -96,9 +95,8 @@ def screen(
     found = applicable(forms, lines, has_motor=isinstance(model, TwoInertiaModel))
     proposals = tuple(effect for effects in found.values() for effect in effects)
     strays = not follows(training, share=_NEAR)
-    # Fixed parameters stay fixed: without a sensor of the twist, a motion that deviates has no information about them.
-    stay = strays and _was_held(training) and not sees_twist(training.stretches)
-    free_now = () if stay else training.free.paths
+    # Fixed parameters stay fixed: their influence along a motion that deviates is not that along the true one.
+    free_now = () if strays and _was_held(training) else training.free.paths
     skipped = len(training.free.paths) - len(free_now)
     leads: dict[str, Lead] = {}
     chance = np.full(DRAWS * PARTNERS, -np.inf)
