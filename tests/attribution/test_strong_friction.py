@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 
 import joints
-from fitting.estimation.experiment import experiment_from_log
+from fitting.attribution.effect_search import base_trial
+from fitting.attribution.screening import screen
+from fitting.estimation.experiment import experiment_from_log, split
 from fitting.loop import close_loop
 from hdjax import Drive, TwoInertiaModel
+from hdjax.drive import Prior
 from hdjax.effects import CATALOGUE, Effect
 from hdjax.effects.actuation import TorqueGain
 from hdjax.effects.friction import CoulombFriction, LoadFriction, MotorFriction, StribeckMotorFriction
@@ -32,6 +36,19 @@ def assert_motor_friction_is_found(seed: int, catalogue: Sequence[type[Effect]])
 def test_strong_motor_friction_is_found_among_few_forms():
     # Coulomb 57 %, viscous 35 % of the rms torque.
     assert_motor_friction_is_found(13, SOME_FORMS)
+
+
+def test_fixed_parameters_do_not_absorb_friction_in_screening():
+    """The load's equation fixes the mesh; the free motion of the base model, without friction, strays far off."""
+    joint = joints.Joint(N=160.0, J_m=1.087e-7, J_l=0.0136, K=18.52, B_sp=0.00985, rms=5.8e-4)
+    joint = joints.with_friction(joint, 0.2, 0.6)
+    experiment = experiment_from_log(joints.log_of(joint, count=3000), hold="zero-order", N=joint.N)
+    free = Prior("J_m", 1.0, np.inf), Prior("J_l", 1.0, np.inf)
+    model = TwoInertiaModel(Drive(N=joint.N, J_m=1.0, J_l=1.0, K=1.0, priors=free))
+    base, _ = base_trial(model, {"zero-order": split((experiment,))}, "zero-order")
+    leads = screen(base.training, base.held_out, catalogue=(MotorFriction, TorqueGain)).leads
+    assert leads[0].effect.name == MotorFriction.name and leads[0].gain > 0.95
+    assert float(leads[0].effect.T_c) == pytest.approx(joint.coulomb, rel=0.1)
 
 
 @pytest.mark.slow
