@@ -22,13 +22,12 @@ from fitting.estimation.residual import Blocks, Products, Unknowns, moved_gap
 from hdjax.compilation import library_of, on_host
 
 # Shares of what a step promises: one that keeps less is not taken (so in optimistix' `ClassicalTrustRegion`), one that
-# keeps more is followed by a bolder one.
-# Long simulations see their parameters together rather than one by one: damping that is small on the diagonal is large
-# across it, so it must go quickly where the model predicts well.
+# keeps more is followed by a bolder one. Damping that is small on the diagonal may be large across it, so it must go
+# quickly where the model predicts well.
 _KEPT, _WELL = 0.01, 0.75
 _LONGER, _SHORTER = 30.0, 0.1
-# Relative changes of the sum of squares that are none; shares of the gaps that are left by a step that closes them, and
-# of the residual that it may leave: of the present one, or of what closing them costs to first order.
+# Relative changes of the sum of squares that are none; share of the gaps that a step leaves which closes them, and of
+# the residual that it may leave.
 _SLIGHT, _CLOSED, _DEAREST = 1e-4, 0.25, 1.5
 # With less damping than this, relative to the diagonal, rounding decides whether the normal equations are definite.
 _LEAST_DAMPING = 1e-12
@@ -281,15 +280,14 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     this returns as a second result.
 
     A step is taken where it lowers the sum of squares by a share of what it promised. Two more kinds are taken in any
-    case: one that hardly changes the sum of squares, and one that closes most of the gaps for little more residual than
-    it has, or than closing them costs a linear model. No finite weight of the gaps repays what closing the last of them
-    costs: where a model can't follow the log, pieces fit far better than the whole.
+    case: one that hardly changes it, and one that closes most of the gaps for little more residual than there is, or
+    than a linear model would leave. Where a model can't follow the log, pieces fit far better than the whole, and no
+    finite weight of the gaps repays closing them.
 
     It ends where a step promises next to nothing: less than `rtol` of what one more degree of freedom explains of
-    noise. (The change of the unknowns says little: they come in many units, and some of them are hardly seen.) Corners
-    of a nonsmooth model make steps promise what they do not keep: the iteration ends as well where the latest of them
-    together have taken off less than a share of the sum of squares, where one is given. How many steps it may take, and
-    that share, are data, so that one compiled program serves hasty fits and patient ones.
+    noise. (The change of the unknowns says little: they come in many units, and some are hardly seen.) Corners of a
+    nonsmooth model make steps promise what they do not keep: it ends as well where the latest of them together have
+    taken off less than a share of the sum of squares, where one is given.
 
     Attributes:
         joined: whether a segment starts where the one before it ends.
@@ -369,8 +367,7 @@ class ArrowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return best, after, found
 
     def _promised(self, found: Products, step: Unknowns) -> tuple[Any, Any]:
-        """By how much half the sum of squares changes along a step, to second order, and that of the residual after
-        it."""
+        """By how much half the sum of squares changes along a step, to second order; and the residual's after it."""
         library = library_of(found.gap, step.states)
         segments = step.states.shape[0]
         own = library.broadcast_to(step.parameters, (segments, step.parameters.size))
