@@ -7,6 +7,7 @@ import numpy as np
 from fitting.logs.findings import Finding
 from fitting.logs.log import Log
 
+# All thresholds are assumed, and tried on logs with and without lost rows (`tests/logs/test_lost_rows.py`).
 # Robust standard deviations of a step's prediction that the step itself must exceed, so that noise never doubles it.
 _CLEAR = 10.0
 _AS_FAR = 0.2  # of a step

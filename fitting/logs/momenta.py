@@ -84,7 +84,7 @@ def motor_alone(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     J_m above the resonance. Between antiresonance and resonance J is negative without k, but not with it: the dynamic
     stiffness falls with frequency (Foster 1924). So only what both estimates agree on counts.
     """
-    name = next((s for s in ("motor_angle", "motor_velocity") if getattr(log, s) is not None), None)
+    name = _motor_signal(log)
     if name is None or not _usable(log):
         return
     J, lost = _apparent_inertia(log, name, drive_file.reduction_ratio)
@@ -114,6 +114,17 @@ def motor_alone(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
     # Near the antiresonance J is large; a factor that is no unit's tells nothing.
     if mend is not None:
         yield _finding(f"motor and load accelerate {gain:.3g} times as much as the torque explains", where, mend)
+
+
+def _motor_signal(log: Log) -> str | None:
+    """Name of the signal that shows the motor's motion; None without one."""
+    return next((s for s in ("motor_angle", "motor_velocity") if getattr(log, s) is not None), None)
+
+
+def _motion(log: Log, name: str) -> tuple[np.ndarray, np.ndarray, int]:
+    """The motor's signal, its velocity, and the order of the derivative that the signal is."""
+    seen = getattr(log, name)
+    return (seen, seen, 1) if name == "motor_velocity" else (seen, _rate(log, seen), 0)
 
 
 def _usable(log: Log) -> bool:
@@ -156,12 +167,13 @@ def behind_the_gear(log: Log, drive_file: DriveFile) -> Iterator[Finding]:
 
     T_m = J_m theta_m'' + tau / N + friction + bias; the friction's coefficients and J_m are estimated as well.
     """
-    name = next((s for s in ("motor_angle", "motor_velocity") if getattr(log, s) is not None), None)
+    name = _motor_signal(log)
     N, tau = drive_file.reduction_ratio, log.joint_torque
     if name is None or N is None or tau is None or not _usable(log) or not _has_scale(drive_file):
         return
-    seen, order = getattr(log, name), int(name == "motor_velocity")
-    friction = _friction(seen, seen if order else _rate(log, seen), 1 - order)
+    assert log.motor_torque is not None
+    seen, velocity, order = _motion(log, name)
+    friction = _friction(seen, velocity, 1 - order)
     best, gain = 0.0, 1.0
     for count in _COUNTS:
         table = _weak(log, [(log.motor_torque, 0), (tau / N, 0), (seen, 2 - order), *friction], count)
@@ -185,9 +197,8 @@ def _apparent_inertia(log: Log, name: str, ratio: float | None) -> tuple[float, 
     """Inertia at the motor [kg m^2], zero where the log does not tell it, and the work of the torque less the kinetic
     energy of this inertia [J]."""
     assert log.motor_torque is not None
-    seen, order = getattr(log, name), int(name == "motor_velocity")
+    seen, velocity, order = _motion(log, name)
     path = path_of(log, seen) if order else seen - seen[0]
-    velocity = seen if order else _rate(log, seen)
     torque = log.motor_torque + (0.0 if log.load_torque is None or ratio is None else log.load_torque / ratio)
     friction = _friction(seen, velocity, 1 - order)
     position = [(path, 0), *(() if ratio is None else _gravity(path / ratio))]
