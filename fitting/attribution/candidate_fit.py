@@ -16,7 +16,7 @@ from fitting.estimation.experiment import Stretch
 from fitting.estimation.free_parameters import fitted_paths
 from fitting.estimation.free_run import FreeRun, free_run, rms_error
 from fitting.estimation.problem import states_from
-from fitting.estimation.whole_log_fit import follows, over_whole_stretches, with_gaps_closed, with_memory_carried
+from fitting.estimation.whole_log_fit import follows, over_whole_stretches, with_memory_carried, without_gaps
 from hdjax import Hold, Model
 from hdjax.effects import Effect
 
@@ -223,10 +223,12 @@ def lasting_share(effect: Effect, before: Trial, trial: Trial) -> float:
     short = before.held_out.objective - trial.held_out.objective
     if not effect.states or short <= 0.0:
         return 1.0
-    long_before, long_after = (over_whole_stretches(t.held_out, least_progress=LEAST_PROGRESS) for t in (before, trial))
+    long_before, long_after = (
+        without_gaps(over_whole_stretches(t.held_out, least_progress=LEAST_PROGRESS)) for t in (before, trial)
+    )
     if not (follows(long_before) or follows(long_after)):
         return 1.0
-    return float(np.clip((with_gaps_closed(long_before) - with_gaps_closed(long_after)) / short, 0.0, 1.0))
+    return float(np.clip((long_before.objective - long_after.objective) / short, 0.0, 1.0))
 
 
 def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[float] | None:

@@ -5,9 +5,12 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from fitting.estimation.engines import linearise
-from fitting.estimation.estimate import Fit, Start, Strategy, fit
+from fitting.estimation.engines import linearise, simulate
+from fitting.estimation.estimate import Fit, Start, Strategy, fit, half_log_determinant
+from fitting.estimation.free_parameters import free_parameters
+from fitting.estimation.free_run import whole_simulations
 from fitting.estimation.problem import Segmentation
+from fitting.estimation.residual import Unknowns
 from fitting.estimation.solver_steps import needed_substeps
 
 _STEPS = 20
@@ -135,6 +138,19 @@ def with_gaps_closed(found: Fit) -> float:
     follow the log over this horizon."""
     gap = np.asarray(linearise(found.problem, found.unknowns).gap) * np.asarray(found.problem.gap_weight)
     return found.objective + 0.5 * float(np.sum(gap**2) / np.sum(np.asarray(found.problem.segments.weight)))
+
+
+def without_gaps(found: Fit) -> Fit:
+    """The fit with the covariance of the errors of one simulation of each stretch, from its fitted initial state."""
+    first = np.cumsum(found.pieces) - found.pieces
+    states = jnp.asarray(np.asarray(found.unknowns.states)[first])
+    nothing = free_parameters(found.model, (), {})
+    problem = whole_simulations(found.model, nothing, found.stretches, found.segmentation.halo, found.substeps)
+    outputs = np.asarray(simulate(problem, Unknowns(jnp.asarray(np.zeros(0)), states))[0])
+    segments = problem.segments
+    error = (np.asarray(segments.measured) - outputs)[np.asarray(segments.weight) > 0]
+    covariance = error.T @ error / len(error)
+    return replace(found, covariance=jnp.asarray(covariance), objective=half_log_determinant(covariance))
 
 
 def _longest(found: Fit) -> int:

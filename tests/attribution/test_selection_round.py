@@ -86,6 +86,7 @@ def test_lasting_share_is_that_of_the_gain_over_whole_stretches(
     before, after = with_objective(0.0), with_objective(-1.0)
     long = {0.0: long_before, -1.0: long_after}
     monkeypatch.setattr(of_a_trial, "over_whole_stretches", lambda f, **_: replace(f, objective=long[f.objective]))
+    monkeypatch.setattr(of_a_trial, "without_gaps", lambda f: f)
     monkeypatch.setattr(of_a_trial, "follows", lambda f: f.objective < 0.0)
     assert of_a_trial.lasting_share(Creep(k=1.0, tau=1.0, span=1.0), before, after) == pytest.approx(share)
     assert of_a_trial.lasting_share(TorqueBias(), before, after) == 1.0

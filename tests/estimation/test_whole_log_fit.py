@@ -1,13 +1,16 @@
 """The fit over whole logs is accepted only where simulations follow them."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import rig
-from fitting.estimation.estimate import Fit, fit
+from fitting.estimation.estimate import Fit, Start, Strategy, fit
 from fitting.estimation.experiment import Stretch
 from fitting.estimation.problem import Segmentation
-from fitting.estimation.whole_log_fit import long_fit
+from fitting.estimation.whole_log_fit import long_fit, without_gaps
 from fitting.uncertainty.standard_errors import uncertainty
 from hdjax.effects.backlash import Backlash
 
@@ -42,3 +45,17 @@ def test_long_fit_reduces_standard_errors_for_a_smooth_motion():
     before, after = (uncertainty(f).estimates["K"] for f in (short, long))
     assert after.std < 0.2 * before.std
     assert abs(after.value - rig.K) < 4.0 * after.std
+
+
+def test_errors_without_gaps_are_those_of_one_simulation():
+    """A wrong stiffness hardly shows over short segments that start anew."""
+    stretch = Stretch(rig.drive_experiment(COUNT), 0, COUNT)
+    wrong = rig.drive_model().replace({"K": 1.02 * rig.K})
+    held = Strategy(hold_parameters=True)
+    short = fit(wrong, [stretch], (), Segmentation(HORIZON, substeps=2), strategy=held)
+    whole = Segmentation(COUNT, COUNT, substeps=2)
+    start = Start(short.covariance, short.unknowns.states[:1])
+    alone = fit(wrong, [stretch], (), whole, start=start, strategy=replace(held, max_steps=0))
+    gapless = without_gaps(short)
+    assert gapless.objective > short.objective + 1.0
+    np.testing.assert_allclose(np.asarray(gapless.covariance), np.asarray(alone.covariance), rtol=1e-6)
