@@ -18,9 +18,10 @@ def is_withheld(estimate: Mapping[str, Any]) -> bool:
 
 def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
     """Mark the intervals of the drive's parameters and derived figures under a large discrepancy; withhold them where
-    that is not explained.
+    that is not explained, or where a learned torque acts in the mesh.
 
-    The parameters absorb a part of what is missing, and this bias exceeds their standard errors.
+    The parameters absorb a part of what is missing, and this bias exceeds their standard errors. A learned torque in
+    the mesh may hold a part of the spring's and the damper's torque, so that these are not unique.
 
     Args:
         report: its content so far, with finite numbers only.
@@ -28,9 +29,13 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
     """
     unexplained = report["decision"] == "unexplained"
     much = times_noise >= RULES.excess
+    learned = report.get("unknown") or {}
+    names = formatting.words(list(report["before"]["parameters"]))
+    if (learned.get("place"), learned.get("quantity")) == ("mesh", "torque"):
+        note = f"A learned torque acts beside {names} in the mesh: they are not unique, their intervals withheld."
+        _mark(report["after"], note, withheld=True)
     if not (unexplained or much):
         return
-    names = formatting.words(list(report["before"]["parameters"]))
     left = (
         f"The model's residual is {formatting.number(times_noise)} times the noise"
         if much
@@ -39,8 +44,12 @@ def say_what_intervals_hold(report: dict[str, Any], times_noise: float) -> None:
     end = "their intervals are withheld" if unexplained and much else "their intervals do not include that"
     note = f"{left}: {names} may be off by more than their standard errors, and {end}."
     for account in (report["before"], report["after"]):
-        for estimate in (*account["parameters"].values(), *account["derived"].values()):
-            if unexplained and much:
-                estimate["ci95"], estimate["interval"] = [None, None], _WITHHELD
-            estimate["flag"] = estimate["flag"] or NOT_COVERED
-            estimate["note"] = estimate.get("note") or note
+        _mark(account, note, withheld=unexplained and much)
+
+
+def _mark(account: dict[str, Any], note: str, *, withheld: bool) -> None:
+    for estimate in (*account["parameters"].values(), *account["derived"].values()):
+        if withheld:
+            estimate["ci95"], estimate["interval"] = [None, None], _WITHHELD
+        estimate["flag"] = estimate["flag"] or NOT_COVERED
+        estimate["note"] = estimate.get("note") or note

@@ -139,13 +139,25 @@ def _report_with_errors(
 def test_intervals_are_withheld_or_flagged_where_the_residual_is_large(
     decision: str, times_noise: float, withheld: bool, flagged: bool
 ):
-    def account() -> dict[str, Any]:
-        omega_0 = {"ci95": [1.0, 2.0], "flag": None}
-        return {"parameters": {"K": omega_0 | {"interval": "quadratic", "note": None}}, "derived": {"omega_0": omega_0}}
-
-    report = {"decision": decision, "before": account(), "after": account()}
+    report = {"decision": decision, "before": _account(), "after": _account(), "unknown": None}
     say_what_intervals_hold(report, times_noise)
     K = report["after"]["parameters"]["K"]
     assert (K["ci95"] == [None, None]) == withheld == is_withheld(report["after"]["derived"]["omega_0"])
     assert (K["flag"] is not None) == (K["note"] is not None) == flagged
     assert not flagged or "K may be off" in K["note"]
+
+
+@pytest.mark.parametrize(
+    ("place", "quantity", "withheld"), [("mesh", "torque", True), ("mesh", "error", False), ("load", "torque", False)]
+)
+def test_intervals_beside_a_learned_torque_in_the_mesh_are_withheld(place: str, quantity: str, withheld: bool):
+    learned = {"place": place, "quantity": quantity}
+    report = {"decision": "unexplained", "before": _account(), "after": _account(), "unknown": learned}
+    say_what_intervals_hold(report, 1.0)
+    assert is_withheld(report["after"]["parameters"]["K"]) == withheld
+    assert not is_withheld(report["before"]["parameters"]["K"])
+
+
+def _account() -> dict[str, Any]:
+    parameter = {"ci95": [1.0, 2.0], "interval": "quadratic", "flag": None, "note": None}
+    return {"parameters": {"K": dict(parameter)}, "derived": {"omega_0": dict(parameter)}}
