@@ -76,7 +76,10 @@ def tables(results: Sequence[dict]) -> list[Table]:
     if pairs:
         found.append(_pairs(pairs))
     if left_out:
-        found.append(_verdicts("Family left out of the catalogue", left_out, lambda r: r["case"]["families"][0]))
+        found += [
+            _verdicts("Family left out of the catalogue", left_out, lambda r: r["case"]["families"][0]),
+            _verdicts("Family left out, by the strength of its effect", sorted(left_out, key=_limits), _by_strength),
+        ]
     done = [r for r in results if not r["error"]]
     if done:
         found += [_errors(done), _bias(done), _costs(results)]
@@ -170,8 +173,8 @@ def _verdicts(title: str, results: Sequence[dict], key: Callable[[dict], str]) -
     names = ("right", "tied", "wrong", "missed", "unexplained", "error")
     groups = list(dict.fromkeys(key(r) for r in results))
     rows = []
-    for group in groups:
-        counts = Counter(verdict(r) for r in results if key(r) == group)
+    for group in [*groups, "all"]:
+        counts = Counter(verdict(r) for r in results if group in (key(r), "all"))
         good = counts["right"] + counts["tied"]
         rows.append((group, *(str(counts[name]) for name in names), _share(good, counts.total())))
     return Table(title, ("", *names, "right or tied"), rows)
