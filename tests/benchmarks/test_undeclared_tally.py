@@ -86,7 +86,11 @@ def test_tables_count_known_results():
     assert confusion[1] == ("creep", "0", "1", "")
     assert confusion[2][1].startswith("66.7 % (2 of 3;")
     strengths = [row[:4] for row in told["Hidden effect, by strength"].rows]
-    assert strengths == [("up to 20 detection limits", "0", "1", "0"), ("up to 1000 detection limits", "1", "0", "1")]
+    assert strengths == [
+        ("up to 20 detection limits", "0", "1", "0"),
+        ("up to 1000 detection limits", "1", "0", "1"),
+        ("all", "1", "1", "1"),
+    ]
     # Clopper and Pearson's interval for 1 of 2 is 1.3 to 98.7 %: (1 - p)^2 = 0.975 at its end.
     assert told["Clean cases: false alarms"].rows[-1] == ("all", "50.0 % (1 of 2; 1.3 to 98.7 %)", "creep 1")
     pairs = dict(told["Pairs of effects"].rows)
