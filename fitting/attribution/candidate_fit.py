@@ -242,7 +242,7 @@ def long_gains(before: Trial, trials: Sequence[Trial], study: Study) -> list[flo
     moves = float(np.std(np.concatenate([run.measured for run in old])))
     if not np.isfinite(before_long) or min(before_long, max(after_long)) > 0.5 * moves:
         return None
-    return [float(np.log(before_long / after)) for after in after_long]
+    return [float(np.log(before_long) - np.log(after)) for after in after_long]
 
 
 def _free_runs(trial: Trial, study: Study) -> tuple[FreeRun, ...]:
