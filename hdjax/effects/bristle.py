@@ -27,8 +27,9 @@ def bristle_rate(rate: Array, z: Array, limit: Array, settling: Array) -> Array:
     """
     # No quotients: each would be one more division for every direction of a derivative.
     by_limit = 1.0 / limit
-    # Of a size below `limit / settling`.
-    rate = rate * jax.lax.rsqrt(1.0 + jnp.square(rate * (settling * by_limit)))
+    # Of a size below `limit / settling`; of the eighth order, so that slower motions are hardly slowed down.
+    eighth = jnp.square(jnp.square(jnp.square(rate * (settling * by_limit))))
+    rate = rate * jax.lax.rsqrt(jnp.sqrt(jnp.sqrt(1.0 + eighth)))
     return rate - jnp.abs(rate) * z * by_limit
 
 

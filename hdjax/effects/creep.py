@@ -24,7 +24,12 @@ class Creep(MeshTorqueEffect):
     drawn_against: ClassVar[str | None] = None
 
     k: Scalar = parameter(
-        0.0, unit="N m/rad", doc="stiffness that relaxes", source="EFFECTS: percent of the twist", role="strength"
+        0.0,
+        unit="N m/rad",
+        doc="stiffness that relaxes",
+        source="EFFECTS: percent of the twist",
+        bounds=(0.0, 1e12),
+        role="strength",
     )
     tau: Scalar = parameter(
         unit="s", doc="relaxation time", source="EFFECTS: minutes to hours", bounds=(0.0, 1e7), role="shape"
