@@ -93,8 +93,10 @@ class Held:
         return TwistTrial(model, hold_out(self.points, model, self.fold))
 
     def beside(self, trial: TwistTrial, terms: Terms) -> TwistTrial:
-        """The model with further terms."""
-        return self.attempt((*trial.model.terms, *(term for term in terms if term[0] not in trial.model.forms)))
+        """The model with further terms, less the forms of which it then has a generalisation."""
+        every = (*trial.model.terms, *(term for term in terms if term[0] not in trial.model.forms))
+        included = {form.includes for form, _ in every}
+        return self.attempt(tuple(term for term in every if term[0].name not in included))
 
     def without(self, trial: TwistTrial, forms: Sequence[Form]) -> TwistTrial:
         """The model without some of its forms."""
@@ -199,11 +201,11 @@ def _simplest_first(
     def is_tied(verdict: TwistVerdict) -> bool:
         if verdict.p_value > RULES.significance or held.is_worse(verdict.trial, leader.trial):
             return False
-        both = held.beside(verdict.trial, leader.trial.model.terms)
+        both = held.beside(verdict.trial, tuple(t for t in leader.trial.model.terms if t[0] in forms[leader.name]))
         return screened.p_value(both.gain_over(verdict.trial)) > RULES.significance
 
     def size(verdict: TwistVerdict) -> int:
-        return sum(form.size for form in forms[verdict.name])
+        return sum(form.size for form in verdict.trial.model.forms)
 
     able = [v for v in verdicts if v.p_value <= RULES.significance and v.gain >= _PLAUSIBLE * verdicts[0].gain]
     leader = next((v for v in able if _is_possible(v.trial.model)), verdicts[0])

@@ -145,11 +145,13 @@ def close_loop(
 def _still_open(forms: tuple[Form, ...], current: TwistTrial, max_effects: int) -> list[tuple[Form, ...]]:
     """Forms that may be added: new families up to the limit, and further forms of accepted ones."""
     present = [form.family for form in current.model.forms]
+    included = {form.includes for form in current.model.forms}
     free = max_effects - len(set(present))
     left = [
         form
         for form in forms
         if form not in current.model.forms
+        and form.name not in included
         and (form.family in present or free > 0)
         and present.count(form.family) < _MOST_OF_A_FAMILY
     ]

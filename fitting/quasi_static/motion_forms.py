@@ -1,4 +1,9 @@
-"""Effects of a moving joint: ripples in an angle, and friction on the motor's side."""
+"""Effects of a moving joint: ripples in an angle, and friction on the motor's side.
+
+A kinematic error is a function of the angle where it arises. With the motor's angle theta_m on one side and N theta_l
+on the other, that is theta_m - s N tau/K, where s is the share of the twist between motor and error. To first order, s
+adds n s N A tau/K sin(n theta_m + psi) to A cos(n theta_m + psi): the regressor of a stiffness ripple.
+"""
 
 import math
 from collections.abc import Iterator
@@ -9,10 +14,13 @@ import numpy as np
 from fitting.quasi_static.form import REST, Form
 from fitting.quasi_static.intervals import Figure
 from fitting.quasi_static.points import Points
+from fitting.quasi_static.twist_model import fit_twist
 
 HIGHEST_ORDER = 12
 # Least number of points per period of an order.
 _POINTS_IN_PERIOD = 6
+# Starting values of the share of the twist between motor and kinematic error.
+_SHARES = (0.5, 1.0)
 
 
 def motion_forms(points: Points) -> Iterator[Form]:
@@ -37,18 +45,23 @@ def orders_seen(angle: np.ndarray | None, points: Points, highest: int) -> list[
 
 
 def _of_the_motor_angle(points: Points) -> Iterator[Form]:
-    for n in orders_seen(points.motor_angle, points, HIGHEST_ORDER):
+    orders = orders_seen(points.motor_angle, points, HIGHEST_ORDER)
+    # Angle of the motor per torque, by which all of the twist shifts the phase.
+    shift = max((points.ratio or 0.0) * float(fit_twist(points).coefficients[0]), 0.0) if orders else 0.0
+    for n in orders:
         waves, names = partial(_waves, "motor_angle", n), (f"cosine {n}", f"sine {n}")
         wave = f"a cos({n} theta_m) + b sin({n} theta_m)"
         yield Form(
             "kinematic_error",
-            f"order {n} of the motor",
+            _at_the_motor(n),
             partial(waves, None),
             names,
             f"twist = tau/K + {wave}",
             _of_a_wave(n, "kinematic error"),
             of_torque=False,
         )
+        if shift > 0.0:
+            yield _behind_the_motor(n, shift, points)
         yield Form(
             "position_dependent_stiffness",
             f"stiffness ripple of order {n}",
@@ -69,6 +82,42 @@ def _of_the_motor_angle(points: Points) -> Iterator[Form]:
                 f"twist = (tau - F sgn(speed) ({wave}))/K",
                 (Figure(f"amplitude_{n}", _share, "N m", "of the friction", True),),
             )
+
+
+def _behind_the_motor(order: int, shift: float, points: Points) -> Form:
+    """A kinematic error with a part of the twist between it and the motor."""
+    assert points.ratio is not None
+    share = partial(_share_of_twist, points.ratio)
+    return Form(
+        "kinematic_error",
+        f"order {order} between motor and load",
+        partial(_shifted_waves, order),
+        (f"cosine {order}", f"sine {order}"),
+        f"twist = tau/K + a cos({order} phi) + b sin({order} phi), where phi = theta_m - s N tau/K",
+        (
+            *_of_a_wave(order, "kinematic error"),
+            Figure(f"share_of_twist_{order}", share, "1", "share s of the twist between motor and kinematic error"),
+        ),
+        shift * np.array(_SHARES)[:, None],
+        ("shift",),
+        np.array([[0.0], [shift]]),
+        of_torque=False,
+        includes=_at_the_motor(order),
+    )
+
+
+def _at_the_motor(order: int) -> str:
+    return f"order {order} of the motor"
+
+
+def _shifted_waves(order: int, points: Points, shape: np.ndarray) -> np.ndarray:
+    assert points.motor_angle is not None
+    phase = order * (points.motor_angle - shape[0] * (points.torque - points.centre))[:, None]
+    return np.hstack([np.cos(phase), np.sin(phase)])
+
+
+def _share_of_twist(ratio: float, own: np.ndarray) -> float:
+    return own[3] / (ratio * own[0])
 
 
 def _eccentricity(points: Points) -> Iterator[Form]:

@@ -49,6 +49,7 @@ class Points:
         twist_noise: Of a point's twist [rad].
         rows: Rows in a point, by log.
         reversals: Of the torque, by log.
+        ratio: Reduction ratio, or None.
         reference: Points that supply middle torque and mean temperature; these points where None.
     """
 
@@ -69,6 +70,7 @@ class Points:
     twist_noise: float
     rows: tuple[int, ...]
     reversals: tuple[int, ...]
+    ratio: float | None = None
     reference: "Points | None" = None
 
     @cached_property
@@ -146,6 +148,7 @@ def points_of(logs: Sequence[Log], motion: Sequence[Motion], ratio: float | None
         rows=tuple(round(len(one) / size) for one, size in zip(logs, sizes, strict=True)),
         # Coarse enough for reversals to exceed the torque's noise.
         reversals=tuple(len(turns(torque_of(one), max(1, len(one) // 200))) for one in logs),
+        ratio=ratio,
     )
 
 

@@ -105,6 +105,27 @@ def test_ripple_amplitude_phase_and_stiffness_are_estimated() -> None:
     assert stiffness_of(loop.held.points, loop.after.model)["K"].value == pytest.approx(K, rel=1e-3)
 
 
+@pytest.mark.parametrize(("share", "order", "moves"), [(0.4, 1, "both ways"), (1.0, 2, "one way")])
+def test_kinematic_error_behind_a_share_of_the_twist_is_no_stiffness_ripple(
+    share: float, order: int, moves: str
+) -> None:
+    """Its phase shifts with the torque, which to first order is a stiffness that depends on the angle."""
+    loop = closed(slow_joint([slow_joints.ripple(1e-4, order, share=share)], moves=moves, cycles=1.6))
+    assert families(loop) == {"kinematic_error"} and len(loop.findings[0].forms) == 1
+    known = figures(loop, "kinematic_error")
+    assert known[f"amplitude_{order}"].value == pytest.approx(1e-4, rel=0.02)
+    estimate = known[f"share_of_twist_{order}"]
+    # Three standard errors, of 0.02 at most.
+    assert estimate.value == pytest.approx(share, abs=0.06) and estimate.identifiable
+
+
+def test_stiffness_ripple_beside_a_kinematic_error_is_identified() -> None:
+    effects = [slow_joints.ripple(1e-4, 2), slow_joints.soft_spots(0.03, 2)]
+    loop = closed(slow_joint(effects, moves="both ways", cycles=1.6))
+    assert families(loop) == {"kinematic_error", "position_dependent_stiffness"}
+    assert figures(loop, "position_dependent_stiffness")["amplitude_2"].value == pytest.approx(0.03, rel=0.1)
+
+
 def test_ripple_amplitude_interval_has_nominal_coverage() -> None:
     hits = 0
     for seed in range(40):
