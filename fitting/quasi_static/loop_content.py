@@ -293,8 +293,8 @@ def _limits(report: Mapping[str, Any], loop: QuasiStaticLoop, parts: Parted) -> 
         ),
         (
             not parts.tests,
-            "The logs are too short to set test data aside: no error on unused data is stated. Name "
-            "another log with --test.",
+            "The logs are too short to set test data aside, or their ends are at rest: no error on unused data is "
+            "stated. Name another log with --test.",
         ),
         beyond_fitted(unseen, points.torque, points.torque_error),
         few_stretches(int(stretches(model.misfit, points.log, each=2)[-1]) + 1),
