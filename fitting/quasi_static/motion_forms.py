@@ -45,10 +45,13 @@ def orders_seen(angle: np.ndarray | None, points: Points, highest: int) -> list[
 
 
 def _of_the_motor_angle(points: Points) -> Iterator[Form]:
-    orders = orders_seen(points.motor_angle, points, HIGHEST_ORDER)
-    # Angle of the motor per torque, by which all of the twist shifts the phase.
-    shift = max((points.ratio or 0.0) * float(fit_twist(points).coefficients[0]), 0.0) if orders else 0.0
-    for n in orders:
+    if points.motor_angle is None:
+        return
+    # Motor angle per torque: the shift by the whole twist.
+    shift = (points.ratio or 0.0) * float(fit_twist(points).coefficients[0])
+    # Where twist alone turns the motor, its share would be a change of the order.
+    behind = orders_seen(_shifted(shift, points), points, HIGHEST_ORDER) if shift > 0.0 else []
+    for n in orders_seen(points.motor_angle, points, HIGHEST_ORDER):
         waves, names = partial(_waves, "motor_angle", n), (f"cosine {n}", f"sine {n}")
         wave = f"a cos({n} theta_m) + b sin({n} theta_m)"
         yield Form(
@@ -60,7 +63,7 @@ def _of_the_motor_angle(points: Points) -> Iterator[Form]:
             _of_a_wave(n, "kinematic error"),
             of_torque=False,
         )
-        if shift > 0.0:
+        if n in behind:
             yield _behind_the_motor(n, shift, points)
         yield Form(
             "position_dependent_stiffness",
@@ -110,9 +113,14 @@ def _at_the_motor(order: int) -> str:
     return f"order {order} of the motor"
 
 
-def _shifted_waves(order: int, points: Points, shape: np.ndarray) -> np.ndarray:
+def _shifted(shift: float, points: Points) -> np.ndarray:
+    """The motor's angle less a shift per torque [rad], (n,)."""
     assert points.motor_angle is not None
-    phase = order * (points.motor_angle - shape[0] * (points.torque - points.centre))[:, None]
+    return points.motor_angle - shift * (points.torque - points.centre)
+
+
+def _shifted_waves(order: int, points: Points, shape: np.ndarray) -> np.ndarray:
+    phase = order * _shifted(shape[0], points)[:, None]
     return np.hstack([np.cos(phase), np.sin(phase)])
 
 

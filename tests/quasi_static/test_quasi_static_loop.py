@@ -37,6 +37,7 @@ NO_EFFECT = [
     {"moves": "held"},
     {"moves": "held", "colour": 0.9, "twist_noise": 2e-5},
     {"moves": "held", "torque_noise": 3.0, "kind": "triangle", "cycles": 6.0},
+    {"moves": "held", "torque_noise": 1.0, "twist_noise": 1e-7, "cycles": 3.0},
     {"moves": "one way", "colour": 0.9},
     {"moves": "both ways", "colour": 0.9, "cycles": 5.0},
 ]
