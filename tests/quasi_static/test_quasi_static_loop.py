@@ -238,6 +238,14 @@ def test_autoregression_and_its_draws_agree_with_the_noise_process() -> None:
     assert np.std(draws) == pytest.approx(np.std(series[1000:]), rel=0.1)
 
 
+def test_lines_between_grid_frequencies_are_no_noise() -> None:
+    """Draws from the residual of two kinematic errors are no larger than the largest lines that noise may contain."""
+    random, at = np.random.default_rng(0), np.arange(1500)
+    noise = random.normal(size=len(at))
+    lines = 30.0 * (np.sin(2 * np.pi * 95.5 / 1500 * at) + np.sin(2 * np.pi * 191.4 / 1500 * at))
+    assert np.std(noise_of_the_same_colour(noise + lines, random)) < 2.0
+
+
 @pytest.mark.parametrize("kind", ["sine", "triangle"])
 def test_stated_error_of_the_smoothed_torque_is_unbiased(kind: str) -> None:
     ratios = []
