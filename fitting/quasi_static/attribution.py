@@ -128,34 +128,42 @@ def look(
             it fall.
     """
     screened = screen(held.points, before.model, choices, held.fold, seed)
-    verdicts = []
-    for lead in _worth_a_refit(screened):
-        trial = held.beside(before, lead.terms)
-        gain = trial.gain_over(before)
-        # The null distribution is that of the grid of shapes; further gain by the search between grid points is not
-        # counted.
-        p_value = screened.p_value(min(gain, lead.gain))
-        name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
-        verdicts.append(Verdict(name, family, trial, gain, p_value, True))
+    verdicts = [_refit(held, before, lead, screened) for lead in _worth_a_refit(screened)]
     if elastic:
         # Physically, the twist rises with the torque.
         verdicts = [v for v in verdicts if v.trial.model.coefficients[0] > 0]
     verdicts.sort(key=lambda verdict: -verdict.gain)
-    if not verdicts:
+    if verdicts:
+        best = verdicts[0]
+        asked = [_evidence(best.trial.beyond(before), best.gain, best.p_value)]
+    else:
         asked = [_evidence(lead.forms, lead.gain, screened.p_value(lead.gain)) for lead in screened.leads[:1]]
-        return Round(before, screened, (), False, RoundEvidence(tuple(asked), {}, ()))
-    seen = _evidence(verdicts[0].trial.beyond(before), verdicts[0].gain, verdicts[0].p_value)
-    if not _is_supported(seen):
-        return Round(before, screened, tuple(verdicts), False, RoundEvidence((seen,), {}, ()))
-    verdicts = _simplest_first(held, verdicts, screened, before, choices)
-    winner, added = verdicts[0], verdicts[0].trial.beyond(before)
-    removed, earlier = before.mean_square - winner.trial.mean_square, base.mean_square - before.mean_square
+    accepted = bool(verdicts) and _is_supported(asked[0])
+    if accepted:
+        verdicts = _simplest_first(held, verdicts, screened, before, choices)
+        winner, share = verdicts[0], _share_of_removed(held, verdicts[0].trial, before, base)
+        asked = [_evidence(winner.trial.beyond(before), winner.gain, winner.p_value, share)]
+        accepted = _is_supported(asked[0])
+    return Round(before, screened, tuple(verdicts), accepted, RoundEvidence(tuple(asked), {}, ()))
+
+
+def _refit(held: Held, before: TwistTrial, lead: Lead, screened: Screen[Lead]) -> TwistVerdict:
+    trial = held.beside(before, lead.terms)
+    gain = trial.gain_over(before)
+    # The null distribution is that of the grid of shapes; further gain by the search between grid points is not
+    # counted.
+    p_value = screened.p_value(min(gain, lead.gain))
+    name, family = (" and ".join(words) for words in ([form.name for form in lead.forms], lead.families))
+    return Verdict(name, family, trial, gain, p_value, True)
+
+
+def _share_of_removed(held: Held, trial: TwistTrial, before: TwistTrial, base: TwistTrial) -> float:
+    """Error that a form removes, over the error that preceding ones have removed (rms)."""
+    removed, earlier = before.mean_square - trial.mean_square, base.mean_square - before.mean_square
     # A form that depends on the torque must also remove more than the torque's error may cause.
-    if any(form.of_torque for form in added) and removed <= torque_error(held.points, base):
+    if any(form.of_torque for form in trial.beyond(before)) and removed <= torque_error(held.points, base):
         removed = 0.0
-    share = math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf if removed > 0 else 0.0
-    seen = _evidence(added, winner.gain, winner.p_value, share)
-    return Round(before, screened, tuple(verdicts), _is_supported(seen), RoundEvidence((seen,), {}, ()))
+    return math.sqrt(max(removed, 0.0) / earlier) if earlier > 0 else math.inf if removed > 0 else 0.0
 
 
 def _evidence(forms: Sequence[Form], gain: float, p_value: float, removed: float = math.inf) -> EffectEvidence:

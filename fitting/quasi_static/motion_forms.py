@@ -120,8 +120,7 @@ def _shifted(shift: float, points: Points) -> np.ndarray:
 
 
 def _shifted_waves(order: int, points: Points, shape: np.ndarray) -> np.ndarray:
-    phase = order * _shifted(shape[0], points)[:, None]
-    return np.hstack([np.cos(phase), np.sin(phase)])
+    return _turning(order * _shifted(shape[0], points))
 
 
 def _share_of_twist(ratio: float, own: np.ndarray) -> float:
@@ -142,8 +141,11 @@ def _eccentricity(points: Points) -> Iterator[Form]:
 
 
 def _waves(angle: str, order: int, factor: str | None, points: Points, shape: np.ndarray) -> np.ndarray:
-    phase = order * getattr(points, angle)[:, None]
-    return np.hstack([np.cos(phase), np.sin(phase)]) * (1.0 if factor is None else getattr(points, factor)[:, None])
+    return _turning(order * getattr(points, angle)) * (1.0 if factor is None else getattr(points, factor)[:, None])
+
+
+def _turning(phase: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.cos(phase), np.sin(phase)])
 
 
 def _amplitude(own: np.ndarray) -> float:

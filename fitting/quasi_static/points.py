@@ -182,17 +182,18 @@ def without_noise(values: np.ndarray) -> tuple[np.ndarray, float]:
         Stein 1981, Annals of Statistics 9(6), equation 2.5; Savitzky and Golay 1964, Analytical Chemistry 36(8).
     """
     variance = noise(values) ** 2
-    best, least = values, variance
+    best, least, error = values, variance, variance
     for width in _WIDTHS:
         if 10 * width > len(values):
             break
         smooth = np.asarray(savgol_filter(values, width, 3))
         own_share = float(savgol_coeffs(width, 3)[width // 2])
-        # The error is at least the variance of the local cubic.
-        risk = max(float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance, own_share * variance)
+        risk = float(np.mean((values - smooth) ** 2)) + (2.0 * own_share - 1.0) * variance
         if risk < least:
-            best, least = smooth, risk
-    return best, math.sqrt(least)
+            # The error is at least the variance of the local cubic. That must not choose the width: the risks of all
+            # widths share the error of the noise variance, and the floor is lowest for the widest one.
+            best, least, error = smooth, risk, max(risk, own_share * variance)
+    return best, math.sqrt(error)
 
 
 def _rests(at_rest: np.ndarray, log: np.ndarray) -> np.ndarray:
